@@ -12,7 +12,7 @@
     run = cl.train(world, teacher, "quickstart", seeds=8)   # what `cuelearner sweep` does, results in memory
     arm = cl.from_gymnasium("FetchReach-v4")                # a world as well: any Gymnasium environment
 
-What these take and give stands in their docstrings. Everything else is a room behind this face.
+Arguments and results are described in each function's docstring. All other modules are internal.
 """
 
 from importlib import import_module
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 __version__ = "1.0.0"
 
-# Where each name lies. They are loaded when they are first used: tasks import the bottom rooms of this package, and the
-# command line needs little of it at a time.
+# The module of each name, loaded at first use: tasks import only the lowest modules of this package, and each command
+# needs few modules.
 _PLACES = {
     "AdaptedPolicy": "api.adaptation",
     "CallablePolicy": "api.policies",
@@ -93,7 +93,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """A name of the face, loaded when it is first asked for."""
+    """Return a public name, whose module is loaded at first use."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     found = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
@@ -102,5 +102,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The face."""
+    """Return the public names."""
     return sorted([*__all__, "__version__"])

@@ -1,4 +1,4 @@
-"""A label's way: question -> answer -> record -> fit, each step a pure function of the guide's part of a lane.
+"""The course of a label: question -> answer -> record -> fit, each step a pure function of a lane's guide state.
 
 A simulated teacher's round scans them (`label_round`); a page calls them one by one, with a person's answer in between;
 adaptation gives another base policy than uniform actions.
@@ -25,15 +25,15 @@ from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
 
 LaneT = TypeVar("LaneT", bound=Any)
 
-ONE_BY_ONE = GuideSizes()  # questions as they come, of one strength: as a page asks them
+ONE_BY_ONE = GuideSizes()  # sizes with one candidate a question, as a page asks
 
 
 class GuideState(struct.PyTreeNode):
-    """The guide's part of a lane: its model, the answers so far, and the situation in which it asks next."""
+    """A lane's guide: the model, the labels so far, and the situation of the next question."""
 
     model: GuidanceModel
     labels: Label  # leading axis: slots, the largest budget of the sweep in whole rounds
-    budget: Int[Array, ""]  # labels that this lane may use
+    budget: Int[Array, ""]  # label budget of this lane
     asked: Int[Array, ""]  # questions so far that count within it, answered or not
     env: EnvState  # leading axis: candidates, where each question is chosen among several situations
     obs: Float[Array, "*candidates obs"]
@@ -51,18 +51,18 @@ class Stream(IntEnum):
 
 
 class Inquiry(struct.PyTreeNode):
-    """Who asks about what: what stays the same from question to question of a lane."""
+    """The guide, environment, base policy and settings that stay the same for all questions of a lane."""
 
     guidance: Guide = struct.field(pytree_node=False)
     env: Environment
     scalars: Any  # `GuideScalars`; with a simulated teacher `Scalars`
-    base: Policy  # whose actions are asked about, as the guide so far has them
+    base: Policy  # its actions are asked about, after refinement by the guide so far
     # Questions stay within it of what the base policy does, as `log` of the space counts; None: wherever guidance leads
     bound: Float[Array, ""] | None = None
 
 
 class QuestionKeys(NamedTuple):
-    """Random numbers of one question."""
+    """Random keys of one question."""
 
     base: PRNGKeyArray  # the base policy's
     question: PRNGKeyArray
@@ -71,13 +71,13 @@ class QuestionKeys(NamedTuple):
 
 
 def question_keys(lane_key: PRNGKeyArray, position: Int[Array, ""] | int) -> QuestionKeys:
-    """Those of a lane's question number `position`."""
+    """Return the keys of a lane's question number `position`."""
     key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.ASK), position)
     return QuestionKeys(*jax.random.split(key, 4))
 
 
 def label_slots(budget: int, sizes: GuideSizes) -> int:
-    """Rows that a label set needs: the budget rounded up to whole rounds."""
+    """Return the rows that a label set needs: the budget rounded up to whole rounds."""
     return -(-budget // sizes.labels_per_round) * sizes.labels_per_round
 
 
@@ -90,9 +90,9 @@ def start(
     k_env: PRNGKeyArray,
     sizes: GuideSizes = ONE_BY_ONE,
 ) -> GuideState:
-    """A guide that has asked nothing yet, at the start of an episode; of as many as there are candidates, if several.
+    """Return a guide without questions at the start of an episode; with several candidates, of as many episodes.
 
-    Raises ValueError if its questions are to be chosen and there is nothing to choose them by.
+    Raises ValueError if questions are chosen among candidates and the guide has no ensemble to choose by.
     """
     candidates = sizes.candidates
     by_members = candidates > 1 and not sizes.ask_all
@@ -119,7 +119,9 @@ def start(
 def question(
     of: Inquiry, guide: GuideState, keys: QuestionKeys
 ) -> tuple[Float[Array, "*candidates action"], Float[Array, "*candidates action"]]:
-    """The action to ask about in the guide's situation, or in each of its candidates; and what the base policy does."""
+    """Return the action to ask about in the guide's situation, or in each of its candidates, and the base policy's
+    action.
+    """
     space, scalars, several = actions_of(of.env), of.scalars, guide.obs.ndim > 1
     if several:
         first = call_policy(of.base, keys.base, guide.env, guide.obs, space)
@@ -147,7 +149,7 @@ def record(
     answered: Bool[Array, " n"],
     base: Float[Array, "n action"] | None,
 ) -> GuideState:
-    """The guide with answers in its labels from the row `position` on; `base`: what was proposed at first, if kept."""
+    """Return the guide with answers in its labels from row `position` on; `base`: uncorrected actions, if kept."""
     positions = position + jnp.arange(len(obs))
     rows = Label(obs, action, answer, answered & (positions < guide.budget), base)
     put = lambda known, new: jax.lax.dynamic_update_slice_in_dim(known, new, position, 0)  # noqa: E731
@@ -158,7 +160,7 @@ def record(
 def proceed(
     env: Environment, guide: GuideState, action: Float[Array, "*candidates action"], keys: QuestionKeys
 ) -> GuideState:
-    """The guide in the situation that the action leads to; of candidates, each by its own."""
+    """Return the guide after the step that the action leads to, in each candidate by its own action."""
     if guide.obs.ndim > 1:
         state, step = jax.vmap(env.step)(jax.random.split(keys.env, len(guide.obs)), guide.env, action)
     else:
@@ -174,7 +176,7 @@ def fit(
     lane_key: PRNGKeyArray,
     times: Int[Array, ""] | None = None,
 ) -> GuideState:
-    """The guide with a model of its labels. `times`: fits before this one, where it is one of several."""
+    """Return the guide with a model of its labels. `times`: number of fits before this one."""
     key = jax.random.fold_in(lane_key, Stream.FIT)
     key = key if times is None else jax.random.fold_in(key, times)
     labels = fitted_labels(key, guide.labels, scalars)
@@ -182,15 +184,15 @@ def fit(
 
 
 def fitted_labels(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> Label:
-    """Return what a model is fitted to: labels (slots, ...), or, where `scalars.answer` is shuffled, its control.
+    """Return the labels (slots, ...) to fit, or, where `scalars.answer` is shuffled, the control.
 
-    Of the control each label that counts has the answer of another. Situations, actions and answers are then as
-    frequent as in the labels, and no answer is about its action. `key`: of the fit.
+    In the control each valid label has the answer of another one. Situations, actions and answers keep their
+    frequencies, but no answer is about its action. `key`: of the fit.
     """
     if getattr(scalars, "answer", "best") != "shuffled":
         return labels
     drawn = jax.random.uniform(jax.random.fold_in(key, Stream.SHUFFLE), labels.valid.shape)
-    order = jnp.argsort(jnp.where(labels.valid, drawn, jnp.inf))  # those that count first
+    order = jnp.argsort(jnp.where(labels.valid, drawn, jnp.inf))  # valid labels first
     place, count = jnp.arange(len(order)), labels.valid.sum()
     after = jnp.where(place < count, (place + 1) % jnp.maximum(count, 1), place)
     return labels.replace(answer=labels.answer.at[order].set(labels.answer[order[after]]))
@@ -204,14 +206,14 @@ def ask(
     position: Int[Array, ""],
     every: bool = False,
 ) -> GuideState:
-    """Question number `position`, answered by a simulated teacher, recorded and acted on.
+    """Ask a simulated teacher question number `position`, record the answer, and step on.
 
     Args:
-        of: who asks about what.
-        teacher: who answers.
-        guide: where it stands.
-        lane_key: of all questions.
-        position: of this one, from 0.
+        of: the guide, environment and base policy of the questions.
+        teacher: the teacher who answers.
+        guide: the current guide state.
+        lane_key: random key of all questions.
+        position: number of this question, from 0.
         every: ask about every candidate, as many questions at once, the first of them number `position`.
 
     Raises:
@@ -243,10 +245,10 @@ def _chosen(
     actions: Float[Array, "*candidates action"],
     first: Float[Array, "*candidates action"],
 ) -> tuple[EnvState, Float[Array, " obs"], Float[Array, " action"], Float[Array, " action"]]:
-    """The one situation to ask in (state, observation), the action to ask about there, and what was proposed at first.
+    """Return the situation to ask in (state, observation), the action to ask about, and the base policy's action.
 
-    Of several candidates it is the one on which the members of the guide's model disagree most (query by committee:
-    Seung, Opper, Sompolinsky, 1992); before the first fit, when they know nothing, the first.
+    Of several candidates the one is chosen on which the members of the guide's model disagree most (query by committee:
+    Seung, Opper, Sompolinsky, 1992); before the first fit the first one.
     """
     candidates = guide.env, guide.obs, actions, first
     if guide.obs.ndim == 1 or not of.guidance.has_members:
@@ -263,9 +265,10 @@ def blame(
     base: Policy | None = None,
     key: PRNGKeyArray | None = None,
 ) -> None:
-    """Raises UserError if a teacher or a base policy gives something else than actions where a guide stands.
+    """Raise UserError if a teacher or a base policy returns invalid actions in the guide's situation.
 
-    For a lane that failed while it asked: it stands where it did before, and its labels hold nothing of the fault.
+    Call this for a lane that failed while asking: its situation is the one before the failure, and its labels do not
+    show the fault.
     """
     states, obs, space = guide.env, guide.obs, actions_of(env)
     if obs.ndim == 1:
@@ -279,7 +282,7 @@ def blame(
 
 
 def walk_unanswered(of: Inquiry, guide: GuideState, keys: Key[Array, " steps"]) -> GuideState:
-    """The guide after steps in which it acts as it would ask, and nobody answers."""
+    """Return the guide after steps with its own actions, without questions."""
 
     def step(guide: GuideState, key: PRNGKeyArray) -> tuple[GuideState, None]:
         own = QuestionKeys(*jax.random.split(key, 4))
@@ -291,7 +294,7 @@ def walk_unanswered(of: Inquiry, guide: GuideState, keys: Key[Array, " steps"]) 
 def label_round(
     of: Inquiry, sizes: GuideSizes, teacher: Teacher, guide: GuideState, lane_key: PRNGKeyArray
 ) -> GuideState:
-    """As many questions as a round has, then a fit to all labels so far; a guide with its budget stays as it is."""
+    """Ask one round of questions, then fit to all labels so far. A guide whose budget is used up does not change."""
     first = guide.asked
     at_once = sizes.candidates if sizes.ask_all else 1
 
@@ -308,7 +311,7 @@ def label_round(
 
 
 def with_guide(lane: LaneT, guide: GuideState) -> LaneT:
-    """The lane with a new guide; where that is not finite the lane fails, and keeps the guide that it had.
+    """Return the lane with a new guide. If that is not finite, the lane fails and keeps its former guide.
 
     `lane`: a record with `guide` and `failed`.
     """
@@ -320,5 +323,5 @@ def with_guide(lane: LaneT, guide: GuideState) -> LaneT:
 def take_labels(
     guidance: Guide, env: Environment, scalars: GuideScalars, labels: Label, guide: GuideState, lane_key: Any
 ) -> GuideState:
-    """The guide with labels (slots, ...) that were given elsewhere, and a model fitted to them once."""
+    """Return the guide with given labels (slots, ...) and a model fitted to them once."""
     return fit(guidance, env, scalars, guide.replace(labels=labels, asked=guide.budget), lane_key)

@@ -1,4 +1,4 @@
-"""Lanes over devices, each of which works on its share of a block and waits for none; how much one takes at once."""
+"""Share lanes out over devices that work independently, and choose how much a device computes at once."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 LANES = "lanes"
-LIBRARY_LANES = 16  # of a device, from which on the matrix products of NVIDIA's library are the faster ones
+LIBRARY_LANES = 16  # lanes of a device, from which on NVIDIA's library is the faster one for matrix products
 SHARED = PartitionSpec()  # the same on every device
-BY_LANE = PartitionSpec(LANES)  # leading axis cut into equal shares
+BY_LANE = PartitionSpec(LANES)  # leading axis divided into equal shares
 
 
 class Portions(NamedTuple):
-    """How much is worked on at once: what a core's cache holds, or what keeps an accelerator busy within its memory."""
+    """Sizes of one computation: what a core's cache holds, or what keeps an accelerator busy within its memory."""
 
     actions: int  # state-action pairs of one agent in one forward pass of an argmax
-    agents: int  # evaluated side by side
-    states: int  # that a teacher looks at together
+    agents: int  # agents evaluated side by side
+    states: int  # situations in one call of a teacher
 
 
 def release_programs(share: float = 0.5, process: Path = Path("/proc/self"), system: Path = Path("/proc/sys")) -> bool:
@@ -54,12 +54,12 @@ def release_programs(share: float = 0.5, process: Path = Path("/proc/self"), sys
 
 
 def portions() -> Portions:
-    """Those of the device that computes."""
+    """Return the portions for the default device."""
     return Portions(8192, 1, 16) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256)
 
 
 def compiler_options(lanes: int) -> dict[str, Any]:
-    """XLA's options for the training loop of so many lanes on each device.
+    """Return XLA's options for the training loop of so many lanes on each device.
 
     A GPU runs the independent kernels of a captured step side by side, and takes the matrix products of many lanes from
     NVIDIA's library, those of few from XLA's compiler (benchmarks/matrix_products.py).
@@ -94,19 +94,19 @@ def goes_through() -> bool:
 
 
 def lane_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """The devices that lanes are shared out to: all of this process's, or those given."""
+    """Return the mesh of devices that share the lanes: all of this process's, or the given ones."""
     devices = jax.local_devices() if devices is None else list(devices)
     return jax.make_mesh((len(devices),), (LANES,), axis_types=(AxisType.Auto,), devices=devices)
 
 
 def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...], gives: Any) -> Callable[..., Any]:
-    """`function` of each device's lanes, in one program. No device learns of another's: nothing is communicated.
+    """Return `function` mapped over each device's lanes, in one program without communication between devices.
 
     Args:
-        mesh: from `lane_mesh`.
-        function: of a block of lanes (leading axis) and of what they share.
+        mesh: a mesh from `lane_mesh`.
+        function: takes a block of lanes (leading axis) and the arrays that they share.
         takes: `SHARED` or `BY_LANE` for each argument.
-        gives: the same for what it returns.
+        gives: `SHARED` or `BY_LANE` for each result.
     """
 
     def whole(*arguments: Any) -> Any:
@@ -133,13 +133,13 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
 
 
 def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` of each lane of a block: side by side on an accelerator, by `jax.vmap`; one by one on a CPU.
+    """Return `function` for every lane of a block: by `jax.vmap` on an accelerator, one by one on a CPU.
 
-    Products of many matrices at once are summed in another order than one alone. So on a CPU a lane's result does not
-    depend on how many there are, not by a bit; and a core is no slower at it.
+    A batched matrix product sums in another order than a single one. On a CPU, therefore, lanes are computed one by
+    one: no bit of a lane's result depends on the number of lanes, and a core is not slower.
 
     Args:
-        function: of one lane's trees of arrays.
+        function: takes one lane's trees of arrays.
 
     Returns:
         The function of blocks: every leaf with a leading axis of lanes.
@@ -156,13 +156,13 @@ def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Callable[[Any], tuple[Any, Any, Any]]:
-    """The same of a function that gives a lane in the place of the one that it takes: no second block is made.
+    """Like `each_lane`, updating the block in place.
 
     Args:
-        function: of a lane -> (the lane after it, what all lanes have in common, what each has).
+        function: lane -> (updated lane, results common to all lanes, results of each lane).
 
     Returns:
-        The function of a block -> (the block after it, what all lanes have in common, what each has).
+        A function: block -> (updated block, results common to all lanes, results of each lane).
     """
 
     def mapped(block: Any) -> tuple[Any, Any, Any]:
@@ -207,5 +207,5 @@ def settled(tree: Any) -> Any:
 
 
 def place(mesh: Mesh, tree: Any, where: PartitionSpec) -> Any:
-    """A tree of arrays as `over_lanes` gives them back. JAX compiles once more for arrays that lie otherwise."""
+    """Return a tree of arrays placed as `over_lanes` returns them, since JAX compiles again for another placement."""
     return jax.device_put(tree, NamedSharding(mesh, where))

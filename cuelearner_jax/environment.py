@@ -1,7 +1,7 @@
-"""What an environment is to the method, what it may offer beyond that, and the symmetries of its data.
+"""The environment protocol, its optional members, and the symmetries of its data.
 
 An environment is a pytree: its parameters are traced, so a changed world needs no new compile. What every environment
-has stands in `Environment`, what it may have in `OptionalMembers`; nobody asks by the name of a task.
+has is in `Environment`, what it may have in `OptionalMembers`; no module asks for the name of a task.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class Quantity(NamedTuple):
     """One slice of an observation."""
 
     name: str
-    size: int  # entries
-    unit: str  # of an entry, as "m", "rad" or "1" for a pure number
-    about: str = ""  # what it is, where from and in which order, in a few words
+    size: int  # number of entries
+    unit: str  # unit of an entry, as "m", "rad" or "1" for a pure number
+    about: str = ""  # meaning, source and order of the entries, in a few words
     # "beams" at equal angles, counterclockwise, or "directions", unit vectors: what a sensor turns with; "own": what a
     # robot measures of itself, which no displaced sensor shifts
     kind: str = ""
-    step_deg: float = 0.0  # of beams: the angle between two neighbours
+    step_deg: float = 0.0  # angle between neighbouring beams
     # Of a place in metres (x, y, perhaps z): the point about which a sensor that is turned turns the place; None: no
-    # sensor turns, or nobody says about which point
+    # sensor turns it, or the point is not known
     origin: tuple[float, float] | None = None
     follows: str = ""  # name of the place from which this difference is taken, and with which it is displaced
 
@@ -43,8 +43,8 @@ DIRECTION = Quantity("direction", 2, "1", "unit vector (x, y) in the frame of th
 class Features(NamedTuple):
     """An observation as it looks from actions. Networks take the two parts where they take observation and action."""
 
-    own: Float[Array, " own"]  # what looks alike from every action: computed once, however many there are
-    turned: Float[Array, "*n turned"]  # what hangs on the action
+    own: Float[Array, " own"]  # the part that does not depend on the action: computed once for all actions
+    turned: Float[Array, "*n turned"]  # the part that depends on the action
 
 
 @runtime_checkable
@@ -67,88 +67,88 @@ class View(Protocol):
 
 @runtime_checkable
 class Environment(View, Protocol):
-    """One task. Inherit `WholeObservations` (or `Described`) for what can be derived."""
+    """One task. Inherit `WholeObservations` (or `Described`) for the members that can be derived."""
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
-        """Starts an episode."""
+        """Start an episode."""
         ...
 
     def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"]) -> tuple[EnvState, Step]:
-        """Executes an action; resets automatically when the episode ends."""
+        """Execute an action; reset automatically when the episode ends."""
         ...
 
     def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " memory"]:
-        """What replay keeps of an observation: as little as `recall` needs."""
+        """Return what replay stores of an observation: as little as `recall` needs."""
         ...
 
     def recall(self, memory: Float[Array, " memory"]) -> Float[Array, " obs"]:
-        """The observation that was acted on."""
+        """Return the observation that was acted on."""
         ...
 
     def recall_next(
         self, memory: Float[Array, " memory"], action: Float[Array, " action"], aftermath: Float[Array, " aftermath"]
     ) -> Float[Array, " obs"]:
-        """`Step.final_obs` of the step that `action` led to from there."""
+        """Return `Step.final_obs` of the step that `action` led to."""
         ...
 
 
 class Aims(NamedTuple):
-    """Actions that somebody may have in mind in a situation, as many in each; see `OptionalMembers.aims`."""
+    """Actions that a teacher may mean in a situation, as many in each; see `OptionalMembers.aims`."""
 
     actions: Float[Array, "aims action"]
-    features: Float[Array, "aims features"]  # what tells good ones from bad ones, of the order of one
-    possible: Bool[Array, " aims"]  # False: none of these, here
-    open: Bool[Array, " aims"] | None = None  # False: may be meant, but is not to be done; None: all that are meant may
+    features: Float[Array, "aims features"]  # features that tell good aims from bad ones, of the order of one
+    possible: Bool[Array, " aims"]  # False: not an aim in this situation
+    open: Bool[Array, " aims"] | None = None  # False: may be meant, but must not be followed; None: all may be followed
 
 
 class OptionalMembers(Protocol):
-    """What an environment may have beside; ask by `offers`, `view_of`, `symmetries_of` and `actions_of`."""
+    """Optional members of an environment; ask by `offers`, `view_of`, `symmetries_of` and `actions_of`."""
 
     @property
     def actions(self) -> Space:
-        """The space of its actions, where these are no directions in the plane."""
+        """The action space, where it is not directions in the plane."""
         ...
 
     def view(self) -> View:
-        """The environment without the parts that no policy looks at."""
+        """Return the environment without the parts that no policy uses."""
         ...
 
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """The obvious action, which needs no learning."""
+        """Return the task's obvious action, without learning."""
         ...
 
     @property
     def symmetries(self) -> int:
-        """Number of exact symmetries that data may be multiplied by (1: only the identity)."""
+        """Number of exact symmetries for data augmentation (1: only the identity)."""
         ...
 
     def mirror(
         self, which: Int[Array, ""], obs: Float[Array, " obs"], vector: Float[Array, " action"]
     ) -> tuple[Float[Array, " obs"], Float[Array, " action"]]:
-        """Image of an observation and of a vector like an action (an action, a residual) under symmetry `which`.
+        """Return the image of an observation and of an action-like vector under symmetry `which`.
 
         0 is the identity.
         """
         ...
 
     def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
-        """What a network is to see of one observation and each of the actions."""
+        """Return a network's inputs for one observation and each of the actions."""
         ...
 
     def aims(self, obs: Float[Array, " obs"]) -> Aims:
-        """One aim for each thing that an action may be about (a ball and a pocket, say), in one order of things.
+        """Return one aim for each thing that an action may be about (a ball and a pocket, say), in a fixed order.
 
-        The order means nothing: one network with the same weights looks at each aim.
+        The order carries no information: one network with the same weights is applied to each aim.
         """
         ...
 
     def rule(self, obs: Float[Array, " obs"]) -> Float[Array, " aims"]:
-        """log-weights of the aims by a rule that somebody wrote by hand: what labels about aims must surpass."""
+        """Return the log-weights of the aims by a hand-written rule: the baseline of labels about aims."""
         ...
 
 
 class Described:
-    """Mixed into an environment: what follows from its `observation`."""
+    """Mixin that derives members from the environment's `observation`."""
 
     observation: tuple[Quantity, ...]
 
@@ -159,43 +159,43 @@ class Described:
 
 
 class WholeObservations(Described):
-    """Mixed into an environment whose observations are small: replay keeps them as they are.
+    """Mixin for environments with small observations: replay stores them whole.
 
     `Step.aftermath` is then `Step.final_obs`.
     """
 
     def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
-        """The observation."""
+        """Return the observation."""
         return obs
 
     def recall(self, memory: Float[Array, " obs"]) -> Float[Array, " obs"]:
-        """The observation."""
+        """Return the observation."""
         return memory
 
     def recall_next(
         self, memory: Float[Array, " obs"], action: Float[Array, " action"], aftermath: Float[Array, " obs"]
     ) -> Float[Array, " obs"]:
-        """The next observation."""
+        """Return the next observation."""
         return aftermath
 
 
 def offers(env: Any, name: str) -> bool:
-    """Has an environment the optional member `name` (`heuristic`, `mirror`, `features`, `aims`, `rule`)?"""
+    """Return whether an environment has the optional member `name`, for instance `heuristic`, `mirror` or `aims`."""
     return getattr(env, name, None) is not None
 
 
 def view_of(env: Any) -> Any:
-    """The view of an environment: what it offers as one, or the environment."""
+    """Return the environment's `view()` if it has one, else the environment."""
     return env.view() if offers(env, "view") else env
 
 
 def actions_of(env: Any) -> Space:
-    """What an environment takes for actions: its `actions`, or directions in the plane."""
+    """Return an environment's action space: its `actions`, or directions in the plane."""
     return getattr(env, "actions", DIRECTIONS)
 
 
 def action_of(env: Any) -> Quantity:
-    """What an action is, in words: an environment's own `action`, a direction, or what its space says."""
+    """Return the description of an action: an environment's own `action`, a direction, or what its space says."""
     space = actions_of(env)
     return getattr(
         env, "action", DIRECTION if space == DIRECTIONS else Quantity("action", space.size, "1", space.about)
@@ -203,7 +203,7 @@ def action_of(env: Any) -> Quantity:
 
 
 class Spaces(NamedTuple):
-    """What networks have to know of an environment."""
+    """The sizes and spaces of an environment, as networks need them."""
 
     obs_size: int
     actions: Space
@@ -212,7 +212,7 @@ class Spaces(NamedTuple):
 
 
 def spaces_of(env: Any) -> Spaces:
-    """An environment's; shapes in place of its arrays will do."""
+    """Return an environment's spaces; shapes in place of its arrays will do."""
     spaces = Spaces(env.obs_size, actions_of(env))
     obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
     if offers(env, "features"):
@@ -223,7 +223,7 @@ def spaces_of(env: Any) -> Spaces:
     return spaces
 
 
-# By names of their own, by which JAX remembers what it has traced.
+# Named functions, since JAX caches traces by function.
 def _features(env: Any, obs: Float[Array, " obs"], action: Float[Array, " action"]) -> Features:
     return env.features(obs, action)
 
@@ -233,7 +233,7 @@ def _aims(env: Any, obs: Float[Array, " obs"]) -> Aims:
 
 
 def symmetries_of(env: Any) -> int:
-    """Number of symmetries that an environment offers (1: only the identity)."""
+    """Return the number of symmetries of an environment (1: only the identity)."""
     return int(getattr(env, "symmetries", 1)) if offers(env, "mirror") else 1
 
 
@@ -241,7 +241,7 @@ Image = Callable[[Array, Array], tuple[Array, Array]]  # observations (n, obs), 
 
 
 def random_symmetries(key: PRNGKeyArray, env: Any, count: int) -> Image:
-    """One random symmetry of the environment for each of `count` rows, as the function that maps rows under it.
+    """Draw a symmetry of the environment for each of `count` rows; return the function that maps rows by them.
 
     Where an environment has none, rows stay as they are.
     """

@@ -1,4 +1,4 @@
-"""The one exception that a user is meant to read."""
+"""Errors for users, and the parts of their messages."""
 
 import difflib
 import errno
@@ -15,7 +15,7 @@ MOST_LISTED = 20  # numbers that a message names
 
 
 def one_line(text: str) -> str:
-    """The text with every character that is not printable as its escape, for instance a newline as `\\n`."""
+    """Return the text with every unprintable character escaped, for instance a newline as `\\n`."""
     return "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
         for character in text
@@ -23,19 +23,19 @@ def one_line(text: str) -> str:
 
 
 class UserError(Exception):
-    """Bad input: its message is one clear line that says what is wrong and what to do.
+    """Bad input. The message is one clear line that says what is wrong and what to do.
 
     The command line prints the message alone, without a traceback, and exits with status 2. Whatever a path or a name
     in the message holds, there are no line breaks and no escape sequences in it.
     """
 
     def __init__(self, message: object = "") -> None:
-        """Keeps the message, on one line."""
+        """Store the message, on one line."""
         super().__init__(one_line(" ".join(str(message).splitlines())))
 
 
 class NotFinite(Exception):
-    """What was trained, or some of it, stopped being finite: its message is one line that says what, and what is kept.
+    """A result stopped being finite. The message is one line that says which result, and what was kept.
 
     The command line prints the message and exits with `status`.
     """
@@ -44,9 +44,9 @@ class NotFinite(Exception):
 
 
 def mentions(error: BaseException | None, numbers: Collection[int | None], *words: str) -> bool:
-    """Does an exception, or what it came from, have one of these error numbers, or say one of these words?
+    """Return whether an exception, or one of its causes, has one of these error numbers or contains one of these words.
 
-    TensorStore tells in words alone what the system refused.
+    TensorStore reports the system's errors in words only.
     """
     while error is not None:
         if (isinstance(error, OSError) and error.errno in numbers) or any(text in str(error) for text in words):
@@ -56,15 +56,15 @@ def mentions(error: BaseException | None, numbers: Collection[int | None], *word
 
 
 def no_space(error: BaseException) -> bool:
-    """Does an exception, or what it came from, say that the disk is full?"""
+    """Return whether an exception, or one of its causes, says that the disk is full."""
     words = ("No space left on device", "Disk quota exceeded", "File too large")
     return mentions(error, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), *words)
 
 
 def file_system_message(error: BaseException, resumes: bool) -> str | None:
-    """What to tell of an exception that the file system is to blame for, in one line; None for any other.
+    """Return one line about an exception that the file system caused; None for any other.
 
-    `resumes`: can the command go on with what it saved?
+    `resumes`: whether the command can resume from what it saved.
     """
     if no_space(error):
         again = "go on with the same command and --resume" if resumes else "give the same command again"
@@ -75,7 +75,7 @@ def file_system_message(error: BaseException, resumes: bool) -> str | None:
 
 
 def format_value(value: Any) -> str:
-    """A value for a message, on one short line: plain values as Python writes them, anything else by its type."""
+    """Return a value for a message, on one short line: plain values in Python's notation, others by type."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if shape := getattr(value, "shape", None):
@@ -86,27 +86,27 @@ def format_value(value: Any) -> str:
     short.maxstring = short.maxother = 60
     try:
         text = short.repr(value)
-    except Exception:  # of what cannot be written: an entry's own `repr`, an integer of thousands of digits
+    except Exception:  # values that have no short text: a failing `repr` of an entry, an integer of thousands of digits
         return f"a {type(value).__name__}"
     return text if text.isprintable() and len(text) <= 120 else f"a {type(value).__name__}"
 
 
 def user_code_error(named: str, error: Exception) -> UserError:
-    """What is told of an exception of the user's own code: one line that says whose it is and what was raised.
+    """Return the UserError for an exception of the user's own code: the code's name and the exception.
 
     Args:
-        named: what the code is, for instance "policy my_policy".
-        error: what it raised.
+        named: name of the code, for instance "policy my_policy".
+        error: the exception that the code raised.
     """
     try:
         words = " ".join(str(error).split())[:200]
-    except Exception:  # it has not even words
+    except Exception:  # the exception's own text fails
         words = ""
     return UserError(f"{named} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
 
 
 def format_numbers(numbers: Iterable[float]) -> str:
-    """Numbers in order for a message: as a range where no whole number between is absent, else 20 at most."""
+    """Return sorted numbers for a message: a range where they are consecutive, else at most 20 numbers."""
     known = sorted(set(numbers))
     texts = [f"{number:g}" if isinstance(number, float) else str(number) for number in known]
     if len(known) > 2 and known == list(range(int(known[0]), int(known[0]) + len(known))):
@@ -115,7 +115,7 @@ def format_numbers(numbers: Iterable[float]) -> str:
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
-    """The end of a message about an unknown word: the one that was probably meant, or all there are."""
+    """Return the end of a message about an unknown word: the probably intended word, or all known words."""
     known = list(known)
     found = difflib.get_close_matches(str(word)[:100], known, n=1)
     return f", did you mean {found[0]!r}?" if found else f": choose one of {', '.join(known)}"

@@ -1,6 +1,6 @@
-"""Validation: fixed-length roll-outs of any policy on episodes that nothing was trained or tuned on.
+"""Evaluation: fixed-length roll-outs of any policy on episodes that no training or tuning used.
 
-A roll-out is begun, walked in one stretch or in several, and summed up: the numbers are the same, bit by bit on a CPU.
+A roll-out may run in one stretch or in several; the numbers are the same, on a CPU bit by bit.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
 
 
 def episodes(split: str = "validation") -> PRNGKeyArray:
-    """Key of the episodes of a split; the same for every policy, seed and time."""
+    """Return the key of a split's episodes; it is the same for every policy, seed and time."""
     return jax.random.fold_in(jax.random.key(0), SPLITS[split])
 
 
 def rollout(
     policy: Policy, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int
 ) -> dict[str, Float[Array, ""]]:
-    """Means over `steps` environment steps, shared by `num_envs` environments that reset by themselves.
+    """Return means over `steps` environment steps, shared by `num_envs` environments that reset automatically.
 
-    Outcomes are those of each environment's first episode: the same episodes whatever the policy, and as many long ones
-    as there are. Give steps enough for the longest: while one has not ended, there is no mean over all of them.
+    Outcomes are those of each environment's first episode: the same episodes for every policy, long
+    ones included. Give steps enough for the longest one, since without it there is no mean over all of them.
 
     Returns:
         "reward" a step, every metric of the environment's, and, where it has outcomes, these (nan unless all first
@@ -45,7 +45,7 @@ def rollout(
 
 
 class Rollout(NamedTuple):
-    """A roll-out: what it came to over all environments, and in each of them, whose values are independent."""
+    """The results of a roll-out: means over all environments, and each environment's values, which are independent."""
 
     means: dict[str, Any]  # (*lanes,) over the environments, as `rollout` gives them
     # (*lanes, envs) means over an environment's own steps; outcomes are of its first episode, nan until that has ended
@@ -59,15 +59,15 @@ def _rolled(policy: Policy, env: Environment, key: PRNGKeyArray, num_envs: int, 
 
 
 class _Walk(NamedTuple):
-    """Where a roll-out stands; leading axis: environments."""
+    """The state of a roll-out; leading axis: environments."""
 
     state: Any
     obs: Array
-    first: Array  # is this still the first episode?
-    episode_steps: Array  # of the first episode so far
-    sums: dict[str, Array]  # of rewards and metrics, over the steps so far
-    outcomes: dict[str, Array]  # of the first episode, nan until it ends
-    acts: Array  # have all actions been finite so far?
+    first: Array  # True during the first episode
+    episode_steps: Array  # steps of the first episode so far
+    sums: dict[str, Array]  # sums of rewards and metrics over the steps so far
+    outcomes: dict[str, Array]  # outcomes of the first episode, NaN until it ends
+    acts: Array  # True while all actions were finite
 
 
 def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
@@ -77,13 +77,14 @@ def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
     _, step = jax.eval_shape(jax.vmap(env.step), keys, state, jnp.zeros((num_envs, actions_of(env).size)))
     names: list[str] = ["reward", *step.metrics]
     sums = dict.fromkeys(names, jnp.zeros(num_envs))
-    outcomes = dict.fromkeys(step.outcome, jnp.full(num_envs, jnp.nan, jnp.float32))  # as steps have them: one program
+    # NaN of the dtypes that steps have, so that one program serves both
+    outcomes = dict.fromkeys(step.outcome, jnp.full(num_envs, jnp.nan, jnp.float32))
     yes = jnp.ones(num_envs, bool)
     return _Walk(state, obs, yes, jnp.zeros(num_envs, jnp.int32), sums, outcomes, yes)
 
 
 def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, indices: Array) -> _Walk:
-    """The steps of these numbers."""
+    """Return the roll-out after the steps of these numbers."""
     _, k_run = jax.random.split(key)
     num_envs = walk.first.shape[0]
 
@@ -103,9 +104,9 @@ def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, in
 
 
 def _summed(walk: _Walk, steps: int) -> Rollout:
-    """What a walk of so many steps an environment has come to."""
+    """Return the results of a roll-out of so many steps an environment."""
     each = {name: total / steps for name, total in walk.sums.items()} | walk.outcomes
-    # What follows from an action that is none means nothing.
+    # Results after an invalid action are meaningless.
     each = {name: jnp.where(walk.acts, values, jnp.nan) for name, values in each.items()}
     if walk.outcomes:
         each["finished"] = 1.0 - walk.first
@@ -113,7 +114,7 @@ def _summed(walk: _Walk, steps: int) -> Rollout:
 
 
 def _apart(policy: PolicyBlock) -> tuple[Any, Any]:
-    """A policy twice, None in place of leaves: with those that each lane has, and with those that lanes share."""
+    """Split a policy into leaves that each lane has and leaves that lanes share, with None in place of the others."""
     by_lane = lambda axis, part: jax.tree.map(lambda _: axis is not None, part)  # noqa: E731
     own = jax.tree.map(by_lane, policy.axes, policy, is_leaf=lambda axis: axis is None)
     each, shared = (
@@ -124,7 +125,7 @@ def _apart(policy: PolicyBlock) -> tuple[Any, Any]:
 
 
 def _together(each: Any, shared: Any) -> Any:
-    """The inverse of `_apart`, also of one lane's leaves."""
+    """Join what `_apart` split, also with one lane's leaves."""
     return jax.tree.map(
         lambda own, common: common if own is None else own, each, shared, is_leaf=lambda leaf: leaf is None
     )
@@ -134,7 +135,7 @@ def _together(each: Any, shared: Any) -> Any:
 def evaluate_policy(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int
 ) -> dict[str, Float[Array, ""]]:
-    """`rollout` of one policy, compiled."""
+    """Run the compiled `rollout` of one policy."""
     return rollout(policy, env, key, num_envs, steps)
 
 
@@ -144,7 +145,7 @@ RESAMPLES = 2_000
 def mean_interval(
     values: Float[np.ndarray, "*lanes n"], resamples: int = RESAMPLES, seed: int = 0
 ) -> Float[np.ndarray, "3 *lanes"]:
-    """The mean of independent values, and the ends of its 95% percentile bootstrap interval (nan for one value alone).
+    """Return the mean of independent values and its 95% percentile bootstrap interval (NaN for a single value).
 
     The same values always give the same interval. For differences of two policies, pass those of each environment.
     """
@@ -157,7 +158,7 @@ def mean_interval(
     return np.stack([mean, *np.quantile(np.stack(list(drawn)), [0.025, 0.975], axis=0)])
 
 
-MOST_STRETCHES = 25  # of a roll-out that is watched
+MOST_STRETCHES = 25  # most stretches of a roll-out with progress
 
 Tell = Callable[[int, int], None]  # (done, of how many): called between stretches; what it raises ends the evaluation
 
@@ -167,7 +168,7 @@ def ignore_progress(done: int, count: int) -> None:
 
 
 def part_of(tell: Tell, number: int, parts: int) -> Tell:
-    """Who is told of part `number` (from 0) of as many equal ones, one after the other."""
+    """Return a progress callback for part `number` (from 0) of as many equal parts, one after the other."""
     return lambda done, count: tell(number * count + done, parts * count)
 
 
@@ -190,17 +191,17 @@ def rollout_lanes(
     tell: Tell = ignore_progress,
     mesh: Mesh | None = None,
 ) -> Rollout:
-    """Roll out a block of lanes, all on the same episodes; a policy that all lanes share is one lane.
+    """Roll out a block of lanes on the same episodes; a policy that all lanes share counts as one lane.
 
     Without a mesh in stretches, as many lanes at once as the device takes well.
 
     Args:
         env: the environment.
         policy: leaves that are `BY_LANE` in its `axes` have a leading axis of lanes.
-        key: of the episodes.
-        num_envs, steps: as `rollout` has them.
-        tell: is told how far it is.
-        mesh: devices that share the lanes, in one stretch, of which nobody is told.
+        key: random key of the episodes.
+        num_envs, steps: as for `rollout`.
+        tell: the progress callback.
+        mesh: devices that share the lanes, in one stretch without progress.
 
     Returns:
         NumPy arrays with a leading axis of lanes.
@@ -216,7 +217,8 @@ def rollout_lanes(
     size = min(lanes, portions().agents)
     firsts, found = range(0, lanes, size), []
     for number, first in enumerate(firsts):
-        rows = np.minimum(np.arange(first, first + size), lanes - 1)  # the last are repeated, which saves a compile
+        # the last lanes are repeated, which saves a compile
+        rows = np.minimum(np.arange(first, first + size), lanes - 1)
         part = jax.tree.map(lambda leaf, rows=rows: jnp.asarray(leaf)[rows], each)
         told = part_of(tell, number, len(firsts))
         found.append(_in_stretches(env, part, shared, key, num_envs, steps, told))
@@ -236,7 +238,7 @@ def _on_mesh(env: Any, each: Any, shared: Any, key: PRNGKeyArray, *, mesh: Mesh,
 def _in_stretches(
     env: Environment, each: Any, shared: Any, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell, whose: str = ""
 ) -> Rollout:
-    """A roll-out of one policy (`each` is None), or of the lanes of `each` side by side; a lane that fails is NaN."""
+    """Roll out one policy (`each` is None), or the lanes of `each` side by side; a lane that fails is NaN."""
     count, lanes = _stretches(steps // num_envs), 0 if each is None else len(jax.tree.leaves(each)[0])
     env, each, shared, key = settled((env, each, shared, key))
     walk = _begin(env, key, num_envs=num_envs)
@@ -250,7 +252,7 @@ def _in_stretches(
 
 
 def _stretches(steps: int) -> int:
-    """Into how many equal stretches so many steps are cut: one program serves them all, none of a single step.
+    """Return the number of equal stretches for so many steps, none of a single step: one program serves them all.
 
     XLA unrolls a loop of one step, whose numbers may then differ in their last bit.
     """

@@ -1,11 +1,11 @@
-"""The one training loop, whatever the guidance: policy -> guidance.act -> environment -> replay -> update.
+"""The training loop of every guidance: policy -> guidance.act -> environment -> replay -> update.
 
-`Lane` has its three parts as pure functions: `act` chooses, `absorb` stores what the actions led to, `learn` takes the
-gradient steps. `iterate` is the three with an environment of JAX between the first two; any other can be stepped there.
+`Lane` has three pure functions: `act` chooses actions, `absorb` stores their results, `learn` makes the gradient steps.
+`iterate` runs all three with a JAX environment between the first two; any other environment can be stepped there.
 
-Written for one lane (one seed with one label budget); lanes are put side by side once, in `make_program`. Random
-numbers come from the lane's own key folded with the shared counters, so a lane's result does not depend on its
-neighbours. On a CPU this holds bitwise, on an accelerator up to the order of the sums in matrix products.
+The code is written for one lane (one seed with one label budget); `make_program` maps it over lanes. Random numbers
+come from the lane's own key folded with the shared counters, so a lane's result does not depend on the other lanes. On
+a CPU the result is the same bit by bit, on an accelerator up to the order in which matrix products are summed.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.run_config import RunConfig, Settings
 from cuelearner_jax.types import EnvState, Label, Params, Step, Teacher
 
-_Parts = tuple[AgentOptions, ArbiterOptions, bool]  # their floats None; does anything bootstrap?
+_Parts = tuple[AgentOptions, ArbiterOptions, bool]  # options with None for floats; whether targets bootstrap
 
 APART = 1 << 30  # folded into a key whose other uses count from 0
-PROGRAMS_KEPT = 8  # compiled ones that a process holds for its next runs
+PROGRAMS_KEPT = 8  # compiled programs that a process keeps for its next runs
 
 
 class AgentState(struct.PyTreeNode):
-    """The agent's part of a lane: what it learns, what it has met, and where it stands."""
+    """The agent's part of a lane: parameters, learning state, replay and environments."""
 
-    params: Params  # with which it acts
-    training: Any  # what learning keeps beside them, such as a target network and the optimiser's state
+    params: Params  # parameters that act
+    training: Any  # learning state beside them, such as a target network and the optimiser's state
     replay: Float[Array, "capacity width"]
     env: EnvState  # leading axis: num_envs
     obs: Float[Array, "num_envs obs"]
@@ -70,17 +70,19 @@ class AgentState(struct.PyTreeNode):
 
 
 class TrainState(struct.PyTreeNode):
-    """One lane's everything: a lane is one seed with one label budget."""
+    """The whole state of one lane: one seed with one label budget."""
 
     agent: AgentState
     guide: GuideState
     arbiter: Any  # in which environments the guide's action is executed; see `arbiters.protocol`
     key: PRNGKeyArray
-    failed: Bool[Array, ""]  # did a loss, a gradient or a parameter stop being finite? It stays as it was before then
+    failed: Bool[
+        Array, ""
+    ]  # True once a loss, gradient or parameter was not finite; the lane then keeps its last finite state
 
 
 class Clock(struct.PyTreeNode):
-    """Counters shared by all lanes: never vmapped, so that branches on them stay branches."""
+    """Counters shared by all lanes; they are never vmapped, so that branches on them stay branches."""
 
     step: Int[Array, ""]  # environment steps of each lane
     update: Int[Array, ""]  # gradient steps of each lane
@@ -104,7 +106,7 @@ class Program(NamedTuple):
 
 
 def start_clock() -> Clock:
-    """All counters at zero."""
+    """Return the clock with all counters at zero."""
     return Clock(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
 
@@ -116,16 +118,16 @@ def make_program(
     mesh: Mesh | None = None,
     lanes: int = 1,
 ) -> Program:
-    """Compiles (on first use) the loop for one kind of guidance.
+    """Compile (on first use) the loop for one kind of guidance.
 
     Another run of the same sizes, guidance and shapes in this process is given the same program, compiled already.
 
     Args:
-        config: what shapes the program is taken from here; its `settings` are passed at each call.
+        config: the configuration that shapes the program; its `settings` are passed at each call.
         env: gives shapes; any environment of the same structure may be passed at the calls.
         largest_budget: labels that the largest lane may use.
         mesh: devices that share the lanes, whose number they must divide into (default: the first device alone).
-        lanes: that each device is expected to take at once; how fast it is may hang on it, nothing else.
+        lanes: expected number of lanes on each device; only speed depends on it.
     """
     leaves, structure = jax.tree.flatten(jax.eval_shape(lambda env: env, env))
     parts = (static(config.agent), static(config.arbiter), config.bootstraps)
@@ -152,7 +154,7 @@ def _program_of(
     mesh: Mesh,
     lanes: int,
 ) -> Program:
-    """The program of lanes in environments of this structure and these shapes."""
+    """Return the program of lanes in environments of this structure and these shapes."""
     lane = _lane_of(sizes, parts, guidance, largest_budget, jax.tree.unflatten(structure, leaves))
 
     def init(env, seeds, budgets, root):
@@ -160,7 +162,7 @@ def _program_of(
         return each_lane(partial(lane.init, env))(keys, budgets)
 
     def label_round(env, teacher, scalars, clock, state):
-        rest, agent = state.replace(agent=None), state.agent  # which is large, and asks nothing
+        rest, agent = state.replace(agent=None), state.agent  # the agent's state is large, and not needed for questions
         asked = each_lane(partial(lane.label_round, env, teacher, scalars))(rest).replace(agent=agent)
         return clock.replace(round=clock.round + 1), asked
 
@@ -201,7 +203,7 @@ def _program_of(
 
 
 class Keys(NamedTuple):
-    """Random numbers of one iteration, by who draws them; derived once, which takes an accelerator microseconds."""
+    """Random keys of one iteration, by consumer; they are derived together, which takes an accelerator microseconds."""
 
     act: PRNGKeyArray
     step: PRNGKeyArray  # the environments
@@ -210,31 +212,31 @@ class Keys(NamedTuple):
 
 
 class ActStep(NamedTuple):
-    """What `Lane.act` has chosen, to be executed and then given to `Lane.absorb`."""
+    """The actions that `Lane.act` chose, to be executed and then given to `Lane.absorb`."""
 
     actions: Float[Array, "num_envs action"]
-    passes: Int[Array, " num_envs"]  # how often guidance moved each
-    remembered: Float[Array, "num_envs memory"]  # what replay keeps of the observations that were acted on
+    passes: Int[Array, " num_envs"]  # number of guidance passes that moved each action
+    remembered: Float[Array, "num_envs memory"]  # what replay stores of the observations that were acted on
 
 
 class Lane(NamedTuple):
-    """The loop of one lane."""
+    """The training loop of one lane."""
 
     sizes: Sizes
     guidance: Guide
     learner: AgentFunctions
     arbiter: Arbiter
     buffer: RingBuffer
-    bootstraps: bool  # do targets look at the next observation?
+    bootstraps: bool  # whether targets use the next observation (discount above 0)
     largest_budget: int
 
     @property
     def counts_guided(self) -> bool:
-        """Whether replay counts guided steps: for an agent that draws them apart, under a guide that acts."""
+        """Whether replay counts guided steps: for an agent that draws them separately, under a guide that acts."""
         return draws_sorts(self.learner.options) and self.guidance.moves
 
     def init(self, env: Environment, key: PRNGKeyArray, budget: Int[Array, ""] | int) -> TrainState:
-        """A fresh lane. Budgets do not touch the random numbers: lanes of one seed start alike."""
+        """Return a new lane. Budgets do not affect the random numbers: lanes of one seed start alike."""
         k_agent, k_guidance, k_ask, k_env = jax.random.split(jax.random.fold_in(key, Stream.INIT), 4)
         slots = label_slots(self.largest_budget, self.sizes)
         params, training = self.learner.init(k_agent)
@@ -253,21 +255,21 @@ class Lane(NamedTuple):
         )
 
     def label_round(self, env: Environment, teacher: Teacher, scalars: Scalars, state: TrainState) -> TrainState:
-        """One round of questions to a simulated teacher about uniform actions (see `asking.label_round`).
+        """Ask a simulated teacher one round of questions about uniform actions (see `asking.label_round`).
 
-        `state` may be without its agent.
+        `state` may lack its agent.
         """
         of = asking.Inquiry(self.guidance, env, scalars, uniform_in(env))
         return asking.with_guide(state, asking.label_round(of, self.sizes, teacher, state.guide, state.key))
 
     def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
-        """Labels that were given elsewhere, in place of questions, and the model fitted to them."""
+        """Return the lane with given labels in place of questions, and a model fitted to them."""
         return asking.with_guide(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
 
     def keep_finite(self, state: TrainState, before: TrainState) -> TrainState:
-        """A lane after a stretch; one that has failed, in it or before, with what it had learned `before`.
+        """Return a lane after a stretch; a lane that has failed keeps the parameters of `before`.
 
-        Asked once a stretch, not at each gradient step: that would read all parameters once more.
+        This is checked once a stretch, since a check at each gradient step would read all parameters again.
         """
         learned = lambda lane: (lane.agent.params, lane.agent.training)  # noqa: E731
         failed = state.failed | ~all_finite(learned(state))
@@ -275,20 +277,20 @@ class Lane(NamedTuple):
         return state.replace(agent=state.agent.replace(params=params, training=training), failed=failed)
 
     def advance(self, clock: Clock, schedule: Schedule) -> Clock:
-        """The clock after one iteration."""
+        """Return the clock after one iteration."""
         steps = self.sizes.num_envs
         updates = jnp.where(clock.step + steps >= schedule.learn_after, steps, 0)
         return clock.replace(step=clock.step + steps, update=clock.update + updates)
 
     def keys(self, clock: Clock, state: TrainState) -> Keys:
-        """Keys of one iteration."""
+        """Return the keys of one iteration."""
         key = jax.random.fold_in(jax.random.fold_in(state.key, Stream.TRAIN), clock.step)
         return Keys(*jax.random.split(key, 4))
 
     def iterate(
         self, env: Environment, settings: Settings, clock: Clock, state: TrainState
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-        """One step in each of the lane's environments, then as many gradient steps."""
+        """Make one step in each of the lane's environments, then as many gradient steps."""
         keys = self.keys(clock, state)
         acted = self.act(env, settings, clock, state, keys.act)
         k_envs = jax.random.split(keys.step, self.sizes.num_envs)
@@ -299,7 +301,7 @@ class Lane(NamedTuple):
         return state, {**met, **learned}
 
     def act(self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray) -> ActStep:
-        """Actions to execute in each environment.
+        """Return the actions to execute in each environment.
 
         Uniform at first, then the agent's; refined by the guidance until the cut-off, where the arbiter says so. The
         branches depend on the shared clock alone, so they stay branches under vmap.
@@ -331,7 +333,7 @@ class Lane(NamedTuple):
         base: Float[Array, "num_envs action"],
         key: PRNGKeyArray,
     ) -> Refinement:
-        """What an arbiter chooses in place of the agent's own actions, until the cut-off."""
+        """Return what an arbiter chooses in place of the agent's own actions, until the cut-off."""
         agent, schedule, model = state.agent, settings.schedule, state.guide.model
         steps = jnp.asarray(schedule.learned_from(clock.step), jnp.float32)
         known = Known(env, self.learner, agent.params, self.guidance, model, settings.scalars, steps)
@@ -345,9 +347,9 @@ class Lane(NamedTuple):
     def absorb(
         self, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray, acted: ActStep, step: Step
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-        """The lane after its actions were executed: they are in replay, and the next observations are there.
+        """Return the lane after its actions were executed: steps are in replay, and the next observations are set.
 
-        `step` (num_envs, ...) is what they led to; the states of environments are left to who steps them.
+        `step` (num_envs, ...) is the result of the actions. The caller keeps the environments' states.
         """
         agent, done = state.agent, step.terminated | step.truncated
         outcome = Outcome(step.reward, done, guides(clock, settings.schedule))
@@ -367,7 +369,7 @@ class Lane(NamedTuple):
     def learn(
         self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-        """As many gradient steps as environment steps were just made, once there are enough of these."""
+        """Make as many gradient steps as environment steps, once replay holds enough."""
         filled, agent, schedule = clock.step + self.sizes.num_envs, state.agent, settings.schedule
         memory = Memory(env, self.buffer, agent.replay, filled, self.sizes.num_envs, self.bootstraps, agent.guided)
         offer = offer_of(self.arbiter, self.guidance, state.guide.model, env, settings.scalars, guides(clock, schedule))
@@ -401,12 +403,12 @@ class Lane(NamedTuple):
 
 
 def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:
-    """Is this the time of guidance: after the random steps and before the cut-off?"""
+    """Return whether guidance is active: after the random steps and before the cut-off."""
     return (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
 
 
 def make_lane(config: RunConfig, guidance: Guide, env: Environment, largest_budget: int) -> Lane:
-    """The loop of one lane for an environment, whose shapes alone are looked at."""
+    """Return the loop of one lane for an environment, of which only the shapes are used."""
     parts = (static(config.agent), static(config.arbiter), config.bootstraps)
     return _lane_of(config.sizes, parts, guidance, largest_budget, env)
 

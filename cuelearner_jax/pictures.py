@@ -1,4 +1,4 @@
-"""Pictures of RGB frames or image files: for the labelling page, as a still and as a film (GIF or MP4)."""
+"""Pictures from RGB frames or image files: for the labelling page, as a still, and as a film (GIF or MP4)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cuelearner_jax.types import Reel, Sketch
 Picture = UInt8[np.ndarray, "height width 3"]
 Source = np.ndarray | bytes  # a `Picture`, or the bytes of a PNG or JPEG file
 KINDS = (".gif", ".mp4")
-SHOWN = {"PNG": "image/png", "JPEG": "image/jpeg"}  # formats of files that are read: their media types
+SHOWN = {"PNG": "image/png", "JPEG": "image/jpeg"}  # readable file formats and their media types
 LARGEST = 1280  # longest side of a picture on the page, of a film there half of it [pixels]
 SHEET = 6  # frames of a film that its still shows
 TURNED = 0x0112  # the EXIF tag that says how a camera was held
@@ -44,12 +44,12 @@ def sketch(image: Source, words: str = "") -> Sketch:
 
 
 def clip(frames: Sequence[Source], period: float, words: str = "") -> Reel:
-    """Return a short film of pictures, to be seen in the place of a sketch's picture.
+    """Return a short film of pictures that replaces a sketch's picture while it plays.
 
     Args:
         frames: pictures as `sketch` takes them, all of one size.
         period: between two of them [s].
-        words: how the film ends.
+        words: words for the film's end.
 
     Raises:
         UserError: there is no frame, one is no picture, their sizes differ, or the period is not positive.
@@ -95,14 +95,14 @@ def animate(frames: Sequence[Source], file: str | os.PathLike[str], fps: float =
     def even(rate: float) -> Iterator[Picture]:
         for number in range(max(1, round(len(frames) * rate / fps))):
             frame = pixels(frames[min(int(number * fps / rate), len(frames) - 1)])
-            yield frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2]  # as codecs want them
+            yield frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2]  # even sides, as codecs need
 
     specimen = np.concatenate([pixels(frames[number]) for number in (0, len(frames) // 2, -1)])
     write_film(file, fps, even, palette_of(specimen, 256))
 
 
 def pixels(image: Source) -> Picture:
-    """Return a picture as RGB uint8 (height, width, 3). Raises UserError if it is none."""
+    """Return a picture as RGB uint8 (height, width, 3). Raises UserError for anything else."""
     return image if isinstance(image, np.ndarray) and _checked(image) else np.asarray(_opened(image)[0].convert("RGB"))
 
 
@@ -113,14 +113,14 @@ def _checked(image: np.ndarray) -> bool:
 
 
 def _opened(image: Any) -> tuple[Image.Image, str]:
-    """The image of a file's bytes, the way up that its camera tells, and its format."""
+    """Return the image of a file's bytes, rotated as its EXIF tag says, and its format."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             found = Image.open(io.BytesIO(image), formats=tuple(SHOWN))
             kind = found.format or ""
             if found.getexif().get(TURNED, 1) != 1:
-                found, kind = ImageOps.exif_transpose(found), ""  # not as it is stored
+                found, kind = ImageOps.exif_transpose(found), ""  # rotated, so the stored bytes are not reused
             found.load()
     except Exception as error:  # Pillow raises many kinds for damaged files
         raise UserError(f"a picture cannot be read ({error}): give the bytes of a PNG or JPEG file") from error
@@ -128,7 +128,7 @@ def _opened(image: Any) -> tuple[Image.Image, str]:
 
 
 def _uri(image: Source, largest: int) -> tuple[str, tuple[int, int]]:
-    """A picture as a data URI, its longer side at most `largest`, and its width and height [pixels]."""
+    """Return a picture as a data URI with its longer side at most `largest`, and its width and height [pixels]."""
     if isinstance(image, np.ndarray):
         _checked(image)
         found, kind = Image.fromarray(image), ""
@@ -167,7 +167,7 @@ def write_film(
 
 
 def check_film(file: str | os.PathLike[str], fps: float) -> None:
-    """Raises ValueError if such a film can't be written."""
+    """Raise ValueError if such a film cannot be written."""
     if Path(file).suffix.lower() not in KINDS:
         raise ValueError(f"cannot animate to {file}: give a name that ends in .gif or .mp4")
     if fps <= 0:
@@ -175,7 +175,7 @@ def check_film(file: str | os.PathLike[str], fps: float) -> None:
 
 
 def palette_of(specimen: Picture, colours: int, exactly: Sequence[str] = ()) -> list[int]:
-    """Red, green and blue of so many colours of a picture after those that must be exact (at most 256 in all).
+    """Return red, green and blue of so many colours of a picture, after the colours that must be exact (256 at most).
 
     Quantizing merges what is rare; few colours mean fewer shades at the edges and a smaller file.
     """

@@ -1,4 +1,4 @@
-"""Objects from outside the package: `package.module:NAME`, as entry points write it."""
+"""Load objects from outside the package by `package.module:NAME`, as entry points write it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ T = TypeVar("T")
 
 
 def load(reference: str, kind: type[T], called: str) -> T:
-    """The object that a reference names; modules of the current folder can be named too.
+    """Return the object that a reference names; modules of the current folder can be named too.
 
     Args:
         reference: `package.module:NAME`.
-        kind: what it must be an instance of.
-        called: what a message calls such an object, for instance "a task".
+        kind: class that the object must be an instance of.
+        called: name of such an object in messages, for instance "a task".
 
     Raises:
         UserError: no such module or name, the module does not import, or the object is something else.
@@ -31,7 +31,7 @@ def load(reference: str, kind: type[T], called: str) -> T:
     module_name, _, name = reference.partition(":")
     if os.getcwd() not in sys.path and "" not in sys.path:  # an installed command starts without it
         sys.path.append(os.getcwd())
-    importlib.invalidate_caches()  # the file may be younger than what Python knows of its folder
+    importlib.invalidate_caches()  # the file may be newer than Python's cache of its folder
     try:
         module: Any = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # whatever the module's own code raises
@@ -54,39 +54,39 @@ def load(reference: str, kind: type[T], called: str) -> T:
 
 
 class PartRegistry(Generic[T]):
-    """Classes of options that make parts of one sort (agents, say), found by their `NAME` or as package.module:NAME."""
+    """A registry of option classes that make parts of one sort (agents, say), by `NAME` or package.module:NAME."""
 
     def __init__(self, sort: str, *built_in: type[T]) -> None:
-        """`sort`: what messages call such a part."""
+        """`sort`: the word for such a part in messages."""
         self._sort, self._found = sort, {kind.NAME: kind for kind in built_in}  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def known(self) -> tuple[type[T], ...]:
-        """The classes that can be named."""
+        """The registered classes."""
         return tuple(self._found.values())
 
     def register(self, kind: type[T]) -> type[T]:
         """Make a class known under its name. Raises UserError if another one has the name."""
         name = kind.NAME  # pyright: ignore[reportAttributeAccessIssue]
         if self._found.setdefault(name, kind) is not kind:
-            raise UserError(f"there is another {self._sort} called {name!r}: give yours another name")
+            raise UserError(f"another {self._sort} is already called {name!r}: give yours another name")
         return kind
 
     def find(self, name: str) -> type[T]:
-        """The class of that name; no code is loaded that the name leads to. Raises UserError if there is none."""
+        """Return the class of that name without loading code. Raises UserError if no class has the name."""
         if name not in self._found:
             own = f"name your own by --{self._sort} package.module:NAME, if you trust that code"
             raise UserError(f"unknown {self._sort} {name!r}{suggestion(name, self._found)} ({own})")
         return self._found[name]
 
     def resolve(self, text: str) -> type[T]:
-        """The class that a user names, by its name or as `package.module:NAME`, whose code is loaded.
+        """Return the class that a user names, by its name or as `package.module:NAME`, whose code is loaded.
 
-        Never call it with what a file says. Raises UserError if there is no such class.
+        Never pass text from a file. Raises UserError if there is no such class.
         """
         if ":" not in text:
             return self.find(text)
         kind: Any = load(text, type, f"options of the {self._sort}")
         if not hasattr(kind, "NAME") or not callable(getattr(kind, "make", None)):
-            raise UserError(f"{text} is no {self._sort}: give a class of options with NAME, ABOUT and make")
+            raise UserError(f"{text} is not an {self._sort}: give a class of options with NAME, ABOUT and make")
         return self.register(kind)

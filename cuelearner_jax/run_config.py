@@ -1,4 +1,4 @@
-"""Everything that determines a run but its lanes: options that all parts share, and those that each part brings."""
+"""The configuration of a run except its lanes: options that all parts share, and the options of each part."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PARTS: Mapping[str, PartRegistry[Any]] = {"agent": AGENTS, "arbiter": ARBITERS}
 
 
 class Settings(NamedTuple):
-    """What a compiled program is given at each call: numbers that cost no new compile."""
+    """The traced inputs of a compiled program: numbers that cost no new compile."""
 
     scalars: Scalars
     schedule: Schedule
@@ -41,7 +41,7 @@ class Settings(NamedTuple):
 
 @dataclass(frozen=True)
 class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
-    """Everything that determines a run but its lanes (seeds, label budgets) and its kind of guidance."""
+    """The configuration of a run except its lanes (seeds, label budgets) and its kind of guidance."""
 
     task: TaskT
     sizes: Sizes = dataclasses.field(default_factory=Sizes)
@@ -56,19 +56,21 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
 
     @property
     def bootstraps(self) -> bool:
-        """Do targets look at the next observation?"""
+        """Whether targets use the next observation (discount above 0)."""
         return self.scalars.discount > 0
 
     def agent_in(self, env: Any) -> AgentFunctions:
-        """The agent's functions for an environment. Raises UserError for a frame in which that cannot be seen."""
+        """Return the agent's functions for an environment. Raises UserError for a frame that it does not support."""
         return self.agent.make(self.sizes.frame, spaces_of(env))
 
     def guide_in(self, env: Any, kind: str) -> Guide:
-        """The guide of a kind for an environment. Raises UserError as `guides.registry.make`."""
+        """Return the guide of a kind for an environment. Raises UserError as `guides.registry.make`."""
         return guidances.make(kind, self.sizes, env, self.options_of(kind))
 
     def options_of(self, kind: str) -> Any:
-        """Options of a kind of guidance; None: its defaults; plain values: the kind is from outside and not known here.
+        """Return the options of a kind of guidance; None: its defaults.
+
+        Plain values are the options of a kind from outside that is not known here.
 
         Raises UserError for options of another kind.
         """
@@ -82,12 +84,12 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
 
     @property
     def settings(self) -> Settings:
-        """What programs are given at each call."""
+        """Return the inputs of programs at each call."""
         return Settings(self.scalars, self.schedule, self.agent, self.arbiter)
 
 
 def check(config: RunConfig) -> None:
-    """Raises UserError with one line for the first value that cannot work."""
+    """Raise UserError with one line for the first value that cannot work."""
     sizes, schedule = config.sizes, config.schedule
     check_part(schedule, "schedule")
     check_guide(sizes, config.scalars)
@@ -109,14 +111,14 @@ def check(config: RunConfig) -> None:
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:
-    """The options as plain JSON values, without the task's: a part's beside the name of the part."""
+    """Return the options as JSON values without the task's; a part's options stand beside the part's name."""
     shared = {name: configuration.to_json(getattr(config, name)) for name in GROUPS}
     parts = {name: part_to_json(getattr(config, name)) for name in PARTS}
     return {**shared, **parts, "kinds": {name: kind_to_json(own) for name, own in config.kinds.items()}}
 
 
 def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
-    """The inverse of `to_json`; code that a file names is never loaded.
+    """Return the configuration of JSON values; code that a file names is never loaded.
 
     Raises:
         UserError: an unknown field, or a part that is not known here.
@@ -129,17 +131,17 @@ def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
 
 
 def kind_to_json(options: Any) -> Any:
-    """Options of a kind of guidance as plain JSON values; None where there are none."""
+    """Return the options of a kind of guidance as JSON values; None where there are none."""
     return options if options is None or isinstance(options, dict) else configuration.to_json(options)
 
 
 def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
-    """The inverse of `kind_to_json`; of a kind from outside that is not known here the plain values.
+    """Return the options of a kind from JSON values; for an unknown kind from outside the plain values.
 
     Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
     """
     if not isinstance(values, dict | None):
-        raise TypeError(f"options of a kind are told by name, not as {values!r}")
+        raise TypeError(f"options of a kind of guidance must be an object of names and values, not {values!r}")
     kind = guidances.find_or_none(name)
     if values is None or kind is None:
         return values
@@ -151,12 +153,12 @@ def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
 
 
 def part_to_json(options: Any) -> dict[str, Any]:
-    """A part's options as plain JSON values beside its name."""
+    """Return a part's options as JSON values beside its name."""
     return {"name": options.NAME, **configuration.to_json(options)}
 
 
 def part_from_json(parts: PartRegistry[Any], values: Mapping[str, Any]) -> Any:
-    """The inverse of `part_to_json`. Raises as `from_json`."""
+    """Return a part's options from JSON values. Raises as `from_json`."""
     return configuration.from_json(
         parts.find(values["name"]), {name: value for name, value in values.items() if name != "name"}
     )

@@ -1,8 +1,8 @@
-"""Ctrl-C, and what schedulers send: work that can be saved is saved, anything else ends at once, in one line.
+"""Handle Ctrl-C and schedulers' signals: finish and save work that can be saved, else end at once with one line.
 
-In a process of the command's own a thread hears them, also while compiled code keeps Python waiting, and ends the
-process without Python's leave-taking, in which threads that still compute would crash. Elsewhere (notebooks, tests)
-Python's own handlers hear them, between two calls of compiled code.
+In a command's own process a thread listens for signals, also while compiled code keeps Python waiting, and ends the
+process without Python's shutdown, in which threads that still compute would crash. Elsewhere (notebooks, tests)
+Python's own handlers run, between two calls of compiled code.
 """
 
 from __future__ import annotations
@@ -18,35 +18,35 @@ from pathlib import Path
 from types import FrameType
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a scheduler, a terminal that was closed
-SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # where a progress bar stood, which hides it
+SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # clears a progress bar's line and shows its cursor
 
 _listening = threading.Event()  # set in a process of the command's own
 _leaving = threading.Lock()
 _saves = threading.RLock()
-_litter: set[Path] = set()  # files that are not to outlive this process
+_litter: set[Path] = set()  # files to delete when this process ends
 
 
 class Interrupted(Exception):
-    """The user or a scheduler asked to stop; everything is saved."""
+    """The user or a scheduler asked to stop. Everything is saved."""
 
-    status = 130  # that a command ends with: 128 and the signal's number
+    status = 130  # exit status of the command: 128 plus the signal's number
 
 
 class Stopping(threading.Event):
-    """Set by the first signal, whose number it keeps."""
+    """An event that the first signal sets. It keeps the signal's number."""
 
     number: int = signal.SIGINT
 
 
 class _LateSignal:
-    """A second Ctrl-C of a process that does not listen, while something was being saved."""
+    """A second Ctrl-C in a process without a listening thread, while a result is being saved."""
 
     saving = 0
     pressed = False
 
 
 class _Heard:
-    """A handler of signals: called by the thread that listens, or else by Python."""
+    """A handler of signals, called by the listening thread or by Python."""
 
     def __init__(self, act: Callable[[int], None]) -> None:
         self.act = act
@@ -58,12 +58,12 @@ class _Heard:
 
 @contextmanager
 def interruptible(what: str = "this stretch of steps") -> Iterator[threading.Event]:
-    """An event that the first signal sets. A second Ctrl-C stops at once, losing what was not saved.
+    """Yield an event that the first signal sets. A second Ctrl-C stops at once and loses unsaved work.
 
     An `Interrupted` that is raised inside ends the command with the status of that signal.
 
     Args:
-        what: is done to its end first, in words.
+        what: the work that is finished first, in words.
     """
     stopping = Stopping()
 
@@ -72,7 +72,7 @@ def interruptible(what: str = "this stretch of steps") -> Iterator[threading.Eve
             stopping.number = number
             stopping.set()
             _say(f"stopping after {what} (Ctrl-C again: at once)")
-        elif number == signal.SIGINT:  # schedulers repeat themselves, and kill in the end
+        elif number == signal.SIGINT:  # schedulers repeat their signal, and kill in the end
             _stop_at_once(number)
 
     if threading.current_thread() is not threading.main_thread():
@@ -91,7 +91,7 @@ def interruptible(what: str = "this stretch of steps") -> Iterator[threading.Eve
 
 @contextmanager
 def saving() -> Iterator[None]:
-    """What is done inside is done to its end, however often Ctrl-C is pressed."""
+    """Run the body to its end, however often Ctrl-C is pressed."""
     with _saves:
         _LateSignal.saving += 1
         try:
@@ -105,7 +105,7 @@ def saving() -> Iterator[None]:
 
 @contextmanager
 def removed(file: Path) -> Iterator[None]:
-    """Removes a file at the end, also at that of a process that a signal ends at once."""
+    """Delete a file at the end, also when a signal ends this process at once."""
     _litter.add(file)
     try:
         yield
@@ -115,9 +115,9 @@ def removed(file: Path) -> Iterator[None]:
 
 
 def listen() -> None:
-    """Makes a signal end this process at once, in one line, with status 128 and its number, but where `interruptible`.
+    """Make a signal end this process at once with one line and status 128 plus its number, except in `interruptible`.
 
-    For a process that runs nothing but a command. What it was started to ignore (nohup) it goes on ignoring.
+    For a process that runs only a command. Signals that the process was started to ignore (nohup) stay ignored.
     """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
@@ -135,7 +135,7 @@ def _listen(reading: int) -> None:
 
 
 def _installed(handler: _Heard, also: int | None = None) -> dict[int, Callable | int]:
-    """Handles the signals that this process was not started to ignore, and `also`. Returns the handlers before."""
+    """Handle `also` and the signals that this process was not started to ignore. Return the former handlers."""
     before: dict[int, Callable | int] = {}
     for number in NUMBERS:
         was = signal.getsignal(number)
@@ -164,12 +164,12 @@ def _leave(number: int) -> None:
     for file in tuple(_litter):
         with contextlib.suppress(OSError):
             file.unlink()
-    with contextlib.suppress(OSError):  # past Python's streams: whoever computes or writes may hold them
+    with contextlib.suppress(OSError):  # bypasses Python's streams, whose locks another thread may hold
         shown = SHOW_CURSOR if os.isatty(2) else b""
         os.write(2, shown + b"stopped at once; what was saved before is safe\n")
     os._exit(128 + number)
 
 
 def _say(text: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # nobody may be reading any more
+    with contextlib.suppress(OSError, ValueError):  # the reader may be gone
         print(text, file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""What a task is to the method: configuration, bodies, teacher, presets, changed worlds and pictures. Types only."""
+"""The task protocol: configuration, bodies, teacher, presets, scenarios and pictures. Types only."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import EnvState, Policy, Reel, Sketch, Teacher
 
-COPIES = 3  # of a world while it is made
-PAPER = "paper"  # the preset that holds where none is given
+COPIES = 3  # bytes of a world while it is made
+PAPER = "paper"  # name of the default preset
 
 # Of a scenario's sizes: the paper's networks and their fitting, in place of the smaller ones that `adapt` else has
 PAPERS_FIT = {name: getattr(GuideSizes, name) for name in ("feedback_layers", "fit_steps", "fit_batch_size")}
@@ -36,15 +36,15 @@ class Preset:
 
     about: str
     config: RunConfig
-    guidance: tuple[str, ...] = ()  # kinds that it compares; none named: all that the task can have
+    guidance: tuple[str, ...] = ()  # kinds that it compares; empty: all that the task can have
     labels: tuple[int, ...] = (500, 1000)
     seeds: int = 5
     first_seed: int = 0
-    takes: str = ""  # how long on which machine
+    takes: str = ""  # duration, and on which machine
 
 
 class Pictures(NamedTuple):
-    """How a body is drawn."""
+    """The drawing functions of a body."""
 
     # (environment, policy, key, steps) -> what the next two draw, a frame a step; the reward of each step
     record: Callable[[Any, Any, PRNGKeyArray, int], tuple[list[Any], list[float]]]
@@ -53,7 +53,7 @@ class Pictures(NamedTuple):
     # (environment, state, observation (obs,), action (action,), file): the situation as a person is asked about it,
     # with the action in question as an arrow; a PNG
     question: Callable[[Any, EnvState, Float[Array, " obs"], Float[Array, " action"], Path], None]
-    # (environment, state): the situation as a person labels it in a browser; None: nobody can
+    # (environment, state): the situation as a person labels it in a browser; None: not possible
     sketch: Callable[[Any, EnvState], Sketch] | None = None
     # (environment, state, action (action,)): what the action leads to, to be seen in the sketch of the state
     # None, or no reel: there is none
@@ -63,49 +63,52 @@ class Pictures(NamedTuple):
     trails: Callable[[Any, EnvState, Float[Array, "n action"]], list[str]] | None = None
     # (environment): raises UserError if it cannot be drawn, which for some only trying tells; None: all can
     check: Callable[[Any], None] | None = None
-    legend: str = ""  # what the trails mean, for a person
-    simulates: bool = True  # is a reel what the action would lead to? False: what was recorded, whatever the action is
+    legend: str = ""  # meaning of the trails, for a person
+    # True if a reel shows the action's consequence; False: the recorded one, whatever the action
+    simulates: bool = True
 
 
 @dataclass(frozen=True)
 class Body:
-    """What acts in a task. To agents all bodies of a task are the same: policies act on each unchanged."""
+    """A robot or player that acts in a task. Policies act unchanged on each body of a task."""
 
     name: str
     about: str
     environment: Callable[[Any, str], Environment]  # (configuration, split); for the splits see `evaluate.SPLITS`
     engines: dict[str, Rollout] = field(default_factory=dict)  # roll-outs in other physics, by name
-    pictures: Callable[[], Pictures] | None = None  # loads what draws, when called; None: nothing draws it
+    # loads the drawing functions, when called; None: the body cannot be drawn
+    pictures: Callable[[], Pictures] | None = None
     # a folder of the user's -> the body with what lies there; raises UserError if that is not for it; None: takes none
     made_of: Callable[[Path], Body] | None = None
-    digest: str = ""  # of what lies in that folder
+    digest: str = ""  # meaning of that folder
     # (configuration, observations (n, obs), actions (n, action)) -> the environment with these in place of what files
     # hold; without them (None) of zeros, as far as shapes and views depend on it; None: as `environment` has it
     filled: Callable[[Any, Any, Any], Environment] | None = None
 
     def shape_environment(self, config: Any) -> Environment:
-        """The environment of a configuration, as far as shapes and views depend on it."""
+        """Return the environment of a configuration with the right shapes and views, but without worlds."""
         return self.environment(config, "training") if self.filled is None else self.filled(config, None, None)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A changed world: what a finished policy may meet, and is adapted to."""
+    """A changed world that a finished policy may meet and be adapted to."""
 
     about: str
     changes: dict[str, Any]  # fields of the task's configuration
     bound_deg: float | None = None  # suggested bound of an adapted policy's corrections [deg]
     eps_deg: float | None = None  # suggested strength of a label in it [deg]
-    # How `cuelearner adapt` corrects a policy there, unless told otherwise:
+    # Defaults of `cuelearner adapt` in this scenario:
     guidance: str | None = None  # kind of guidance
-    judge_by: str | None = None  # metric by which a model must be worth using
-    judge_bounds: tuple[float, ...] = ()  # shares of the bound within which it is tried as well
+    judge_by: str | None = None  # metric that judges whether a model is used
+    judge_bounds: tuple[float, ...] = ()  # shares of the bound that are tried as well
     sizes: dict[str, Any] = field(default_factory=dict)  # fields of `GuideSizes`
     scalars: dict[str, Any] = field(default_factory=dict)  # fields of `Scalars`
-    options: dict[str, Any] = field(default_factory=dict)  # of the kind of guidance: fields of its `Kind.config`
+    # options of the kind of guidance: fields of its `Kind.config`
+    options: dict[str, Any] = field(default_factory=dict)
 
     def apply(self, config: Any) -> Any:
-        """The configuration with the changes in it."""
+        """Return the configuration with the scenario's changes."""
         return dataclasses.replace(config, **self.changes)
 
 
@@ -115,30 +118,31 @@ class Task:
 
     name: str
     about: str
-    config: type  # its configuration: a dataclass, one line of help a field
-    bodies: tuple[Body, ...]  # its own first
-    teacher: Callable[[Any, Any], Teacher] | None = None  # (configuration, environment); None: nobody answers
-    # (configuration, environment, questions): one that answers alike, in less time for so few; None: there is none
+    config: type  # class of its configuration: a dataclass with one line of help a field
+    bodies: tuple[Body, ...]  # the task's own body comes first
+    # (configuration, environment) -> teacher; None: the task has no teacher
+    teacher: Callable[[Any, Any], Teacher] | None = None
+    # (configuration, environment, questions) -> a teacher with the same answers that is faster for so few; None: none
     brief_teacher: Callable[[Any, Any, int], Teacher | None] | None = None
     # configuration -> digests of the user's own files that it names, by field; raises UserError if one is not there
     files: Callable[[Any], dict[str, str]] = lambda config: {}
     # configuration -> steps of its longest episode, where episodes count (`Step.outcome`); None: steps count
     longest: Callable[[Any], int] | None = None
-    wants: Callable[[Any], str] = lambda config: ""  # configuration -> what is wanted there: a sentence for a person
-    # environment -> the policy whose actions people are asked about where none is named; None: uniform actions
+    wants: Callable[[Any], str] = lambda config: ""  # configuration -> the instruction for a person, a sentence
+    # environment -> default policy whose actions people are asked about; None: uniform actions
     proposed: Callable[[Any], Policy] | None = None
-    near_aims: bool = False  # are people asked near the aims of a situation? Elsewhere no answer would mean much
+    near_aims: bool = False  # True if people are asked near a situation's aims, since answers elsewhere say little
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
-    named: str = ""  # how a command names it, where not by its name alone: "gymnasium:FetchReach-v4"
-    origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that
-    default: Any = None  # the configuration that holds where nothing is given; None: `config()`
-    # configuration -> the metric that adapted policies are judged by where nothing else says
+    named: str = ""  # its name in commands, if other than `name`: "gymnasium:FetchReach-v4"
+    origin: str = ""  # "package.module:name" of a task from outside, set by the code that resolved it
+    default: Any = None  # the default configuration; None: `config()`
+    # configuration -> default metric that judges adapted policies
     judge_by: Callable[[Any], str] = lambda config: "reward"
 
     def __post_init__(self) -> None:
-        """Raises ValueError for the first thing that cannot be."""
+        """Raise ValueError for the first part that cannot work."""
         if not self.name.isidentifier():
             raise ValueError(f"task {self.name!r}: the name must be an identifier, as in Python")
         if not (isinstance(self.config, type) and dataclasses.is_dataclass(self.config)):
@@ -175,11 +179,11 @@ class Task:
             raise ValueError(f"{called} makes no configuration ({error})") from error
 
     def plain(self) -> Any:
-        """Return the configuration that holds where nothing is given."""
+        """Return the default configuration."""
         return self.config() if self.default is None else self.default
 
     def configure(self, scenario: str | None = None, **changes: Any) -> Any:
-        """The task's configuration in a changed world, with fields changed.
+        """Return the task's configuration in a scenario, with fields changed.
 
         Raises UserError for no such scenario or field, or a value that its field cannot hold.
         """
@@ -190,15 +194,15 @@ class Task:
         return dataclasses.replace(config, **values)
 
     def first_preset(self, default: str = PAPER) -> str:
-        """The name of the preset that holds where none is given: `default`, or the first."""
+        """Return the name of the default preset: `default`, or the first."""
         return default if default in self.presets else next(iter(self.presets))
 
     def start(self) -> RunConfig:
-        """The configuration that a policy is taken to be trained with where no folder says so."""
+        """Return the configuration that a policy is assumed to be trained with, where no folder says so."""
         return self.presets[self.first_preset()].config if self.presets else RunConfig(self.plain())
 
     def environment(self, config: Any, split: str = "training") -> Environment:
-        """The world of a configuration with the first body in it, for the episodes of a split.
+        """Return the world of a configuration with the first body in it, for the episodes of a split.
 
         Raises UserError if it is more than memory holds, before any of it is made.
         """
@@ -208,17 +212,14 @@ class Task:
         return self.bodies[0].environment(config, split)
 
     def view(self, config: Any) -> View:
-        """What policies look at in a configuration; worlds that no policy looks at are not generated."""
+        """Return what policies see in a configuration; worlds that no policy uses are not generated."""
         make = lambda: self.bodies[0].shape_environment(config)  # noqa: E731
         if not offers(jax.eval_shape(make), "view"):
             return self.environment(config)
         return jax.jit(lambda: view_of(make()))()
 
     def make_teacher(self, config: Any, env: Environment, questions: int | None = None) -> Teacher:
-        """Return who answers in a world; `questions`: how many there will be, if that is known.
-
-        Raises UserError if the task has no teacher.
-        """
+        """Return the teacher of a world; `questions`: their number, if known. Raises UserError if there is no teacher."""
         if self.teacher is None:
             raise UserError(f"{self.name} has no teacher to ask: give --labels-from, or a guidance without labels")
         if questions is not None and self.brief_teacher is not None:
@@ -228,9 +229,9 @@ class Task:
         return self.teacher(config, env)
 
     def check_whole(self, config: Any, envs: int, steps: int, envs_option: str, steps_option: str) -> None:
-        """Raises UserError if an episode of a world may outlast the steps of each of the environments that share them.
+        """Raise UserError if an episode may outlast the steps of each environment.
 
-        Means over the episodes that ended in time would be those of the short ones.
+        Means over the episodes that ended in time would be means of short episodes only.
         """
         if self.longest is not None and steps // envs < self.longest(config):
             raise UserError(
@@ -239,15 +240,15 @@ class Task:
             )
 
     def check_evaluations(self, config: RunConfig) -> None:
-        """Raises UserError unless the evaluations of a training see whole episodes."""
+        """Raise UserError unless the evaluations of a training see whole episodes."""
         schedule = config.schedule
         options = "--schedule.eval-envs", "--schedule.eval-steps"
         self.check_whole(config.task, schedule.eval_envs, schedule.eval_steps, *options)
 
     def on(self, body: str | None) -> Task:
-        """The task with that body first (None: as it is); with what lies in a folder, if it is called NAME:FOLDER.
+        """Return the task with that body first (None: unchanged); NAME:FOLDER adds the user's files in a folder.
 
-        Raises UserError if it has no such body, or nothing for it lies there.
+        Raises UserError if there is no such body, or the folder has no files for it.
         """
         if body is None:
             return self
@@ -265,7 +266,7 @@ class Task:
         return dataclasses.replace(self, bodies=(found, *others))
 
     def engine(self, name: str | None) -> Rollout | None:
-        """The first body's roll-out in other physics (None: its own). Raises UserError if it has no such engine."""
+        """Return the first body's roll-out in other physics (None: its own). Raises UserError for an unknown engine."""
         if name is None:
             return None
         engines = self.bodies[0].engines
@@ -279,13 +280,16 @@ class Task:
         return engines[name]
 
     def pictures(self, otherwise: str = "evaluate it instead") -> Pictures:
-        """How the first body is drawn. Raises UserError, with what to do `otherwise`, if nothing draws it."""
+        """Return the first body's drawing functions.
+
+        Raises UserError, with the remedy `otherwise`, if there are none.
+        """
         if self.bodies[0].pictures is None:
             raise UserError(f"{self.name} has no pictures of {self.bodies[0].name}: {otherwise}")
         return self.bodies[0].pictures()
 
     def scenario(self, name: str) -> Scenario:
-        """The changed world of that name. Raises UserError if there is none."""
+        """Return the scenario of that name. Raises UserError if there is none."""
         if not self.scenarios:
             raise UserError(f"{self.name} has no scenarios to choose from: leave out --scenario")
         if name not in self.scenarios:
@@ -294,5 +298,5 @@ class Task:
 
 
 def shape_of(task: Task, config: Any) -> Any:
-    """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
+    """Return the environment of a configuration with shapes in place of arrays, at almost no cost."""
     return jax.eval_shape(lambda: task.bodies[0].shape_environment(config))

@@ -1,7 +1,7 @@
-"""Learned teachers: the best direction by a network's values of what the environment's features show; their folders.
+"""Learned teachers: the best direction by a network's values of the environment's features; and their folders.
 
-A folder holds the network in half precision, and teacher.json: what the teacher is and how it was made. A teacher knows
-the world that it learned in. Who loads one for another world asks `world_of` first.
+A folder holds the network in half precision, and teacher.json: what the teacher is and how it was made. A teacher is
+right in the world that it learned in. Before loading one for another world, call `world_of`.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import Params
 
 ABOUT = "teacher.json"
-TRAIN = "python experiments/train_teacher.py"  # of the repository, in messages
+TRAIN = "python experiments/train_teacher.py"  # folder of the repository, for messages
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What a reader has to know of a teacher's network."""
+    """The sizes of a teacher's network."""
 
     layers: tuple[int, ...]
     directions: int
 
 
 def initial_params(layers: tuple[int, ...], env: Any, key: PRNGKeyArray) -> Params:
-    """Fresh weights of a teacher's network."""
+    """Return random weights of a teacher's network."""
     return q_network(layers).init(key, *network_inputs("action", env, jnp.zeros(env.obs_size), jnp.array([1.0, 0.0])))
 
 
 def expected_reward(
     layers: tuple[int, ...], env: Any, params: Params, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]
 ) -> Float[Array, "*n"]:
-    """A teacher's network: the reward that it expects of actions in one situation, as it looks from them."""
+    """Return the reward that a teacher's network expects of actions in one situation."""
     return as_function(q_network(layers))(params, *network_inputs("action", env, obs, actions))[..., 0]
 
 
 class LearnedTeacher(struct.PyTreeNode):
-    """The best direction by a network's values (`cuelearner_jax.types.Teacher`). Looks at the observation alone."""
+    """A teacher by a network's values of directions (`cuelearner_jax.types.Teacher`); it sees the observation alone."""
 
-    env: Any  # gives the features
+    env: Any  # the environment or view whose features the network sees
     params: Params
     aim_error: Float[Array, ""] | float  # standard deviation of the error of a player's aim [rad]
     habit: Float[Array, ""] | float  # settles near-ties, see `actions.best_direction`
@@ -63,11 +63,11 @@ class LearnedTeacher(struct.PyTreeNode):
     directions: int = struct.field(pytree_node=False)
 
     def values(self, obs: Float[Array, " obs"], options: Float[Array, "n 2"]) -> Float[Array, " n"]:
-        """Expected reward of each direction."""
+        """Return the expected reward of each direction."""
         return expected_reward(self.layers, self.env, self.params, obs, options)
 
     def best_action(self, state: Any, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
-        """The direction with the largest value."""
+        """Return the direction with the largest value."""
         values = self.values(obs, geometry.evenly_spaced(self.directions))
         return geometry.best_direction(values, self.aim_error, self.habit)
 
@@ -79,13 +79,13 @@ class LearnedTeacher(struct.PyTreeNode):
         spread: Float[Array, ""] | float,
         share: Float[Array, ""] | float,
     ) -> Float[Array, "2"]:
-        """The nearest direction that it holds for good (`cuelearner_jax.types.ValuesDirections`)."""
+        """Return the nearest good direction (`cuelearner_jax.types.ValuesDirections`)."""
         values = self.values(obs, geometry.evenly_spaced(self.directions))
         return geometry.nearest_direction(values, spread, share, action)
 
 
 def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
-    """Writes a teacher: its network in half precision, and teacher.json: what it is and how it was made.
+    """Write a teacher's folder: its network in half precision, and teacher.json.
 
     `about` must hold the `layers` and `directions` of the network under `config`.
 
@@ -98,7 +98,7 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
             f"{folder}; train with a smaller --teacher.learning-rate and another --out"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / "network").exists():  # an earlier teacher's, which would be kept
+    if (folder / "network").exists():  # delete an earlier teacher's file, which would be kept
         shutil.rmtree(folder / "network")
     with checkpoints(folder / "network") as saved:
         saved.save(0, {"params": params})
@@ -106,7 +106,7 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
 
 
 def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
-    """A teacher that `save` wrote. Raises UserError if there is none, or one for other observations."""
+    """Return a teacher that `save` wrote. Raises UserError if there is none, or its observations differ."""
     about = _about(folder)
     try:
         shape = from_json(Shape, {name: about["config"][name] for name in ("layers", "directions")})
@@ -117,7 +117,8 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     ):
         raise formats.damaged("teacher", folder / ABOUT, "layers or directions that no teacher has")
     told = f"{folder / ABOUT} has {shape.directions:,} directions"
-    check_room(told, 8 * max(shape.layers) * shape.directions, "restore the file")  # as of a run's (`grid.load`)
+    # the same remedy as for a run (`grid.load`)
+    check_room(told, 8 * max(shape.layers) * shape.directions, "restore the file")
     template = jax.eval_shape(lambda key: initial_params(shape.layers, env, key), jax.random.key(0))
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:
@@ -128,16 +129,16 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
 
 
 def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> Any:
-    """The configuration of the world that a teacher learned in.
+    """Return the configuration of the world that a teacher learned in.
 
     Args:
-        folder: of the teacher.
+        folder: folder of the teacher.
         task: name of the task in which it is to be asked.
         config: the configuration in which it is to be asked.
-        apart: fields in which the two may differ, because they change nothing or the task sees to it.
+        apart: fields in which the two may differ, because they change nothing or the task handles them.
 
     Raises:
-        UserError: no teacher there, one of another task, or one that knows nothing of a change in this world.
+        UserError: no teacher there, one of another task, or one that does not know a change of this world.
     """
     told = _about(folder).get("task")
     if not isinstance(told, dict) or "name" not in told:
@@ -152,7 +153,7 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
     for field, value in before.items():
         if value != now[field]:
             raise UserError(
-                f"the teacher in {folder} learned with {_typed({field: value})} and knows nothing of this world's "
+                f"the teacher in {folder} learned with {_typed({field: value})} and does not know this world's "
                 f"{_typed({field: now[field]})}: use the search teacher (--task.teacher search), or train one for this "
                 f"world ({TRAIN} {task} {_typed(now)} --out FOLDER) and give --task.teacher FOLDER"
             )
@@ -160,7 +161,7 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
 
 
 def digest(folder: Path) -> str:
-    """Short hash of a teacher's files. Raises UserError if there is none."""
+    """Return a short hash of a teacher's files. Raises UserError if there is no teacher."""
     _about(folder)
     found = hashlib.sha256()
     for file in [folder / ABOUT, *sorted((folder / "network").rglob("*"))]:
@@ -170,7 +171,7 @@ def digest(folder: Path) -> str:
 
 
 def _about(folder: Path) -> dict[str, Any]:
-    """What teacher.json says. Raises UserError if there is none or it is damaged."""
+    """Return the content of teacher.json. Raises UserError if it is missing or damaged."""
     if not (folder / ABOUT).is_file():
         raise UserError(
             f"no teacher in {folder}: train one with `{TRAIN}` and give its folder "
@@ -180,6 +181,6 @@ def _about(folder: Path) -> dict[str, Any]:
 
 
 def _typed(fields: dict[str, Any]) -> str:
-    """Fields of a task's configuration as they are typed on the command line."""
+    """Return fields of a task's configuration as command-line arguments."""
     told = {name: value if isinstance(value, list) else [value] for name, value in fields.items()}
     return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in told.items())

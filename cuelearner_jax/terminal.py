@@ -1,4 +1,4 @@
-"""What long work says on the terminal: messages and progress on standard error, which nobody needs to read."""
+"""Messages and progress of long work, on standard error."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Interrupted", "abandon", "console", "interruptible", "progress_bars"
 
 
 class _StandardError:
-    """`sys.stderr` of the moment. Work goes on where nobody reads it any more: a closed pipe, a terminal that went."""
+    """The current `sys.stderr`. Work goes on if its reader is gone: a closed pipe or terminal."""
 
     def write(self, text: str) -> int:
         with self._heard() as stream:
@@ -35,7 +35,7 @@ class _StandardError:
         stream = _stderr()
         try:
             yield stream
-        except OSError:  # Python would try again to write what is left, when it ends, and fail
+        except OSError:  # else Python would try again to write the rest when it ends, and fail
             abandon(stream)
 
     def __getattr__(self, name: str) -> Any:
@@ -43,18 +43,18 @@ class _StandardError:
 
 
 def _stderr() -> Any:
-    return getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # a progress bar puts itself in front
+    return getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # a progress bar wraps the stream
 
 
 def abandon(stream: Any) -> None:
-    """Sends what is still written to a stream that nobody reads to nowhere."""
+    """Redirect a stream without a reader to the null device."""
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
         os.close(nowhere)
 
 
-# Text is the user's in parts (paths, names of tasks): nothing in it is markup.
+# Text contains the user's words (paths, names of tasks), so none of it is markup.
 PLAIN: dict[str, Any] = {"markup": False, "emoji": False, "highlight": False, "soft_wrap": True}
 console = Console(file=cast(IO[str], _StandardError()), **PLAIN)
 
@@ -146,7 +146,7 @@ class ProgressLines(Progress):
 
 
 def watched_by(bars: Progress) -> Callable[[str], Callable[[int, int], None]]:
-    """Return a function that starts a bar for a piece of work and returns who is told how far that is."""
+    """Return a function that starts a bar for a piece of work and returns the bar's progress callback."""
 
     def watch(what: str) -> Callable[[int, int], None]:
         bar = bars.add_task(what, total=None, note="")

@@ -1,4 +1,4 @@
-"""What environments, teachers, policies and guides exchange, with the shape and unit of each field.
+"""Records that environments, teachers, policies and guides exchange, with the shape and unit of each field.
 
 Records describe one sample or one seed; leading axes appear only where code is vmapped.
 Directions are unit vectors in the plane; angles are radians, counterclockwise positive.
@@ -13,34 +13,34 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 Params = Any  # a Flax parameter pytree
-EnvState = Any  # whatever pytree an environment carries from step to step
+EnvState = Any  # the pytree that an environment carries from step to step
 
 
 class Step(struct.PyTreeNode):
-    """What one environment step returns."""
+    """The result of one environment step."""
 
-    obs: Float[Array, " obs"]  # to act on next: after the automatic reset where the episode ended
-    final_obs: Float[Array, " obs"]  # what the action led to: before the automatic reset
-    aftermath: Float[Array, " aftermath"]  # what replay keeps of `final_obs`, see `Environment.recall_next`
+    obs: Float[Array, " obs"]  # the next observation: after the automatic reset where the episode ended
+    final_obs: Float[Array, " obs"]  # the action's result: before the automatic reset
+    aftermath: Float[Array, " aftermath"]  # what replay stores of `final_obs`, see `Environment.recall_next`
     reward: Float[Array, ""]
-    terminated: Bool[Array, ""]  # the task ended: nothing follows
-    truncated: Bool[Array, ""]  # time ran out: something would have followed
+    terminated: Bool[Array, ""]  # the task ended: no value follows
+    truncated: Bool[Array, ""]  # time ran out: values would have followed
     metrics: Mapping[str, Float[Array, ""]]  # averaged over steps in every report
     outcome: Mapping[str, Float[Array, ""]]  # averaged over episodes: counts where an episode ends
 
 
 @runtime_checkable
 class Teacher(Protocol):
-    """Knows (or believes it knows) the best action. A pytree, like an environment."""
+    """A teacher: it returns an action that it holds for the best. A pytree, like an environment."""
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """The action that the teacher would choose."""
+        """Return the action that the teacher would choose."""
         ...
 
 
 @runtime_checkable
 class ValuesDirections(Protocol):
-    """A teacher that holds more than one action for good, and so knows the way to the nearest."""
+    """A teacher that values all directions, and so can name the nearest good one."""
 
     def nearest_good(
         self,
@@ -50,7 +50,8 @@ class ValuesDirections(Protocol):
         spread: Float[Array, ""] | float,
         share: Float[Array, ""] | float,
     ) -> Float[Array, " action"]:
-        """Of the actions worth at least a share of the best, averaged over an error of aim, the nearest to `action`.
+        """Return the good action nearest to `action`: its value is at least a share of the best, averaged over an error
+        of aim.
 
         `spread` is the standard deviation of the aim [rad]; see `spaces.directions.nearest_direction`.
         """
@@ -59,43 +60,43 @@ class ValuesDirections(Protocol):
 
 @runtime_checkable
 class Policy(Protocol):
-    """Anything that acts. A pytree, like an environment; see `policies`."""
+    """A policy: a pytree that acts, like an environment; see `policies`."""
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """Actions in n situations; `states` are what a teacher may look at, and what no agent does."""
+        """Return actions in n situations; `states` are for teachers, and no agent uses them."""
         ...
 
 
 class Label(struct.PyTreeNode):
-    """One answer of a teacher: what it said, not what a network is to predict of it (`Guide.target`)."""
+    """One answer of a teacher as given, not a network's target (`Guide.target`)."""
 
     obs: Float[Array, " obs"]
     action: Float[Array, " action"]  # the action asked about
-    answer: Float[Array, " answer"]  # in its form's words; relative: h in {-1, 0, +1}, see `guidance.answers`
+    answer: Float[Array, " answer"]  # by its form; relative: h in {-1, 0, +1}, see `feedback.answers`
     valid: Bool[Array, ""]  # False: padding, past this lane's budget, or no answer
-    base: Float[Array, " action"] | None = None  # what was proposed before any correction; None: no model looks at it
+    base: Float[Array, " action"] | None = None  # the uncorrected action; None: no model uses it
 
 
 class GuidanceModel(struct.PyTreeNode):
-    """A guidance's learned part."""
+    """The learned part of a guide."""
 
     params: Params
-    fitted: Bool[Array, ""]  # False until labels have been fitted: the model then leaves actions alone
+    fitted: Bool[Array, ""]  # False until labels have been fitted; until then actions are not changed
 
 
 class Sketch(NamedTuple):
     """A situation as lines or a picture for a browser: SVG in a frame of its own, y down [m; pixels of a picture].
 
-    Colours that hang on light or dark are the page's: `var(--floor)`, `var(--solid)`, `var(--low)`, `var(--ink)`,
-    `var(--free)`, `var(--hit)`, `var(--goal)`, `var(--body)`.
+    Colours that depend on light or dark mode are the page's: `var(--floor)`, `var(--solid)`, `var(--low)`,
+    `var(--ink)`, `var(--free)`, `var(--hit)`, `var(--goal)`, `var(--body)`.
     """
 
     box: tuple[float, float, float, float]  # left, top, width, height of what is shown [m]
-    still: str  # elements of what stays as it is while an action is executed
-    movers: dict[str, str]  # elements of what moves, by name, drawn round (0, 0) and heading along +x
-    places: dict[str, tuple[float, float, float]]  # where they are: x, y [m], turn on the screen, clockwise [deg]
+    still: str  # SVG elements that do not move while an action is executed
+    movers: dict[str, str]  # SVG elements that move, by name, drawn around (0, 0) and heading along +x
+    places: dict[str, tuple[float, float, float]]  # place of each: x, y [m], turn on the screen, clockwise [deg]
     foot: tuple[float, float]  # where the arrow of an action begins [m]
-    reach: tuple[float, float]  # from there: beginning and end of that arrow [m]
+    reach: tuple[float, float]  # distances of the arrow's beginning and end from there [m]
     turn: float  # counterclockwise angle on the screen of an action of angle 0 [deg]
     aim: float = 0.0  # length of a thin line that goes on from the arrow [m]
     words: str = ""  # about the situation, in a few words
@@ -105,9 +106,9 @@ class Sketch(NamedTuple):
 
 
 class Reel(NamedTuple):
-    """What an action leads to, as places of a sketch's movers, or as pictures in the place of a sketch's picture."""
+    """The consequence of an action: places of a sketch's movers, or pictures that replace the sketch's picture."""
 
     period: float  # between two frames [s]
-    frames: list[dict[str, tuple[float, float, float] | None]]  # of each mover, as `Sketch.places`; None: not seen
-    words: str = ""  # how it ended
+    frames: list[dict[str, tuple[float, float, float] | None]]  # place of each mover, as `Sketch.places`; None: hidden
+    words: str = ""  # how the film ended
     pictures: Sequence[str] = ()  # one a frame, as data URIs; see `pictures.clip`

@@ -1,9 +1,9 @@
-"""Policies, teachers and environments of the user's own: what their code raised, and gave in place of actions.
+"""Errors of the user's own policies, teachers and environments: exceptions, and invalid actions.
 
-Such code runs inside compiled programs, from which no exception finds its way out in one line. A function that is
-called back on the host leaves what it raised here and gives NaN; NaN spreads, and whoever looks at a program's results
-on the host asks here first. What raises while JAX traces is told apart by the frames of its traceback. Threads may call
-policies at the same time: each is then told of its own policy alone.
+User code runs inside compiled programs, whose exceptions are long and unclear. A function that is called back on the
+host leaves its exception here and returns NaN. NaN spreads, and code that reads a program's results on the host asks
+here first. Exceptions while JAX traces are recognised by the frames of their traceback. Threads may call policies at
+the same time: each thread then gets only its own policy's error.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cuelearner_jax.errors import NotFinite, UserError, no_space, user_code_erro
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# Who has a method of that name; of anything else no more is said than that it is code.
+# The kind of object that has a method of that name; other objects are called code.
 METHODS = {"act": "policy", "best_action": "teacher", "nearest_good": "teacher"}
 METHODS |= dict.fromkeys(("reset", "step", "remember", "recall", "recall_next"), "environment")
 METHODS |= dict.fromkeys(("features", "aims", "heuristic", "mirror", "observation"), "environment")
@@ -34,23 +34,25 @@ _PACKAGE = Path(__file__).parent
 _OURS = (_PACKAGE, *(_PACKAGE.parent / place / "cuelearner_envs" for place in ("", "envs")))
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))
 
-_left: dict[str, UserError] = {}  # by functions on the host, which other threads call; by what messages call them
+_left: dict[
+    str, UserError
+] = {}  # errors left by functions on the host, which other threads call; by their names in messages
 _working: Counter[int] = Counter()  # calls of `report_user_errors` functions at work, by thread
 _counting = threading.Lock()
 
 
 def leave(whose: str, error: UserError) -> None:
-    """Keeps what a function on the host raised until `tell` is called; of several errors of one function, the first."""
+    """Keep the exception of a function on the host until `tell` is called; of several of one function, the first."""
     _left.setdefault(whose, error)
 
 
 def is_waiting() -> bool:
-    """Return whether a function on the host has failed since `tell` was last called, and nobody else may be meant."""
+    """Return whether a function on the host has failed since `tell` was last called, if no other thread works."""
     return bool(_left) and _is_alone()
 
 
 def tell(whose: str = "") -> None:
-    """Raises the UserError that a function on the host left, if there is one, and forgets all of them.
+    """Raise the UserError that a function on the host left, if there is one, and forget all of them.
 
     While other threads work, only the error of the policy `whose` is raised and forgotten.
     """
@@ -82,7 +84,7 @@ def _at_work() -> Iterator[None]:
 
 
 def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
-    """A function that users call, with the faults of their own code told in one line, the original as `__cause__`."""
+    """Return a public function that reports faults of the user's code in one line, with the original as `__cause__`."""
 
     @functools.wraps(function)
     def wrapped(*arguments: P.args, **named: P.kwargs) -> T:
@@ -100,9 +102,9 @@ def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def raise_in_one_line(error: Exception) -> None:
-    """Raises a UserError from an exception that the user's own code raised; does nothing about any other.
+    """Raise a UserError from an exception of the user's own code; do nothing for any other exception.
 
-    A full disk is no fault of the code that met it first.
+    A full disk is not a fault of the code that met it.
     """
     if isinstance(error, UserError | NotFinite) or no_space(error):
         return
@@ -113,7 +115,7 @@ def raise_in_one_line(error: Exception) -> None:
 
 
 def _of_user(error: BaseException) -> Any:
-    """The code of the user's function that was called first on the way to an exception; None: there is none."""
+    """Return the code of the user's function that was called first on the way to an exception; None: there is none."""
     step = error.__traceback__
     while step is not None:
         if _is_users(step.tb_frame):
@@ -130,17 +132,17 @@ def _is_users(frame: FrameType) -> bool:
 
 
 def acts_in(name: str, policy: Any, env: Any) -> None:
-    """Raises UserError for a policy that cannot act in a world, without acting."""
+    """Raise UserError for a policy that cannot act in a world, without acting."""
     _tried(name, "act", env, policy.act)
 
 
 def answers_in(name: str, teacher: Any, env: Any) -> None:
-    """Raises UserError for a teacher that cannot answer in a world, without asking."""
+    """Raise UserError for a teacher that cannot answer in a world, without asking."""
     _tried(name, "answer", env, lambda key, states, obs: jax.vmap(teacher.best_action)(states, obs))
 
 
 def _tried(name: str, verb: str, env: Any, function: Any) -> None:
-    """Traces a function of a key, states (1, ...) and observations (1, obs) of a world."""
+    """Trace a function of a key, states (1, ...) and observations (1, obs) of a world."""
     own = jax.random.key(0)
     states, obs = jax.eval_shape(lambda: jax.vmap(env.reset)(own[None]))
     try:
@@ -157,7 +159,7 @@ def _tried(name: str, verb: str, env: Any, function: Any) -> None:
 
 
 def check_actions(actions: Any, whose: str) -> None:
-    """Raises UserError unless all of a program's actions are finite.
+    """Raise UserError unless all of a program's actions are finite.
 
     Args:
         actions: on the host, of any shape; or whether all of them are finite.

@@ -31,17 +31,15 @@ from cuelearner_jax.types import Label, Teacher
 
 USUAL = 100  # default number of labels
 LEAST = 5  # labels: every fifth is held out
-USED = (
-    "eps_deg",
-    *(entry.name for entry in dataclasses.fields(TeacherFaults)),
-)  # fields of the scalars that calibration reads
+# fields of the scalars that calibration reads
+USED = ("eps_deg", *(entry.name for entry in dataclasses.fields(TeacherFaults)))
 Theta = dict[str, float]  # unknowns by name; one that is not there is zero
 
 
 class Calibrating(Adaptation):
     """The guide, world, base policies and family that all lanes of a calibration share."""
 
-    family: Family = struct.field(pytree_node=False)  # what may have changed
+    family: Family = struct.field(pytree_node=False)  # possible changes
     named: str = struct.field(pytree_node=False, default="")  # the code of it; empty: the world declares it
 
     def policy(self, block: Any, env: Any = None) -> Calibrated:
@@ -53,7 +51,7 @@ class Evidence(struct.PyTreeNode):
     """A block of lanes with their answers and estimates."""
 
     base: Int[Array, " lanes"]
-    theta: Float[Array, "lanes unknowns"]  # what is corrected
+    theta: Float[Array, "lanes unknowns"]  # corrected values of the unknowns
     labels: Label  # (lanes, slots, ...)
     asked: Int[Array, " lanes"]
     bound: Float[Array, " lanes"]
@@ -89,7 +87,9 @@ def check_unused(sizes: GuideSizes, scalars: Scalars, **others: Any) -> None:
             given = " ".join(map(str, value)) if isinstance(value, tuple) else value
             raise UserError(f"{name} is {given}, but calibration fits no model and has no bound: leave {name} out")
     if scalars.answer == "shuffled":
-        raise UserError("scalars.answer is shuffled, a control of models: give best or nearest to calibration")
+        raise UserError(
+            "scalars.answer is shuffled, which is a control of feedback models: give --scalars.answer best or nearest"
+        )
 
 
 def adapt(
@@ -103,12 +103,12 @@ def adapt(
     """Ask for answers, estimate the changes and judge the corrected policy in every lane.
 
     Args:
-        of: what lanes share.
-        lanes: what is adapted.
-        how: policies are judged; by labels: by calibration's own rule, held-out answers.
-        teacher: who answers; None where labels are given.
+        of: settings that all lanes share.
+        lanes: the lanes to adapt.
+        how: settings of the judgement; "labels" means calibration's own rule on held-out answers.
+        teacher: the teacher who answers; None where labels are given.
         labels: rows (lanes, slots, ...) in place of questions.
-        watch: by what is being done, who is told how far it is.
+        watch: takes the name of a piece of work, returns its progress callback.
 
     Raises:
         UserError: too few answers, or policies cannot be judged as asked.

@@ -75,21 +75,20 @@ def adapt(
     """Ask for labels, fit a model and judge the corrected policy in every lane.
 
     Args:
-        of: what lanes share: the kind of guidance, the world, the base policies.
-        lanes: what is adapted.
-        how: policies are judged.
-        teacher: who answers in rounds; None where labels are given.
+        of: settings that all lanes share: the kind of guidance, the world, the base policies.
+        lanes: the lanes to adapt.
+        how: settings of the judgement.
+        teacher: the teacher who answers in rounds; None where labels are given.
         labels: rows (lanes, slots, ...) in place of questions, fitted at once.
         mesh: devices that share the lanes (default: all of this process's).
-        watch: by what is being done, who is told how far it is.
+        watch: takes the name of a piece of work, returns its progress callback.
 
     Raises:
         UserError: policies cannot be judged as asked.
     """
     mesh, count = mesh or lane_mesh(), lanes.number
-    filled = np.minimum(
-        np.arange(-(-count // mesh.size) * mesh.size), count - 1
-    )  # the block is filled up with repeats of the last lane, which are dropped in the end
+    # the block is filled up with repeats of the last lane, which are dropped in the end
+    filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)
     judge = Judge(of, lanes.rows(filled), how, mesh, watch)
     if labels is not None:
         labels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
@@ -136,9 +135,9 @@ def learn_lanes(
 
 
 def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> str:
-    """Return a hint where a bound or a label strength looks like a value in another unit; else an empty string.
+    """Return a hint if refinement cannot reach the largest bound, else an empty string.
 
-    Raises UserError for what cannot be, or could teach nothing.
+    Raises UserError for values that cannot work, or from which nothing could be learned.
     """
     eps, given = scalars.eps_deg, " ".join(f"{bound:g}" for bound in bounds)
     if not all(math.isfinite(bound) and 0 < bound <= space.reach for bound in bounds):

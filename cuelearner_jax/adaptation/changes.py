@@ -70,15 +70,18 @@ def check_acts(family: Family, env: Environment) -> None:
             if found.shape != given.shape:
                 raise UserError(f"distortion {one.name!r}: {name} returns {found.shape[1:]}: give {given.shape[1:]}")
             if not np.allclose(np.asarray(found), np.asarray(given), atol=SAME, rtol=SAME):
-                raise UserError(f"distortion {one.name!r}: {name} changes rows though all of its unknowns are zero")
+                raise UserError(
+                    f"distortion {one.name!r}: {name} changes rows although all of its unknowns are "
+                    "zero: let it change nothing at zero"
+                )
 
 
 def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
     """Return the distortions of a policy that was read from a file.
 
     Args:
-        layer: what the file says of the policy.
-        env: where it acts.
+        layer: the policy's plain values from the file.
+        env: the world that the policy acts in.
         changes: code of the user's own distortions, as `family_of` takes it; None: none was named.
 
     Raises:
@@ -92,9 +95,14 @@ def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
         )
     known = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env, gains=True))}
     if missing := [name for name in names if name not in known]:
-        raise UserError(f"this policy corrects {missing[0]!r}, which {code or 'this world'} lacks: give its own")
+        raise UserError(
+            f"this policy corrects {missing[0]!r}, which {code or 'this world'} lacks: give the code "
+            "that made the policy"
+        )
     family = tuple(known[name] for name in names)
     told = [(one["name"], one["unit"]) for one in layer["changes"]]
     if [(one.name, one.unit) for one in unknowns_of(family)] != told:
-        raise UserError(f"the unknowns of {', '.join(names)} are others than this policy's: give the code that made it")
+        raise UserError(
+            f"the unknowns of {', '.join(names)} differ from this policy's: give the code that made the policy"
+        )
     return family

@@ -78,7 +78,7 @@ def check_bounds(shares: tuple[float, ...], by: str) -> None:
         given = " ".join(f"{share:g}" for share in shares)
         raise UserError(f"judge_bounds is {given}: give shares of the bound above 0 and below 1, each once")
     if shares and by == LABELS:
-        raise UserError("judge_bounds needs episodes to try them on: judge by a metric of the task")
+        raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
 
 
 class Judge:
@@ -178,7 +178,7 @@ def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
         told = form.name if form else "no"
         raise UserError(f"{told} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
     if int(np.asarray(block.guide.labels.valid).sum(-1).min()) < HELD_OUT:
-        raise UserError(f"fewer than {HELD_OUT} labels cannot be judged by: give more, or --judge-by a metric")
+        raise UserError(f"fewer than {HELD_OUT} labels cannot judge a model: give more, or --judge-by a metric")
     zero, right = jax.device_get(_predicted(of, block))
     used = ~np.asarray(block.failed) & (right >= zero)
     unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
@@ -199,9 +199,8 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
         moved = guidance.refine_labelled_actions(model, env, labels, held, one_pass).actions
         moves = space.log(labels.action, moved) / space.from_unit(of.scalars.eps_deg)
-        told = (
-            is_answered(labels.answer) & held[:, None]
-        )  # words about one cue each; of the other cues nothing is compared
+        # words about one cue each; of the other cues nothing is compared
+        told = is_answered(labels.answer) & held[:, None]
         count = jnp.maximum(told.sum(), 1)
         share = lambda flags: jnp.sum(flags, where=told) / count  # noqa: E731
         right = share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer)

@@ -1,11 +1,11 @@
 """The lanes of an adaptation, each a (base policy, seed, label budget, bound), asked and fitted together.
 
 A lane asks about what its base policy does, then about what its model so far makes of that (DAgger), never farther from
-the base than its bound, and fits its model anew after each round. Lanes differ by arrays alone: budgets are masks over
+the base than its bound, and fits a new model after each round. Lanes differ by arrays alone: budgets are masks over
 labels, bounds are traced, and several base policies are one pytree with a leading axis. So any number of them is one
 compiled program: side by side on an accelerator, one by one on a CPU (`devices.each_lane`), shared out over a mesh.
 
-    of = Adaptation(guide, sizes, scalars, env, bases)    # what lanes share
+    of = Adaptation(guide, sizes, scalars, env, bases)    # settings of all lanes
     lanes = product(bases=8, seeds=(0,), budgets=(100, 250, 500), bounds_deg=(60.0, 180.0))    # or `one_each`
     block = begin(of, lanes)
     for _ in range(rounds(lanes, sizes)):
@@ -92,7 +92,7 @@ class LaneState(struct.PyTreeNode):
     """The state of one lane; in a block every leaf has a leading axis of lanes."""
 
     guide: GuideState
-    base: Int[Array, ""]  # which of the base policies
+    base: Int[Array, ""]  # number of its base policy
     bound: Float[Array, ""]  # in the unit of the space's `log`
     key: PRNGKeyArray
     failed: Bool[Array, ""]  # True once the model stopped being finite; the lane then keeps its last finite state
@@ -118,7 +118,7 @@ class Adaptation(struct.PyTreeNode):
 
     guidance: Guide = struct.field(pytree_node=False)  # a guide that asks for labels
     sizes: GuideSizes = struct.field(pytree_node=False)  # sizes that the guide was made with
-    scalars: Scalars  # of refinement, of fitting and of a simulated teacher's faults
+    scalars: Scalars  # settings of refinement, of fitting and of a simulated teacher's faults
     env: Environment  # the changed world
     bases: PolicyBlock  # leaves that are `BY_LANE` in its `axes` have a row for each base; or `policies.Common`
 
@@ -206,9 +206,7 @@ def _take(of: Adaptation, labels: Label, block: LaneState, *, mesh: Mesh) -> Lan
             ):  # files do not keep the base policy's actions: the base policy is asked again
                 labels = labels.replace(base=of.bases.lane(lane.base).act(lane.key, None, labels.obs))
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
-            last = (
-                lane.guide.budget - 1
-            ) // of.sizes.labels_per_round  # the key of the fit that follows the last round
+            last = (lane.guide.budget - 1) // of.sizes.labels_per_round  # number of the last round
             return asking.with_guide(lane, asking.fit(of.guidance, of.env, of.scalars, guide, lane.key, last))
 
         return each_lane(one)(labels, block)

@@ -1,8 +1,8 @@
 """Convert policies to plain values and arrays, and back.
 
-A policy's values are those of its `describe()`. Kept are an `agent` with its `params`; `guided` with its `model` and,
-where there is one, its `bound`; `calibrated` with the `theta` of its unknowns; `uniform`; `heuristic`; and the name of
-`code`, as package.module:NAME.
+A policy's values are those of its `describe()`. The stored kinds are `agent` with its `params`; `guided` with its
+`model` and, where there is one, its `bound`; `calibrated` with the `theta` of its unknowns; `uniform`; `heuristic`; and
+the name of `code`, as package.module:NAME.
 
 Code is never loaded because a file names it: the caller who opens the policy names the code again.
 """
@@ -30,7 +30,7 @@ from cuelearner_jax.run_config import kind_from_json, part_from_json
 
 CORRECTED = ("guided", "calibrated")  # policies that change another policy's actions
 KINDS = ("agent", "uniform", "heuristic", *CORRECTED, "code")
-PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # of a guided policy's values
+PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # groups in a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other values and the arrays hold them already
 MOST_LAYERS = 16  # most layers of a policy that was adapted again and again
 
@@ -44,11 +44,15 @@ def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
     described = describe(policy)
     for layer in layers(described):
         if layer.get("asks"):
-            raise UserError("a policy that asks a teacher cannot be kept in a folder: give one that acts by itself")
+            raise UserError(
+                "a policy that asks a teacher cannot be stored in a folder: give one that acts without a teacher"
+            )
         if layer["policy"] not in KINDS:
-            raise UserError(f"a policy of kind {layer['policy']} cannot be kept in a folder: give another")
+            raise UserError(
+                f"a policy of kind {layer['policy']} cannot be stored in a folder: give a policy of another kind"
+            )
         if layer["policy"] == "guided" and layer["sizes"] is None:
-            raise UserError("a policy under a guidance of unknown sizes cannot be kept in a folder: give them as sizes")
+            raise UserError("a policy under a guidance of unknown sizes cannot be stored in a folder: give its sizes")
         if layer["policy"] == "code":
             layer["named"] = named or "code"
         for change in layer.get("changes", ()):
@@ -68,13 +72,13 @@ def check(values: dict[str, Any]) -> None:
     for depth, layer in enumerate(layers(values)):
         kind = layer["policy"]
         if kind not in (KINDS if depth else CORRECTED) or depth >= MOST_LAYERS:
-            raise ValueError(f"{kind!r} is no policy here")
+            raise ValueError(f"{kind!r} is not a kind of policy that a folder holds")
         if (kind in CORRECTED) != isinstance(layer.get("base"), dict):
-            raise ValueError(f"a policy of kind {kind} has a base, or one that corrects has none")
+            raise ValueError(f"a policy of kind {kind} has a base that it must not have, or lacks its base")
         if kind == "agent":
             check_part(part_from_json(AGENTS, layer["agent"]), "agent")
             if set(layer) != {"policy", "agent", "frame"} or layer["frame"] not in get_args(Frame):
-                raise ValueError(f"an agent is told by {sorted(layer)}, in the frame {layer.get('frame')!r}")
+                raise ValueError(f"an agent is described by {sorted(layer)}, in the frame {layer.get('frame')!r}")
         if kind == "code" and not isinstance(layer["named"], str):
             raise TypeError(f"code is named {layer['named']!r}")
         if kind == "guided":
@@ -86,12 +90,12 @@ def check(values: dict[str, Any]) -> None:
         if kind == "calibrated":
             told = [*layer["distortions"], *(change[part] for change in layer["changes"] for part in ("name", "unit"))]
             if layer["guidance"] != KIND.name or not all(isinstance(name, str) for name in (layer["code"], *told)):
-                raise TypeError("changes are told by names and units")
+                raise TypeError("changes are not described by names and units")
 
 
 def arrays_of(policy: Any) -> Any:
     """Return the arrays of a policy, or of a block of policies."""
-    kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # that `Common` holds
+    kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # `Common` holds it as `policy`
     if kind == "agent":
         return {"params": policy.params}
     if kind == "guided":
@@ -128,7 +132,7 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
     """Return the policy of plain values and arrays, to act in a world.
 
     Args:
-        values, arrays: of the policy.
+        values, arrays: the policy's plain values and arrays.
         env: the world.
         code: the policy that stands for code in it; None: none was given.
         changes: the user's own distortions in it, as `changes.family_of` takes them; None: none were given.

@@ -35,12 +35,12 @@ def best_near_peaks(
     """Return the choice of `best_of`, if the largest value lies next to a high peak of a coarse first look.
 
     Args:
-        value: see `best_of`.
-        rough: the same, as roughly as may be: it decides where to look only.
+        value: the value function, as in `best_of`.
+        rough: an approximation of `value`, which only decides where to search.
         options: evenly spaced, the last beside the first.
         obs: situations.
         coarse: actions of the first look, evenly spaced among the options.
-        peaks: how many of its local maxima to look round, up to its neighbours.
+        peaks: number of local maxima of the first look to search around, up to their neighbours.
     """
     stride = len(options) // coarse
 

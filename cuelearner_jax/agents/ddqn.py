@@ -81,7 +81,7 @@ class Config:
         if self.coarse_directions and (self.coarse_directions < 3 or self.directions % self.coarse_directions):
             raise UserError(
                 f"agent.coarse_directions is {self.coarse_directions}: give a divisor of agent.directions "
-                f"({self.directions}) above 2, or 0 to look at all of them"
+                f"({self.directions}) above 2, or 0 to value all of them"
             )
         if self.coarse_directions and self.peaks > self.coarse_directions:
             raise UserError(f"agent.peaks is {self.peaks}: give at most agent.coarse_directions")

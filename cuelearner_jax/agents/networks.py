@@ -42,7 +42,7 @@ class MLP(nn.Module):
 
     layers: Sequence[int]
     outputs: int
-    dtype: DTypeLike = jnp.float32  # of the hidden layers' arithmetic; parameters and outputs are float32
+    dtype: DTypeLike = jnp.float32  # dtype of the hidden layers' arithmetic; parameters and outputs are float32
     layer_norm: bool = False  # whether hidden layers are normalised before their ReLU
 
     @nn.compact
@@ -87,9 +87,9 @@ def widen_layers(params: Params, layers: Sequence[int], multiple: int) -> tuple[
     The units that are added are zero throughout and add exactly nothing.
 
     Args:
-        params: of a network of this module.
-        layers: its hidden widths.
-        multiple: of which the new widths are.
+        params: parameters of a network of this module.
+        layers: the network's hidden widths.
+        multiple: the new widths are multiples of this number.
 
     Returns:
         Parameters and hidden widths of the wider network.

@@ -81,13 +81,13 @@ class AgentFunctions(Protocol):
         """Make one gradient step.
 
         Args:
-            env: see `act`; its `recall` has made the memory's observations.
+            env: as for `act`; its `recall` rebuilds the memory's observations.
             options: those that the agent was made from, their floats traced.
-            scalars: what all parts share, such as the discount factor.
+            scalars: settings that all parts share, such as the discount factor.
             count: gradient steps, this one included.
-            params, rest: as `init` gives them.
+            params, rest: as `init` returns them.
             memory: the steps to learn from.
-            key: of this step.
+            key: random key of this step.
 
         Returns:
             Parameters; the rest; the loss; the norm of the gradient.
@@ -124,8 +124,10 @@ class AgentOptions(Protocol):
 class OptionalFacts(Protocol):
     """Optional members of a class of options, beside `AgentOptions`; read them by the functions below."""
 
-    ACTOR: ClassVar[bool]  # does an actor choose, not the argmax of `value`? `update` then takes an `Offer`, `other`
-    SORTS: ClassVar[bool]  # does `update` draw guided and own steps apart? Replay then counts the guided ones
+    ACTOR: ClassVar[
+        bool
+    ]  # True if an actor chooses, not the argmax of `value`; `update` then takes an `Offer`, `other`
+    SORTS: ClassVar[bool]  # True if `update` draws guided and own steps separately; replay then counts guided steps
     ACTS_IN: ClassVar[Space]  # one of the spaces in which it acts, where these are not all
 
 

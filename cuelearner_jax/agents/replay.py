@@ -38,7 +38,9 @@ class Transition(struct.PyTreeNode):
     obs: Float[Array, " obs"]
     action: Float[Array, " action"]  # as executed
     reward: Float[Array, ""]
-    discount: Float[Array, ""]  # of `next_obs`: 0 at termination, never at truncation; 1 after one step
+    discount: Float[
+        Array, ""
+    ]  # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
     next_obs: Float[Array, " obs_or_0"]
 
 
@@ -186,7 +188,7 @@ def count_guided(
     """Count guided steps beside the rows of a ring buffer: of all steps made up to each row, that row included.
 
     Args:
-        counts: of the rows so far, 0 at first.
+        counts: the counts of the rows so far, 0 at first.
         step: rows written so far, see `RingBuffer`.
         guided: which of the steps being added the guide chose.
     """
@@ -204,7 +206,7 @@ def draw_sorts(
     out: the count before it, which told its sort, is gone.
 
     Args:
-        key: of the draw.
+        key: random key of the draw.
         counts: guided steps up to each row, see `count_guided`.
         filled: rows written so far, also those written over since.
         guided: which of the numbers are to be of guided steps, the others of own ones; of a sort without rows the
@@ -243,7 +245,7 @@ def n_step_return(
     The sum stops with the episode's last step, or with the last step that is known.
 
     Args:
-        rewards, discounts, ended: of consecutive steps; `discounts` is 0 at termination, else 1.
+        rewards, discounts, ended: values of consecutive steps; `discounts` is 0 at termination, else 1.
         known: which of them have been made already; the first is.
         discount: discount factor.
 

@@ -50,12 +50,12 @@ class Config:
     critic_layers: Layers = (256, 256)
     """Hidden layers of each critic."""
     critics: Annotated[int, POSITIVE] = 2
-    """Critics."""
+    """Number of critics."""
     target_critics: Annotated[int, POSITIVE] = 2
     """Critics drawn for each target, of whose values the smallest counts. With more critics than that the actor climbs
     their mean, else their smallest value."""
     layer_norm: bool = False
-    """Are the critics' hidden layers normalised? It keeps values of actions never tried from growing."""
+    """Normalise the critics' hidden layers, which keeps the values of untried actions from growing."""
     batch_size: Annotated[int, POSITIVE] = 256
     """Transitions in a minibatch."""
     updates_per_step: Annotated[int, POSITIVE] = 1
@@ -75,7 +75,7 @@ class Config:
     target_entropy: float = -1.0
     """Entropy that the temperature is tuned to, for each entry of an action, in unit coordinates [nats]."""
     entropy_in_targets: bool = True
-    """Does a target's value include the entropy of the action that follows?"""
+    """Include the entropy of the next action in targets."""
     polyak: Annotated[float, SHARE] = 0.005
     """Rate at which the target critics follow."""
 
@@ -90,7 +90,7 @@ class Config:
             )
         if frame != "raw":
             raise UserError(
-                f"sizes.frame is {frame!r}, but the actor of 'sac' is given no action: give --sizes.frame raw"
+                f"sizes.frame is {frame!r}, but the actor of 'sac' has no action as input: give --sizes.frame raw"
             )
         return SoftActorCritic(self, frame, spaces, bootstraps)
 

@@ -1,8 +1,8 @@
 """The inputs of networks: observation and action as they are, or the observation as it looks from the action.
 
-Seen from the action (`frame` "action"), situations that differ by a turn look alike, so a network's output for one
-holds for all of them. This is equivariance by the input. Sources: Wang, Walters, Platt, "SO(2)-equivariant
-reinforcement learning", ICLR 2022; van der Pol et al., "MDP homomorphic networks", NeurIPS 2020.
+In the action's frame (`frame` "action"), situations that differ by a rotation have the same inputs, and a network's
+output for one holds for all of them. This is equivariance by the input (Wang, Walters, Platt, "SO(2)-equivariant
+reinforcement learning", ICLR 2022; van der Pol et al., "MDP homomorphic networks", NeurIPS 2020).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def widths(frame: Frame, spaces: Spaces) -> tuple[int, int]:
         return spaces.obs_size, spaces.actions.size
     if spaces.features is None:
         raise UserError(
-            "sizes.frame is 'action', but this task does not say how an observation looks from an action "
+            "sizes.frame is 'action', but this task does not define an observation as seen from an action "
             "(`features`): give --sizes.frame raw"
         )
     return spaces.features

@@ -93,10 +93,11 @@ class AdaptedPolicy(CallablePolicy):
         folder = arguments.path("folder", folder)
         arguments.flag("overwrite", overwrite)
         if folder.exists() and not folder.is_dir():
-            raise UserError(f"folder {folder} is a file: give another")
+            raise UserError(f"folder {folder} is a file: give the path of a folder")
         if self.named is None:
             raise UserError(
-                "a policy folder says in which world its policy acts: adapt in a world, as cl.make gives it"
+                "a policy folder names the world of its policy, and this policy was adapted in a "
+                "bare environment: adapt in a world from cl.make"
             )
         with policy_folders.place_of(folder, overwrite) as place:
             self.outcome._replace(origin={"code": self.named}).write(place)
@@ -129,24 +130,24 @@ def adapt(
     Args:
         policy: the policy to correct: a policy, or any function of a batch of observations (NumPy in, NumPy out; one
             that `jax.jit` made is compiled in).
-        world: where it acts; a bare environment will do.
-        teacher: who answers: a teacher, or a function of observations (NumPy in, NumPy out) or another policy, which
-            teaches what it does itself; None where labels are given.
+        world: the world that the policy acts in; a bare environment will do.
+        teacher: a teacher; or a function of observations (NumPy in, NumPy out) or another policy, which teaches what
+            it does itself; None where labels are given.
         labels: number of questions (default: 500, of calibration 100); or labels that are there already: arrays, or a
             label file.
         bound_deg: how far corrections may lead from the policy's own actions [deg] (default: the scenario's, of labels
             that are there already as far as they reach, or else 45).
         eps_deg: strength of an answer [deg] (default: as labels, scenario or training had it).
         guidance: kind of guidance: what is asked, and what a model makes of it (default: the scenario's or "relative").
-        sizes: of the network, its fitting, and the labels of a round.
-        scalars: of the fitting, of refinement and of the teacher's faults.
-        seed: of everything random.
+        sizes: sizes of the network, of its fitting, and of a round of labels.
+        scalars: settings of fitting, of refinement and of the teacher's faults.
+        seed: seed of all random numbers.
         judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones (default: the
             scenario's, or "reward"; of calibration "labels").
         judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
-        changes: of guidance "calibration": what may have changed, as `Distortion`s of your own, or a function of the
+        changes: for guidance "calibration", the possible changes, as `Distortion`s of your own, or a function of the
             environment that returns them (default: what the world declares).
 
     Raises:
@@ -180,7 +181,9 @@ def adapt(
         teacher = arguments.teacher("teacher", teacher, space)
         user_code.answers_in("teacher", teacher, env)
     elif file is None and rows is None:
-        raise UserError("labels are asked of a teacher: give one, for instance teacher_of(world), or labels")
+        raise UserError(
+            "teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels as arrays or a file"
+        )
     subject = Subject(source, BaseLanes(source.default_policy), own, teacher=teacher, rows=rows, changes=changes)
     outcome = study.run(subject, request, note=partial(warnings.warn, stacklevel=5))
     if outcome.found.failed.any():

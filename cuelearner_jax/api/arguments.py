@@ -113,7 +113,7 @@ def path(name: str, value: Any) -> Path:
         Path(given).exists()
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or "its name is not UTF-8"
-        raise UserError(f"{name} can be no path ({why}): give another") from error
+        raise UserError(f"{name} cannot be a path ({why}): give another path") from error
     return Path(given)
 
 
@@ -189,13 +189,12 @@ def policy(name: str, value: Any) -> Policy:
 def teacher(name: str, value: Any, space: Space) -> Teacher:
     """Return a teacher: the given one, or one that shows what a given policy does itself."""
     answers, acts = (callable(getattr(value, verb, None)) for verb in ("best_action", "act"))
-    leaf = answers and any(
-        leaf is value for leaf in jax.tree.leaves(value)
-    )  # not a pytree, so no compiled program could take it
+    # not a pytree, so no compiled program could take it
+    leaf = answers and any(leaf is value for leaf in jax.tree.leaves(value))
     if isinstance(value, type) or leaf or not (answers or acts or callable(value)):
         raise argument_error(name, value, "a teacher, for instance teacher_of(world), or a function of observations")
     if acts and not answers:
-        value = getattr(value, "policy", value)  # of a `CallablePolicy`, which stands above this file
+        value = getattr(value, "policy", value)  # for a `CallablePolicy`, which is above this module
     try:
         return teaching(value, space)
     except UserError as error:

@@ -79,18 +79,18 @@ def correct(
         guidance: how answers are used: "relative" fits a model, "calibration" estimates a constant change.
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         low, high: bounds of the actions, a number an entry (default: the range of the labels' actions).
-        space: instead of these three: the space of the actions, such as `cuelearner_jax.spaces.DIRECTIONS`.
-        changes: of guidance "calibration": what may have changed, as for `adapt`.
-        sizes, scalars: of the model and its fitting.
-        seed: of everything random.
+        space: the space of the actions, such as `cuelearner_jax.spaces.DIRECTIONS`, in place of cues, low and high.
+        changes: for guidance "calibration", the possible changes, as for `adapt`.
+        sizes, scalars: settings of the model and its fitting.
+        seed: seed of all random numbers.
 
     Raises:
         UserError: labels or settings that make no sense, or with which the fit diverges.
     """
     if policy is None:
         raise UserError(
-            "policy is None: give the policy whose actions the labels are about; of the answers alone, without a base, "
-            "cl.fit_feedback makes a model"
+            "policy is None: give the policy whose actions the labels are about; without a base policy, "
+            "cl.fit_feedback fits a model to the answers"
         )
     policy = load_policy(policy) if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX) else policy
     before = _recording_of(policy)
@@ -106,9 +106,8 @@ def correct(
         raise UserError(f"{labels} holds answers of {found.eps:g} {found.space.unit}: leave out eps")
     world = world_of(found, before)
     own = as_policy(policy)
-    CallablePolicy(in_space(own, found.space), actions=found.space)(
-        found.rows.obs
-    )  # raises UserError where the policy returns something else than actions
+    # raises UserError where the policy returns something else than actions
+    CallablePolicy(in_space(own, found.space), actions=found.space)(found.rows.obs)
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
         world,
@@ -136,11 +135,11 @@ def agreement(
     """Return how many answers a policy agrees with, beside its base and "already right" always.
 
     Args:
-        policy: what `correct` takes or returns.
+        policy: any policy that `correct` takes or returns.
         labels: answers that the policy was not corrected by, as `correct` takes them.
         base: the policy as it was (default: what a corrected policy corrects).
         eps: strength of an answer (default: the file's, the corrected policy's, or 1/36 of the range).
-        space: of the actions (default: the file's, or that of the corrected policy).
+        space: space of the actions (default: the file's, or that of the corrected policy).
 
     Raises:
         UserError: labels that do not fit the policy, or no space.
@@ -149,7 +148,7 @@ def agreement(
     if space is None and isinstance(policy, CallablePolicy) and not isinstance(labels, str | os.PathLike):
         space = policy.actions
     if space is None and not isinstance(labels, str | os.PathLike):
-        raise UserError("space is not known: give the space of the actions, or a label file")
+        raise UserError("space is None, and arrays of labels name none: give space=, or a label file")
     found = _given(labels, space, "", None, None)
     strength = arguments.optional(arguments.amount, "eps", eps, found.space) or found.eps
     if strength is None:
@@ -208,7 +207,7 @@ def labels_from_file(path: Path) -> GivenLabels:
         try:
             config = configuration.from_json(LogsConfig, values)
         except (TypeError, UserError) as error:
-            raise UserError(f"{path} does not say of which situations its labels are: write it anew") from error
+            raise UserError(f"{path} does not name the situations of its labels: write the file again") from error
     return GivenLabels(rows, file.space, file.eps, config)
 
 
@@ -237,7 +236,9 @@ def world_of(found: GivenLabels, before: LogsConfig | None = None) -> World:
     plain = {"path": "", "digest": "", "order": "recorded", "rows": len(found.rows.obs)}
     config = dataclasses.replace(config, **plain, **values)
     if logs.space_of(config).to_json() != found.space.to_json():
-        raise UserError(f"the space {found.space.name!r} is none that a recording can have: give a box with plain cues")
+        raise UserError(
+            f"the space {found.space.name!r} is not one that a recording can have: give a box with plain cues"
+        )
     filled = lambda config, split: logs.filled(config, found.rows.obs, found.rows.action)  # noqa: E731
     return World(logs.configured(config, dataclasses.replace(logs.BODY, environment=filled)), config)
 

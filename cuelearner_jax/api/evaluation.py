@@ -26,9 +26,9 @@ def measure(
 
     Args:
         policy: a policy, or any function of a batch of observations in NumPy.
-        world: where it acts.
+        world: the world that the policy acts in.
         episodes: whole episodes, where the task counts episodes (default: 100).
-        steps: instead: environment steps (default, where the task counts steps: 10,000).
+        steps: environment steps in place of episodes (default, where the task counts steps: 10,000).
         envs: environments that share the steps (default: 100).
         engine: other physics that the world's robot has (default: its own).
 

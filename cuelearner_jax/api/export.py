@@ -23,7 +23,7 @@ def export_policy(
     Args:
         policy: one that was loaded, adapted or refined, or anything else made of JAX functions that acts.
         out: a new folder.
-        world: in which it acts: it names the slices of the observation, and golden cases are taken from it (default:
+        world: the world that names the slices of the observation and supplies golden cases (default:
             where it was corrected).
         format: "stablehlo", "onnx" or "numpy".
 
@@ -50,9 +50,9 @@ def export_correction(policy: Any, out: str | Path, world: World | None = None, 
     `base_action`, its output `action`.
 
     Args:
-        policy: from `correct`, `adapt` or `refine`, or loaded from a policy folder.
+        policy: a policy from `correct`, `adapt` or `refine`, or loaded from a policy folder.
         out: a new folder.
-        world: in which it acts (default: where it was corrected).
+        world: the world that the policy acts in (default: where it was corrected).
         format: "onnx", "numpy" or "stablehlo".
 
     Returns:
@@ -72,7 +72,7 @@ def _world_of(policy: Any, world: Any) -> World:
     """Return where a policy acts. Raises UserError if it is not known."""
     world = getattr(policy, "world", None) if world is None else world
     if world is None:
-        raise UserError("world is not given, and this policy was corrected in none: give one, as cl.make gives it")
+        raise UserError("world is None, and this policy names none: give world=cl.make(...)")
     return a_world("world", world)
 
 

@@ -58,7 +58,7 @@ class FeedbackModel:
     scalars: Scalars  # eps of the labels, and how actions are refined
     labels: Labels
     sizes: GuideSizes  # sizes that the guide was made with
-    space: Space = DIRECTIONS  # of the actions
+    space: Space = DIRECTIONS  # space of the actions
     env: Any = None  # provides `features`, which the raw frame does not use
 
 
@@ -76,11 +76,11 @@ def fit_feedback(
 
     Args:
         labels: arrays, or a label file (its first seed's).
-        space: of the actions in arrays; a file says its own.
+        space: space of the actions in arrays; a file names its own.
         eps_deg: strength of an answer in the space's unit (default: of arrays 5 degrees, of a file the file's).
-        sizes: of the network and its fitting (default: small ones, the paper's are `config.GuideSizes()`).
-        scalars: of the fitting and of refinement.
-        seed: of the network.
+        sizes: sizes of the network and its fitting (default: small ones, the paper's are `config.GuideSizes()`).
+        scalars: settings of fitting and of refinement.
+        seed: seed of the network.
 
     Raises:
         UserError: labels or settings that make no sense, or with which the fit diverges.
@@ -100,7 +100,7 @@ def fit_feedback(
         labels = labels_of(jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels))
     rows = rows_of(labels)
     if len(rows.obs) < 2:
-        raise UserError(f"{len(rows.obs)} labels teach nothing: give more")
+        raise UserError(f"{len(rows.obs)} labels are too few to fit a model: give more labels")
     spaces = Spaces(rows.obs.shape[1], space)
     external_labels.check(rows, spaces, RELATIVE)
     sizes, scalars = settings(space, sizes, scalars, eps_deg)
@@ -131,15 +131,15 @@ def ask(
 
     Args:
         policy: the policy to correct: a policy, or any function of a batch of observations in NumPy.
-        world: where it acts.
-        teacher: who answers; a function of observations, or another policy, teaches what it does itself.
+        world: the world that the policy acts in.
+        teacher: the teacher who answers; a function of observations, or another policy, teaches what it does.
         labels: number of questions.
         bound_deg: refined actions that are asked about stay within this of the policy's own, in the space's unit
             (default: a quarter of its reach, 45 degrees).
         eps_deg: strength of an answer in the space's unit (default: the scalars').
-        sizes: of the network, its fitting, and the labels of a round.
-        scalars: of the fitting, of refinement and of the teacher's faults.
-        seed: of everything random.
+        sizes: sizes of the network, of its fitting, and of a round of labels.
+        scalars: settings of fitting, of refinement and of the teacher's faults.
+        seed: seed of all random numbers.
 
     Raises:
         UserError: settings that make no sense, or with which the fit diverges.
@@ -176,8 +176,8 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     """Return a policy whose actions are refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
 
     Args:
-        policy: as for `ask`.
-        model: from `ask` or `fit_feedback`.
+        policy: the policy to refine, as for `ask`.
+        model: a feedback model from `ask` or `fit_feedback`.
         bound_deg: how far refinement may lead from the policy's own actions, in the space's unit. By default as far as
             the labels reach: the distance within which 95% of the actions asked about lie from the policy's own, at
             least eps. A larger one is a warning: there the model was shown nothing.
@@ -193,7 +193,10 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     labels = _checked_model(model).labels
     width, seen = labels.obs.shape[1], entries_of(policy)
     if seen not in (0, width):
-        raise UserError(f"model is of observations with {width} entries, the policy's have {seen}: give one of its own")
+        raise UserError(
+            f"model takes observations with {width} entries, the policy's have {seen}: give a model "
+            "fitted for this policy"
+        )
     reach = max(by_model.reach(space, base, labels.obs, labels.action), model.scalars.eps_deg)
     if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
         warnings.warn(
@@ -229,7 +232,7 @@ def label_path(labels: Any) -> Path:
     """Return the path of a label file. Raises UserError if no file lies there."""
     path = arguments.path("labels", labels)
     if not path.exists():
-        raise UserError(f"labels: there is no label file at {path}: give one that a run or a person wrote, or arrays")
+        raise UserError(f"labels: there is no label file at {path}: give the path of a label file, or arrays")
     return path
 
 

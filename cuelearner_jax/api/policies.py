@@ -110,7 +110,10 @@ def as_policy_in(given: Any, env: Any) -> Policy:
     policy, seen = as_policy(given), entries_of(given)
     own = sum(quantity.size for quantity in getattr(env, "observation", ()))
     if seen and own and seen != own:
-        raise UserError(f"the policy's observations have {seen} entries, this world's {own}: keep its structure")
+        raise UserError(
+            f"the policy's observations have {seen} entries, this world's {own}: give a world with "
+            f"observations of {seen} entries"
+        )
     policy = in_space(policy, actions_of(env))
     user_code.acts_in("policy", policy, env)
     return policy
@@ -139,17 +142,17 @@ def load_policy(
     """Load the policy of a lane of a finished run, or of a policy folder (`adapt`).
 
     Args:
-        folder: of the run, or of a sweep in pieces; or the policy folder; or a shipped agent, as "shipped:navigation".
+        folder: folder of a run, of a sweep in pieces, or of a policy; or a shipped agent, as "shipped:navigation".
         policy: "agent", "guided" or another that `evaluate TASK --help` lists (default: the trained agent, or the
             adapted policy).
-        guidance: kind of guidance of the lane (default: the run's last).
-        labels: its label budget (default: the largest).
-        bound_deg: of a policy folder: its bound [deg] (default: the largest).
-        seed: its seed (default: the first).
+        guidance: the lane's kind of guidance (default: the run's last).
+        labels: the lane's label budget (default: the largest).
+        bound_deg: bound [deg] of a lane of a policy folder (default: the largest).
+        seed: the lane's seed (default: the first).
         base: the policy that was adapted, where it is code: the folder names it, and does not hold it.
         changes: the distortions of your own that calibration corrected: the folder names them, and does not hold them.
         task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
-        world: where it is to act, for policies that look at more than observations (default: as it was trained).
+        world: the world to act in, for policies that need more than observations (default: as it was trained).
 
     Raises:
         UserError: no such folder, lane or policy.

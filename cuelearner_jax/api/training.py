@@ -87,9 +87,9 @@ def train(
     last finite state, and their rows have no metrics.
 
     Args:
-        world: where.
-        teacher: who answers (a function of observations, or another policy, teaches what it does itself); needed by
-            kinds of guidance that ask, unless a label file answers.
+        world: the world to train in.
+        teacher: a teacher (a function of observations, or another policy, teaches what it does); needed by kinds of
+            guidance that ask, unless a label file answers.
         config: everything else, or the name of one of the task's presets; its world is the one given.
         guidance: kinds of guidance (default: the preset's, of these what can be had without a teacher if there is none;
             with a configuration, all that the world can have).

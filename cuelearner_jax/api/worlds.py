@@ -87,9 +87,9 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     """Return a world of a task.
 
     Args:
-        name: of the task ("billiards", "navigation", one of an installed package, `package.module:NAME`), or the task.
+        name: the task, or its name ("billiards", "navigation", one of an installed package, `package.module:NAME`).
         scenario: a changed world of the task's by name.
-        robot: what acts there (default: the task's own): "anymal" in navigation, "pooltool" in billiards, "fetch" in
+        robot: the body that acts (default: the task's own): "anymal" in navigation, "pooltool" in billiards, "fetch" in
             arm.
         changes: fields of its configuration, as `cuelearner evaluate TASK --help-all` lists them under "task options".
 
@@ -128,9 +128,9 @@ def from_gymnasium(
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         observation: a name, a number of entries and a unit for each slice of the flattened observation,
             [("gripper", 3, "m"), ("goal", 3, "m")] (default: its entries by the names of its space).
-        units: instead: units of slices by name; those in "m" and "rad" may have shifted, for calibration.
-        processes: that play (0: one for each processor; 1: none, they are played in this process).
-        arguments: of the environment.
+        units: units of slices by name, in place of `observation`; calibration may shift slices in "m" and "rad".
+        processes: number of processes that play (0: one for each processor; 1: this process plays).
+        arguments: arguments of the environment.
 
     Raises:
         UserError: Gymnasium is not installed, the environment cannot be made, or its spaces are none that are served.
@@ -166,6 +166,6 @@ def teacher_of(source: World | Policy) -> Teacher:
     """
     if isinstance(source, World):
         return source.task.make_teacher(source.config, source.env)
-    if not hasattr(source, "policy"):  # of a `CallablePolicy`, which stands above this file
+    if not hasattr(source, "policy"):  # `CallablePolicy` is above this module, so its `policy` is looked up by name
         source = arguments.policy("source", source)
     return Teaching(source)

@@ -46,9 +46,9 @@ class Config:
     probability: Annotated[float, SHARE] = 1.0
     """Probability that an episode is arbitrated; others are the agent's own."""
     in_targets: bool = True
-    """Do targets, too, bootstrap from the better of both actions? Of agents with an actor alone."""
+    """Let targets bootstrap from the better of both actions (only for agents with an actor)."""
     in_policy: bool = True
-    """May the finished policy take the better of both actions? Of agents with an actor alone."""
+    """Let the finished policy take the better of both actions (only for agents with an actor)."""
     judge_steps: Annotated[int, POSITIVE] = 2_000
     """Steps in which the agent alone and the better of both are validated before an evaluation, where `in_policy`."""
 
@@ -116,7 +116,7 @@ class Comparing:
     def follow(
         self, state: Compared, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
     ) -> Compared:
-        """Draw anew whether to arbitrate each episode that begins."""
+        """Draw whether to arbitrate each episode that begins."""
         return state.replace(arbitrated=redrawn(key, state.arbitrated, outcome.done, options.probability))
 
     def compares(self, state: Compared, known: Known) -> Params:

@@ -41,7 +41,7 @@ class Episodes(NamedTuple):
     def follow(
         self, state: Bool[Array, " num_envs"], options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
     ) -> Bool[Array, " num_envs"]:
-        """Draw anew whether to guide each episode that begins."""
+        """Draw whether to guide each episode that begins."""
         return redrawn(key, state, outcome.done, options.probability)
 
 
@@ -51,5 +51,5 @@ def redrawn(
     done: Bool[Array, " num_envs"],
     probability: Float[Array, ""] | float,
 ) -> Bool[Array, " num_envs"]:
-    """Return which episodes are guided, drawn anew where an episode is done."""
+    """Return which episodes are guided, with a new draw where an episode is done."""
     return jnp.where(done, jax.random.bernoulli(key, probability, done.shape), guided)

@@ -1,17 +1,17 @@
 """Paced arbiter: the share of guided episodes follows the recent returns of guided and own episodes.
 
-A two-armed bandit whose arms change. Each arm (own, guided) keeps sums over its finished episodes. The sums fade with
-every episode of either arm, so an arm that is seldom played becomes uncertain again (discounted UCB: Garivier and
-Moulines, "On upper-confidence bound policies for switching bandit problems", 2011). The next episode is guided with the
-probability that guidance is the better arm (Thompson sampling of the difference of two means, taken as normal), doubled
-and cut: a draw means the unpaced share.
+Source: a two-armed bandit with changing arms. Each arm (own, guided) keeps sums over its finished episodes, which fade
+with every episode of either arm, so that a rarely played arm becomes uncertain again. (Discounted UCB: Garivier and
+Moulines, "On upper-confidence bound policies for switching bandit problems", 2011.) The next episode is guided with the
+probability that guidance is the better arm, doubled and clipped: equal arms give the unpaced share. (Thompson sampling
+of the difference of two means, taken as normal.)
 
-An episode that earns a little more does not teach more: a weak guide costs an agent most of what it would have learned
-from episodes of its own (docs/results/bootstrapping.md). With a `lead` the share is proportional as well to what own
-episodes are behind, up to that lead (regret matching: Hart and Mas-Colell, "A simple adaptive procedure leading to
-correlated equilibrium", 2000), so that a draw means the floor.
+An episode with a slightly larger return does not teach more: a weak guide costs an agent most of what it would have
+learned from episodes of its own (docs/results/bootstrapping.md). With a `lead` the share is also proportional to the
+lag of own episodes, up to that lead, so that equal arms give the floor. (Regret matching: Hart and Mas-Colell, "A
+simple adaptive procedure leading to correlated equilibrium", 2000.)
 
-What an episode earned is a pair (gain, size), an arm's score the ratio of their sums:
+Each episode gives a pair (gain, size); an arm's score is the ratio of the pairs' sums:
 
 - At discount 0 each step is a problem of its own, and agents maximise the reward a step: gain is the episode's reward,
   size its steps. Episodes differ in length, so this is a ratio of two random sums.
@@ -72,8 +72,8 @@ class Pace(struct.PyTreeNode):
     """The returns of guided and own episodes so far, and the running episodes' sums."""
 
     guided: Bool[Array, " num_envs"]  # True where the running episode is guided
-    gain: Float[Array, " num_envs"]  # of the running episode so far
-    steps: Float[Array, " num_envs"]  # of the running episode so far
+    gain: Float[Array, " num_envs"]  # gain of the running episode so far
+    steps: Float[Array, " num_envs"]  # steps of the running episode so far
     whole: Bool[Array, " num_envs"]  # True where the running episode belonged to its arm from its first step on
     sums: ArmSums
 
@@ -81,7 +81,7 @@ class Pace(struct.PyTreeNode):
 class Paced(NamedTuple):
     """The arbiter's functions (`protocol.Arbiter`)."""
 
-    bootstraps: bool  # do targets look at the next observation?
+    bootstraps: bool  # whether targets use the next observation (discount above 0)
 
     def init(self, num_envs: int) -> Pace:
         """Return the state before the first episode."""

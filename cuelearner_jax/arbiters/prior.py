@@ -1,23 +1,23 @@
 """Arbiter by prior: labels act as a prior on the agent's choice, during learning and in the finished policy.
 
-What the labels say of an action and what the critic says of its value are two opinions to be combined, not a reward
-and its bonus. This is policy shaping (Griffith, Subramanian, Scholz, Isbell, Thomaz, "Policy shaping: integrating human
-feedback with reinforcement learning", NeurIPS 2013). The choice is
+Source: policy shaping (Griffith, Subramanian, Scholz, Isbell, Thomaz, "Policy shaping: integrating human feedback with
+reinforcement learning", NeurIPS 2013). The labels' density and the critic's value of an action are two opinions to be
+combined; labels are not a bonus on the reward. The choice is
 
     argmax over actions of   Q(s, a) + beta_n log p(a | labels),   beta_n = beta * trust_after / n
 
-after n steps of learning: the prior alone before the first, the critic alone in the end. In the random steps actions
-are drawn from p. The guide says p, and among which actions (`Guide.log_p`, `Guide.candidates`).
+after n steps of learning: only the prior before the first step, only the critic in the end. In the random steps actions
+are drawn from p. The guide gives p and the candidate actions (`Guide.log_p`, `Guide.candidates`).
 
-Candidates must not be a cage, for a guide's may miss the good actions. So each episode is played by one of three arms,
-whose steps all enter the same replay:
+The guide's candidates may miss the good actions. So each episode is played by one of three arms, whose steps all enter
+the same replay:
 
 - own: the agent's choice among all actions, without the prior;
 - prior: the choice above;
 - near: that choice, then again among the actions near it, which the critic can only know if they are tried.
 
-The arm that validates best acts in the finished policy (`Finishes`). No share of an arm follows what the arm earns: an
-arm that earns less now is the one that has to learn.
+The arm that validates best acts in the finished policy (`Finishes`). The arms' shares do not depend on their returns:
+an arm with a low return now may be the one that has to learn.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Config:
     ABOUT: ClassVar[str] = "values and labels choose together: argmax of Q + beta log p(action | labels)"
 
     beta: Annotated[float, Bounds(0)] = 0.1
-    """What a unit of log p(action | labels) counts for after `trust_after` steps of learning, in units of reward."""
+    """Weight of log p(action | labels) after `trust_after` steps of learning, in units of reward."""
     trust_after: Annotated[float, Bounds(0, above=True)] = 100_000.0
     """Steps of learning after which beta is `beta`; beta falls in inverse proportion to these steps."""
     own_share: Annotated[float, SHARE] = 0.5
@@ -58,7 +58,7 @@ class Config:
     near_deg: Annotated[float, Bounds(0)] = 1.5
     """How far near actions lie from the chosen one at most [deg]."""
     near_actions: Annotated[int, POSITIVE] = 16
-    """Actions near the chosen one, along each cue."""
+    """Number of actions near the chosen one, along each cue."""
     directions: Annotated[int, POSITIVE] = 720
     """Evenly spaced actions among which to choose where the guide names none (`intent` names the task's aims)."""
     judge_steps: Annotated[int, POSITIVE] = 2_000

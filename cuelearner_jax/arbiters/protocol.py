@@ -45,9 +45,9 @@ class Arbiter(Protocol):
         Args:
             state: before it.
             options: those that the arbiter was made from, their floats traced.
-            scalars: what all parts share, such as the discount factor.
-            outcome: of the step.
-            key: of this step.
+            scalars: settings that all parts share, such as the discount factor.
+            outcome: the step's outcome.
+            key: random key of this step.
         """
         ...
 
@@ -57,11 +57,11 @@ class Known(NamedTuple):
 
     env: Any  # or its view
     agent: AgentFunctions
-    params: Params  # of the agent
+    params: Params  # parameters of the agent
     guide: Guide
     model: GuidanceModel
     scalars: GuideScalars
-    steps: Float[Array, ""]  # that the agent has learned from
+    steps: Float[Array, ""]  # environment steps that the agent has learned from
 
 
 @runtime_checkable
@@ -81,13 +81,13 @@ class Chooses(Arbiter, Protocol):
         """Return the actions to execute in place of the agent's, until the cut-off.
 
         Args:
-            state: of the arbiter.
-            options: see `follow`.
+            state: the arbiter's state.
+            options: as for `follow`.
             known: the lane's parts.
             obs: to act on.
             base: the agent's own actions, in the random steps uniform ones.
             learns: are the random steps over?
-            key: of this step.
+            key: random key of this step.
 
         Returns:
             The actions, and a pass for each that is not the agent's own.

@@ -1,1 +1,1 @@
-"""Environments and agents of other packages."""
+"""Bridges to environments and agents of other packages."""

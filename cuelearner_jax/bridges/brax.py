@@ -1,4 +1,4 @@
-"""Our environments for brax's agents, and brax's environments for our loop. The only file that knows `brax.envs`.
+"""Run brax's agents on our environments, and brax's environments in our loop. The only module that imports `brax.envs`.
 
 `to_brax` and `wrap_for_training`: brax's PPO and SAC on our tasks. `from_brax`: a brax environment in our loop.
 Written for brax 0.14.2 (`brax/envs/base.py`, `brax/envs/wrappers/training.py`).
@@ -29,7 +29,7 @@ State = Any  # brax.envs.State, whose methods of flax a type checker does not kn
 
 
 def supply_device_put_replicated() -> None:
-    """Gives `jax` back the function `device_put_replicated`, gone since JAX 0.10, where it is missing.
+    """Restore `jax.device_put_replicated`, which JAX 0.10 removed, where it is missing.
 
     PPO, SAC and APG of brax 0.14.2 call it. `to_brax` does this by itself; before one of brax's agents trains on any
     other environment, do it yourself.
@@ -39,7 +39,7 @@ def supply_device_put_replicated() -> None:
 
 
 def _device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
-    """A copy of every leaf on every device, stacked along a new first axis, one entry a device: what `pmap` takes."""
+    """Copy every leaf to every device, stacked along a new first axis, one entry a device, as `pmap` takes it."""
     mesh = jax.sharding.Mesh(np.array(devices), ("device",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
 
@@ -52,15 +52,15 @@ def _device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
 
 
 class Episode(struct.PyTreeNode):
-    """`State.pipeline_state` of `BraxView`: where our environment, which resets by itself, stands."""
+    """The state of our environment, which resets automatically, within `State.pipeline_state` of `BraxView`."""
 
     env: EnvState
-    obs: Float[Array, " obs"]  # to act on next: after the automatic reset where the episode ended
-    ended: Bool[Array, ""]  # `env` has begun an episode that nobody has been told of yet
+    obs: Float[Array, " obs"]  # the next observation: after the automatic reset where the episode ended
+    ended: Bool[Array, ""]  # True once `env` began a new episode that brax has not seen yet
 
 
 class BraxView(envs.Env):
-    """One of our environments as brax sees it, made by `to_brax`. Its parameters are constants of what is compiled."""
+    """One of our environments as a brax environment, made by `to_brax`. Its parameters are compiled as constants."""
 
     def __init__(self, env: Environment):
         self.sys = env  # brax's domain randomization replaces the attribute of this name
@@ -77,11 +77,11 @@ class BraxView(envs.Env):
 
     @property
     def backend(self) -> str:
-        """None of brax's."""
+        """The name "cuelearner": the environment uses none of brax's backends."""
         return "cuelearner"
 
     def reset(self, rng: RawKey) -> State:
-        """Starts an episode."""
+        """Start an episode."""
         k_start, k_next = jax.random.split(_typed(rng))
         state, obs = self.sys.reset(k_start)
         zero = jnp.zeros(())
@@ -98,7 +98,7 @@ class BraxView(envs.Env):
         )
 
     def step(self, state: State, action: Float[Array, " n"]) -> State:
-        """Executes the action that `action` stands for, see `to_brax`.
+        """Execute the action that `action` stands for, see `to_brax`.
 
         A finished episode stays as it is until a wrapper begins another.
 
@@ -135,9 +135,9 @@ def to_brax(env: Environment) -> BraxView:
     bound, 1 its upper bound, and what lies beyond is brought back.
 
     Episodes that our environment truncates arrive at brax's agents as truncated, under brax's own wrappers too. But
-    `AutoResetWrapper` begins every episode of a lane at the same cached first state, and brax's evaluator then calls
-    the length of a truncated episode infinite. `wrap_for_training` does neither:
-    `ppo.train(to_brax(env), wrap_env_fn=wrap_for_training, ...)`.
+    `AutoResetWrapper` begins every episode of a lane at the same cached first state, and brax's evaluator then reports
+    an infinite length for a truncated episode. `wrap_for_training` avoids both: `ppo.train(to_brax(env),
+    wrap_env_fn=wrap_for_training, ...)`.
 
     `metrics` are `Step.metrics` and, where an episode ends, `Step.outcome` (elsewhere 0), so that brax's sum over an
     episode is the outcome. A brax `randomization_fn` gets our environment and returns a batch of it with its axes.
@@ -157,10 +157,11 @@ def to_brax(env: Environment) -> BraxView:
 def wrap_for_training(
     env: envs.Env, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable | None = None
 ) -> envs.Wrapper:
-    """In place of `brax.envs.training.wrap`, for environments from `to_brax`: every episode has a new random start.
+    """Wrap an environment from `to_brax` so that every episode has a new random start; replaces
+    `brax.envs.training.wrap`.
 
     Args:
-        env: from `to_brax`.
+        env: an environment from `to_brax`.
         episode_length: episodes are truncated after this many steps, if not before by the environment itself.
         action_repeat: how often each action is executed.
         randomization_fn: our environment -> a batch of it and the axes to map over.
@@ -174,16 +175,16 @@ def wrap_for_training(
 
 
 class FreshEpisodes(envs.Wrapper):
-    """What `AutoResetWrapper` does, but with our automatic reset in place of a cached first state."""
+    """A replacement for `AutoResetWrapper` that begins new random episodes instead of a cached first state."""
 
     def step(self, state: State, action: Float[Array, "envs n"]) -> State:
-        """Steps; where that ended an episode, the state is the next one's first and `done` says so."""
+        """Step; where an episode ended, return the next episode's first state, with `done` set."""
         info = {**state.info, "steps": jnp.where(state.done > 0, 0.0, state.info["steps"])}
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action)
         episode = state.pipeline_state
-        cut = (state.done > 0) & ~episode.ended  # by brax's limit: our environment knows nothing of it
+        cut = (state.done > 0) & ~episode.ended  # cut by brax's step limit, which our environment does not know
         begun = (episode, episode.obs, state.info["rng"])
-        # A reset of all is only worth its time if one needs it; the predicate is one for the whole batch.
+        # All environments are reset together, and only if one needs it: the predicate is one for the whole batch.
         episode, first_obs, rng = jax.lax.cond(cut.any(), lambda: self._restarted(cut, begun), lambda: begun)
         info = {**state.info, "rng": rng, "steps": state.info["episode_metrics"]["length"]}
         return state.replace(
@@ -193,7 +194,7 @@ class FreshEpisodes(envs.Wrapper):
         )
 
     def _restarted(self, cut: Bool[Array, " envs"], begun: tuple) -> tuple:
-        """New episodes where the old ones were cut."""
+        """Return new episodes where brax's limit cut the old ones."""
         fresh = self.env.reset(begun[2])
         started = (fresh.pipeline_state, fresh.obs, fresh.info["rng"])
 
@@ -204,7 +205,7 @@ class FreshEpisodes(envs.Wrapper):
 
 
 def _from_cube(space: Space, action: Float[Array, " n"]) -> Float[Array, " action"]:
-    """The action that a vector of brax's agents stands for, in [-1, 1]^n as a rule."""
+    """Return the action that a vector in [-1, 1]^n of brax's agents stands for."""
     if not isinstance(space, Box):
         return space.retract(action)
     low, high = jnp.array(space.low), jnp.array(space.high)
@@ -212,12 +213,12 @@ def _from_cube(space: Space, action: Float[Array, " n"]) -> Float[Array, " actio
 
 
 def _typed(rng: RawKey) -> PRNGKeyArray:
-    """Our kind of key."""
+    """Return a typed key."""
     return rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
 
 
 def _measures(step: Step) -> dict[str, Array]:
-    """What brax adds up over an episode: outcomes only count where it ends."""
+    """Return the measures that brax sums over an episode; outcomes count only where it ends."""
     ended = step.terminated | step.truncated
     outcome = {name: jnp.where(ended, value, 0.0) for name, value in step.outcome.items()}
     return {name: jnp.asarray(value, jnp.float32) for name, value in {**step.metrics, **outcome}.items()}

@@ -1,4 +1,4 @@
-"""Simulators of brax's interface, MuJoCo Playground's too, as environments for our loop.
+"""Simulators with brax's interface, MuJoCo Playground's included, as environments for our loop.
 
 Such a simulator has `reset(rng) -> State` and `step(state, action) -> State`; a State has `obs`, `reward`, `done`,
 `metrics` and `info`. This file imports neither library. `bridges.brax` and `bridges.playground` say what each brings.
@@ -22,7 +22,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space, box
 from cuelearner_jax.types import Step
 
-State = Any  # of the simulator: a pytree with the members that this file's docstring names
+State = Any  # a simulator's state: a pytree with the members that this module's docstring names
 UNIT = "as the simulator has it"
 WORDS = ("more", "less")
 # Keys of cues, enough for the 21 entries of a humanoid: those of any box, letters and digits that are left, signs.
@@ -32,7 +32,7 @@ KEYS = (*box.KEYS, "zx", "cv", "bn", "mp", "12", "34", "56", "78", "90", ",.", "
 class Running(struct.PyTreeNode):
     """State of a `JaxEnvironment` between steps."""
 
-    state: State  # of the simulator
+    state: State  # the simulator's state
     steps: Int[Array, ""]  # taken in this episode
 
 
@@ -44,7 +44,8 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     """
 
     max_steps: Int[Array, ""]  # an episode is truncated after this many
-    simulator: Callable[[], Any] = struct.field(pytree_node=False)  # gives it; equal ones share what is compiled
+    # makes the simulator; equal makers share compiled programs
+    simulator: Callable[[], Any] = struct.field(pytree_node=False)
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
     # action of ours -> the simulator's (n,); None: as it is
@@ -58,7 +59,7 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
 
     def step(self, key: PRNGKeyArray, state: Running, action: Float[Array, " action"]) -> tuple[Running, Step]:
         """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
-        before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into dictionaries that they are given
+        before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into their input dictionaries
         given = action if self.to_action is None else self.to_action(action)
         after = Running(_as_arrays(self.simulator().step(before, given)), state.steps + 1)
         stopped = jnp.asarray(after.state.info.get("truncation", 0)) > 0
@@ -81,7 +82,7 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
 
 @dataclass(frozen=True)
 class Given:
-    """A simulator that the caller made; two of one simulator are equal."""
+    """A maker that returns the caller's simulator; two makers of one simulator are equal."""
 
     simulator: Any
 
@@ -91,7 +92,7 @@ class Given:
 
 
 class Layout(NamedTuple):
-    """What policies have to know of a simulator."""
+    """The sizes and names of a simulator's observations and actions, as policies need them."""
 
     slices: tuple[str, ...]  # names of an observation's slices, in their order
     sizes: tuple[int, ...]  # entries of each slice
@@ -99,7 +100,7 @@ class Layout(NamedTuple):
 
     @property
     def observation(self) -> tuple[Quantity, ...]:
-        """The slices as an environment has them."""
+        """Return the slices as an environment has them."""
         return tuple(Quantity(name, size, UNIT) for name, size in zip(self.slices, self.sizes, strict=True))
 
     def box(self, cues: Sequence[Cue] = ()) -> Box:
@@ -110,10 +111,10 @@ class Layout(NamedTuple):
 
 
 def layout_of(simulator: Any, name: str) -> Layout:
-    """Return the layout of a simulator; nothing is compiled. `name`: of the simulator, for messages.
+    """Return the layout of a simulator without compiling. `name`: the simulator's, for messages.
 
     Raises:
-        UserError: it is a batch of several, hides the end of an episode, or observes images.
+        UserError: the simulator is a batch of several, hides the end of an episode, or observes images.
     """
     shapes = jax.eval_shape(simulator.reset, jax.random.key_data(jax.random.key(0)))
     if shapes.reward.shape:
@@ -139,7 +140,7 @@ def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:
 
 
 def model_of(simulator: Any) -> Any:
-    """Return a simulator's model as MuJoCo has it (`mujoco.MjModel`); None: there is none."""
+    """Return a simulator's MuJoCo model (`mujoco.MjModel`); None if there is none."""
     return getattr(simulator, "mj_model", None) or getattr(getattr(simulator, "sys", None), "mj_model", None)
 
 
@@ -171,7 +172,7 @@ def space_of(
     to_action: Callable[[Float[Array, "2"]], Float[Array, " n"]] | None,
     cues: Sequence[Cue] = (),
 ) -> Space:
-    """Return directions where `to_action` says what they mean, else the whole box.
+    """Return directions where `to_action` maps them to actions, else the whole box.
 
     Raises UserError where `to_action` gives other shapes, or cues are given beside it or do not fit the box.
     """
@@ -186,5 +187,5 @@ def space_of(
 
 
 def _as_arrays(state: State) -> State:
-    """Some simulators pay Python's numbers."""
+    """Return a state's numbers as arrays, since some simulators return Python numbers."""
     return jax.tree.map(jnp.asarray, state)

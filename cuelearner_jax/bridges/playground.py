@@ -1,4 +1,4 @@
-"""MuJoCo Playground's dm_control tasks for our loop. The only file that knows `mujoco_playground`.
+"""MuJoCo Playground's dm_control tasks for our loop. The only module that imports `mujoco_playground`.
 
 Written for playground 0.2.0. Its locomotion and manipulation tasks download their robots when they are made: they are
 not offered by name, and `from_playground` takes one that the caller made.
@@ -32,7 +32,7 @@ def suite() -> ModuleType:
 
 
 def make(name: str) -> Any:
-    """Return a dm_control task of Playground's by its name, in MJX's own JAX implementation.
+    """Return a dm_control task of Playground by its name, in MJX's JAX implementation.
 
     Raises:
         UserError: Playground is not installed, has no such task or cannot make it, or downloads its robot.
@@ -49,7 +49,7 @@ def make(name: str) -> Any:
     try:
         with jax.ensure_compile_time_eval():  # a task holds arrays, and may be asked for while something is traced
             return known.load(name, config_overrides={"impl": "jax"})
-    except AttributeError as error:  # of MuJoCo's own interface, which has changed since
+    except AttributeError as error:  # MuJoCo's own interface has changed
         raise UserError(
             f"playground:{name} does not work with the installed MuJoCo ({error}): choose another task"
         ) from error
@@ -63,7 +63,7 @@ def from_playground(
     *,
     cues: Sequence[Cue] = (),
 ) -> JaxEnvironment:
-    """Return a Playground environment (`mujoco_playground.MjxEnv`) as one of ours, with its whole box of actions.
+    """Return a Playground environment (`mujoco_playground.MjxEnv`) as one of ours, with its whole action box.
 
     Arguments and errors are those of `bridges.brax.from_brax`. Observations of pixels are refused.
     """

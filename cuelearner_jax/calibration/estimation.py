@@ -31,12 +31,12 @@ from cuelearner_jax.policies import in_space, policy_of
 from cuelearner_jax.spaces import Space, is_answered
 
 Floats = np.ndarray
-Given = Array | np.ndarray  # what is taken
+Given = Array | np.ndarray  # accepted arrays
 BATCH = 10  # questions between two fits
 CHOICE = 6  # situations from which one question is chosen
 LOOKS = 6  # nodes at which the policy is asked in each situation to choose from
 FRESH = 3  # nodes after each batch
-ROUNDS = 4  # of samples, where there were none
+ROUNDS = 4  # rounds of samples for a set without samples
 LEAST = 20  # answers before two changes at once are considered
 DOUBT = 2.0  # least evidence for each change [nats]
 SURE = 3.0  # least evidence for all changes, against no change [nats]
@@ -92,10 +92,10 @@ class Calibration:
 
     Args:
         policy: a policy, or any function of a batch of observations.
-        family: what may have changed; see `families.declared_distortions`.
-        space: of the actions.
+        family: the possible changes; see `families.declared_distortions`.
+        space: space of the actions.
         eps_deg: strength of an answer, in the space's unit.
-        seed: of everything random.
+        seed: seed of all random numbers.
 
     Raises:
         UserError: a family that makes no sense, or actions without cues.
@@ -238,7 +238,7 @@ class Calibration:
         return fit.evidence - DOUBT * len(fit.family)
 
     def _odds(self, fits: list[Fit]) -> Floats:
-        """Return the odds of the fits with the most answers; before the first answer all odds are equal."""
+        """Return the log odds of the fits with the most answers; before the first answer all odds are equal."""
         known = [0 if fit.answers is None else len(fit.answers.obs) for fit in fits]
         if not max(known):
             return np.zeros(len(fits))
@@ -259,7 +259,7 @@ class Calibration:
     def result(self) -> Result:
         """Return the result of all answers. Raises UserError for too few answers."""
         if self.asked < HELD_OUT:
-            raise UserError(f"{self.asked} answers tell too little: give at least {HELD_OUT}")
+            raise UserError(f"{self.asked} answers are too few for calibration: give at least {HELD_OUT}")
         self._settle()
         best, none = self.fits[self.chosen], self.fits[()]
         before, after = none.predict_held_out(), best.predict_held_out()
@@ -299,7 +299,7 @@ class Calibration:
 
 
 def _explains(fit: Fit) -> bool:
-    """Return whether most answers are about what the fit says, and near it."""
+    """Return whether most answers are about the fit's actions, and near them."""
     rho, width = (fit.nuisance @ GRID)[:2]
     return bool(rho <= MOSTLY and width <= APART)
 
@@ -323,12 +323,12 @@ def calibrate(
 
     Args:
         policy: a policy, or any function of a batch of observations.
-        family: what may have changed.
+        family: the possible changes.
         situations: gives states and observations (count, obs) that a policy meets.
         teacher: gives answers (n, cues), -1, 0, 1 or `UNSAID`; NaN where it did not answer.
         labels: number of questions.
-        key: of everything random.
-        space: of the actions.
+        key: key of all random numbers.
+        space: space of the actions.
         eps_deg: strength of an answer, in the space's unit.
 
     Raises:

@@ -1,8 +1,9 @@
 """Families of possible changes between a policy and its world, in named unknowns, and how each change is undone.
 
 A distortion says how observations or actions may have changed: balls are seen shifted, a lidar is mounted turned, every
-strike is turned. `sees` gives the observation as it was before the change, `acts` the action that leads there to what
-the policy meant. Several distortions together are a family; with all unknowns at zero a family changes nothing.
+strike is turned. `sees` returns the observation as it would be without the change. `acts` returns the action that,
+after the change, does what the policy meant. Several distortions together are a family; with all unknowns at zero a
+family changes nothing.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def _parts(family: Family, theta: Float[Array, " unknowns"]) -> list[tuple[Disto
 def check_family(family: Sequence[Distortion]) -> Family:
     """Return a family as a tuple. Raises UserError for no distortion, one without unknowns, or two of one name."""
     if not family:
-        raise UserError("there is nothing that could have changed: give at least one distortion")
+        raise UserError("changes is empty: give at least one distortion")
     names = [unknown.name for unknown in unknowns_of(tuple(family))]
     for distortion in family:
         if not distortion.unknowns:
@@ -115,7 +116,7 @@ def check_family(family: Sequence[Distortion]) -> Family:
             raise UserError(f"distortion {distortion.name!r} changes nothing: give `sees`, `acts` or `plans`")
     for taken in (names, [distortion.name for distortion in family]):
         if twice := sorted({name for name in taken if taken.count(name) > 1}):
-            raise UserError(f"{twice[0]!r} stands twice in a family: give each name once")
+            raise UserError(f"{twice[0]!r} is the name of two distortions or unknowns: give each name once")
     return tuple(family)
 
 
@@ -233,10 +234,13 @@ def _turned_places(places: list[tuple[Quantity, int]]) -> list[Distortion]:
     groups: dict[tuple[float, float], list[tuple[Quantity, int]]] = {}
     for quantity, start in places:
         if quantity.follows and quantity.follows not in starts:
-            raise UserError(f"slice {quantity.name!r} follows {quantity.follows!r}, which is no slice: name one")
+            raise UserError(
+                f"slice {quantity.name!r} follows {quantity.follows!r}, which is not a slice of the "
+                "observation: name one"
+            )
         if quantity.origin is not None:
             if quantity.unit != "m" or quantity.size < 2:
-                raise UserError(f"slice {quantity.name!r} has an origin and is no place: give x and y in metres")
+                raise UserError(f"slice {quantity.name!r} has an origin but is not a place: give x and y in metres")
             groups.setdefault(quantity.origin, []).append((quantity, start))
     found = []
     for origin, slices in groups.items():

@@ -1,10 +1,10 @@
 """The likelihood of a relative answer, given the action that the teacher means.
 
-An answer about an action is, with probability 1 - rho, an ordered logistic in the way from the action to what is meant:
-"already right" near it, with a width w. With probability rho, it is about something else: more and less are then as
-likely. An action far from what is meant tells nothing either: who looks for the nearest good action finds another
-one there. How near and how far that is, rho and w are not known; they are values of a grid with a prior. Where the
-policy itself is not sure what it means, its spread adds to the width.
+With probability 1 - rho an answer is about the meant action: an ordered logistic in the offset from the asked action to
+the meant one, with "already right" near zero and a width w. With probability rho it is about another action; more and
+less are then equally likely. An answer about an action far from the meant one tells nothing either, since a teacher who
+looks for the nearest good action finds another one there. The limits of near and far, rho and w are unknown: they are
+points of a grid with a prior. Where the policy itself is not sure what it means, its spread adds to the width.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def log_chances(
         spread: standard deviation of that [eps].
         answer: -1, 0 or 1 for each cue.
         told: 1 where the answer says something of a cue, else 0.
-        doubt: of each answer's situation, see `chances`.
+        doubt: each situation's doubt, see `chances`.
     """
     answer, told, doubt = (jnp.broadcast_to(part, offset.shape) for part in (answer, told, doubt[:, None]))
     each = jnp.log(chances(offset, spread, answer, doubt))

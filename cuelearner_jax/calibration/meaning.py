@@ -26,7 +26,7 @@ class Meaning:
 
     Args:
         policy: acts by its observations alone; opaque Python functions included.
-        space: of its actions.
+        space: space of the policy's actions.
     """
 
     def __init__(self, policy: Any, space: Space) -> None:

@@ -23,9 +23,8 @@ class Calibrated(PolicyNode):
     base: Any  # a policy
     theta: Float[Array, " unknowns"]  # unknowns in their units; of a block (lanes, unknowns)
     family: Family = struct.field(pytree_node=False)
-    named: str = struct.field(
-        pytree_node=False, default=""
-    )  # reference of the family's code; empty: the world declares the family
+    # reference of the family's code; empty: the world declares the family
+    named: str = struct.field(pytree_node=False, default="")
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the base's actions, corrected."""

@@ -26,10 +26,8 @@ SAMPLES = 96  # samples of a round for each unknown
 PORTION = 32  # samples weighed in one call
 ENOUGH, MORE = 6.0, 4  # least effective samples for each unknown and one; most extra rounds for these
 ANEW = 0.15  # share of a round's samples drawn from the prior
-FIRST, CLOSER = (
-    2,
-    0.1,
-)  # rounds from the prior and from a prior with scales smaller by this factor; these rounds are kept
+# rounds from the prior and from a prior with scales smaller by this factor; these rounds are kept
+FIRST, CLOSER = 2, 0.1
 KEPT = 4  # later rounds that are kept
 HELD_OUT = 5  # every fifth answer is held out in turn
 
@@ -60,9 +58,8 @@ class Prior(NamedTuple):
         """Return samples (count, unknowns), evenly spread."""
         if not len(self.scale):
             return np.zeros((count, 0))
-        from scipy.stats import (
-            qmc,
-        )  # imported here, since SciPy's module takes seconds to load and a stored policy does not need it
+        # imported here, since SciPy's module takes seconds to load and a stored policy does not need it
+        from scipy.stats import qmc
 
         even = qmc.Halton(len(self.scale), rng=random).random(count)
         return stdtrit(PRIOR_FREEDOM, np.clip(even, 1e-4, 1 - 1e-4)) * self.scale
@@ -81,7 +78,7 @@ class Prior(NamedTuple):
 
 
 class Kernels(NamedTuple):
-    """A mixture of Student's t around centres, with one shape, and a share of the prior so that no region is excluded."""
+    """A mixture of Student's t around centres, with one shape, and a share of the prior: no region is excluded."""
 
     centres: Float[Floats, "kernels unknowns"]
     shape: Float[Floats, "unknowns unknowns"]  # lower triangle
@@ -109,17 +106,17 @@ class Round(NamedTuple):
     proposal: Kernels | Prior
     theta: Float[Floats, "samples unknowns"]
     offset: Float[Floats, "samples n cues"]  # from asked actions to the ones that the teacher would call right [eps]
-    log_likelihood: Float[Floats, "samples grid"]  # with the prior of the grid
+    log_likelihood: Float[Floats, "samples grid"]  # including the prior of the grid
 
 
 class Fit:
     """Weighted samples of the posterior of a family's unknowns.
 
     Args:
-        family: what may have changed; empty: nothing.
-        scales: of its unknowns, in their units.
+        family: the possible changes; empty: no change.
+        scales: prior scales of the unknowns, in their units.
         responses: the policy.
-        seed: of the samples.
+        seed: seed of the samples.
     """
 
     def __init__(self, family: Family, scales: dict[str, float], responses: Responses, seed: int) -> None:
@@ -167,7 +164,7 @@ class Fit:
         return found
 
     def right(self, theta: Floats, response: Response) -> tuple[Floats, Floats]:
-        """Return the actions (samples, n, action) that the teacher would call right, and their spread along cues [eps]."""
+        """Return the actions (samples, n, action) that the teacher would call right, and their spread [eps]."""
         meaning, (mean, spread) = self.responses.meaning, response.at(self.places(theta))
         meant = np.asarray(
             meaning.space.exp(response.centre[None], jnp.asarray(mean * self.responses.eps, jnp.float32))

@@ -1,4 +1,4 @@
-"""Choose questions: the actions whose answers are expected to tell most about the changes, away from the policy's ties."""
+"""Choose the actions whose answers are expected to tell most about the changes, away from the policy's ties."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ Floats = np.ndarray
 ANSWERS = (-1.0, 0.0, 1.0)
 DRAWS = 24  # draws of the unknowns
 NUDGES, NUDGE = 4, 1e-3  # tiny changes of an observation, as a share of how much its entries differ
-TURNS = np.array(
-    [-2.0, -1.3, -0.8, -0.4, 0.0, 0.4, 0.8, 1.3, 2.0]
-)  # offsets of an asked action, in spreads of the possibly meant actions
+# offsets of an asked action, in spreads of the possibly meant actions
+TURNS = np.array([-2.0, -1.3, -0.8, -0.4, 0.0, 0.4, 0.8, 1.3, 2.0])
 LEAST_SPREAD = 0.75  # [eps]
 WIDEST = 5.0  # [eps]: beyond, a teacher may mean another action
 
@@ -70,7 +69,7 @@ def choose(
     """Return `count` questions: from each share of the situations the most informative one.
 
     Args:
-        draws: what may have changed.
+        draws: draws of the unknowns.
         response: the policy's responses in the situations to choose from, at least `count`.
         count: number of questions.
         random: source of the simulated answers.
@@ -99,8 +98,8 @@ def _told_most(
 ) -> tuple[Floats, Floats, Floats]:
     """Return for each share of the situations the most informative one, its turn of the action, and its information.
 
-    Questions are chosen one after another. Each draw in turn is taken as the truth, answers the earlier questions, and so
-    weights all draws.
+    Questions are chosen one after another. Each draw in turn is taken as the truth, answers the earlier questions, and
+    so weights all draws.
     """
     cues, _, draws = chance.shape[:3]
     weight = np.full((draws, draws), 1 / draws)  # (truth, draw)
@@ -115,7 +114,8 @@ def _told_most(
         worth.append(told[..., best].max(1).sum())
         for cue in range(cues):
             said = chance[cue, :, :, turn[-1][cue], share[best]]  # (answers, draws)
-            answer = (said.cumsum(0) < random.random(draws)[None]).sum(0).clip(max=2)  # of each truth
+            # simulated answer of each draw as truth
+            answer = (said.cumsum(0) < random.random(draws)[None]).sum(0).clip(max=2)
             weight = weight * said[answer]
         weight /= weight.sum(1, keepdims=True)
     return np.array(index), np.array(turn), np.array(worth)

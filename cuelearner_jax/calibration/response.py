@@ -1,8 +1,9 @@
 """A policy's response to changed observations: asked at few nodes, interpolated between them by kriging.
 
-A policy is expensive and jumps, and every family asks about the same changes of what is seen. So it is asked at few
-nodes in the unknowns of all families. Between these a Gaussian process with a linear trend and a nugget (Rasmussen and
-Williams, 2006, chapter 2) gives the mean and how sure that is. Rows share length and nugget; each has its own size.
+A policy is expensive to call, its actions jump, and every family needs it for the same changes of the observation. So
+the policy is called at few nodes in the unknowns of all families. Between the nodes a Gaussian process with a linear
+trend and a nugget (Rasmussen and Williams, 2006, chapter 2) gives mean and variance. Rows share length and nugget; each
+row has its own size.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ AXIS = (0.35, 1.2)  # distances of the first nodes from no change, in prior scal
 MOST = 28  # nodes
 CLIP = 10.0  # [eps]: larger offsets are clipped
 TREND = 100.0  # variance of the trend, relative to the residual variance
-LENGTHS, NUGGETS = (0.15, 0.5, 2.0), (1e-3, 0.1, 0.6)  # in prior scales; as shares of the variance
+LENGTHS, NUGGETS = (0.15, 0.5, 2.0), (1e-3, 0.1, 0.6)  # lengths in prior scales; nuggets as shares of the variance
 LEAST = 0.05  # [eps]: least standard deviation of a row
 RELEVANT = 0.02  # weight of nodes that are unlikely given the answers
 
@@ -57,7 +58,7 @@ class Responses:
     Args:
         meaning: the policy.
         asks: all distortions that change what is seen, or what an action leads to.
-        scales: of their unknowns.
+        scales: prior scales of their unknowns.
         eps: strength of an answer, as `space.log` counts.
     """
 
@@ -136,7 +137,7 @@ def _covariance(nodes: Floats, length: float, nugget: float) -> Floats:
 
 
 def _smoothness(nodes: Floats, rows: Float[Floats, "nodes rows"]) -> tuple[float, float]:
-    """Length and nugget under which the rows are likeliest, each with its own size."""
+    """Return the maximum-likelihood length and nugget, with each row's own size."""
 
     def log_likelihood(length: float, nugget: float) -> float:
         covariance = _covariance(nodes, length, nugget)

@@ -10,7 +10,7 @@ from cuelearner_jax.calibration.meaning import Meaning
 
 Floats = np.ndarray
 CHANGED_BY = 10.0  # [eps]: the mean change of the policy's actions
-MOST = 1 / 4  # of the space's reach
+MOST = 1 / 4  # largest mean change, as a share of the space's reach
 SITUATIONS = 16
 SIZES = np.geomspace(1e-4, 1e3, 29)  # scales that are tried, in the unknown's unit
 

@@ -1,8 +1,8 @@
 """Changes of the physics, whose compensating action is found in a simulator with the unknowns as parameters.
 
-A tilted table changes neither what is seen nor the action that is given, but where an action leads. Whoever has a
-simulator of the world can play actions near the meant one in it, before and after the change. The action to give is
-that round which rewards are after the change as they were before it round the meant action.
+A tilted table changes neither the observation nor the executed action, but the action's effect. A simulator of the
+world can play actions near the meant one, before and after the change. The compensating action is the one around which
+rewards after the change match the rewards around the meant action before the change.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def simulator_distortion(
     """Return a distortion of the physics, as a simulator predicts it.
 
     Args:
-        name: of the distortion.
+        name: name of the distortion.
         unknowns: parameters of the simulator; at zero it is the world of the policy.
         env_of: gives the environment of some unknowns; its `step(key, state, action)` tells the reward.
         state_of: gives a state of the simulator that looks like an observation.
-        space: of the actions; it has one cue.
+        space: space of the actions, with one cue.
         reach: how far an action may have to change, in the space's unit.
         tried: actions within the reach of another one; odd.
 

@@ -25,7 +25,7 @@ class Walk:
 
     Args:
         env: the changed world.
-        teacher: of that world.
+        teacher: that world's teacher.
         scalars: strength of answers, in the space's unit, and faults of the teacher.
     """
 

@@ -1,4 +1,4 @@
-"""Options that all parts share, how a part brings its own, what of them can work, and how they are kept."""
+"""Configuration: options that all parts share, options of single parts, their checks, and their JSON form."""
 
 from cuelearner_jax.config.checks import LARGEST_ROUND, check_guide, check_multiple
 from cuelearner_jax.config.groups import (

@@ -1,4 +1,4 @@
-"""What values of the guide's configuration can work together: one clear line for the first that cannot."""
+"""Check which values of the guide's configuration work together; one clear line for the first that does not."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from cuelearner_jax.config.groups import GuideScalars, GuideSizes
 from cuelearner_jax.config.parts import check_part
 from cuelearner_jax.errors import UserError
 
-LARGEST_ROUND = 1 << 30  # so that budgets of as many labels, in whole rounds, are a 32-bit integer too
+LARGEST_ROUND = 1 << 30  # keeps budgets in whole rounds within 32-bit integers
 
 
 def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
-    """Raises UserError with one line for the first value of a guide's that cannot work."""
+    """Raise UserError with one line for the first value of the guide's configuration that cannot work."""
     check_part(sizes, "sizes")
     check_part(scalars, "scalars")
     _check_choice(sizes)
@@ -20,9 +20,11 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
 
 
 def _check_choice(sizes: GuideSizes) -> None:
-    """Of the situations to ask in."""
+    """Check the options that choose among several situations for a question."""
     if sizes.ask_all and sizes.candidates == 1:
-        raise UserError("sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave it out")
+        raise UserError(
+            "sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave out sizes.ask_all"
+        )
     if sizes.ask_all:
         check_multiple(sizes.labels_per_round, sizes.candidates, "sizes.labels_per_round", "sizes.candidates")
     elif sizes.candidates > 1 and sizes.ensemble == 1:
@@ -33,6 +35,6 @@ def _check_choice(sizes: GuideSizes) -> None:
 
 
 def check_multiple(value: int, unit: int, name: str, unit_name: str) -> None:
-    """Raises UserError unless a value is a whole number of units."""
+    """Raise UserError unless a value is a multiple of `unit`."""
     if value % unit:
         raise UserError(f"{name} is {value}: give a multiple of {unit_name} ({unit})")

@@ -23,8 +23,8 @@ class GuideSizes:
     """Static sizes of the guidance model and of its fitting."""
 
     frame: Frame = "raw"
-    """What networks see: observation and action as they are, or the observation as it looks from the action (and
-    a guide then says by how much to turn from there)."""
+    """Inputs of networks: raw, the observation and the action; action, the observation as seen from the action (a guide
+    then predicts a turn from there)."""
     feedback_layers: Layers = (400, 400, 300, 300)
     """Hidden layers of the guidance model."""
     labels_per_round: Annotated[int, POSITIVE] = 10
@@ -34,18 +34,17 @@ class GuideSizes:
     fit_batch_size: Annotated[int, POSITIVE] = 100
     """Labels in one step of a fit."""
     validate_every: Annotated[int, POSITIVE] = 20
-    """Adam steps between two looks at the validation labels (every fifth label); the best parameters are kept."""
+    """Adam steps between two checks on the validation labels (every fifth label); the best parameters are kept."""
     ensemble: Annotated[int, POSITIVE] = 1
     """Members of the guidance model, each fitted to all labels; it predicts their mean."""
     candidates: Annotated[int, POSITIVE] = 1
-    """Situations among which each question is chosen, where the members of an ensemble disagree most (1: as they
-    come)."""
+    """Situations among which each question is chosen by the disagreement of an ensemble's members (1: no choice)."""
     ask_all: bool = False
-    """Is every candidate asked about, in place of one that is chosen? Simulated labels by the thousand are then soon
-    asked for: a round takes its number of questions divided by `candidates` in steps."""
+    """Ask about every candidate instead of choosing one. This makes thousands of simulated labels fast: a round takes
+    its number of questions divided by `candidates` in steps."""
     question_every: Annotated[int, POSITIVE] = 1
-    """Steps from one question of a simulated teacher to the next (1: every situation is asked about): questions farther
-    apart are of more different situations."""
+    """Steps between two questions of a simulated teacher (1: a question in every situation). Larger values give more
+    diverse situations."""
 
 
 @dataclass(frozen=True)
@@ -83,28 +82,27 @@ class TeacherFaults:
     """Scalars of a simulated teacher: what it answers about, and how it errs; traced, but for words."""
 
     answer: Literal["best", "nearest", "shuffled"] = "best"
-    """What it has in mind: its best action, or of those that it holds for good the nearest to the one asked about.
-    shuffled, a control: best, but models are fitted to labels that have each other's answers."""
+    """The action that the teacher intends: best, its best action; nearest, the good action nearest to the one asked
+    about; shuffled, a control: best, but models are fitted to labels with exchanged answers."""
     says: Literal["all", "worst", "one"] = "all"
-    """Relative feedback of several cues speaks of all of them, of the one whose difference is largest, or of one at
-    random; of the others nothing is said, which does not mean "already right"."""
+    """The cues that a relative answer names: all, the worst (largest difference), or one at random. A cue that is not
+    named does not count as "already right"."""
     nearest_share: Annotated[float, SHARE] = 0.6
-    """Good is an action worth at least this share of the best one."""
+    """An action is good if its value is at least this share of the best one's."""
     nearest_aim_deg: Annotated[float, Bounds(0)] = 1.0
-    """Standard deviation of the error of aim over which that worth is averaged [deg]."""
+    """Standard deviation of the error of aim over which these values are averaged [deg]."""
     scalar_within_deg: Annotated[float, Bounds(0)] = 5.0
-    """Scalar feedback calls good what lies so near the action in mind [deg]."""
+    """Scalar feedback calls an action good within this distance of the intended one [deg]."""
     mistake_probability: Annotated[float, SHARE] = 0.0
-    """Teacher's fault: with this probability a turn is told the wrong way round, a demonstration errs on the other side
-    of the action asked about, good is called bad and bad good."""
+    """Teacher's fault: with this probability a relative answer has the wrong sign, a demonstration is mirrored at the
+    action asked about, and a good action is called bad or a bad one good."""
     silence_probability: Annotated[float, SHARE] = 0.0
     """Teacher's fault: no answer, of any form, with this probability (the question still counts as a label)."""
     indifference_deg: Annotated[float, Bounds(0)] = 0.0
-    """Teacher's fault: errors up to this pass for right (relative feedback alone implies eps / 2): the action asked
-    about is then the one demonstrated, and called good [deg]."""
+    """Teacher's fault: errors up to this count as right (relative feedback implies at least eps / 2); the action asked
+    about is then demonstrated, and called good [deg]."""
     teacher_bias_deg: float = 0.0
-    """Teacher's fault: constant error, counterclockwise, of what it takes for the best action or for a good one,
-    whatever the form of its answers [deg]."""
+    """Teacher's fault: constant error, counterclockwise, of the intended action, for every form of answers [deg]."""
 
 
 @dataclass(frozen=True)
@@ -134,12 +132,12 @@ class Schedule:
     eval_envs: Annotated[int, POSITIVE] = 100
     """Environments that share an evaluation's steps."""
     checkpoint_every: Annotated[int, POSITIVE] = 1_000_000
-    """Steps between two checkpoints, which is what a killed run may lose."""
+    """Steps between two checkpoints; a killed run loses at most these."""
     guide_eval_every: Annotated[int, Bounds(0)] = 0
-    """Labels between two evaluations of the guide alone (0: after the last label alone)."""
+    """Labels between two evaluations of the guide alone (0: only after the last label)."""
 
     def learned_from(self, step: Any) -> Any:
-        """Return of so many steps those after which gradient steps followed; numbers, or traced ones."""
+        """Return the number of environment steps, of the first `step`, that gradient steps followed; traced or not."""
         return jnp.maximum(step - self.learn_after, 0)
 
 

@@ -24,26 +24,26 @@ from cuelearner_jax.errors import UserError, format_value, suggestion
 
 LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
 LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
-MOST_LAYERS = 64  # each is compiled by itself
-TRACED = "traced"  # annotates a whole number that shapes nothing
+MOST_LAYERS = 64  # most layers, since each is compiled by itself
+TRACED = "traced"  # annotates a whole number that does not shape the program
 
 PartT = TypeVar("PartT")
 
 
 class Bounds(NamedTuple):
-    """What numbers a field may hold; of a tuple each of its entries."""
+    """The range of numbers that a field may hold; for a tuple each of its entries."""
 
     least: float = -math.inf
     most: float = math.inf
-    above: bool = False  # is `least` itself excluded?
+    above: bool = False  # True if `least` itself is excluded
 
     def __contains__(self, number: object) -> bool:
-        """Whether a number may be held."""
+        """Whether a number is within the bounds."""
         assert isinstance(number, int | float)
         return (number > self.least if self.above else number >= self.least) and number <= self.most
 
     def __str__(self) -> str:
-        """What a message asks for."""
+        """Describe the allowed numbers for a message."""
         if math.isinf(self.most):
             return "a positive number" if self.least or self.above else "a number that is not negative"
         if self.above:
@@ -51,7 +51,7 @@ class Bounds(NamedTuple):
         return f"a number from {self.least:g} to {self.most:g}"
 
 
-POSITIVE = Bounds(1)  # of whole numbers
+POSITIVE = Bounds(1)  # bounds of whole numbers
 SHARE = Bounds(0, 1)
 Layers = Annotated[tuple[int, ...], POSITIVE]  # hidden widths of a network
 
@@ -73,16 +73,16 @@ def register(kind: type, *traced_too: type) -> None:
 
 
 def static(options: PartT) -> PartT:
-    """The options with None in place of floats: what a program is compiled for."""
+    """Return the options with None in place of floats: what a program is compiled for."""
     return jax.tree.map(lambda leaf: None, options)
 
 
 def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
-    """Values that fields of a configuration are to get, as they are kept: NumPy's numbers as Python's, lists as tuples.
+    """Return checked values for a configuration's fields: NumPy's numbers as Python's, lists as tuples.
 
     Args:
         group: a configuration, or its class.
-        prefix: what messages call it.
+        prefix: name of the group in messages.
         changes: the values by field (default: those that the configuration holds).
 
     Raises:
@@ -107,7 +107,7 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
 
 
 def normalize_options(group: PartT, prefix: str) -> PartT:
-    """A configuration with its values as they are kept. Raises UserError as `check_types`."""
+    """Return a configuration with its values as `check_types` returns them. Raises UserError likewise."""
     kept = check_types(group, prefix)
     changed = {name: value for name, value in kept.items() if value is not getattr(group, name)}
     return dataclasses.replace(group, **changed) if changed else group  # pyright: ignore[reportArgumentType]
@@ -118,7 +118,7 @@ def _called(kind: Any) -> str:
 
 
 def check_part(group: Any, prefix: str) -> None:
-    """Raises UserError for the first value of a group that its field may not hold: of another type or out of bounds."""
+    """Raise UserError for the first field of a group with a value of the wrong type or out of bounds."""
     check_types(group, prefix)
     hints = get_type_hints(type(group), include_extras=True)
     for field in dataclasses.fields(group):
@@ -135,7 +135,7 @@ def check_part(group: Any, prefix: str) -> None:
 
 
 def _check_range(value: Any, name: str) -> None:
-    """Raises UserError for numbers that 32 bits do not hold."""
+    """Raise UserError for numbers outside 32 bits."""
     for number in value if isinstance(value, tuple) else (value,):
         if isinstance(number, int) and abs(number) > LARGEST:
             raise UserError(f"{name} is {number}: give at most {LARGEST}, which is counted in 32 bits")

@@ -1,4 +1,4 @@
-"""Configurations as plain JSON values, and back."""
+"""Convert configurations to plain JSON values, and back."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ NUMBERS = "biufU"  # kinds of NumPy's values that Python has too
 
 
 def plain(given: Any) -> Any:
-    """A value as Python has it: numbers and words of NumPy and JAX, and tuples for lists and arrays of one axis.
+    """Return numbers and words of NumPy and JAX as Python's, and lists and arrays of one axis as tuples.
 
-    Anything else is returned as it is.
+    Any other value is returned unchanged.
     """
     if isinstance(given, list | tuple):
         return tuple(map(plain, given))
@@ -34,12 +34,12 @@ def plain(given: Any) -> Any:
 
 
 def to_json(config: Any) -> dict[str, Any]:
-    """A configuration as plain JSON values."""
+    """Return a configuration as plain JSON values."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
 def from_json(kind: type, values: dict[str, Any]) -> Any:
-    """A flat configuration dataclass (Sizes, Scalars, Schedule, a task's) from JSON values; lists become tuples.
+    """Return a flat configuration dataclass (Sizes, Scalars, Schedule, a task's) from JSON values; lists become tuples.
 
     Raises:
         UserError: an unknown field.
@@ -60,7 +60,7 @@ def from_json(kind: type, values: dict[str, Any]) -> Any:
 
 
 def fits(value: Any, kind: Any) -> bool:
-    """Is a value of a field's type? Of the types that configurations have; every value is of any other."""
+    """Return whether a value has a field's type. For types that no configuration uses, every value fits."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Literal:
         return any(type(value) is type(choice) and value == choice for choice in parts)
@@ -75,7 +75,7 @@ def fits(value: Any, kind: Any) -> bool:
 
 
 def defaults(kind: type) -> dict[str, Any]:
-    """The JSON values of a configuration dataclass's fields, of those that have a default."""
+    """Return the default values of a configuration dataclass's fields, as JSON values."""
     fields = [field for field in dataclasses.fields(kind) if field.init]
     plain = {field.name: field.default for field in fields if field.default is not dataclasses.MISSING}
     made = {field.name: field.default_factory for field in fields if field.default_factory is not dataclasses.MISSING}
@@ -83,5 +83,5 @@ def defaults(kind: type) -> dict[str, Any]:
 
 
 def digest(values: dict[str, Any]) -> str:
-    """Short hash of JSON values: equal configurations have equal hashes."""
+    """Return a short hash of JSON values: equal configurations have equal hashes."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]

@@ -20,7 +20,7 @@ def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
     """Raise UserError if a teacher cannot give the answers that `scalars.answer` asks for."""
     if faults.answer == "nearest" and not isinstance(teacher, ValuesDirections):
         raise UserError(
-            "scalars.answer is nearest, but this teacher knows the best action alone, not what others are worth: "
+            "scalars.answer is nearest, but this teacher knows only the best action, not the values of others: "
             "give --scalars.answer best"
         )
 

@@ -19,15 +19,15 @@ def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, 
 
     Args:
         file: the labels.
-        spaces: of the environment; None: observations of any size, the file's own space of actions.
-        form: of the answers; None: it is not known, and answers are only finite.
-        named: what a message calls the file.
+        spaces: the environment's spaces; None: observations of any size, the file's own space of actions.
+        form: form of the answers; None: unknown, then answers are only checked to be finite.
+        named: name of the file in messages.
 
     Raises:
         UserError: as `check`, or the file does not say how strong its answers are.
     """
     if form is not None and form.by_eps and file.eps is None:
-        raise UserError(f"{named} does not say how strong its {form.name} answers are: write it anew")
+        raise UserError(f"{named} does not name the strength (eps) of its {form.name} answers: write the file again")
     check(file.labels, spaces or Spaces(file.labels.obs.shape[1], file.space), form, named)
 
 
@@ -36,19 +36,20 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
 
     Args:
         labels: rows (labels, ...) of arrays.
-        spaces: of the environment.
-        form: of their answers; None: it is not known, and they are only finite.
-        named: what a message calls them.
+        spaces: the environment's spaces.
+        form: form of the answers; None: unknown, then answers are only checked to be finite.
+        named: name of the labels in messages.
 
     Raises:
-        UserError: a wrong shape, a number that is not finite, an action outside the space, or a value that is not allowed.
+        UserError: a wrong shape, a number that is not finite, an action outside the space, or an answer that is not
+            allowed.
     """
     rows = {"observations": labels.obs, "actions": labels.action, "answers": labels.answer}
     width = labels.answer.shape[-1] if form is None else form.width(spaces.actions)
     widths = {"observations": spaces.obs_size, "actions": spaces.actions.size, "answers": width}
     for name, values in rows.items():
         if values.ndim != 2 or values.shape[1] != widths[name]:
-            raise UserError(f"{named}: {name} have the shape {values.shape}, (labels, {widths[name]}) is needed")
+            raise UserError(f"{named}: {name} have the shape {values.shape}: give (labels, {widths[name]})")
         _refuse(~np.isfinite(values), f"{named}: {name} hold numbers that are not finite", "leave these labels out")
     for name in ("actions", "answers") if form is not None and form.is_action else ("actions",):
         action = np.asarray(rows[name])

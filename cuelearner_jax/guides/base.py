@@ -25,28 +25,26 @@ from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refinement, bounded_scalars, refine
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-NAME = re.compile(
-    r"[a-z][a-z0-9_-]*"
-)  # pattern of names of kinds, also in files: neither a path nor a reference to code
+# pattern of names of kinds, also in files: neither a path nor a reference to code
+NAME = re.compile(r"[a-z][a-z0-9_-]*")
 
 
 @dataclass(frozen=True)
 class Kind:
     """A kind of guidance, before sizes and an environment are known."""
 
-    name: str  # in options, folders and columns
-    about: str  # in a few words
+    name: str  # name in options, folders and columns
+    about: str  # description in a few words
     guide: type[Guide]
     form: AnswerForm | None = None  # form of the answers that it asks for; None: it never asks
     needs: tuple[str, ...] = ()  # optional members of an environment that it needs
-    title: str = ""  # in figures, if other than the name
-    colour: str | None = None  # in figures
+    title: str = ""  # title in figures, if other than the name
+    colour: str | None = None  # colour in figures
     config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
     sees_base: bool = False  # True if it needs a finished policy's actions; it then serves adaptation only
     by_cues: bool = False  # True if its model measures along cues, whatever its answers say
-    by_evidence: bool = (
-        False  # True if `calibration` reads its answers; it then has no model and serves adaptation only
-    )
+    # True if `calibration` reads its answers; it then has no model and serves adaptation only
+    by_evidence: bool = False
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -107,7 +105,7 @@ class Guide:
         if self.kind.needs_cues and not self.spaces.actions.cues:
             told = "measures" if self.kind.by_cues else "asks"
             raise UserError(
-                f"guidance {self.name!r} {told} which way to change an action, and the {self.spaces.actions.name} have "
+                f"guidance {self.name!r} {told} which way to change an action, but the {self.spaces.actions.name} have "
                 "no order: give them one (`Choices(count, order)`), or guidance demonstration or scalar"
             )
 
@@ -186,7 +184,7 @@ class Guide:
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """Return the model of labels (slots, ...); `former` is the previous model, which fitting from scratch ignores."""
+        """Return the model of labels (slots, ...); fitting from scratch ignores `former`, the previous model."""
         rows, predict = self.lessons(labels, scalars), partial(self.predict, env)
         return fit_least_squares(
             key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes, redrawn=self.redrawn
@@ -222,8 +220,8 @@ class Guide:
     ) -> Float[Array, " m"]:
         """Return log p(action | labels) of each action in one situation, up to a constant.
 
-        Here an action is likelier, the less one pass of `act` changes it: a Laplace distribution of scale eps. All actions
-        are equally likely where a guide changes none, for example without a fitted model.
+        Here an action is likelier, the less one pass of `act` changes it: a Laplace distribution of scale eps. All
+        actions are equally likely where a guide changes none, for example without a fitted model.
         """
         space, rows = self.spaces.actions, len(actions)
         once = dataclasses.replace(scalars, k_max=1)

@@ -96,7 +96,7 @@ class BatchCoach(DeepCoach):
         count, adam = rows.valid.sum(), optimizer(scalars)
 
         def batch_of(key: PRNGKeyArray, number: Int[Array, ""]) -> tuple[Lesson, Lesson]:
-            """A minibatch of the first labels up to `number`, its first row: for the policy, for the human model."""
+            """Return minibatches of the first labels up to `number`, which comes first: for policy and human model."""
             numbers = jax.random.randint(key, (self.sizes.fit_batch_size,), 0, number + 1).at[0].set(number)
             return jax.tree.map(lambda leaf: leaf[order[numbers]], (rows, answered))
 
@@ -106,7 +106,7 @@ class BatchCoach(DeepCoach):
             return coached.replace(human=optax.apply_updates(coached.human, updates), human_optimizer=state)
 
         def moved(key: PRNGKeyArray, coached: BatchCoached, batch: Lesson, own: Array) -> BatchCoached:
-            """One step of the policy; `own`: rows that keep the target of their label."""
+            """Return the policy after one step; `own`: rows that keep their label's target."""
             seen = self.redrawn(key, batch)
 
             def loss(policy: Params) -> Array:
@@ -121,7 +121,7 @@ class BatchCoach(DeepCoach):
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
 
         def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: BatchCoached) -> BatchCoached:
-            """By label `number` of those that count, then by the buffer up to it."""
+            """Return the model after label `number` of the valid ones, and after the buffer up to it."""
             keys = jax.random.split(jax.random.fold_in(key, number), 3)
             batch, told = batch_of(keys[0], number)
             first = jnp.arange(self.sizes.fit_batch_size) == 0

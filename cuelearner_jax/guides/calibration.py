@@ -22,7 +22,7 @@ class Config:
     gains: bool = False
     """Also ask whether lengths that are seen, and the actions of a box, were scaled."""
     teacher_bias: bool = False
-    """A constant difference between answers and policy is the teacher's own: it is told and not corrected."""
+    """A constant difference between answers and policy is the teacher's own: it is reported and not corrected."""
 
 
 KIND = Kind(

@@ -60,7 +60,7 @@ class Searching:
     sampled_actions: Annotated[int, Bounds(4)] = 32
     """Actions between which the energy is compared in a step of a fit, for each label."""
     searched_actions: Annotated[int, Bounds(2)] = 256
-    """Actions among which the least energy is looked for at first."""
+    """Actions among which the search for the least energy begins."""
 
 
 @part
@@ -68,7 +68,7 @@ class Config(Searching):
     """Options of CLIC."""
 
     implicit_pairs: Annotated[int, POSITIVE] = 8
-    """Pairs of actions that narrow a half-space, drawn anew in each step of a fit."""
+    """Pairs of actions that narrow a half-space, drawn again in each step of a fit."""
     angle_deg: Annotated[float, Bounds(0, 90)] = 30.0
     """How far the worse actions of these pairs lie from the answer's direction [deg]: 0 leaves the half-space."""
     gamma: Annotated[float, SHARE] = 0.1
@@ -91,7 +91,7 @@ class Contrast(struct.PyTreeNode):
     answer: Float[Array, " answer"]
     valid: Bool[Array, ""]
     draw: Int[Array, ""]  # number of its random stream for sampling
-    base: Float[Array, " action"]  # what a finished policy did, where labels keep it; else the action
+    base: Float[Array, " action"]  # the finished policy's action, where labels keep it; else the action asked about
 
 
 def log_nearer(apart: Float[Array, "..."], closer: Float[Array, "..."], softness: float) -> Float[Array, "..."]:
@@ -246,7 +246,7 @@ class Clic(Guide):
             return actions[jnp.argmin(self.energy(env, params, obs, actions, base, scalars))]
 
         def box(center: Array, half: Array, count: int) -> Float[Array, "count action"]:
-            """Actions spread evenly around one, up to `half` away along each cue."""
+            """Return actions spread evenly around one, up to `half` away along each cue."""
             offsets = Box((-1.0,) * cues, (1.0,) * cues).spread(count)
             return space.exp(jnp.broadcast_to(center, (count, space.size)), half * offsets)
 

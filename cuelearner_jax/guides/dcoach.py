@@ -1,20 +1,20 @@
 """Deep COACH: every correction updates a policy network, which is never fitted from scratch.
 
 Source: Perez-Dattari, Celemin, Ruiz-del-Solar, Kober, "Interactive learning with corrective feedback for policies based
-on deep neural networks" (ISER 2018), Algorithm 1. A correction h has the target a + e h. It gets a gradient step, and
-another on a minibatch of a replay of the newest corrections (their code: 200 of them, minibatches of 50). Here e is
-eps, and the sum is `exp` of the space, along the cues of which the label speaks:
+on deep neural networks" (ISER 2018), Algorithm 1. A correction h gives the target a + e h; one gradient step is made on
+the target, and one on a minibatch of a replay of the newest corrections. (Their code: 200 corrections, minibatches of
+50.) Here e is eps, and the sum is `exp` of the space, along the cues that the label names:
 
     y = exp(a, eps h)
     pi <- pi - Adam(grad of sum over those cues of (d log (pi(s) - y))^2)
     a <- clip(retract(pi(s)), a, tau_max)
 
-What differs, and why: corrections come in rounds, so a round's are learned one after the other at its end
-(`--sizes.labels-per-round 1` learns each at once). "Already right" is an answer here where silence is meant there, and
-holds the policy where it is. There the replay is learned from at every tenth step too, of which a person corrects few;
-here every step is asked about, and `replay_steps` minibatches follow a correction. Adam in place of their SGD: the
-paper's appendix gives all auxiliary policies the same optimiser. Members of an ensemble are corrected each by itself,
-and differ by where they began and by what they drew from the replay.
+Differences and their reasons. Corrections come in rounds, so the corrections of a round are learned one after another
+at the round's end (`--sizes.labels-per-round 1` learns each at once). "Already right" is an answer here, which holds
+the policy in place; in the paper it is silence. The paper also learns from the replay at every tenth step, of which a
+person corrects few; here every step is asked about, and `replay_steps` minibatches follow a correction. Adam replaces
+their SGD, since the CueLearner paper's appendix gives all auxiliary policies the same optimiser. The members of an
+ensemble are corrected separately, and differ by their initial parameters and their draws from the replay.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class DeepCoach(Demonstration):
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
 
         def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
-            """By label `number` of those that count, and by a replay of the newest up to it."""
+            """Return the policy after label `number` of the valid ones, and after a replay of the newest labels."""
             oldest = jnp.maximum(number + 1 - self.options.correction_replay, 0)
 
             def replay(coached: Coached, key: PRNGKeyArray) -> tuple[Coached, None]:

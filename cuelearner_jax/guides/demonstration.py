@@ -1,10 +1,10 @@
 """Guidance by demonstrations: an auxiliary policy is cloned from the teacher's demonstrated actions.
 
-Source: paper, section V-A ("train an auxiliary policy that imitates the human teacher") and appendix. Questions are
-about what the policy itself would do, once there is one (DAgger: Ross, Gordon, Bagnell, 2011). On raw observations the
-policy sees nothing else. In the action's frame it sees the situation from some direction and says which way its action
-lies from there. It is taught from all directions, for what is to be done depends on none; and it looks again from the
-action that it came to, until that settles: from there it sees best. Of a label (s, a, a*), in any space:
+Source: paper, section V-A ("train an auxiliary policy that imitates the human teacher") and appendix. After the first
+fit, questions are about the auxiliary policy's own actions (DAgger: Ross, Gordon, Bagnell, 2011). On raw observations
+the policy sees only the observation. In the action's frame it sees the situation from some direction and predicts its
+action relative to that direction. It is trained from all directions, since the right action depends on none. It then
+looks again from the action that it reached, until the action settles. For a label (s, a, a*), in any space:
 
     pi = argmin over f of sum over labels of |f(s) - a*|^2,      a <- clip(retract(pi(s)), a, tau_max)
 

@@ -43,7 +43,7 @@ def lessons(
     A label that names no cue is not valid.
     """
     targets = jax.vmap(lambda label: target(label, scalars))(labels)
-    # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.
+    # Rounded here: fused with later operations, the targets' last bits would depend on the compiler.
     rows = Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
     if space is None or len(space.cues) == 1:
         return rows
@@ -101,8 +101,8 @@ def fit_least_squares(
 ) -> GuidanceModel:
     """Fit by least squares (paper, Eq. 3), as `fit_model`.
 
-    Lessons are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's answer
-    in the mirror image is mostly not the mirror image of its answer.
+    Lessons are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
+    answer in the mirror image is mostly not the mirror image of its answer.
 
     Args:
         key, rows, scalars, init, sizes, redrawn: as `fit_model` has them.

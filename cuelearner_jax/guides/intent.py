@@ -1,12 +1,12 @@
 """Relative feedback read as intent: which of a situation's aims does the teacher mean?
 
-"More to the left" says that what the teacher means lies to the left: of the aims there (`Environment.aims`) some remain
-likely, the others do not. One network weighs every aim by its features, with the same weights for all; it is fitted by
-the likelihood of the teacher's words, summed over what may have been meant. (Inferring goals from what somebody does or
-says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
-at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Where the teacher
-seems to mean none of them (`aim_doubt`), actions stay as they are: the same bad shot again and again is worse than the
-agent's own. With g_i the aims of s, p their weights by the network, and each cue of which a label speaks by itself:
+"More to the left" says that the teacher's aim lies to the left, so some of the situation's aims (`Environment.aims`)
+become more likely than others. One network weights every aim by its features, with shared weights, and is fitted by
+maximum likelihood of the answers, summed over the aims that may be meant. (Goal inference: Baker, Saxe, Tenenbaum,
+"Action understanding as inverse planning", Cognition 2009.) A pass of refinement moves an action by at most eps toward
+the likeliest aim and ends there, so the action is as precise as the aim, not as the label. Where the teacher seems to
+mean none of the aims (`aim_doubt`), actions do not change, since repeating one bad shot is worse than the agent's own
+choice. With g_i the aims of s, p their weights by the network, and each cue that a label names by itself:
 
     P(h | s, a) = sum over i of p_i(s) prod over cues of P(h_c | log(a, g_i)_c)                          (`likelihood`)
     p = argmax of sum over labels of log P(h | s, a),      a <- approach(a, likeliest g_i, eps)                 (`act`)
@@ -172,7 +172,7 @@ class Intent(Guide):
         )
 
         def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
-            """-log of the probability of each answer."""
+            """Return -log of the probability of each answer."""
             share = self.network.predict(None, params, rows.features, rows.possible)
             return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
 
@@ -215,9 +215,7 @@ class Intent(Guide):
         actions: Float[Array, "m action"],
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """Return the log density of actions around the aims (`log_density`); before the first fit by the rule, or
-        uniform.
-        """
+        """Return the log density of actions around the aims (`log_density`); before the first fit the rule's, or 0."""
         aims = jax.vmap(partial(self.aims, env))(obs[None])
         share = self.shares(model, env, aims)[0]
         return log_density(self.spaces.actions, aims.actions[0], share, actions)

@@ -28,7 +28,7 @@ class GuideModel(NamedTuple):
 
     init: Callable[[PRNGKeyArray], Params]
     predict: Predict  # the members' mean; of parameters with any number of members
-    disagreement: Predict  # of several members: their variance, summed over outputs (n,)
+    disagreement: Predict  # the variance of several members, summed over outputs (n,)
 
 
 def ensemble(members: int, init: Callable[[PRNGKeyArray], Params], predict: Predict) -> GuideModel:
@@ -54,9 +54,9 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     """Return the networks of these sizes.
 
     Args:
-        sizes: of the networks.
+        sizes: sizes of the networks.
         spaces: the environment's.
-        outputs: how many numbers they predict, such as the value of an action; None: a vector to be added to the
+        outputs: number of outputs, such as the value of an action; None: a vector to be added to the
             action, whichever frame it is seen in.
         beside: numbers that they see beside observation and action: actions then have so many entries more, at the end.
 
@@ -72,7 +72,7 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     def predict(
         env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "m action"]
     ) -> Float[Array, "m outputs"]:
-        """Of m situations with an action each, or of one with m actions."""
+        """Return predictions for m situations with an action each, or for one situation with m actions."""
         bare, known = jnp.split(actions, [size], -1)
         of_obs, of_action = view.network_inputs(sizes.frame, env, obs, bare)
         return as_function(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)
@@ -93,7 +93,7 @@ def for_each(members: int, function: Callable[..., Any], key: PRNGKeyArray, *par
     Args:
         members: their number.
         function: (key, *parameters of one member) -> a tree.
-        key: of all of them; of one member, its own.
+        key: the members' common key; a single member uses it directly.
         parameters: the members', with the leading axis that several have.
     """
     if members == 1:
@@ -112,8 +112,8 @@ def fitted_members(
     Args:
         members: their number.
         fit: the model of one member from a key and its `init`.
-        key: of all of them.
-        init: of the ensemble. A member is fitted as an ensemble of one, whose mean is its own prediction.
+        key: the members' common key.
+        init: the ensemble's initialiser. A member is fitted as an ensemble of one, whose mean is its own prediction.
     """
     if members == 1:
         return fit(key, init)

@@ -1,13 +1,13 @@
 """Relative feedback for adaptation: a correction that depends on the action's offset from the finished policy's.
 
-Of a finished policy in a changed world much is wrong in the same way everywhere, and right once an action has been
-turned far enough from what the policy did. A few labels tell that, where no network of the situation can be learned
-from them. So a correction has two parts. One is a smoothing spline of the turn alone (Eilers, Marx, "Flexible smoothing
-with B-splines and penalties", Statistical Science 1996). The other is a network, which sees the turn beside situation
-and action and is fitted to what the spline leaves. The network counts as much as held-out labels say that it should
-(stacked regressions: Breiman, Machine Learning 1996): by nothing, where it predicts them no better.
+In a changed world a finished policy is often wrong by the same offset everywhere. A few labels determine such an
+offset, but not a network of the situation. So a correction has two parts. The first depends on the offset alone: a
+smoothing spline (Eilers, Marx, "Flexible smoothing with B-splines and penalties", Statistical Science 1996). The second
+is a network of offset, situation and action, fitted to the spline's residuals. Held-out labels set the network's weight
+(stacked regressions: Breiman, Machine Learning 1996); the weight is zero where the network does not predict them
+better.
 
-With a_0 what the policy did, t = log(a_0, a) / eps the turn so far along each cue, m_c a spline for each cue c:
+With a_0 the policy's action, t = log(a_0, a) / eps the offset so far along each cue, m_c a spline for each cue c:
 
     m_c = argmin over m of sum over labels that speak of c of (h_c - m(t_c))^2 + ROUGHNESS |m''|^2 + RIDGE |m|^2
     phi(s, a) = exp(a, eps m(t)) - a + eps w f(s, a, t),   w in [0, 1] the share of the network f
@@ -43,7 +43,7 @@ RIDGE = 0.3  # penalty on its squared heights, which keeps unlabelled offsets un
 class Spline(struct.PyTreeNode):
     """A function of the turn: straight lines between knots, level beyond them. Of several cues each has its own."""
 
-    heights: Float[Array, "*cues knots"]  # in units of eps; of directions counterclockwise
+    heights: Float[Array, "*cues knots"]  # corrections in units of eps; for directions counterclockwise
     reach: Float[Array, "*cues"]  # offset of the outermost knots, in units of eps
 
 
@@ -77,7 +77,7 @@ def fit_spline(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Boo
     """Return the spline with the least penalised squared error.
 
     Args:
-        turns: of the actions asked about, in units of eps.
+        turns: offsets of the actions asked about, in units of eps.
         wanted: corrections that the answers ask for, in units of eps, counterclockwise.
         valid: rows that count.
     """
@@ -112,7 +112,7 @@ def vectors(
 def share_of(
     left: Float[Array, "n action"], predicted: Float[Array, "n action"], valid: Bool[Array, " n"]
 ) -> Float[Array, ""]:
-    """Return the weight in [0, 1] that scales predictions nearest to the residuals, by least squares over valid rows."""
+    """Return the weight in [0, 1] that scales predictions nearest to the residuals, by least squares."""
     product = jnp.sum(jnp.sum(left * predicted, -1), where=valid)
     size = jnp.sum(jnp.sum(jnp.square(predicted), -1), where=valid)
     return jnp.clip(product / jnp.where(size > 0, size, 1.0), 0, 1)

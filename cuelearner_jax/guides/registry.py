@@ -49,7 +49,7 @@ _KINDS: dict[str, Kind] = {kind.name: kind for kind in _BUILT_IN}
 def register(kind: Kind) -> Kind:
     """Register a kind under its name. Raises UserError if another kind has the name."""
     if _KINDS.setdefault(kind.name, kind) != kind:
-        raise UserError(f"there is another guidance called {kind.name!r}: give yours another name")
+        raise UserError(f"another guidance is already called {kind.name!r}: give yours another name")
     return kind
 
 
@@ -69,9 +69,7 @@ def find(name: str) -> Kind:
     """Return the kind of that name without loading code. Raises UserError if no kind has the name."""
     _register_installed()
     if name not in _KINDS:
-        raise UserError(
-            f"unknown guidance {name!r}{suggestion(name, _KINDS)} (one of your own is named as package.module:NAME)"
-        )
+        raise UserError(f"unknown guidance {name!r}{suggestion(name, _KINDS)} (name your own as package.module:NAME)")
     return _KINDS[name]
 
 
@@ -100,9 +98,9 @@ def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
     """Return a kind's guide for an environment (shapes in place of arrays will do).
 
     Args:
-        name: of the kind.
-        sizes: of its model.
-        env: whose spaces are looked at.
+        name: name of the kind.
+        sizes: sizes of its model.
+        env: the environment, of which only the spaces are used.
         options: the kind's own, a `Kind.config`; None: its defaults.
 
     Raises:
@@ -111,7 +109,10 @@ def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
     kind = find(name)
     for need in (*kind.needs, *getattr(options, "needs", ())):
         if not offers(env, need):
-            raise UserError(f"guidance {kind.name!r} needs an environment with `{need}`, which this task's has not")
+            raise UserError(
+                f"guidance {kind.name!r} needs an environment with `{need}`, which this task does not "
+                "have: choose another guidance"
+            )
     return kind.make(sizes, spaces_of(env), options)
 
 

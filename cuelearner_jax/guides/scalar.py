@@ -1,14 +1,15 @@
 """Guidance by scalar feedback: a model of whether the teacher calls an action good; its argmax acts.
 
-Source: paper, section V-A and appendix; its public code fits a network like the agent's to labels of 1 and 0, and has
-the network's own argmax labelled. Hardly any uniform action is good, so a model that is asked about its own choices
-alone may never see one: a share `explored_fraction` of the questions stays about base actions. Of a label (s, a, g), g
-1 for a good action and 0 for another, in any space:
+Source: paper, section V-A and appendix. The paper's public code fits a network like the agent's to labels of 1 and 0,
+and asks about the network's own argmax. Hardly any uniform action is good, so a model that is asked only about its own
+choices may never see a good one: a share `explored_fraction` of the questions stays about base actions. For a label (s,
+a, g), with g 1 for a good action and 0 for another, in any space:
 
     v = argmin over f of sum over labels of (f(s, a) - g)^2
     a <- argmax over `space.spread(guide_directions)` of v(s, a)
 
-Of choices these are all there are. In a box they thin out with its size: give more `guide_directions`.
+For choices `space.spread` returns all of them. In a box a fixed number of actions gets sparser with the box's size:
+give more `guide_directions`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Config:
     guide_directions: Annotated[int, POSITIVE] = 360
     """Directions over which the guide takes its argmax."""
     explored_fraction: Annotated[float, SHARE] = 0.25
-    """Share of the questions that are about base actions even so, to find good ones."""
+    """Share of questions about base actions after the first fit, to find good actions."""
 
 
 class Scalar(Guide):

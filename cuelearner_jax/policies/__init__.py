@@ -1,4 +1,4 @@
-"""Policies: pytrees that act. What evaluation, pictures, labelling and adaptation are about.
+"""Policies: pytrees that act, for evaluation, pictures, labelling and adaptation.
 
 A policy's `act` sees many environments at once. Its `axes` say which of its leaves a block of lanes has one of each
 (`evaluate.rollout_lanes` maps over them); what lanes share is there once.

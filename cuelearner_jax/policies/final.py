@@ -1,4 +1,4 @@
-"""The policy that a lane is trained for: the agent alone, or with an arbiter that acts in the finished policy too."""
+"""The finished policy of a lane: the agent alone, or the agent with an arbiter that also acts after training."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ from cuelearner_jax.types import EnvState, GuidanceModel, Params
 
 
 class Arbitrated(PolicyNode):
-    """A finished agent whose arbiter chooses with it, by the arm that validated best."""
+    """A finished agent with an arbiter, which chooses by the arm that validated best."""
 
     base: Agent
     model: GuidanceModel
     scalars: Scalars
-    options: Any  # of the arbiter
+    options: Any  # options of the arbiter
     arm: Int[Array, "*lanes"]
-    steps: Float[Array, ""]  # that the agent has learned from
+    steps: Float[Array, ""]  # environment steps that the agent has learned from
     arbiter: Finishes = struct.field(pytree_node=False)
     guide: Guide = struct.field(pytree_node=False)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """The arm's choice."""
+        """Return the arm's choice of actions."""
         agent = self.base
         known = Known(agent.view, agent.functions, agent.params, self.guide, self.model, self.scalars, self.steps)
         return self.arbiter.act(self.arm, self.options, known, obs, key)
 
     @property
     def axes(self) -> Arbitrated:
-        """Each lane has its own agent, model and arm; an arm that stands alone is for all lanes."""
+        """Lane axes: each lane has its own agent, model and arm; a single arm is shared by all lanes."""
         arm = SHARED if jnp.ndim(self.arm) == 0 else BY_LANE
         shared = dict.fromkeys(("scalars", "options", "steps"), SHARED)
         return self.replace(base=self.base.axes, model=BY_LANE, arm=arm, **shared)
 
     def describe(self) -> dict[str, Any]:
-        """The arbiter and its arm (of a block, each lane's), the guidance, what was learned from, and the agent."""
+        """Return the arbiter, its arm (of a block each lane's), the guidance and the agent, as JSON values."""
         arms = [self.arbiter.arms[int(arm)] for arm in np.ravel(np.asarray(self.arm))]
         return {
             "policy": "arbitrated",
@@ -61,28 +61,28 @@ class Arbitrated(PolicyNode):
 
 
 def arbiter_of(config: RunConfig) -> Arbiter:
-    """The arbiter of a run."""
+    """Return the arbiter of a run."""
     return make_arbiter(config.arbiter, config.agent, config.bootstraps)
 
 
 def acting_state(arbiter: Arbiter, params: Params, model: GuidanceModel, state: Any) -> dict[str, Any]:
-    """What of a lane its finished policy acts with: that of a checkpoint which `final_policy` reads.
+    """Return the part of a lane that its finished policy needs, as checkpoints hold it for `final_policy`.
 
-    `state`: the arbiter's, of which one that acts in the finished policy keeps the arm.
+    `state`: the arbiter's state, whose arm is kept if the arbiter acts in the finished policy.
     """
     arm = {"arm": arbiter.arm(state)} if isinstance(arbiter, Finishes) else {}
     return {"params": params, "guidance": model, **arm}
 
 
 def final_policy(config: RunConfig, guide: Guide, view: Any, step: int, known: Mapping[str, Any]) -> Agent | Arbitrated:
-    """The policy that lanes are trained for, as they stand after so many steps.
+    """Return the lanes' policies as they stand after so many steps.
 
     Args:
-        config: of the run.
-        guide: of their kind of guidance.
-        view: of where the policy acts.
+        config: the run's configuration.
+        guide: the guide of the lanes' kind of guidance.
+        view: view of the world that the policy acts in.
         step: environment steps of each lane.
-        known: what they act with (`acting_state`), leading axis: lanes; an arm may be one for all lanes.
+        known: the lanes' `acting_state` with a leading axis of lanes; one arm may serve all lanes.
     """
     agent = Agent(known["params"], config.agent_in(view), view)
     arbiter = arbiter_of(config)

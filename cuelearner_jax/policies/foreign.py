@@ -1,7 +1,7 @@
 """Policies of other libraries as functions of a batch of observations: PyTorch, Stable-Baselines3, ONNX.
 
-None of these libraries is imported to find out: what belongs to one that nobody has imported cannot be given. A file in
-ONNX is run by onnxruntime.
+These libraries are not imported to recognise a policy: an object of a library exists only once the library was
+imported. A file in ONNX is run by onnxruntime.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Foreign:
     """A function of a batch of observations (n, obs) that returns actions (n, action), in NumPy."""
 
     def __init__(self, given: Any, reference: str) -> None:
-        """`given`: what acts; `reference`: how messages and folders name it."""
+        """`given`: the policy object; `reference`: its name in messages and folders."""
         self.given, self.reference, self.__qualname__ = given, reference, reference.rpartition(":")[2]
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
-        """Actions for observations."""
+        """Return actions for observations."""
         raise NotImplementedError
 
     # The same object is the same policy: programs that call it are compiled once.
@@ -42,7 +42,7 @@ class Foreign:
 
 
 def function_of(given: Any) -> Foreign | None:
-    """Return what another library's policy does as a function; None: it is none of these.
+    """Return another library's policy as a function; None if the object is none of these.
 
     Args:
         given: a `torch.nn.Module`; a model or policy of Stable-Baselines3, or its `predict`; the path of a file in
@@ -65,7 +65,7 @@ def function_of(given: Any) -> Foreign | None:
 
 
 def _predicts(given: Any) -> bool:
-    """Is an object a model or policy as Stable-Baselines3 has them?"""
+    """Return whether an object is a model or policy of Stable-Baselines3."""
     return callable(getattr(given, "predict", None)) and hasattr(given, "observation_space")
 
 
@@ -79,10 +79,10 @@ class _Torch(Foreign):
 
     def __init__(self, given: Any) -> None:
         super().__init__(given, _reference(given))
-        self._alone = threading.Lock()  # modes are the module's, not a call's
+        self._alone = threading.Lock()  # evaluation mode is a state of the module, so calls must not overlap
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
-        """Actions for observations; the module's modes are as before afterwards."""
+        """Return actions for observations; the module's modes are restored afterwards."""
         torch = sys.modules["torch"]
         weights = next((own for own in self.given.parameters() if own.is_floating_point()), None)
         where = {"device": weights.device, "dtype": weights.dtype} if weights is not None else {"dtype": torch.float32}
@@ -100,17 +100,17 @@ class _Torch(Foreign):
 
 
 class _Predicting(Foreign):
-    """A model's deterministic `predict`, of dictionaries where its observations are such."""
+    """A model's deterministic `predict`, with dictionaries where the model observes dictionaries."""
 
     def __init__(self, given: Any) -> None:
         super().__init__(given, _reference(given))
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
-        """Actions for observations."""
+        """Return actions for observations."""
         return self.given.predict(self._arranged(np.array(obs)), deterministic=True)[0]
 
     def _arranged(self, rows: np.ndarray) -> Any:
-        """Rows as the model's observation space has them: flattened ones in the order of its keys."""
+        """Return rows as the model's observation space has them; flattened dictionaries in the order of their keys."""
         space = self.given.observation_space
         parts = getattr(space, "spaces", None)
         if isinstance(parts, dict):
@@ -151,7 +151,7 @@ class _Onnx(Foreign):
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own kinds
             why = " ".join(str(error).split())[:160]
-            raise UserError(f"{path} cannot be run by onnxruntime ({why}): export the policy anew") from error
+            raise UserError(f"{path} cannot be run by onnxruntime ({why}): export the policy again") from error
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or inputs[0].type not in REAL or len(inputs[0].shape) != 2:
             told = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs)
@@ -169,7 +169,7 @@ class _Onnx(Foreign):
         return hash(self.given)
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
-        """Actions for observations. Raises UserError for observations of another size."""
+        """Return actions for observations. Raises UserError for observations of another size."""
         if isinstance(self._size, int) and obs.shape[1] != self._size:
             raise UserError(
                 f"{self.reference} takes observations of {self._size} entries, these have {obs.shape[1]}: give the "
@@ -180,11 +180,13 @@ class _Onnx(Foreign):
         if fixed in (0, len(rows)):
             return self._run(rows)
         if fixed != 1:
-            raise UserError(f"{self.reference} takes batches of {fixed} alone: export it with batches of any size")
+            raise UserError(f"{self.reference} takes batches of {fixed} only: export it with batches of any size")
         return np.concatenate([self._run(rows[number : number + 1]) for number in range(len(rows))])
 
     def _run(self, rows: np.ndarray) -> np.ndarray:
         found = self._session.run([self._output], {self._name: rows})[0]
         if not isinstance(found, np.ndarray):
-            raise UserError(f"{self.reference} gives {format_value(found)} in place of actions: export the policy anew")
+            raise UserError(
+                f"{self.reference} gives {format_value(found)} in place of actions: export the policy again"
+            )
         return found

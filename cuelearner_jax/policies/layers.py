@@ -1,4 +1,4 @@
-"""The policies of the package, and those that change another policy's actions."""
+"""The package's policies, and policies that change another policy's actions."""
 
 from __future__ import annotations
 
@@ -31,45 +31,45 @@ class Agent(PolicyNode):
 
     params: Params
     functions: AgentFunctions = struct.field(pytree_node=False)
-    view: Any = None  # says how an observation looks from an action; the raw frame needs none
+    view: Any = None  # provides `features`; the raw frame needs none
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """The agent's action once learning is over."""
+        """Return the finished agent's actions."""
         return self.functions.act(self.view, self.params, obs, key)
 
     @property
     def axes(self) -> Agent:
-        """Each lane has its own network."""
+        """Lane axes: each lane has its own network."""
         return self.replace(params=BY_LANE, view=SHARED)
 
     def describe(self) -> dict[str, Any]:
-        """The agent's options, and the frame in which it sees."""
+        """Return the agent's options and its frame, as JSON values."""
         own = {"agent": part_to_json(self.functions.options), "frame": self.functions.frame}
         return {"policy": "agent", **own}
 
 
 class Uniform(PolicyNode):
-    """Uniform actions."""
+    """A policy of uniform actions."""
 
     actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """Drawn anew each time (paper, Eq. 6)."""
+        """Return new uniform draws at each call (paper, Eq. 6)."""
         return self.actions.sample(key, (obs.shape[0],))
 
     def describe(self) -> dict[str, Any]:
-        """Chance."""
+        """Return {"policy": "uniform"}."""
         return {"policy": "uniform"}
 
 
 class NearAims(PolicyNode):
-    """Actions near one of a situation's aims, each aim as likely; uniform ones where there is none."""
+    """A policy of random actions near a situation's aims; uniform actions where there is no aim."""
 
-    view: Any  # offers aims
-    reach: Float[Array, ""] | float  # how far from the aim at most, as `log` of the space counts
+    view: Any  # an environment or view with aims
+    reach: Float[Array, ""] | float  # largest distance from the aim, in the unit of the space's `log`
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """Drawn anew each time."""
+        """Return new draws at each call."""
         return jax.vmap(self._one)(jax.random.split(key, len(obs)), obs)
 
     def _one(self, key: PRNGKeyArray, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
@@ -81,51 +81,52 @@ class NearAims(PolicyNode):
         return jnp.where(aims.possible.any(), space.exp(aims.actions[index], change), elsewhere)
 
     def describe(self) -> dict[str, Any]:
-        """Chance near aims."""
+        """Return the kind of policy, as a JSON value."""
         return {"policy": "near aims", "reach": float(actions_of(self.view).to_unit(self.reach))}
 
 
 class Taught(PolicyNode):
-    """What a teacher holds for best."""
+    """A policy that executes a teacher's best actions."""
 
     teacher: Teacher
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """The teacher's own actions."""
+        """Return the teacher's best actions."""
         return best_actions(self.teacher, states, obs)
 
     def describe(self) -> dict[str, Any]:
-        """A teacher."""
+        """Return the kind of policy, as a JSON value."""
         return {"policy": "teacher", "asks": True}
 
 
 class Heuristic(PolicyNode):
-    """The environment's own obvious action."""
+    """A policy of the environment's heuristic."""
 
     view: Any
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """It needs no learning."""
+        """Return the environment's heuristic actions."""
         return jax.vmap(self.view.heuristic)(obs)
 
     def describe(self) -> dict[str, Any]:
-        """The task's own."""
+        """Return the kind of policy, as a JSON value."""
         return {"policy": "heuristic"}
 
 
 class Guided(PolicyNode):
-    """Another policy's actions, every one of them under guidance."""
+    """Another policy with every action under guidance."""
 
     base: Any  # a policy
     model: GuidanceModel
     view: Any
     scalars: GuideScalars
     guidance: Guide = struct.field(pytree_node=False)
-    bound: Float[Array, ""] | None = None  # to the way from the base's actions; None: wherever guidance leads
-    sizes: GuideSizes | None = struct.field(pytree_node=False, default=None)  # of the guidance: needed to store it
+    bound: Float[Array, ""] | None = None  # largest distance from the base's actions; None: unbounded
+    # sizes of the guidance, needed to store it
+    sizes: GuideSizes | None = struct.field(pytree_node=False, default=None)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """The base's actions as the guidance has them."""
+        """Return the base's actions after guidance."""
         base = self.base.act(key, states, obs)
         where = (self.model, self.view, obs, base, jnp.ones(obs.shape[0], bool), self.scalars)
         if self.bound is None:
@@ -134,12 +135,12 @@ class Guided(PolicyNode):
 
     @property
     def axes(self) -> Guided:
-        """Each lane has its own base and model, and its own bound where there is more than one."""
+        """Lane axes: each lane has its own base and model, and its own bound where there is more than one."""
         bound = SHARED if self.bound is None or jnp.ndim(self.bound) == 0 else BY_LANE
         return self.replace(base=self.base.axes, model=BY_LANE, view=SHARED, scalars=SHARED, bound=bound)
 
     def describe(self) -> dict[str, Any]:
-        """The guidance, its sizes (None: not known) and scalars, how far it leads at most, and the base."""
+        """Return the guidance, its sizes (None: not known) and scalars, its bound, and the base, as JSON values."""
         scalars = plain_part(Scalars, self.scalars)
         space = self.guidance.spaces.actions
         bound = space.reach if self.bound is None else float(space.to_unit(np.max(self.bound), np))
@@ -157,25 +158,25 @@ class Guided(PolicyNode):
 
 
 class Common(PolicyNode):
-    """One policy that all lanes of a block share, whatever it is made of."""
+    """One policy shared by all lanes of a block."""
 
     policy: Any
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """What the policy does."""
+        """Return the policy's actions."""
         return self.policy.act(key, states, obs)
 
     def describe(self) -> dict[str, Any]:
-        """The policy's own description."""
+        """Return the policy's own description."""
         return describe(self.policy)
 
     def lane(self, index: int | ArrayLike) -> Any:
-        """The policy itself; of several lanes, what they share."""
+        """Return the shared policy, for any lane."""
         return self if np.ndim(index) else self.policy
 
 
 class Corrected(PolicyNode):
-    """Another policy's actions, refined by the teacher's own relative feedback instead of a model of it."""
+    """Another policy with actions refined by the teacher's own relative feedback, instead of a model of it."""
 
     base: Any  # a policy
     teacher: Teacher
@@ -183,7 +184,7 @@ class Corrected(PolicyNode):
     actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """The base's actions, told the way until they are right."""
+        """Return the base's actions, corrected by the teacher's answers until the teacher calls them right."""
         space, first = self.actions, self.base.act(key, states, obs)
         eps = space.from_unit(self.scalars.eps_deg)
         best = wanted_actions(space, self.teacher, states, obs, first, self.scalars)
@@ -203,16 +204,16 @@ class Corrected(PolicyNode):
 
     @property
     def axes(self) -> Corrected:
-        """Each lane has its own base; the teacher is one for all."""
+        """Lane axes: each lane has its own base; all lanes share the teacher."""
         return self.replace(base=self.base.axes, teacher=SHARED, scalars=SHARED)
 
     def describe(self) -> dict[str, Any]:
-        """A teacher's corrections of the base."""
+        """Return the kind of policy and the base, as JSON values."""
         return {"policy": "corrected", "asks": True, "base": describe(self.base)}
 
 
 def plain_part(kind: type, values: Any) -> dict[str, Any]:
-    """The fields of a configuration class that an instance has, of it or of a class with more or fewer."""
+    """Return a configuration class's fields, read from an instance of this or another class."""
     plain = lambda value: value.item() if hasattr(value, "item") else value  # noqa: E731
     names = [field.name for field in dataclasses.fields(kind) if hasattr(values, field.name)]
     own = {name: plain(getattr(values, name)) for name in names}
@@ -220,18 +221,18 @@ def plain_part(kind: type, values: Any) -> dict[str, Any]:
 
 
 class Teaching(struct.PyTreeNode):
-    """A policy as a teacher (`types.Teacher`): a finished agent, for instance, teaches what it does itself."""
+    """A policy as a teacher (`types.Teacher`), which shows what the policy does."""
 
     policy: Any
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """What the policy does; one that acts at random always draws the same."""
+        """Return the policy's action; a random policy always draws the same."""
         states = jax.tree.map(lambda leaf: leaf[None], state)
         return self.policy.act(jax.random.key(0), states, obs[None])[0]
 
 
 def teaching(given: Any, space: Space) -> Teacher:
-    """Return who answers: a teacher, or whatever acts as a policy in a space of actions, which teaches what it does.
+    """Return a teacher as given, or the teacher that shows what a given policy does.
 
     Raises UserError for what is neither.
     """
@@ -242,7 +243,9 @@ def teaching(given: Any, space: Space) -> Teacher:
 
 
 def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-    """A teacher's actions in n situations; few at a time, for one by search simulates hundreds of actions of each."""
+    """Return a teacher's actions in n situations, a few at a time: a searching teacher simulates hundreds of actions
+    each.
+    """
     ask = lambda pair: teacher.best_action(*pair)  # noqa: E731
     return jax.lax.map(ask, (states, obs), batch_size=min(len(obs), portions().states))
 
@@ -255,9 +258,9 @@ def wanted_actions(
     actions: Float[Array, "n action"],
     scalars: Any,
 ) -> Float[Array, "n action"]:
-    """What a teacher would have done instead: its best, or, where `scalars.answer` says so, the nearest good action.
+    """Return the actions that a teacher intends: its best or, with `scalars.answer` "nearest", the nearest good ones.
 
-    `scalars` without such a field (`GuideScalars`) mean the best.
+    `scalars` without that field (`GuideScalars`) select the best ones.
     """
     if getattr(scalars, "answer", "best") != "nearest":
         return best_actions(teacher, states, obs)
@@ -266,5 +269,5 @@ def wanted_actions(
 
 
 def uniform_in(env: Any) -> Uniform:
-    """Uniform actions of an environment's space."""
+    """Return the policy of uniform actions of an environment's space."""
     return Uniform(actions_of(env))

@@ -1,4 +1,4 @@
-"""Policies of the user's own making: any function of observations, and how messages call it."""
+"""Policies from the user's own functions, and the names of policies in messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cuelearner_jax.types import EnvState
 class Opaque(PolicyNode):
     """Any function of a batch of observations: of JAX arrays, or, `on_host`, of NumPy arrays in plain Python.
 
-    What it returns (n, action) is retracted to the space: made unit vectors, held within bounds. A function on the host
+    The returned actions (n, action) are retracted to the space: unit vectors, or within bounds. A function on the host
     is called back from compiled programs (`jax.pure_callback`): it must give the same for the same observations.
     """
 
@@ -32,9 +32,9 @@ class Opaque(PolicyNode):
     actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """What the function gives. Raises UserError if that has another shape."""
+        """Return the function's actions. Raises UserError if they have another shape."""
         if self.on_host:
-            # Asked once while tracing: another shape is told before anything is compiled.
+            # Called once while tracing, so that a wrong shape is reported before anything is compiled.
             with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
                 self._called(np.zeros(obs.shape, obs.dtype))
             shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
@@ -44,7 +44,7 @@ class Opaque(PolicyNode):
         return self.actions.retract(self.actions.only_actions(chosen))
 
     def _called_back(self, obs: Any) -> np.ndarray:
-        """The function's actions; NaN once it has failed, which `user_code` tells when the program is done."""
+        """Return the function's actions; NaN once it has failed, which `user_code` reports after the program."""
         nothing = np.full((*obs.shape[:-1], self.actions.size), np.nan, np.float32)
         if user_code.is_waiting():
             return nothing
@@ -62,7 +62,7 @@ class Opaque(PolicyNode):
             return nothing
 
     def _called(self, rows: np.ndarray) -> np.ndarray:
-        """The function of a batch with any leading axes. Raises UserError for whatever it raises."""
+        """Call the function with a batch of any leading axes. Raises UserError for any exception of the function."""
         flat = rows.reshape(-1, rows.shape[-1])
         try:
             chosen = self.function(flat)
@@ -71,10 +71,10 @@ class Opaque(PolicyNode):
         return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
 
     def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
-        """What the function returned, as an array of real numbers.
+        """Return the function's result as an array of real numbers.
 
-        Of a pair of actions and the policy's own state, as models of Stable-Baselines3 return it, the actions. Whole
-        numbers in place of choices are their places.
+        Of a pair (actions, policy state), as models of Stable-Baselines3 return, the actions are taken. Whole numbers
+        in a space of choices are numbers of choices.
         """
         wanted = (rows, self.actions.size)
         if isinstance(chosen, tuple) and len(chosen) == 2 and (chosen[1] is None or np.ndim(chosen[0]) == 2):
@@ -97,14 +97,14 @@ class Opaque(PolicyNode):
             return found.astype(np.float32)
 
     def describe(self) -> dict[str, Any]:
-        """Code, named as Python names it."""
+        """Return the description of code, with the function's name."""
         return {"policy": "code", "named": _called(self.function)}
 
 
 def call_policy(
     policy: types.Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
 ) -> Float[Array, "n action"]:
-    """A policy's actions, NaN in place of each that is none. Raises UserError if they have another shape."""
+    """Return a policy's actions, NaN in place of each invalid one. Raises UserError for another shape."""
     chosen, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
     if chosen.shape != wanted:
         raise UserError(f"{policy_name(policy)} returned actions of shape {chosen.shape}: return {wanted}")
@@ -112,24 +112,24 @@ def call_policy(
 
 
 def policy_name(policy: Any) -> str:
-    """A policy for a message: by the user's function or class that acts, below whatever changes its actions."""
+    """Return a policy's name for a message: that of the user's function or class below all layers."""
     while (below := getattr(policy, "base", None) or getattr(policy, "policy", None)) is not None:
         policy = below
     return f"policy {_called(getattr(policy, 'function', type(policy)))}"
 
 
 def _called(code: Any) -> str:
-    """How Python calls a function or class."""
+    """Return the qualified name of a function or class."""
     return getattr(code, "__qualname__", type(code).__qualname__).replace("<locals>.", "")
 
 
 def in_space(policy: Any, space: Space) -> Any:
-    """A policy with actions of a space, where it is a bare function, of which nobody said in which space it acts."""
+    """Return a policy whose bare function gets this space of actions, if it was given without one."""
     return policy.replace(actions=space) if isinstance(policy, Opaque) else policy
 
 
 def policy_of(given: Any) -> Any:
-    """Anything that acts as a policy.
+    """Return anything that acts as a policy.
 
     Args:
         given: a policy; a class or function that gives one when it is called with nothing; a function of a batch of
@@ -137,7 +137,7 @@ def policy_of(given: Any) -> Any:
             policy of another library, see `foreign.function_of`.
 
     Raises:
-        UserError: it is none of these, or a policy that is no pytree.
+        UserError: the object is none of these, or a policy that is not a pytree.
     """
     if (function := foreign.function_of(given)) is not None:
         return Opaque(function, on_host=True)
@@ -152,7 +152,7 @@ def policy_of(given: Any) -> Any:
         if any(leaf is given for leaf in jax.tree.leaves(given)):
             kind = type(given).__name__
             raise UserError(
-                f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function"
+                f"a {kind} has `act` but is not a pytree: make it a flax.struct.PyTreeNode, or give a function"
             )
         return given
     if isinstance(given, jax.stages.Wrapped):
@@ -166,10 +166,10 @@ def policy_of(given: Any) -> Any:
 
 
 def _takes_nothing(given: Callable[..., Any]) -> bool:
-    """Can it be called without arguments?"""
+    """Return whether an object can be called without arguments."""
     try:
         parameters = inspect.signature(given).parameters.values()
-    except (TypeError, ValueError):  # of code that is not Python's
+    except (TypeError, ValueError):  # compiled code has no signature
         return False
     variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return all(one.default is not one.empty for one in parameters if one.kind not in variable) and not any(

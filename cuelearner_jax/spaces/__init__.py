@@ -1,4 +1,4 @@
-"""Spaces of actions: directions in the plane, boxes, choices."""
+"""Action spaces: directions in the plane, boxes, choices."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 def from_json(about: Any) -> Space:
     """Return the space that a file describes (`Space.to_json`), of a class that has been imported.
 
-    Raises ValueError for a description of none.
+    Raises ValueError for a description of no known space.
     """
     try:
         cues = tuple(Cue(cue["name"], tuple(cue["words"]), tuple(cue["keys"]), cue["unit"]) for cue in about["cues"])
@@ -39,5 +39,5 @@ def from_json(about: Any) -> Space:
     except (KeyError, TypeError, AttributeError, UserError) as error:
         raise ValueError("the description of its space of actions makes no sense, or is of unknown code") from error
     if not same:
-        raise ValueError("its space of actions is none that this program knows")
+        raise ValueError("its space of actions is unknown to this program")
     return space

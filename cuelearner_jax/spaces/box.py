@@ -1,4 +1,4 @@
-"""Actions whose entries lie between two bounds, each entry a cue of its own."""
+"""The box: actions whose entries lie between two bounds, each entry a cue of its own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.space import Cue, Space, Vectors, numbers
 
 SHARE = "shares"
-KEYS = ("qa", "ed", "rf", "tg", "yh", "uj", "ik", "ol")  # of the cues that a box is not given
+KEYS = ("qa", "ed", "rf", "tg", "yh", "uj", "ik", "ol")  # words of the cues where a box is given none
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Box(Space):
     reach = 1.0
 
     def __post_init__(self) -> None:
-        """Raises UserError for bounds or cues that fit no box."""
+        """Raise UserError for bounds or cues that do not fit together."""
         low, high = numbers("low", self.low), numbers("high", self.high)
         if len(low) != len(high) or any(b <= a for a, b in zip(low, high, strict=True)):
             raise UserError(f"low is {low} and high is {high}: give as many of both, each high above its low")
@@ -47,7 +47,7 @@ class Box(Space):
 
     @property
     def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Entries of an action."""
+        """Number of entries of an action."""
         return len(self.low)
 
     @property
@@ -115,7 +115,7 @@ class Box(Space):
 
 
 def _row(values: Any, like: Vectors) -> Float[Array, "... action"]:
-    """One number an entry, for every action of an array."""
+    """Return one number for every entry, broadcast over an array of actions."""
     return jnp.broadcast_to(jnp.asarray(values, jnp.float32), jnp.shape(like))
 
 

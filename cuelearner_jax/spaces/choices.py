@@ -1,4 +1,4 @@
-"""One of several actions, as a vector with a one at its place."""
+"""Choices: one of several actions, as a one-hot vector."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ STEPS = "steps"
 class Choices(Space):
     """One of `count` choices; an action is a vector (count,), 1 at the choice and 0 elsewhere.
 
-    With `order` a task says that choices stand in a row: `log` then counts the steps from one to another. Without,
-    there is no cue, nobody can ask for "more", and a bound holds nothing.
+    With `order` the choices stand in a row, and `log` counts the steps from one to another. Without `order` there is no
+    cue, no answer can ask for "more", and bounds have no effect.
     """
 
     count: int
-    order: Cue | None = None  # whose unit is "steps"
+    order: Cue | None = None  # the cue of the order, whose unit is "steps"
 
     name = "choices"
     grain = 1.0
     about = "vectors with a single 1 among zeros"
 
     def __post_init__(self) -> None:
-        """Raises UserError for too few choices, or an order in another unit."""
+        """Raise UserError for too few choices, or an order in another unit."""
         if self.count < 2:
             raise UserError(f"count is {self.count}: give at least two choices")
         if self.order is not None and self.order.unit != STEPS:
@@ -40,21 +40,21 @@ class Choices(Space):
 
     @property
     def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Entries of an action."""
+        """Number of entries of an action."""
         return self.count
 
     @property
     def cues(self) -> tuple[Cue, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The order, if there is one."""
+        """The order as the only cue, if there is one."""
         return () if self.order is None else (self.order,)
 
     @property
     def reach(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Steps from the first choice to the last; without an order any two are 1 apart."""
+        """Number of steps from the first choice to the last; without an order 1."""
         return float(self.count - 1) if self.cues else 1.0
 
     def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Float[Array, "*shape action"]:
-        """Draw each choice as often."""
+        """Draw choices uniformly."""
         return jax.nn.one_hot(jax.random.randint(key, shape, 0, self.count), self.count)
 
     def log(self, action: Vectors, other: Vectors) -> Float[Array, "... cues"]:
@@ -63,7 +63,7 @@ class Choices(Space):
         return jnp.repeat(steps[..., None], len(self.cues), -1).astype(jnp.float32)
 
     def exp(self, action: Vectors, change: Float[Array, "... cues"]) -> Float[Array, "... action"]:
-        """Go so many steps, rounded, and no farther than the ends of the row."""
+        """Move so many steps, rounded, but no farther than the ends of the row."""
         if not self.cues:
             return jnp.asarray(action)
         place = jnp.round(jnp.argmax(jnp.asarray(action), -1) + jnp.asarray(change)[..., 0])

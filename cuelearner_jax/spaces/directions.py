@@ -1,4 +1,4 @@
-"""Directions in the plane, as unit vectors: the space of the paper's tasks, and the geometry that tasks need.
+"""Directions in the plane, as unit vectors: the space of the paper's tasks, and their geometry.
 
 Source: paper, section IV-A. Angles are radians, counterclockwise positive. Every function works on any leading axes.
 Angles are wrapped with `atan2`, never with a modulo, so that the functions export to other runtimes unchanged.
@@ -18,45 +18,45 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.space import Cue, Space
 
-SQUARABLE = 1e15  # an entry up to this, and down to its inverse, has a square in single precision
-ROUNDING = 1e-5  # of the largest of values that a Fourier transform averaged
+SQUARABLE = 1e15  # entries between this and its inverse have squares within single precision
+ROUNDING = 1e-5  # rounding error of a Fourier transform, as a share of the largest value
 
 Direction = Float[Array, "... 2"]
-DirectionLike = Direction | Float[np.ndarray, "... 2"]  # what functions take; they give JAX's arrays
+DirectionLike = Direction | Float[np.ndarray, "... 2"]  # accepted arrays; results are JAX's arrays
 Angle = Float[Array, "..."] | Float[np.ndarray, "..."] | float
 
 
 def from_angle(angle: Angle) -> Direction:
-    """Unit vector that points along `angle` [rad]."""
+    """Return the unit vector that points along `angle` [rad]."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
 def to_angle(action: DirectionLike) -> Float[Array, "..."]:
-    """Angle of a direction in (-pi, pi] [rad]."""
+    """Return the angle of a direction in (-pi, pi] [rad]."""
     return jnp.arctan2(action[..., 1], action[..., 0])
 
 
 def rotate(action: DirectionLike, angle: Angle) -> Direction:
-    """`action` turned counterclockwise by `angle` [rad]."""
+    """Return `action` turned counterclockwise by `angle` [rad]."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     x, y = action[..., 0], action[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def difference(start: DirectionLike, end: DirectionLike) -> Float[Array, "..."]:
-    """Signed angle from `start` to `end` in (-pi, pi] [rad]; positive: counterclockwise."""
+    """Return the signed angle from `start` to `end` in (-pi, pi] [rad], counterclockwise positive."""
     cross = start[..., 0] * end[..., 1] - start[..., 1] * end[..., 0]
     dot = start[..., 0] * end[..., 0] + start[..., 1] * end[..., 1]
     return jnp.arctan2(cross, dot)
 
 
 def retract(vector: DirectionLike) -> Direction:
-    """The direction nearest to a vector (the vector divided by its length), however long or short the vector is.
+    """Return the direction nearest to a vector of any length: the vector divided by its length.
 
-    The zero vector gives the x axis, which networks need; a vector that is not finite gives NaN, which shows.
+    The zero vector gives the x axis, as networks need a direction; a vector that is not finite gives NaN.
     """
     largest = jnp.max(jnp.abs(vector), axis=-1, keepdims=True)
-    # By powers of two, and by 1.0 as a rule: no bit of a usual vector changes.
+    # Scaling by powers of two, mostly 1.0, changes no bit of a usual vector.
     small = jnp.where(largest < 1 / SQUARABLE, 2.0**80, 1.0)
     vector = vector * jnp.where(largest > SQUARABLE, 2.0**-80, small).astype(vector.dtype)
     length = jnp.linalg.norm(vector, axis=-1, keepdims=True)
@@ -65,24 +65,24 @@ def retract(vector: DirectionLike) -> Direction:
 
 
 def outward(vector: DirectionLike, action: DirectionLike) -> Float[Array, "... 2"]:
-    """A vector given along and across (counterclockwise) a direction, in the frame in which the direction is given."""
+    """Return a vector, given along and across (counterclockwise) a direction, in the frame of the direction."""
     along, across = vector[..., 0], vector[..., 1]
     x, y = action[..., 0], action[..., 1]
     return jnp.stack([x * along - y * across, y * along + x * across], axis=-1)
 
 
 def inward(vector: Float[Array, "... 2"], action: DirectionLike) -> Float[Array, "... 2"]:
-    """The inverse of `outward`: how much of a vector lies along a direction, and how much across it."""
+    """Return how much of a vector lies along a direction, and how much across it: the inverse of `outward`."""
     return outward(vector, jnp.stack([action[..., 0], -action[..., 1]], axis=-1))
 
 
 def evenly_spaced(count: int) -> Float[Array, "count 2"]:
-    """`count` directions, the first along x, the others counterclockwise."""
+    """Return `count` directions, the first along x, the others counterclockwise."""
     return from_angle(jnp.arange(count) * (2 * math.pi / count))
 
 
 def uniform(key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Direction:
-    """Directions drawn uniformly (paper, Eq. 6): shape (*shape, 2)."""
+    """Draw directions uniformly (paper, Eq. 6): shape (*shape, 2)."""
     return from_angle(jax.random.uniform(key, shape, minval=-math.pi, maxval=math.pi))
 
 
@@ -141,7 +141,7 @@ DIRECTIONS = Directions()
 
 
 def check_directions(space: Space, what: str, instead: str) -> None:
-    """Raises UserError for another space than `DIRECTIONS`, in which `what` would be wrong; `instead`: what to do."""
+    """Raise UserError for a space other than `DIRECTIONS`; `what`: what needs directions; `instead`: what to do."""
     if space != DIRECTIONS:
         about = f"{space.name} of {space.size} entries"
         raise UserError(f"{what} works for directions in the plane alone, not for actions of a {about}: {instead}")
@@ -150,7 +150,7 @@ def check_directions(space: Space, what: str, instead: str) -> None:
 def best_direction(
     values: Float[Array, " count"], spread: Float[Array, ""] | float, habit: Float[Array, ""] | float
 ) -> Float[Array, "2"]:
-    """The best of `evenly_spaced(count)` for a player with an imperfect aim and a habit.
+    """Return the best of `evenly_spaced(count)` for a player with an imperfect aim and a habit.
 
     Args:
         values: value of each direction, not negative where it matters.
@@ -170,16 +170,16 @@ def nearest_direction(
     share: Float[Array, ""] | float,
     action: Float[Array, "2"],
 ) -> Float[Array, "2"]:
-    """The direction nearest to an action among those of `evenly_spaced(count)` that a player holds for good.
+    """Return the good direction nearest to an action, among `evenly_spaced(count)`.
 
-    Good is what is expected to be worth at least a share of the best. Where nothing is worth anything (the best is not
-    above 0), the best alone is.
+    A direction is good if its expected value is at least a share of the best one's. Where the best value is not above
+    0, only the best direction is good.
 
     Args:
         values: value of each direction.
         spread: standard deviation of the aim [rad], over which values are averaged; 0: perfect aim.
-        share: of the best expected value.
-        action: from which it is looked for.
+        share: least share of the best expected value.
+        action: the action from which the nearest one is searched.
     """
     expected = expected_values(values, spread)
     best = jnp.argmax(expected)
@@ -190,7 +190,10 @@ def nearest_direction(
 
 
 def expected_values(values: Float[Array, " count"], spread: Float[Array, ""] | float) -> Float[Array, " count"]:
-    """Values of evenly spaced directions, averaged over a normal error of aim of standard deviation `spread` [rad]."""
+    """Return the values of evenly spaced directions, averaged over a normal error of aim.
+
+    `spread`: standard deviation of the error [rad].
+    """
     turn = _turns(values.shape[0])
     around = jnp.minimum(turn, 2 * math.pi - turn)
     kernel = jax.nn.softmax(-0.5 * jnp.square(around / jnp.maximum(spread, 1e-6)))
@@ -198,5 +201,5 @@ def expected_values(values: Float[Array, " count"], spread: Float[Array, ""] | f
 
 
 def _turns(count: int) -> Float[Array, " count"]:
-    """How far each of `evenly_spaced(count)` is turned from x, counterclockwise [rad]."""
+    """Return the angle of each of `evenly_spaced(count)` from x, counterclockwise [rad]."""
     return jnp.arange(count) * (2 * math.pi / count)

@@ -1,4 +1,4 @@
-"""What a space of actions is: its cues, and how far along each of them it is from one action to another.
+"""The base class of action spaces: their cues, and the distance of two actions along each cue.
 
 A space brings `sample`, `log`, `exp`, `retract` and `spread`; distances, bounds and steps follow here, for all spaces.
 `log` of two actions is how far to go, and `exp` goes: exp(a, log(a, b)) = b, as on any smooth space of actions.
@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
 
-Vectors = Float[Array, "... action"] | Float[np.ndarray, "... action"]  # what methods take; they give JAX's arrays
+Vectors = Float[Array, "... action"] | Float[np.ndarray, "... action"]  # accepted arrays; results are JAX's arrays
 Amount = Float[Array, "..."] | Float[np.ndarray, "..."] | float
-UNSAID = 2.0  # what a relative answer holds for a cue of which nothing was said
+UNSAID = 2.0  # entry of a relative answer for a cue that the answer does not name
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,12 @@ class Cue:
     """One way in which an action may change, in the words of a person who asks for the change."""
 
     name: str
-    words: tuple[str, str]  # of a change by more, and by less: ("counterclockwise", "clockwise"), ("open", "close")
+    words: tuple[str, str]  # words for more and less: ("counterclockwise", "clockwise"), ("open", "close")
     keys: tuple[str, str]  # for these words on the labelling page, as browsers call them (`KeyboardEvent.key`)
-    unit: str  # of a change in options and files: "degrees", "shares" (of the cue's range), "steps"
+    unit: str  # unit of a change in options and files: "degrees", "shares" (of the cue's range), "steps"
 
 
-KNOWN: dict[str, type[Space]] = {}  # by the names that files hold
+KNOWN: dict[str, type[Space]] = {}  # registered spaces by their names in files
 
 
 class Space:
@@ -40,15 +40,15 @@ class Space:
     Every method works on any leading axes. An action has `size` entries on the last axis, a change `len(cues)`.
     """
 
-    name: str  # in files
-    about: str  # what its actions are, in a few words
+    name: str  # name in files
+    about: str  # description of its actions, in a few words
     size: int  # entries of an action
-    cues: tuple[Cue, ...]  # none: nobody can say in which way an action should change
-    reach: float  # the largest change along a cue that means anything, in `unit`
-    grain: float = 0.0  # the smallest, in `unit`; 0: however small a change is, it is one
+    cues: tuple[Cue, ...]  # empty: no relative answer is possible
+    reach: float  # the largest meaningful change along a cue, in `unit`
+    grain: float = 0.0  # the smallest change along a cue, in `unit`; 0: there is no smallest
 
     def __init_subclass__(cls) -> None:
-        """Make a space of one's own known to `spaces.from_json`, by its name."""
+        """Register a space of your own for `spaces.from_json`, by its name."""
         super().__init_subclass__()
         if "name" in vars(cls):
             KNOWN[cls.name] = cls
@@ -58,7 +58,7 @@ class Space:
         raise NotImplementedError
 
     def log(self, action: Vectors, other: Vectors) -> Float[Array, "... cues"]:
-        """Return how far it is from `action` to `other` along each cue."""
+        """Return the change from `action` to `other` along each cue."""
         raise NotImplementedError
 
     def exp(self, action: Vectors, change: Float[Array, "... cues"]) -> Float[Array, "... action"]:
@@ -113,7 +113,7 @@ class Space:
     def only_actions(self, vector: Vectors) -> Float[Array, "... action"]:
         """Return vectors as they are, NaN in place of each that is unusable.
 
-        What a user's code gives passes through here, so that a fault of that code shows and does not act.
+        Actions of user code pass through here, so that a fault of that code is reported and not executed.
         """
         return jnp.where(self.usable(vector)[..., None], vector, jnp.nan)
 
@@ -122,17 +122,17 @@ class Space:
         return jnp.asarray(vector)
 
     def distance(self, action: Vectors, other: Vectors) -> Float[Array, "..."]:
-        """Return how far two actions are apart along the cue in which they differ most."""
+        """Return the distance of two actions along the cue in which they differ most."""
         apart = jnp.abs(self.log(action, other))
         return apart[..., 0] if len(self.cues) == 1 else jnp.max(apart, -1, initial=0.0)
 
     def sense(self, action: Vectors, goal: Vectors) -> Float[Array, "... cues"]:
-        """Return h of each cue: +1 where `goal` lies at more, -1 at less, 0 where it is the same."""
+        """Return h of each cue: +1 where `goal` lies at more, -1 at less, 0 where the two are equal."""
         return jnp.sign(self.log(action, goal))
 
     def toward(self, action: Vectors, h: Float[Array, "... cues"], step: Amount) -> Float[Array, "... action"]:
         """Change an action by h steps along each cue; a cue of which nothing was said (`UNSAID`) stays."""
-        h = h if len(self.cues) == 1 else jnp.where(h == UNSAID, 0.0, h)  # of one cue, nothing said is no answer
+        h = h if len(self.cues) == 1 else jnp.where(h == UNSAID, 0.0, h)  # with one cue, an unsaid cue is no answer
         return self.exp(action, h * _for_cues(step))
 
     def approach(self, action: Vectors, goal: Vectors, most: Amount) -> Float[Array, "... action"]:
@@ -153,13 +153,13 @@ class Space:
 
 
 def _for_cues(amount: Amount) -> Array:
-    """An amount for each action as one that counts along every cue of it."""
+    """Return an amount for each action, broadcast over the action's cues."""
     amount = jnp.asarray(amount)
     return amount[..., None] if amount.ndim else amount
 
 
 def is_answered(answer: Float[Array, "... cues"]) -> Bool[Array, "... cues"]:
-    """Return of which cues a relative answer says something.
+    """Return which cues a relative answer names: (..., cues) bool.
 
     "Not said" is a finite number (`UNSAID`): NaN means that a teacher failed, JSON knows no NaN, and answers that hold
     a NaN do not equal themselves.

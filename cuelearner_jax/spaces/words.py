@@ -1,4 +1,4 @@
-"""Cues from the words of a person: "left,right;up,down;open,close"."""
+"""Make cues from a person's words: "left,right;up,down;open,close"."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from cuelearner_jax.spaces.space import Cue
 
 LONGEST = 40  # characters of a word
 ARROWS = {"left": "ArrowLeft", "right": "ArrowRight", "up": "ArrowUp", "down": "ArrowDown"}
-HELD = {"left": "a", "right": "d"}  # what stands for two of these arrows too
+HELD = {"left": "a", "right": "d"}  # letter keys that stand for these arrows too
 
 
 def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple[Cue, ...]:
-    """Return cues by their words, each with keys of its own.
+    """Return cues by their words, each with its own keys.
 
     Keys are arrows for left, right, up and down, or else a letter of the word that is free.
 
     Args:
         words: "left,right;up,down", or pairs of words; the first of a pair asks for more of an entry, the second for
             less.
-        names: of the cues; none given: "left or right" and so on.
-        unit: of a change.
+        names: names of the cues (default: "left or right" and so on).
+        unit: unit of a change.
 
     Raises:
         UserError: the words are no pairs, or not as many as there are names.

@@ -87,8 +87,8 @@ class GymnasiumConfig:
         if not self.slices or len({len(row) for row in rows}) > 1 or not all(size > 0 for size in self.slice_sizes):
             raise UserError(
                 f"task.slices is {format_value(self.slices)} of task.slice_sizes {format_value(self.slice_sizes)}: "
-                f"give a name, a size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which fills "
-                "them"
+                f"give a name, a size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which "
+                "fills them"
             )
         known = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
         return tuple(

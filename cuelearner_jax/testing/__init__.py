@@ -1,4 +1,4 @@
-"""Conformance checks for the parts of one's own: each raises AssertionError with one line that says what to mend.
+"""Conformance checks for parts of your own. Each raises AssertionError with one line that says what to fix.
 
 A check compiles once or twice and takes seconds; call it from a test, with a world as small as there is.
 """

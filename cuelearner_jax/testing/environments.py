@@ -1,4 +1,4 @@
-"""The laws of an environment (`cuelearner_jax.environment.Environment`), held against a roll-out of uniform actions."""
+"""Check the laws of an environment (`cuelearner_jax.environment.Environment`) on a roll-out of uniform actions."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cuelearner_jax.testing.laws import Laws, OnceTraced, change_floats, pytree
 from cuelearner_jax.types import Step
 
 COMPARED = 8  # steps of the roll-out that are taken again in one batch, and actions that features are asked about
-OWN_COLUMNS = {"reward", "finished"}  # of results: no metric or outcome may be called so
+OWN_COLUMNS = {"reward", "finished"}  # reserved columns of results: no metric or outcome may have these names
 
 
 class Trajectory(NamedTuple):
-    """What a roll-out met; leading axis: steps."""
+    """The steps of a roll-out; leading axis: steps."""
 
     obs: Array  # acted on
     actions: Array
@@ -28,16 +28,16 @@ class Trajectory(NamedTuple):
     step: Step
     batched: Any  # the state and `Step` of the first steps, taken in one batch
     alone: Any  # the same, as the roll-out met them
-    optional: dict[str, Any]  # what the members give that an environment may have
+    optional: dict[str, Any]  # results of the optional members
 
 
 def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None, tolerance: float = 1e-5) -> None:
-    """Holds an environment against its laws.
+    """Check that an environment keeps its laws.
 
     Args:
-        env: what claims to be an environment, small: it is compiled once, with a batch of a few steps.
-        steps: of the roll-out; enough for an episode to end.
-        key: of the roll-out (default: always the same).
+        env: the environment to check; it should be small, since it is compiled once with a batch of a few steps.
+        steps: steps of the roll-out; enough for an episode to end.
+        key: random key of the roll-out (default: always the same).
         tolerance: relative and absolute, of numbers that are computed in two ways (a recalled observation, a batch).
 
     Raises:
@@ -65,7 +65,7 @@ def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None
 
 
 def _check_names(laws: Laws, env: Environment) -> None:
-    """What an observation is made of."""
+    """Check the slices of an observation."""
     laws.hold(len(env.observation) > 0, "`observation` names nothing: give a Quantity for each slice")
     for quantity in env.observation:
         laws.hold(isinstance(quantity, Quantity), f"`observation` holds {quantity!r}: give a Quantity for each slice")
@@ -78,7 +78,7 @@ def _check_names(laws: Laws, env: Environment) -> None:
 
 
 def _check_shapes(laws: Laws, env: Environment) -> None:
-    """Shapes and types, from traces alone."""
+    """Check shapes and types by tracing only."""
     space, key = actions_of(env), jax.random.key(0)
     shape = jax.eval_shape(lambda: space.sample(key, (3,))).shape
     laws.hold(shape == (3, space.size), f"its actions' `sample` gives shape {shape} for 3 actions of {space.size}")
@@ -139,14 +139,14 @@ def _vector(laws: Laws, value: Any, called: str, size: int | None = None) -> Non
 
 
 def _program(env: Environment, key: PRNGKeyArray) -> tuple[str, list[bytes]]:
-    """What `reset` and `step` compute, as text and constants, without compiling."""
+    """Return the traced program of `reset` and `step`, as text and constants, without compiling."""
 
     def both(env: Any, key: PRNGKeyArray) -> Any:
         state, obs = env.reset(key)
         return env.step(key, state, actions_of(env).sample(key, ())), obs
 
     closed = jax.make_jaxpr(both)(env, key)
-    text = re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr))  # where functions lie in memory
+    text = re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr))  # memory addresses of functions
     return text, [np.asarray(value).tobytes() for value in closed.consts if not _is_key(value)]
 
 
@@ -155,7 +155,7 @@ def _is_key(value: Any) -> bool:
 
 
 def _walk(env: Any, key: PRNGKeyArray, steps: int) -> Trajectory:
-    """Everything that is computed of an environment, as one program."""
+    """Compute everything that is checked of an environment, as one program."""
     k_reset, k_walk = jax.random.split(key)
 
     def one(carry: tuple, number: Array) -> tuple[tuple, tuple]:
@@ -175,7 +175,7 @@ def _walk(env: Any, key: PRNGKeyArray, steps: int) -> Trajectory:
 
 
 def _asked(env: Any, obs: Array, actions: Array) -> dict[str, Any]:
-    """What the optional members give of a roll-out's observations and actions."""
+    """Return the optional members' results for a roll-out's observations and actions."""
     found: dict[str, Any] = {}
     if offers(env, "heuristic"):
         found["heuristic"] = jax.vmap(env.heuristic)(obs)
@@ -205,7 +205,7 @@ def _asked(env: Any, obs: Array, actions: Array) -> dict[str, Any]:
 
 
 def _check_walk(laws: Laws, env: Environment, walk: Trajectory, steps: int) -> None:
-    """Laws of the steps themselves."""
+    """Check the laws of the steps."""
     step = walk.step
     laws.actions(actions_of(env), walk.actions, "what its actions' `sample` draws")
     told = {"obs": step.obs, "final_obs": step.final_obs, "reward": step.reward, **step.metrics, **step.outcome}
@@ -245,7 +245,7 @@ def _check_walk(laws: Laws, env: Environment, walk: Trajectory, steps: int) -> N
 
 
 def _check_optional(laws: Laws, env: Environment, walk: Trajectory) -> None:
-    """Laws of the members that an environment may have."""
+    """Check the laws of the optional members."""
     if "heuristic" in walk.optional:
         laws.actions(actions_of(env), walk.optional["heuristic"], "what `heuristic` gives")
     if "features" in walk.optional:
@@ -263,15 +263,15 @@ def _check_optional(laws: Laws, env: Environment, walk: Trajectory) -> None:
 
 
 def _check_features(laws: Laws, together: Any, each: Any) -> None:
-    """Those of many actions are those of each, and what they say of the observation alone hangs on no action."""
+    """Check that features of many actions are those of each, and that `own` does not depend on the action."""
     laws.hold(
         len(together) == len(each) == 2,
-        "`features` are no `environment.Features`: give what hangs on no action, and the rest",
+        "`features` are no `environment.Features`: give the part that does not depend on the action, and the rest",
     )
     (own, turned), (owns, singly) = together, each
     laws.hold(
         np.ndim(own) == 1 and laws.same(np.broadcast_to(own, np.shape(owns)), owns),
-        "`features` hold in `own` what hangs on the action: move it to `turned`",
+        "`features` hold values in `own` that depend on the action: move them to `turned`",
     )
     fits = np.shape(turned) == np.shape(singly) and np.ndim(turned) == 2
     laws.hold(
@@ -284,7 +284,7 @@ def _check_features(laws: Laws, together: Any, each: Any) -> None:
 
 
 def _check_aims(laws: Laws, env: Environment, aims: Any) -> None:
-    """They are actions with features, possible or not, as many in every situation (leading axis: steps)."""
+    """Check that aims are actions with features, as many in every situation (leading axis: steps)."""
     laws.hold(isinstance(aims, Aims), f"`aims` returns a {type(aims).__name__}: give `environment.Aims`")
     rows = np.shape(aims.possible)
     fits = len(rows) == 2 and np.shape(aims.actions)[:-1] == rows and np.shape(aims.features)[:-1] == rows
@@ -299,7 +299,7 @@ def _check_aims(laws: Laws, env: Environment, aims: Any) -> None:
 
 
 def _check_mirrors(laws: Laws, walk: Trajectory, images: Any, other: Any, combined: Any, twice: Any) -> None:
-    """They are a group of linear isometries, 0 the identity."""
+    """Check that symmetries form a group of linear isometries with 0 as identity."""
     obs, vectors = images
     same = np.shape(obs)[1:] == np.shape(walk.obs) and np.shape(vectors)[1:] == np.shape(walk.actions)
     laws.hold(same, "`mirror` changes a shape: an image is an observation and a vector of the same sizes")
@@ -324,5 +324,5 @@ def _check_mirrors(laws: Laws, walk: Trajectory, images: Any, other: Any, combin
 
 
 def _first(rows: Array | np.ndarray) -> int:
-    """The first of the rows in which something is true."""
+    """Return the first row in which something is true."""
     return int(np.argmax(np.asarray(rows).reshape(len(rows), -1).any(-1)))

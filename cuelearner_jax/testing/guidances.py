@@ -1,4 +1,4 @@
-"""The laws of a kind of guidance (`cuelearner_jax.guides.base.Kind`), held against it in one environment."""
+"""Check the laws of a kind of guidance (`cuelearner_jax.guides.base.Kind`) in one environment."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ ROWS = 6  # situations, of which every second is guided; as many labels
 
 
 class Steady(struct.PyTreeNode):
-    """A teacher that always holds one action for best."""
+    """A teacher whose best action is always the same."""
 
     action: Float[Array, " action"]
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """That action."""
+        """Return that action."""
         return self.action
 
 
 def check_guidance(kind: Kind, env: Environment, sizes: GuideSizes = SMALL, tolerance: float = 1e-5) -> None:
-    """Holds a kind of guidance against its laws.
+    """Check that a kind of guidance keeps its laws.
 
     Args:
         kind: the kind.
         env: an environment that it can be had in.
-        sizes: of its model, small.
+        sizes: small sizes of its model.
         tolerance: relative and absolute, of actions.
 
     Raises:
@@ -63,7 +63,7 @@ def check_guidance(kind: Kind, env: Environment, sizes: GuideSizes = SMALL, tole
 
 
 def _answered(laws: Laws, guide: Guide, form: AnswerForm, env: Any, states: Any, obs: Array, actions: Array) -> Label:
-    """Labels (rows, ...) by a simulated teacher."""
+    """Return labels (rows, ...) of a simulated teacher."""
     space = actions_of(env)
     named, width = re.fullmatch(r"[a-z][a-z0-9_-]*", form.name) and form.meaning(space), form.width(space)
     laws.hold(named, f"its form {form.name!r} lacks a name in lower case or a meaning: label files tell both")
@@ -88,7 +88,7 @@ def _answered(laws: Laws, guide: Guide, form: AnswerForm, env: Any, states: Any,
 
 
 def _fitted(laws: Laws, guide: Guide, env: Any, model: GuidanceModel, labels: Label) -> GuidanceModel:
-    """The model of labels, fitted beside a lane that has none."""
+    """Return the model of labels, fitted beside a lane without labels."""
     lanes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), labels)
     lanes = lanes.replace(valid=lanes.valid.at[1].set(False))
     former = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), model)
@@ -119,7 +119,7 @@ def _check_act(
     obs: Array,
     actions: Array,
 ) -> None:
-    """What it does to a batch of actions."""
+    """Check the changes to a batch of actions."""
     active, act = jnp.arange(ROWS) % 2 == 0, OnceTraced(guide.act)
     scalars = GuideScalars()
     with laws.attempted("`act` under jit", "it gets a batch of rows and returns Refined(actions, passes)"):
@@ -154,7 +154,7 @@ def _check_question(laws: Laws, guide: Guide, env: Any, model: GuidanceModel, ob
 
 
 def _check_disagreement(laws: Laws, kind: Kind, env: Any, sizes: GuideSizes, obs: Array, actions: Array) -> None:
-    """What the members of an ensemble say of each other."""
+    """Check the disagreement of an ensemble's members."""
     guide = kind.make(dataclasses.replace(sizes, ensemble=2), spaces_of(env))
     model = guide.init(jax.random.key(4))
     model = model.replace(params=jax.tree.map(_moved, model.params))  # members may start out alike
@@ -166,7 +166,7 @@ def _check_disagreement(laws: Laws, kind: Kind, env: Any, sizes: GuideSizes, obs
 
 
 def _moved(leaf: Array) -> Array:
-    """Parameters that are no longer those of the start, as after a fit."""
+    """Return parameters that differ from the start's, as after a fit."""
     if not jnp.issubdtype(leaf.dtype, jnp.floating):
         return leaf
     return leaf + 0.1 * jax.random.normal(jax.random.key(leaf.size), leaf.shape)

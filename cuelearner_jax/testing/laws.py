@@ -1,4 +1,4 @@
-"""What the checks share: a law that holds or is told in one line, equal arrays, actions of a space, counted traces."""
+"""Tools of the checks: a law that holds or fails in one line, equal arrays, actions of a space, counted traces."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from cuelearner_jax.spaces import Space
 
 
 class Laws:
-    """Laws of one subject."""
+    """The laws of one subject."""
 
     def __init__(self, subject: Any, tolerance: float) -> None:
-        """`subject`: what messages begin with, a string or an object whose class is named."""
+        """`subject`: the beginning of messages, a string or an object whose class is named."""
         self.subject = subject if isinstance(subject, str) else type(subject).__name__
         self.tolerance = tolerance
 
     def hold(self, law: Any, broken: str) -> None:
-        """Raises AssertionError with what is broken, and how to mend it, unless the law holds."""
+        """Raise AssertionError with the broken law and how to fix it, unless the law holds."""
         if not law:
             raise AssertionError(f"{self.subject}: {broken}")
 
     @contextmanager
     def attempted(self, deed: str, mend: str) -> Iterator[None]:
-        """Raises AssertionError in one line in place of whatever the subject's own code raises."""
+        """Raise AssertionError in one line in place of any exception of the subject's code."""
         try:
             yield
         except AssertionError:
@@ -38,7 +38,7 @@ class Laws:
             raise AssertionError(f"{self.subject}: {deed} fails ({type(error).__name__}: {told}): {mend}") from error
 
     def same(self, one: Any, other: Any) -> bool:
-        """Are two trees of arrays equal, within the tolerance? Keys are compared by their words."""
+        """Return whether two trees of arrays are equal, within the tolerance. Keys are compared by their words."""
         pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
         return all(
             np.shape(a) == np.shape(b) and np.allclose(a, b, self.tolerance, self.tolerance, equal_nan=True)
@@ -46,7 +46,7 @@ class Laws:
         )
 
     def actions(self, space: Space, actions: Any, called: str) -> None:
-        """Raises AssertionError unless rows (..., size) are actions of a space."""
+        """Raise AssertionError unless rows (..., size) are actions of a space."""
         shape = np.shape(actions)
         self.hold(
             shape[-1:] == (space.size,), f"{called} has shape {shape}: an action has {space.size} entries, in one axis"
@@ -54,7 +54,7 @@ class Laws:
         self.hold(np.isfinite(actions).all(), f"{called} is not finite everywhere: give an action in every situation")
         self.hold(
             self.same(space.retract(jnp.asarray(actions)), actions),
-            f"{called} is no action of the space: pass it through the space's `retract` (directions: unit length)",
+            f"{called} is not an action of the space: pass it through the space's `retract` (directions: unit length)",
         )
 
 
@@ -62,7 +62,7 @@ class OnceTraced:
     """A function compiled by `jax.jit` that counts how often it was traced."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        """Compiles nothing yet."""
+        """Wrap the function; nothing is compiled yet."""
         self.traces = 0
 
         def counted(*arguments: Any) -> Any:
@@ -72,16 +72,16 @@ class OnceTraced:
         self._compiled = jax.jit(counted)
 
     def __call__(self, *arguments: Any) -> Any:
-        """The function's result."""
+        """Return the function's result."""
         return self._compiled(*arguments)
 
 
 def pytree(laws: Laws, subject: Any, called: str) -> None:
-    """Raises AssertionError unless something is a pytree of numbers whose static fields can be compared."""
+    """Raise AssertionError unless an object is a pytree of numbers with comparable static fields."""
     leaves, tree = jax.tree.flatten(subject)
     laws.hold(
         not (len(leaves) == 1 and leaves[0] is subject),
-        f"{called} is no pytree: derive its class from flax.struct.PyTreeNode",
+        f"{called} is not a pytree: derive its class from flax.struct.PyTreeNode",
     )
     for path, leaf in jax.tree_util.tree_leaves_with_path(subject):
         laws.hold(
@@ -97,7 +97,7 @@ def pytree(laws: Laws, subject: Any, called: str) -> None:
 
 
 def change_floats(tree: Any) -> Any:
-    """The same with another value of every float: what a changed world is to a compiled program."""
+    """Return the tree with another value of every float, as a changed world has."""
 
     def other(leaf: Any) -> Any:
         return leaf * 1.01 if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating) else leaf
@@ -106,7 +106,7 @@ def change_floats(tree: Any) -> Any:
 
 
 def _statics(tree: Any) -> Iterator[Any]:
-    """What the static fields hold, of all nodes of a tree's structure that are not Python's own containers."""
+    """Return the static fields of all nodes of a tree that are not Python's own containers."""
     node = tree.node_data()
     if node is not None and node[0] not in (dict, list, tuple):
         yield node[1]

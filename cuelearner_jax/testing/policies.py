@@ -1,4 +1,4 @@
-"""The laws of a policy (`cuelearner_jax.policies.PolicyBlock`), held against it in one environment."""
+"""Check the laws of a policy (`cuelearner_jax.policies.PolicyBlock`) in one environment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROWS = 9
 
 
 def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None:
-    """Holds a policy against its laws.
+    """Check that a policy keeps its laws.
 
     Args:
         policy: one policy, as `evaluate.evaluate_policy` takes it.
@@ -53,7 +53,7 @@ def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None
         np.shape(alone) == (1, size), f"`act` returns shape {np.shape(alone)} for 1 observation: return {(1, size)}"
     )
     laws.actions(actions_of(env), alone, "the action for one observation")
-    if laws.same(actions, other):  # where actions are drawn, rows of another order are drawn anew
+    if laws.same(actions, other):  # random actions differ where rows have another order
         order = jnp.roll(jnp.arange(ROWS), 4)
         turned = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[order], states), obs[order])
         laws.hold(
@@ -63,7 +63,7 @@ def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None
 
 
 def _check_axes(laws: Laws, policy: Any) -> None:
-    """`axes` is a prefix of the policy, with `BY_LANE` or `SHARED` in place of fields."""
+    """Check that `axes` is a prefix of the policy, with `BY_LANE` or `SHARED` in place of fields."""
 
     def known(axis: Any, part: Any) -> bool:
         return axis is SHARED or (isinstance(axis, int) and axis == BY_LANE) or axis is part

@@ -1,4 +1,4 @@
-"""The laws of a space of actions (`cuelearner_jax.spaces.Space`), held against actions that it draws."""
+"""Check the laws of an action space (`cuelearner_jax.spaces.Space`) on actions that it draws."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DRAWN = 64  # actions
 
 
 def check_space(space: Space, tolerance: float = 1e-5) -> None:
-    """Holds a space against its laws.
+    """Check that a space keeps its laws.
 
     Raises:
         AssertionError: the first law that is broken.
@@ -40,4 +40,4 @@ def check_space(space: Space, tolerance: float = 1e-5) -> None:
         farthest = float(np.max(np.abs(space.to_unit(np.asarray(far), np))))
         laws.hold(farthest <= space.reach * (1 + tolerance), f"`log` goes as far as {farthest:g}: beyond `reach`")
     lost = space.retract(one.at[0].set(jnp.nan))
-    laws.hold(np.isnan(lost[0]).all(), "`retract` of NaN is no NaN: a fault of somebody's code must show")
+    laws.hold(np.isnan(lost[0]).all(), "`retract` of NaN is not NaN: return NaN, so that a fault of user code is seen")

@@ -1,4 +1,4 @@
-"""The laws of a task (`cuelearner_jax.task.Task`): what its presets, scenarios, teacher and pictures must be."""
+"""Check the laws of a task (`cuelearner_jax.task.Task`): its presets, scenarios, teacher and pictures."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ FILMED = 3  # steps
 def check_task(
     task: Task, small: Any = None, steps: int = 64, pictures: Path | None = None, tolerance: float = 1e-5
 ) -> None:
-    """Holds a task against its laws. Without a small world nothing is compiled.
+    """Check that a task keeps its laws. Without a small world nothing is compiled.
 
     Args:
         task: the task.
         small: a configuration of it that compiles quickly: its environment is checked, its teacher asked.
-        steps: of that environment's roll-out.
+        steps: steps of that environment's roll-out.
         pictures: an empty folder, for pictures of the small world (default: none are drawn).
-        tolerance: as `check_environment` has it.
+        tolerance: as for `check_environment`.
 
     Raises:
         AssertionError: the first law that is broken.
@@ -67,7 +67,7 @@ def _shapes(laws: Laws, task: Task, config: Any, called: str) -> Any:
 
 
 def _check_splits(laws: Laws, task: Task, config: Any, name: str) -> None:
-    """Training, tuning and validation are one compiled program."""
+    """Check that training, tuning and validation share one compiled program."""
 
     def seen(split: str) -> Any:
         env = jax.eval_shape(lambda: task.environment(config, split))
@@ -88,7 +88,7 @@ def _check_scenarios(laws: Laws, task: Task, config: Any, obs_size: int) -> None
 
 
 def _check_longest(laws: Laws, task: Task, config: Any) -> None:
-    """Where episodes have outcomes, evaluations must know how long to wait for them."""
+    """Check that the longest episode is known where episodes have outcomes."""
     env = task.environment(config)
     state, _ = jax.eval_shape(env.reset, jax.random.key(0))
     action = jax.eval_shape(lambda: actions_of(env).sample(jax.random.key(0), ()))
@@ -120,7 +120,7 @@ def _check_teacher(laws: Laws, task: Task, config: Any) -> None:
 
 
 def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
-    """A film, a still and a question of a few random steps."""
+    """Check a film, a still and a question of a few random steps."""
     try:
         drawn = task.pictures()
     except UserError as error:

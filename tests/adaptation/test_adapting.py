@@ -230,7 +230,7 @@ def test_what_is_a_policy():
     shifted = Shifted(jnp.array(1.0))
     assert policy_of(shifted) is shifted
     assert isinstance(policy_of(quarter), Opaque)
-    for bad, says in ((Actor, "is no pytree"), (42, "42 is no policy")):
+    for bad, says in ((Actor, "is not a pytree"), (42, "42 is no policy")):
         with pytest.raises(UserError, match=says):
             policy_of(bad)
 

@@ -169,7 +169,7 @@ def test_bounds_that_are_not_given_are_told():
         ({"policy": None}, "policy is None: give the policy"),
         ({"labels": cl.Labels(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))}, "labels have shapes"),
         ({"labels": "absent", "low": None, "high": None, "cues": ""}, "there is no label file"),
-        ({"labels": cl.Labels(OTHERS[:20], wanted(OTHERS[:20]), np.zeros((20, 2)))}, r"\(labels, 3\) is needed"),
+        ({"labels": cl.Labels(OTHERS[:20], wanted(OTHERS[:20]), np.zeros((20, 2)))}, r"give \(labels, 3\)"),
         ({"labels": cl.Labels(OTHERS[:20], wanted(OTHERS[:20]), np.full((20, 3), 0.5))}, "an answer is none of"),
         ({"labels": cl.Labels(np.full((20, 3), np.nan), wanted(OTHERS[:20]), np.zeros((20, 3)))}, "not finite"),
         ({"low": (0.0,) * 3}, "actions are no vectors between the bounds"),

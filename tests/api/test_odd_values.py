@@ -153,7 +153,7 @@ def test_models_and_policies_with_parts_of_something_else_are_refused():
     with pytest.raises(cl.UserError, match=r"^observation is 'abc'"):
         cl.CallablePolicy(Heuristic(WORLD.env), "abc")
     wide = cl.fit_feedback(LABELS._replace(obs=np.ones((4, 5), np.float32)), sizes=SIZES)
-    with pytest.raises(cl.UserError, match="model is of observations with 5 entries, the policy's have 2"):
+    with pytest.raises(cl.UserError, match="model takes observations with 5 entries, the policy's have 2"):
         cl.refine(POLICY, wide)
     with pytest.raises(cl.UserError, match="state"):
         WORLD.step(jax.random.key(0), np.array(["a", "b"]), [1, 0])

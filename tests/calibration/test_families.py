@@ -95,9 +95,18 @@ def test_places_turn_about_their_origin_and_differences_follow():
 @pytest.mark.parametrize(
     ("slices", "said"),
     [
-        ((Quantity("cup", 1, "m", origin=(0.0, 0.0)),), "'cup' has an origin and is no place: give x and y in metres"),
-        ((Quantity("cup", 3, "1", origin=(0.0, 0.0)),), "'cup' has an origin and is no place: give x and y in metres"),
-        ((Quantity("way", 3, "m", follows="cup"),), "'way' follows 'cup', which is no slice: name one"),
+        (
+            (Quantity("cup", 1, "m", origin=(0.0, 0.0)),),
+            "'cup' has an origin but is not a place: give x and y in metres",
+        ),
+        (
+            (Quantity("cup", 3, "1", origin=(0.0, 0.0)),),
+            "'cup' has an origin but is not a place: give x and y in metres",
+        ),
+        (
+            (Quantity("way", 3, "m", follows="cup"),),
+            "'way' follows 'cup', which is not a slice of the observation: name one",
+        ),
     ],
 )
 def test_slices_that_cannot_turn_are_refused(slices, said):
@@ -126,10 +135,10 @@ def test_an_action_leads_where_the_policy_meant_it_to():
 def test_families_that_make_no_sense_are_refused():
     one = Distortion("tilt", (Unknown("tilt", "degrees"),), sees=lambda theta, obs: obs)
     for family, message in (
-        ([], "nothing that could have changed"),
+        ([], "changes is empty"),
         ([one._replace(unknowns=())], "no unknowns"),
         ([one._replace(sees=None)], "changes nothing"),
-        ([one, one], "stands twice"),
+        ([one, one], "name of two distortions"),
     ):
         with pytest.raises(UserError, match=message):
             check_family(family)

@@ -215,8 +215,8 @@ def test_what_calibration_cannot_use_is_refused(home, refused, tmp_path):
         ("--sizes.fit-steps", "20", "sizes.fit_steps is 20, but calibration fits no model"),
         ("--scalars.k-max", "3", "leave scalars.k_max out"),
         ("--judge-bounds", "0.5", "leave judge_bounds out"),
-        ("--scalars.answer", "shuffled", "a control of models"),
-        ("--changes", "own_askew:WRONG", "'twist': sees changes rows though all of its unknowns are zero"),
+        ("--scalars.answer", "shuffled", "a control of feedback models"),
+        ("--changes", "own_askew:WRONG", "'twist': sees changes rows although all of its unknowns are zero"),
         ("--changes", "own_askew:SEEN", "has no 'SEEN'"),
         ("--changes", "own_askew:OWN", "has no 'OWN'"),
     ):

@@ -64,4 +64,4 @@ def test_a_teacher_that_does_not_fit_is_refused(trained, refused, tmp_path):
     edit_json(navigation / "teacher.json", lambda about: about.update(task={"name": "navigation"}))
     refused([*RUN, "--task.teacher", navigation, *new], "is one of navigation, not of billiards", tmp_path)
     steep = ["evaluate", "billiards", "--preset", "easy", "--policy", "teacher", "--task.acceleration", "0", "0.05"]
-    refused(steep, "knows nothing of this world's --task.acceleration 0.0 0.05: use the search teacher", tmp_path)
+    refused(steep, "does not know this world's --task.acceleration 0.0 0.05: use the search teacher", tmp_path)

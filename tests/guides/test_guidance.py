@@ -174,7 +174,7 @@ def test_a_kind_can_be_registered_again_but_not_another_of_its_name(registered):
     assert guidance.register(one) is one
     assert [kind.name for kind in guidance.kinds()].count("calm") == 1
     assert guidance.make("calm", probes.SIZES, ENV).name == "calm"
-    with pytest.raises(UserError, match="there is another guidance called 'calm': give yours another name"):
+    with pytest.raises(UserError, match="another guidance is already called 'calm': give yours another name"):
         guidance.register(kind_of("calm", about="another"))
     with pytest.raises(UserError, match="another guidance called 'none'"):
         guidance.register(kind_of("none"))

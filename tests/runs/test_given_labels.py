@@ -54,7 +54,7 @@ def test_labels_of_another_task_are_refused(path):
 
 def test_labels_of_other_observations_are_refused(path):
     written(path, obs_size=3)
-    with pytest.raises(UserError, match=r"observations have the shape \(40, 3\), \(labels, 2\) is needed"):
+    with pytest.raises(UserError, match=r"observations have the shape \(40, 3\): give \(labels, 2\)"):
         read_for(path)
 
 

@@ -69,5 +69,5 @@ def test_what_makes_no_choices_is_refused():
         Choices(3, Cue("gear", ("higher", "lower"), ("a", "b"), "degrees"))
     with pytest.raises(ValueError, match="unknown code"):
         from_json({**FRUIT.to_json(), "name": "fruit"})
-    with pytest.raises(ValueError, match="none that this program knows"):
+    with pytest.raises(ValueError, match="unknown to this program"):
         from_json({**FRUIT.to_json(), "low": [0.0]})

@@ -64,7 +64,7 @@ BROKEN = {
     "an unfitted guide": (altered(act=unfitted_too), "`act` of an unfitted model changes actions"),
     "no directions": (
         altered(act=result(lambda refined: refined._replace(actions=2.0 * refined.actions))),
-        "an action that `act` returns is no action of the space",
+        "an action that `act` returns is not an action of the space",
     ),
     "no count": (
         altered(act=result(lambda refined: refined._replace(passes=1.0 * refined.passes))),

@@ -72,10 +72,10 @@ class Bare:
 
 
 BROKEN = {
-    "no pytree": (Bare(), "the policy is no pytree"),
+    "no pytree": (Bare(), "the policy is not a pytree"),
     "other axes": (Sideways(), "`axes` holds something else than BY_LANE and SHARED"),
     "an if": (Branching(), "`act` under jit fails"),
-    "a length": (altered(lambda key, actions: 2.0 * actions), "is no action of the space"),
+    "a length": (altered(lambda key, actions: 2.0 * actions), "is not an action of the space"),
     "one for all": (altered(lambda key, actions: actions[0]), "`act` returns shape (2,) for 9 observations"),
     "neighbours": (altered(lambda key, actions: retract(actions + actions[:1])), "depends on the others of the batch"),
     "not finite": (altered(lambda key, actions: actions / 0.0), "is not finite everywhere"),

@@ -126,11 +126,11 @@ BROKEN = {
     ),
     "no direction": (
         dataclasses.replace(PROBE, teacher=lambda config, env: Mistaken(env)),
-        "its teacher's best action is no action of the space",
+        "its teacher's best action is not an action of the space",
     ),
     "no good direction": (
         dataclasses.replace(PROBE, teacher=lambda config, env: Halfhearted(env)),
-        "its teacher's nearest good action is no action of the space",
+        "its teacher's nearest good action is not an action of the space",
     ),
     "nothing draws it": (PROBE, "window has no pictures of point"),
     "nothing is written": (with_pictures(DRAWN._replace(still=lambda *_: None)), "window.png was not written"),

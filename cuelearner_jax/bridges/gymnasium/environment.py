@@ -1,4 +1,4 @@
-"""A Gymnasium environment as one of ours: a pure function of the seed of an episode and the actions so far."""
+"""A Gymnasium environment as a pure function of an episode's seed and the actions so far."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOWHERE = bytes(PLACE_BYTES)
 
 
 class Episode(struct.PyTreeNode):
-    """All that an episode depends on, and the name of where it stands (see `instances`)."""
+    """Everything that an episode depends on, and the name of its current place (see `instances`)."""
 
     seed: UInt[Array, ""]
     steps: Int[Array, ""]  # taken so far
@@ -43,8 +43,8 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
     source: Source = struct.field(pytree_node=False)
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
-    succeeds: bool = struct.field(pytree_node=False, default=False)  # does it tell of success?
-    refusal: str = struct.field(pytree_node=False, default="")  # why it cannot be made; empty: it can
+    succeeds: bool = struct.field(pytree_node=False, default=False)  # True if it reports success
+    refusal: str = struct.field(pytree_node=False, default="")  # reason why it cannot be made; empty: it can
 
     def reset(self, key: PRNGKeyArray) -> tuple[Episode, Float[Array, " obs"]]:
         """Begin an episode with a seed drawn from the key. Raises UserError where the environment cannot be made."""
@@ -121,9 +121,9 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         return tuple(column.reshape((*shape, *column.shape[1:])) for column in found)
 
     def _carried(self, requests: Sequence[Request | None]) -> tuple[np.ndarray, ...]:
-        """What requests led to, column by column; NaN where there is none, and once an environment has failed.
+        """Return the results of requests, column by column; NaN where there is none, and after a failure.
 
-        `user_code` then tells of the failure.
+        `user_code` then reports the failure.
         """
         rows, asked = len(requests), [row for row, one in enumerate(requests) if one is not None]
         obs, final_obs = np.full((2, rows, self.obs_size), np.nan, np.float32)
@@ -138,12 +138,12 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
             else:
                 columns = zip(*went, strict=True)
                 parts = obs, final_obs, reward, terminated, truncated, success, total
-                for part, column in zip(parts, columns, strict=False):  # all but the places
+                for part, column in zip(parts, columns, strict=False):  # all columns but the places
                     part[asked] = column
                 place[asked] = np.frombuffer(b"".join(one.place for one in went), np.uint32).reshape(-1, 2)
         return obs, final_obs, reward, terminated, truncated, success, total, place
 
 
 def _seed(key: PRNGKeyArray) -> UInt[Array, ""]:
-    """A seed below 2^31, which every environment takes."""
+    """Return a seed below 2^31, which every environment accepts."""
     return jax.random.bits(key, (), jnp.uint32) >> 1

@@ -1,8 +1,8 @@
-"""Instances of one environment, which reset, step and replay: what a process of the pool does, and what it answers.
+"""Instances of one environment, which reset, step and replay: the work of one process of the pool.
 
 Where an instance stands is named by a chain of hashes: of the seed and the first observation, then of each action with
-the observation, reward and end that followed. Equal places have equal names. An environment that replays otherwise than
-it went comes to another name, and is told.
+the observation, reward and end that followed. Equal places have equal names. An environment that does not repeat itself
+comes to another name, which is reported.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ PLACE_BYTES = 8
 
 
 class Order(NamedTuple):
-    """What one instance is to do."""
+    """An instruction to one instance."""
 
-    slot: int  # which instance
-    seed: int  # of the episode
-    place: bytes  # where it is to stand before the action; empty: the episode begins
+    slot: int  # number of the instance
+    seed: int  # seed of the episode
+    place: bytes  # place before the action; empty: the episode begins
     action: np.ndarray | None  # (action,); None: begin the episode
-    next_seed: int = 0  # of the next episode, where this one ends
+    next_seed: int = 0  # seed of the next episode, where this one ends
     replay: np.ndarray | None = None  # (steps, action): go there first; None: it stands there
-    steps: int = 0  # taken so far in the episode
+    steps: int = 0  # number of steps so far in the episode
 
 
 class Went(NamedTuple):
-    """What an order led to."""
+    """The result of an order."""
 
     obs: np.ndarray  # (obs,) to act on next
     final_obs: np.ndarray  # (obs,) what the action led to
@@ -45,23 +45,23 @@ class Went(NamedTuple):
     truncated: bool
     success: float
     total: float  # the rewards of the episode so far
-    place: bytes  # where the instance stands now
+    place: bytes  # the instance's place now
 
 
 class Shot(NamedTuple):
-    """What an instance is to be filmed at."""
+    """A request for pictures of an episode."""
 
     slot: int
-    seed: int  # of the episode
+    seed: int  # seed of the episode
     actions: np.ndarray  # (steps, action) from its beginning
-    first: int  # pictures from after so many of these on
+    first: int  # number of the first step that is filmed
 
 
 class Running:
-    """One instance and where it stands."""
+    """One instance and its current place."""
 
     def __init__(self, env: Any, whose: str) -> None:
-        """Raises UserError for an environment whose spaces have no vectors."""
+        """Raise UserError for an environment whose spaces cannot be vectors."""
         self.env, self.whose = env, whose
         self.leaves = leaves_of(whose, env.observation_space)
         actions_of(whose, env.action_space)
@@ -143,15 +143,15 @@ class Instances:
     """The instances of one process."""
 
     def __init__(self, make: Callable[[], Any], whose: str, max_steps: int, size: int) -> None:
-        """`make` gives an environment; `size`: entries of an observation, as the task has them (0: whatever it is)."""
+        """`make` returns an environment; `size`: entries of an observation by the task (0: unknown)."""
         self.make, self.whose, self.max_steps, self.size = make, whose, max_steps, size
         self.running: dict[int, Running] = {}
         self.filmed: dict[int, np.ndarray] = {}  # actions (steps, action) of the episodes that are filmed
 
     def carry_out(self, orders: Sequence[Order | Shot]) -> list[Any]:
-        """Carry out orders; the words of an error in place of what failed, whose instance is then dropped.
+        """Carry out orders. Return a `Went` for each order, and pictures [(height, width, 3) uint8] for each shot.
 
-        Returns a `Went` an order, pictures [(height, width, 3) uint8] a shot.
+        Where one fails, its result is the words of the error, and its instance is dropped.
         """
         found: list[Any] = []
         for order in orders:
@@ -176,7 +176,10 @@ class Instances:
         return Went(obs, final_obs, reward, terminated, truncated, success, total, one.place)
 
     def _go(self, one: Running, order: Order) -> None:
-        """Make an instance stand where an order says. Raises UserError if the environment does not repeat itself."""
+        """Bring an instance to the place that an order names.
+
+        Raises UserError if the environment does not repeat itself.
+        """
         assert order.replay is not None
         one.reset(order.seed)
         for action in order.replay:
@@ -189,7 +192,7 @@ class Instances:
             )
 
     def _filmed(self, shot: Shot) -> list[np.ndarray]:
-        """Pictures of an episode; where it ends before its actions do, as many as there are."""
+        """Return pictures of an episode; fewer where the episode ends before its actions do."""
         one = self._instance(shot.slot)
         before = self.filmed.get(shot.slot, shot.actions[:0])
         goes_on = one.seed == shot.seed and len(before) <= shot.first and len(before) == one.steps
@@ -224,13 +227,13 @@ class Instances:
         return self.running[slot]
 
     def drop(self, slot: int) -> None:
-        """Close an instance, if there is one."""
+        """Close an instance, if it exists."""
         one = self.running.pop(slot, None)
         if one is not None:
-            with contextlib.suppress(Exception):  # it is given up, whatever closing raises
+            with contextlib.suppress(Exception):  # the instance is dropped, whatever closing raises
                 one.env.close()
 
     def close(self) -> None:
-        """Close all."""
+        """Close all instances."""
         for slot in list(self.running):
             self.drop(slot)

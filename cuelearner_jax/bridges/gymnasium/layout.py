@@ -1,6 +1,6 @@
-"""Gymnasium's spaces as vectors: how observations are flattened, and how a vector becomes an action.
+"""Convert between Gymnasium's spaces and vectors: flatten observations, and make actions from vectors.
 
-Loads neither JAX nor Gymnasium: a worker process begins quickly.
+This module imports neither JAX nor Gymnasium, so that worker processes start quickly.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ class Leaf(NamedTuple):
 
     path: tuple[Any, ...]  # keys and places that lead to it
     kind: str  # "box", "bits" or "one of"
-    shape: tuple[int, ...]  # of what the environment gives
-    choices: tuple[int, ...] = ()  # of "one of": the number of values of each entry
-    start: tuple[int, ...] = ()  # of "one of": the first value of each entry
+    shape: tuple[int, ...]  # shape of the environment's value
+    choices: tuple[int, ...] = ()  # for "one of": the number of values of each entry
+    start: tuple[int, ...] = ()  # for "one of": the first value of each entry
 
     @property
     def size(self) -> int:
-        """Entries of the vector that it fills."""
+        """Number of entries of the vector that it fills."""
         return sum(self.choices) if self.kind == "one of" else int(np.prod(self.shape, dtype=int))
 
     @property
     def name(self) -> str:
-        """Its keys, for people."""
+        """Its keys as a name for people."""
         return ".".join(map(str, self.path)) or "observation"
 
 
@@ -74,11 +74,11 @@ def _leaves(whose: str, space: Any, path: tuple[Any, ...]) -> Iterator[Leaf]:
 
 
 class NoVector(Exception):
-    """An observation that is none of its space: the message says what was given and what is wanted."""
+    """An observation outside its space; the message says what was given and what is wanted."""
 
 
 def flatten(leaves: tuple[Leaf, ...], obs: Any) -> np.ndarray:
-    """Return an observation as a vector (obs,) of float32. Raises NoVector where it is none of its space's."""
+    """Return an observation as a vector (obs,) of float32. Raises NoVector for an observation outside its space."""
     parts = [_vector(leaf, obs) for leaf in leaves]
     return np.concatenate(parts, dtype=np.float32, casting="unsafe") if len(parts) > 1 else parts[0].astype(np.float32)
 
@@ -116,7 +116,7 @@ class Actions(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Entries of an action."""
+        """Number of entries of an action."""
         return self.choices or len(self.low)
 
 
@@ -140,7 +140,7 @@ def actions_of(whose: str, space: Any) -> Actions:
 
 
 def action_maker(space: Any) -> Callable[[np.ndarray], Any]:
-    """Return what makes an action of the environment of a vector (action,)."""
+    """Return the function that makes an environment's action from a vector (action,)."""
     if type(space).__name__ == "Discrete":
         start = int(space.start)
         return lambda vector: int(vector.argmax()) + start

@@ -1,4 +1,4 @@
-"""The pool: finds the instance that stands where a state says, or makes one stand there by replaying its actions."""
+"""The pool finds the instance at the place that a state names, or brings one there by replaying its actions."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from cuelearner_jax.bridges.gymnasium.source import Source
 from cuelearner_jax.errors import UserError
 
 WORKER = "cuelearner_jax.bridges.gymnasium.worker"
-PACKAGES = Path(__file__).parents[3]  # from where this package is imported
-MOST_POOLS = 8  # that are open at once
-MOST_INSTANCES = 1024  # of a pool, beyond those that one call needs
-RECENT = 16  # calls: an instance that was used within so many is still wanted
+PACKAGES = Path(__file__).parents[3]  # folder that this package is imported from
+MOST_POOLS = 8  # most pools open at once
+MOST_INSTANCES = 1024  # spare instances of a pool, beyond those that one call needs
+RECENT = 16  # an instance that was used within so many calls is kept
 
 
 class Process:
     """Instances in a process of their own."""
 
     def __init__(self, sent: bytes, more: Mapping[str, str]) -> None:
-        """Begin it.
+        """Start the process.
 
         Args:
             sent: the arguments of `Instances`, pickled.
@@ -45,7 +45,7 @@ class Process:
         command = [sys.executable, "-m", WORKER, str(theirs.fileno()), str(os.getpid())]
         paths = os.pathsep.join([str(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])
         environ = {**os.environ, "PYTHONPATH": paths, **more}
-        # What an environment prints is no output of ours.
+        # An environment's prints must not mix with our output.
         self.child = subprocess.Popen(
             command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2, env=environ
         )
@@ -56,18 +56,18 @@ class Process:
 
     def send(self, orders: Sequence[Order | Shot]) -> None:
         """Give orders, to be answered by `receive`."""
-        with contextlib.suppress(OSError):  # `receive` tells
+        with contextlib.suppress(OSError):  # `receive` reports it
             self.link.send_bytes(pickle.dumps(orders, pickle.HIGHEST_PROTOCOL))
 
     def receive(self, count: int) -> list[Any] | None:
-        """Return what orders led to; None: the process is gone."""
+        """Return the results of the orders; None: the process is gone."""
         try:
             return pickle.loads(self.link.recv_bytes())
         except (EOFError, OSError):
             return None
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self.link.close()
         try:
             self.child.wait(2)
@@ -80,7 +80,7 @@ class Here:
     """Instances in this process."""
 
     def __init__(self, instances: Instances) -> None:
-        """Keep them."""
+        """Make the instances of this process."""
         self.instances = instances
         self.found: list[Any] = []
 
@@ -89,11 +89,11 @@ class Here:
         self.found = self.instances.carry_out(orders)
 
     def receive(self, count: int) -> list[Any] | None:
-        """Return what they led to."""
+        """Return the results of the orders."""
         return self.found
 
     def close(self) -> None:
-        """Close all."""
+        """Close all instances."""
         self.instances.close()
 
 
@@ -102,7 +102,7 @@ class Slot:
     """An instance as the pool knows it."""
 
     number: int
-    place: bytes = b""  # where it stands; empty: nowhere
+    place: bytes = b""  # name of its place; empty: none
     used: int = -1 - RECENT  # the number of the call that used it last
 
 
@@ -111,7 +111,7 @@ class Request:
     """One row of a call."""
 
     seed: int
-    place: bytes = b""  # where the state says that it stands
+    place: bytes = b""  # name of the place that the state gives
     steps: int = 0
     history: np.ndarray | None = None  # (max_steps, action)
     action: np.ndarray | None = None  # None: begin an episode
@@ -127,7 +127,7 @@ class Pool:
     calls: int = 0
     lock: Any = field(default_factory=threading.RLock)
     hosts: dict[int, Process | Here] = field(default_factory=dict)
-    replays: int = 0  # steps that were taken again
+    replays: int = 0  # number of replayed steps
     _standing: dict[bytes, list[Slot]] = field(default_factory=dict)
 
     def carry_out(self, requests: Sequence[Request]) -> list[Went]:
@@ -159,7 +159,7 @@ class Pool:
             return went
 
     def _chosen(self, requests: Sequence[Request]) -> list[Slot]:
-        """The instance of each row: one that stands there, a new one, or the one that was used least recently."""
+        """Return the instance for each row: one at the right place, a new one, or the least recently used one."""
         chosen: list[Slot | None] = []
         for request in requests:
             there = self._standing.get(request.place) if request.action is not None else None
@@ -174,7 +174,7 @@ class Pool:
         ]
 
     def _vacated(self, request: Request, free: Iterator[Slot]) -> Slot:
-        """The instance that was used least recently, or a new one, where a state that is still wanted would be lost."""
+        """Return the least recently used instance, or a new one where a state in use would be lost."""
         slot = next(free, None)
         wanted = slot is not None and slot.place and slot.used > self.calls - RECENT
         if slot is None or (wanted and request.steps and len(self.slots) < MOST_INSTANCES):
@@ -212,7 +212,7 @@ class Pool:
         return self.hosts[number]
 
     def _lost(self, number: int) -> str:
-        """Forget a process that is gone, with its instances; return what is told of it."""
+        """Forget a process that is gone with its instances; return the error message."""
         gone = self.hosts.pop(number)
         assert isinstance(gone, Process)
         gone.close()
@@ -243,7 +243,7 @@ class Pool:
 
 
 def _without_screen() -> dict[str, str]:
-    """What lets MuJoCo draw where there is no screen, and nobody has said how."""
+    """Return the environment variables that let MuJoCo draw without a screen, unless the user set them."""
     if "MUJOCO_GL" in os.environ or "DISPLAY" in os.environ or sys.platform != "linux":
         return {}
     return {"MUJOCO_GL": "osmesa" if find_library("OSMesa") else "egl"}

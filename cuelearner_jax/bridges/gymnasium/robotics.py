@@ -1,4 +1,4 @@
-"""What gymnasium_robotics 1.4.2 lacks beside MuJoCo 3.17. The only file that knows it.
+"""Make gymnasium_robotics 1.4.2 work with MuJoCo 3.17. The only module that knows its internals.
 
 `gymnasium_robotics.utils.mujoco_utils` asks whether a joint's type, a NumPy integer, is in a list of members of
 `mujoco.mjtJoint`. MuJoCo 3.17's members equal no NumPy integer, and every reset fails with an AssertionError.
@@ -17,7 +17,7 @@ def register() -> None:
     """Register the environments of gymnasium_robotics with Gymnasium, so that these work beside the MuJoCo here."""
     import gymnasium
 
-    with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about other environments of its own
+    with contextlib.redirect_stderr(io.StringIO()):  # importing prints a notice about other environments
         import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
@@ -33,7 +33,7 @@ def supply_joint_types() -> None:
     import numpy as np
     from gymnasium_robotics.utils import mujoco_utils
 
-    mujoco: Any = library  # whose members a type checker does not know
+    mujoco: Any = library  # `Any`, since type checkers do not know its members
     own = mujoco.mjtJoint
     if np.int32(int(own.mjJNT_HINGE)) in (own.mjJNT_HINGE,) or isinstance(mujoco_utils.mujoco, _View):
         return

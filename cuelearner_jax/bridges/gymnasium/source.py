@@ -1,4 +1,4 @@
-"""Where instances come from: an environment of Gymnasium's registry by its id, or the user's own class or function."""
+"""Sources of instances: an environment id of Gymnasium's registry, or the user's own class or function."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ MISSING = "Gymnasium is not installed: pip install 'cuelearner-jax[gymnasium]'"
 
 @dataclass(frozen=True)
 class Source:
-    """What makes instances, and how many processes play them. Hashable: compiled programs hold it."""
+    """A maker of instances and the number of their processes. Hashable, since compiled programs hold it."""
 
     name: str  # an id of Gymnasium's registry, or what the user's code is called
-    arguments: str  # of the environment, by name, as JSON
+    arguments: str  # arguments of the environment, by name, as JSON
     max_steps: int  # an episode is truncated after so many
     processes: int  # 0: one for each processor; 1: this one
     size: int = 0  # entries of an observation; 0: not known yet
     factory: Callable[..., Any] | None = None  # None: by the id
-    drawn: bool = False  # are its instances drawn? Then one process plays them
+    drawn: bool = False  # True if its instances are drawn, which takes one process
 
     @property
     def hosts(self) -> int:
-        """Processes that play."""
+        """Number of processes that play."""
         return 1 if self.drawn else self.processes or cores()
 
     @property
     def plays_here(self) -> bool:
-        """Whether instances are played in this process. What is drawn is not: OpenGL and threads do not go together."""
+        """Whether instances are played in this process. Drawn ones are not: OpenGL does not work across threads."""
         return self.hosts == 1 and not self.drawn
 
     @property
     def make(self) -> Callable[[], Any]:
-        """What gives one instance, called with nothing."""
+        """A function without arguments that makes one instance."""
         named = json.loads(self.arguments)
         if self.drawn and (self.factory is None or _takes(self.factory, DRAWN)):
             named[DRAWN] = "rgb_array"
@@ -51,11 +51,11 @@ class Source:
         return partial(make_registered, self.name, named, self.max_steps)
 
     def arguments_of_instances(self) -> tuple[Any, ...]:
-        """What `Instances` takes."""
+        """Return the arguments of `Instances`."""
         return self.make, self.name, self.max_steps, self.size
 
     def pickled(self, arguments: tuple[Any, ...]) -> bytes:
-        """Pickle what a process is sent, code of `__main__` and local functions included.
+        """Pickle the arguments for a process, with code of `__main__` and local functions.
 
         Raises UserError for code that cannot be sent.
         """
@@ -71,7 +71,7 @@ class Source:
 
 
 def _takes(factory: Callable[..., Any], name: str) -> bool:
-    """Whether a function or class can be given an argument of that name."""
+    """Return whether a function or class accepts an argument of that name."""
     try:
         parameters = inspect.signature(factory).parameters
     except (TypeError, ValueError):
@@ -86,13 +86,13 @@ def cores() -> int:
 
 
 def check_installed() -> None:
-    """Raises UserError unless Gymnasium is installed."""
+    """Raise UserError unless Gymnasium is installed."""
     if find_spec("gymnasium") is None:
         raise UserError(MISSING)
 
 
 def registry_spec(name: str) -> Any:
-    """Return the specification that Gymnasium's registry has of an id, without importing what the id names.
+    """Return the specification of an id in Gymnasium's registry, without importing the id's module.
 
     Raises UserError for an id that is not there.
     """
@@ -103,7 +103,8 @@ def registry_spec(name: str) -> Any:
         )
     import gymnasium
 
-    imported_before = "gymnasium_robotics" in sys.modules  # by the caller: its environments are registered, and fail
+    # imported by the caller: its environments are registered, and fail
+    imported_before = "gymnasium_robotics" in sys.modules
     if imported_before or (name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None):
         from cuelearner_jax.bridges.gymnasium.robotics import register
 
@@ -132,7 +133,7 @@ def make_registered(name: str, arguments: dict[str, Any], max_steps: int) -> Any
 
 
 def make_from_code(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
-    """Return an environment of the user's code. Raises UserError for what is none."""
+    """Return an environment of the user's code. Raises UserError for any other object."""
     try:
         env = factory(**arguments)
     except AssertionError:

@@ -1,7 +1,7 @@
-"""A process that plays instances for the pool: reads orders from a socket until that is closed.
+"""A process that plays instances for the pool: it reads orders from a socket until the socket is closed.
 
-The process is begun as a program of its own, not as a copy of its parent: a copy of a process with threads may hang,
-and a script of the user's is not run a second time.
+The process is started as a program of its own, not forked: a fork of a process with threads may hang. The user's
+script is not run a second time.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
-LOOKED = 1.0  # from one look at the parent to the next [s]
+LOOKED = 1.0  # time between two checks of the parent [s]
 
 
 def main(descriptor: int, parent: int) -> None:
     """Serve until the pool closes its end, or its process is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the process that waits, which then ends this one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles an interrupt, and then ends this process
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     link = Connection(descriptor)
     instances: Any = None
@@ -39,7 +39,7 @@ def main(descriptor: int, parent: int) -> None:
 
 
 def _begun(link: Connection) -> Any:
-    """The instances of what the pool sends; an error is its answer to every order."""
+    """Return the instances that the pool's arguments describe; an error becomes the answer to every order."""
     from cuelearner_jax.bridges.gymnasium.instances import Instances
     from cuelearner_jax.errors import UserError, user_code_error
 
@@ -63,7 +63,7 @@ def _begun(link: Connection) -> Any:
 
 
 def _end_with(parent: int) -> None:
-    """End this process once its parent is gone, in the middle of a step too."""
+    """End this process once its parent is gone, even in the middle of a step."""
     while os.getppid() == parent:
         time.sleep(LOOKED)
     os._exit(1)
