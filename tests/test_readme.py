@@ -95,7 +95,7 @@ def test_each_kind_of_feedback_has_a_page():
         page = (PAGES / f"{PAGE_OF.get(kind.name, kind.name)}.md").read_text(encoding="utf-8")
         assert f"`{kind.name}`" in index or kind.name == "none"
         assert kind.name in page
-        assert {"## Equation", "## Run", "## When to use it"} <= set(page.splitlines()), kind.name
+        assert {"## Equation", "## Run", "## When"} <= set(page.splitlines()), kind.name
         assert re.search(r"!\[.+\]\(\.\./figures/feedback/\w+\.svg\)", page), kind.name
     arbiters = (PAGES / "arbiters.md").read_text(encoding="utf-8")
     assert [name for name in (kind.NAME for kind in ARBITERS.known) if f"`{name}`" not in arbiters] == []
