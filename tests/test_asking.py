@@ -62,7 +62,9 @@ def asked_one_by_one(guide, number, base, scalars, env=ENV, teacher=EXPERT):
     return fit(env, scalars, guide, LANE_KEY, jnp.asarray(number))
 
 
-@pytest.mark.parametrize("base", [Uniform(), Heuristic(ENV)], ids=["uniform", "heuristic"])
+@pytest.mark.parametrize(
+    "base", [Uniform(), pytest.param(Heuristic(ENV), marks=pytest.mark.long)], ids=["uniform", "heuristic"]
+)
 def test_asking_one_by_one_is_bitwise_a_round(base):
     rounds = typed = begun(budget=17)
     for number in range(2):

@@ -246,7 +246,7 @@ BLOCKS = {
 }
 
 
-@pytest.mark.parametrize("name", BLOCKS)
+@pytest.mark.parametrize("name", probes.long_but(("agent", "guided agent"), BLOCKS))
 def test_a_block_is_evaluated_as_each_of_its_lanes(name):
     policy = BLOCKS[name]()
     together = rollout_lanes(ENV, policy, KEY, 20, 400, mesh=MESH).means

@@ -7,10 +7,10 @@ import tomllib
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import cuelearner_jax as cl
+from cuelearner_jax.cli import label
 from cuelearner_jax.storage import formats
 from cuelearner_jax.tasks import registry, shipped
 
@@ -50,15 +50,19 @@ def test_every_import_is_of_a_declared_dependency_or_extra():
     assert sorted(others - {one for one in others if NAMED_OTHERWISE.get(one, one) in declared}) == []
 
 
-def test_each_task_of_its_own_has_a_shipped_agent_and_its_policy_acts():
+def test_each_task_of_its_own_has_a_shipped_agent():
     assert shipped.names() == ("shipped:arm", "shipped:billiards", "shipped:navigation")
     for name in shipped.names():
         described = formats.read("config", shipped.folder_of(name) / "config.json")
         assert f"shipped:{described['task']['name']}" == name
         assert described["task"]["name"] in registry.names()
-    policy = cl.load_policy("shipped:billiards")
-    size = sum(quantity.size for quantity in policy.observation)
-    np.testing.assert_allclose(np.linalg.norm(policy(np.full(size, 0.1))), 1, atol=1e-6)
+
+
+def test_a_shipped_agent_can_be_labelled_and_is_no_code():
+    task = registry.find("billiards")
+    source = label._source(task, "shipped:billiards", None)
+    assert source is not None
+    assert (source.folder.name, source.task.name, source.default_policy) == ("billiards", "billiards", "agent")
 
 
 def test_a_shipped_agent_that_does_not_exist_is_refused():

@@ -185,6 +185,7 @@ def test_without_a_simulator_held_out_answers_decide():
         judging.judged_by_labels(of(), few)
 
 
+@pytest.mark.long
 def test_a_bound_is_narrowed_where_that_is_worth_more():
     """Wrong answers about a policy that is right already: within half of the window it stays right."""
     lanes = product(1, (0,), (40,), (60.0,))

@@ -4,7 +4,6 @@ import dataclasses
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -116,7 +115,7 @@ def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(tmp_path):
 def test_the_shipped_agent_is_loaded_without_worlds_and_without_a_training_program(monkeypatch):
     monkeypatch.setattr(Task, "environment", lambda *_: pytest.fail("an environment was made"))
     monkeypatch.setattr(loop, "make_program", lambda *_: pytest.fail("a training program was made"))
-    loaded = cl.load_policy(Path(__file__).parents[2] / "docs" / "data" / "navigation_agent")
+    loaded = cl.load_policy("shipped:navigation")
     assert sum(np.size(leaf) for leaf in jax.tree.leaves(loaded.policy.view)) < 20
     size = sum(quantity.size for quantity in loaded.observation)
     np.testing.assert_allclose(np.linalg.norm(loaded(np.full(size, 0.5))), 1, atol=1e-6)

@@ -42,6 +42,7 @@ def estimates(found):
     return {one.name: one for one in found.estimates}
 
 
+@pytest.mark.long
 def test_a_python_function_turned_by_30_degrees_is_put_right_by_50_answers():
     found = asked(TURNED, policy=lambda obs: np.asarray(aims(obs)), family=TURN)
     assert (found.verdict, found.changes) == (CHANGED, ("direction: change",))

@@ -127,6 +127,7 @@ def test_a_calibrated_folder_is_compared_with_its_base(calibrated, tmp_path):
     assert "bound_deg" not in row or row["bound_deg"] is None
 
 
+@pytest.mark.long
 def test_labels_of_a_file_are_read_once_and_serve_models_too(calibrated, tmp_path):
     """The same file, without a question: the same change, and a model of another kind."""
     ask = [*ASK, "--labels-from", str(calibrated), "--out"]

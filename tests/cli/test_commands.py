@@ -54,9 +54,9 @@ def test_the_same_seed_gives_the_same_rewards_in_another_run(run_folder, tmp_pat
 @pytest.mark.parametrize(
     "policy",
     [
-        "guided",
+        "agent",
         "uniform",
-        *(pytest.param(name, marks=pytest.mark.long) for name in ("agent", "guide", "teacher", "heuristic")),
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("guided", "guide", "teacher", "heuristic")),
     ],
 )
 def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
@@ -124,19 +124,13 @@ def test_an_evaluation_says_how_far_it_is(run_folder, monkeypatch):
         assert re.search(rf"{kind} .*{5 * lanes}/{5 * lanes} ", shown.getvalue())
 
 
-def test_a_changed_world_changes_the_measurement(run_folder, tmp_path):
-    rewards = []
-    for turn in ("0", "90"):
-        out = tmp_path / f"{turn}.json"
-        command = ["evaluate", str(run_folder), "--policy", "teacher", "--task.action-turn-deg", turn]
-        assert (
-            main([*command, "--task.search-directions", "1440", "--steps", "20", "--out", str(out), "--envs", "10"])
-            == 0
-        )
-        rewards.append(json.loads(out.read_text())["rows"][0]["reward"][0])
-    assert json.loads(out.read_text())["world"]["action_turn_deg"] == 90.0
-    assert rewards[0] > 0.8  # the teacher searches in the changed world, so it does as well there
-    assert rewards[1] > 0.8
+def test_a_teacher_is_evaluated_in_a_changed_world(run_folder, tmp_path):
+    out, changed = tmp_path / "turned.json", ["--task.action-turn-deg", "90", "--task.search-directions", "1440"]
+    command = ["evaluate", str(run_folder), "--policy", "teacher", *changed, "--steps", "20", "--envs", "10"]
+    assert main([*command, "--out", str(out)]) == 0
+    measured = json.loads(out.read_text())
+    assert measured["world"]["action_turn_deg"] == 90.0
+    assert measured["rows"][0]["reward"][0] > 0.8  # the teacher searches in the changed world
 
 
 def test_a_report_has_curves_and_tables(run_folder, tmp_path):
@@ -265,15 +259,5 @@ def explained(command, out, err):
         )
 
 
-def test_the_installed_command_fails_in_one_line(tmp_path):
-    done = subprocess.run(
-        [*ENTRY, "sweep", "billiards", "--seedz", "3", "--out", str(tmp_path / "x")],
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "perhaps you meant --seeds" in done.stderr
-    assert not (tmp_path / "x").exists()
+def test_an_option_that_does_not_exist_is_refused_in_one_line(refused, tmp_path):
+    refused(["sweep", "billiards", "--seedz", "3", "--out", tmp_path / "x"], "perhaps you meant --seeds", tmp_path)

@@ -11,20 +11,20 @@ from cuelearner_jax.export import contract, decisions, runner
 from cuelearner_jax.policies import layers
 
 
-def test_a_runs_guided_agent_is_exported_and_checked(run_folder, refused, tmp_path, capsys, monkeypatch):
+def test_a_runs_agent_is_exported_and_checked(run_folder, refused, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(contract, "golden_cases", partial(decisions.golden_cases, most=6))  # NumPy takes a second each
     out = tmp_path / "new" / "decision"
-    export = ["export", str(run_folder), "--policy", "guided", "--labels", "20", "--seed", "2001"]
+    export = ["export", str(run_folder), "--guidance", "relative", "--labels", "20", "--seed", "2001"]
     assert main([*export, "--format", "numpy", "--out", str(out)]) == 0
     assert "golden cases replayed" in capsys.readouterr().out
     told = json.loads((out / runner.CONTRACT).read_text())
-    assert told["source"]["policy"] == "guided"
+    assert told["source"]["policy"] == "agent"
     assert told["source"]["world"]["name"] == "billiards"
-    assert [each["policy"] for each in layers(told["policy"])] == ["guided", "agent"]
+    assert [each["policy"] for each in layers(told["policy"])] == ["agent"]
     assert [each["unit"] for each in told["observation"]["slices"][:2]] == ["m", "1"]
     with np.load(out / runner.GOLDEN) as golden:
         obs, actions = golden["obs"], golden["actions"]
-    own = load_policy(run_folder, policy="guided", labels=20, seed=2001)
+    own = load_policy(run_folder, guidance="relative", labels=20, seed=2001)
     np.testing.assert_allclose(own(obs), actions, atol=1e-5)
     assert main(["export", "--check", str(out)]) == 0
     assert "is as it was exported" in capsys.readouterr().out

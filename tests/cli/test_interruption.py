@@ -10,7 +10,7 @@ from small_runs import SMALL, rows
 from cuelearner_jax.cli import main
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
-STEPS = 1200
+STEPS = 800
 LONG = [*SMALL, "--schedule.total-steps", str(STEPS), "--guidance", "none", "--seeds", "2"]
 COMMAND = ["sweep", "billiards", "--preset", "quickstart", *LONG]
 

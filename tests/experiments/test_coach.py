@@ -47,9 +47,8 @@ def test_lessons_are_seen_from_the_base_and_ask_for_the_action_told_about_turned
     np.testing.assert_allclose(rows.target, directions.rotate(OBS, jnp.deg2rad(7.0)), atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "kind", [coach.KIND, *(pytest.param(k, marks=pytest.mark.long) for k in (coach.BATCH, energy.KIND))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("kind", [coach.KIND, coach.BATCH, energy.KIND])
 def test_labels_turn_a_finished_policy_and_held_out_ones_say_so(kind):
     guidance = kind.make(SIZES, spaces_of(ENV))
     lanes = product(bases=1, seeds=(0,), budgets=(60,), bounds_deg=(BOUND_DEG,))

@@ -15,6 +15,7 @@ from cuelearner_jax.spaces import directions
 
 CONFIG = probes.config(schedule={"learn_after": 32, "total_steps": 4800})
 STEPS, NOISE_DEG = 400, 10.0
+pytestmark = pytest.mark.long  # a baseline of the experiments alone, which trains eight lanes
 
 
 @pytest.fixture(scope="module")

@@ -89,6 +89,7 @@ def begun(tmp_path):
     return tmp_path / "teacher"
 
 
+@pytest.mark.long
 def test_it_learns_to_win_nearly_always(trained):
     made, metrics = trained
     measure = jax.jit(lambda made: rollout(Taught(made), ENV, jax.random.key(5), 20, 200))

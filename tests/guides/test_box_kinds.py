@@ -49,11 +49,12 @@ def away(kind, rounds=3, **faults):
 
 
 LONG = [pytest.param(kind, 0.12, marks=pytest.mark.long) for kind in ("bdcoach", "clic", "clic_shown")]
+LONG += [pytest.param(kind, 0.3, marks=pytest.mark.long) for kind in ("dcoach", "scalar")]
 
 
 @pytest.mark.parametrize(
     ("kind", "within"),
-    [("demonstration", 0.06), ("intent", 0.06), ("dcoach", 0.3), ("scalar", 0.3), *LONG],
+    [("demonstration", 0.06), ("intent", 0.06), *LONG],
 )
 def test_every_kind_that_asks_leads_toward_the_goal_of_a_box(kind, within):
     first, after = away(kind, scalar_within_deg=0.3)  # by chance a fifth of the actions are good
@@ -79,6 +80,7 @@ def test_who_speaks_of_one_cue_at_a_time_leads_there_in_rounds(says):
     assert np.median(after) < 0.4 * np.median(first)
 
 
+@pytest.mark.long
 def test_a_constant_bias_of_the_teacher_is_learned_along_every_entry():
     """A teacher who holds everything for 0.1 more than it is leads there."""
     _, after = away("demonstration", teacher_bias_deg=0.1)

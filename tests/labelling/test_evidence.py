@@ -32,7 +32,15 @@ def estimate(status):
     return [float(number) for number in found.groups()]
 
 
-def test_the_estimate_narrows_the_policy_follows_and_a_restart_goes_on(opened):
+def test_the_estimate_narrows_the_page_shows_it_the_policy_follows_and_a_restart_goes_on(opened):
+    pytest.importorskip("nicegui")
+    from page_user import shown
+
+    async def acts(user, pages):
+        await user.should_see("estimate 1, of 10 labels")
+        await user.should_see("direction: turn: ")
+        await user.should_see("the policy as corrected so far")
+
     session = opened(**SETTINGS)
     assert session.status().newest.told == ()
     ends = []
@@ -41,6 +49,8 @@ def test_the_estimate_narrows_the_policy_follows_and_a_restart_goes_on(opened):
         mean, low, high = estimate(settled(session, fits=number))
         assert low < -34.4 < high
         ends.append(high - low)
+        if number == 1:
+            shown(session, acts)
     assert ends[1] < ends[0]
     assert abs(mean + 34.4) < 12
     item = session.item
@@ -69,19 +79,3 @@ def test_an_answer_taken_back_is_forgotten_and_a_policy_that_is_right_is_told_to
     known = session._learner._known.answers
     np.testing.assert_array_equal(known.answer, np.asarray(session._labels().answer)[:20])
     assert status.newest.told == ("no change seen yet",)
-
-
-def test_the_page_shows_the_estimate(opened):
-    pytest.importorskip("nicegui")
-    from page_user import shown
-
-    session = opened(**SETTINGS)
-    give(session, 10, EPS_DEG)
-    settled(session, fits=1)
-
-    async def acts(user, pages):
-        await user.should_see("estimate 1, of 10 labels")
-        await user.should_see("direction: turn: ")
-        await user.should_see("the policy as corrected so far")
-
-    shown(session, acts)

@@ -136,6 +136,7 @@ def test_one_press_about_one_cue_says_nothing_of_the_others():
     assert pressed(known, np.array([UNSAID, -1.0, UNSAID])) == ["only-1-less"]
 
 
+@pytest.mark.long
 def test_one_cue_a_press_on_a_folder_of_pictures(folder, tmp_path):
     arguments = [str(folder), "--cues", CUES, *BOUNDS]
     task, _ = task_named(arguments, "label", label.Label)

@@ -54,7 +54,7 @@ def restore(folder, like=None, read_only=True):
         return saved.restore({"policy": shapes(state())} if like is None else like)
 
 
-@pytest.mark.parametrize("like", [lambda item: item, shapes])
+@pytest.mark.parametrize("like", [pytest.param(lambda item: item, marks=pytest.mark.long), shapes])
 def test_everything_comes_back_bit_by_bit(tmp_path, like):
     save(tmp_path, 3)
     found = restore(tmp_path, {"policy": like(state()), "rest": like(state())}, read_only=False)
@@ -115,7 +115,9 @@ def spoil(path):
     path.write_bytes(b"\0" * (path.stat().st_size // 2))
 
 
-@pytest.mark.parametrize("change", [spoil, lambda path: path.unlink()], ids=["spoilt", "missing"])
+@pytest.mark.parametrize(
+    "change", [spoil, pytest.param(lambda path: path.unlink(), marks=pytest.mark.long)], ids=["spoilt", "missing"]
+)
 @pytest.mark.parametrize("which", ["main", pytest.param("every", marks=pytest.mark.long)])
 def test_a_damaged_checkpoint_is_refused(tmp_path, change, which):
     save(tmp_path, 5)
