@@ -2,15 +2,17 @@
 
     python experiments/gallery.py --work runs/gallery
 
-The commands of a film are those that a user types (`FILMS` below); policies that lie in the folder of `--work` already
-are not made again. Each film shows the same episodes of both policies, in a GIF of at most 600 kB. All of them take
-about half an hour of processor time.
+Run in the folder above this one. The commands of a film are those that a user types (`FILMS` below); what lies in the
+folder of `--work` already is not made again. Each film shows the same episodes of both policies, in a GIF of at most
+600 kB. All films take about ten minutes of processor time.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +21,8 @@ from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
 from cuelearner_jax.cli import main as cuelearner
 
-FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures" / "gallery"
+HERE = Path(__file__).resolve().parent
+FIGURES = HERE.parent / "docs" / "figures" / "gallery"
 MOST_BYTES = 600_000
 BAR = 26  # height of the line of words over each picture [pixels]
 LIGHT, INK = "#ffffff", "#222222"
@@ -30,10 +33,11 @@ class Film:
     """Two renderings of the same episodes, and how their policies are made."""
 
     name: str
-    make: tuple[tuple[str, str], ...]  # (folder that the command writes, arguments of `cuelearner`)
-    before: str  # arguments of `cuelearner render`
-    after: str
     words: tuple[str, str]  # over the two pictures
+    before: str = ""  # arguments of `cuelearner render`
+    after: str = ""
+    make: tuple[tuple[str, str], ...] = ()  # (folder that the command writes, arguments of `cuelearner`)
+    program: str = ""  # of this folder, which makes both renderings in place of the commands
     width: int = 360  # of each picture [pixels]
     period: int = 80  # from one picture to the next in the renderings [ms]
     slower: float = 1.0  # by this factor the film is played
@@ -42,7 +46,6 @@ class Film:
 
 
 SCRIPTS = "cuelearner_envs.arm.scripts"
-ROOMS = ("rooms", "adapt docs/data/navigation_agent --scenario rooms --labels 250 --judge-episodes 100")
 REACH = (
     "reach",
     f"adapt {SCRIPTS}:reach --task arm --task.skill reach --scenario turned_camera --labels 100",
@@ -65,21 +68,19 @@ FILMS = (
     ),
     Film(
         "navigation",
-        make=(ROOMS,),
-        before="docs/data/navigation_agent --scenario rooms --episode 0 --steps 60",
-        after="WORK/rooms --episode 0 --steps 60",
-        words=("trained in halls, no labels in rooms", "250 labels in rooms"),
-        width=300,
+        before="navigation --policy heuristic --episode 1 --steps 65",
+        after="docs/data/navigation_agent --episode 1 --steps 65",
+        words=("straight to the goal, no labels", "an agent guided by 500 labels"),
+        width=330,
         period=200,
         slower=0.5,
     ),
     Film(
         "anymal",
-        make=(ROOMS,),
-        before="docs/data/navigation_agent --robot anymal --scenario rooms --episode 0 --steps 40",
-        after="WORK/rooms --robot anymal --episode 0 --steps 40",
-        words=("no labels in rooms", "250 labels in rooms"),
-        width=400,
+        before="navigation --robot anymal --policy heuristic --episode 36 --steps 28",
+        after="docs/data/navigation_agent --robot anymal --episode 36 --steps 28",
+        words=("straight to the goal, no labels", "an agent guided by 500 labels"),
+        width=360,
         period=200,
         slower=0.5,
     ),
@@ -110,15 +111,7 @@ FILMS = (
         width=320,
         slower=1.5,
     ),
-    Film(
-        "fetch",
-        make=(REACH,),
-        before=f"WORK/reach --base {SCRIPTS}:reach --policy base --robot fetch --steps 100",
-        after=f"WORK/reach --base {SCRIPTS}:reach --robot fetch --steps 100",
-        words=CAMERA,
-        width=320,
-        slower=1.5,
-    ),
+    Film("fetch", program="fetch_film.py", words=CAMERA, width=320, slower=1.5),
 )
 
 
@@ -142,21 +135,30 @@ def main() -> int:
 
 def made(film: Film, work: Path, to: Path) -> int:
     """Run the commands of one film and join its two renderings; return the first exit status that is not 0."""
-    sides = [work / film.name / side for side in ("before", "after")]
-    commands = [(work / folder, f"{arguments} --out {work / folder}") for folder, arguments in film.make]
-    for side, arguments in zip(sides, (film.before, film.after), strict=True):
-        commands.append((side, f"render {arguments} --out {side}"))
-    for folder, arguments in commands:
+    place = work / "films" / film.name
+    sides = [place / side for side in ("before", "after")]
+    commands = [(work / folder, f"cuelearner {words} --out WORK/{folder}") for folder, words in film.make]
+    if film.program:
+        commands.append((sides[1], f"python {HERE / film.program} --out {place}"))
+    else:
+        renderings = zip(sides, (film.before, film.after), strict=True)
+        commands += [(side, f"cuelearner render {words} --out {side}") for side, words in renderings]
+    for folder, command in commands:
         if not folder.exists():
-            words = shlex.split(arguments.replace("WORK", str(work)))
-            print(f"$ cuelearner {shlex.join(words)}", flush=True)
-            status = cuelearner(words)
+            words = shlex.split(command.replace("WORK", str(work)))
+            print(f"$ {shlex.join(words)}", flush=True)
+            status = _run(words)
             if status:
                 return status
-    films = [next(side.glob("*.gif")) for side in sides]
-    size = join(films, film, to)
-    print(f"{to}: {size:,} bytes")
+    print(f"{to}: {join([next(side.glob('*.gif')) for side in sides], film, to):,} bytes")
     return 0
+
+
+def _run(words: list[str]) -> int:
+    """Run a command in this process if it is `cuelearner`, in one of its own if it is `python`; return its status."""
+    if words[0] == "cuelearner":
+        return cuelearner(words[1:])
+    return subprocess.run([sys.executable, *words[1:]], check=False).returncode
 
 
 def join(files: Sequence[Path], film: Film, to: Path) -> int:
