@@ -20,7 +20,7 @@ Points = dict[tuple[str, str], tuple[list[int], np.ndarray]]
 
 
 def curve_points(known: Sequence[Line], metric: str, whole: Line | None = None) -> Points:
-    """What methods reach over labels or steps, from not adapted on, over the bases that all have."""
+    """Return what methods reach over labels or steps, from not adapted on, over the bases that all have."""
     start = [line for line in known if line.method == "none"]
     if not start:
         return {}
@@ -55,13 +55,13 @@ def gain_cells(points: Points) -> list[list[str]]:
             continue
         mine, theirs = (reached(values, labels, reference, own) for own in (True, False))
         unit = "steps" if method == "finetuning" else "labels"
-        own = "never gained" if not np.isfinite(mine.estimate) else f"{mine.told(labels[-1])} {unit}"
-        rows.append([named(method, variant), own, f"{theirs.told(labels[-1])} {unit}"])
+        own = "never gained" if not np.isfinite(mine.estimate) else f"{mine.in_words(labels[-1])} {unit}"
+        rows.append([named(method, variant), own, f"{theirs.in_words(labels[-1])} {unit}"])
     return rows
 
 
 def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[float, str] | None) -> None:
-    """Curves over labels and steps on one logarithmic axis, a panel a world."""
+    """Draw curves over labels and steps on one logarithmic axis, a panel a world."""
     drawn = Figure(figsize=(3.2 * len(curves) + 0.6, 3.2), layout="constrained")
     for axes, (world, points) in zip(drawn.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
         for (method, variant), (labels, values) in points.items():

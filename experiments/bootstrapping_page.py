@@ -224,7 +224,6 @@ def draw_overview(data: Path, stem: Path) -> bool:
             axes.minorticks_off()
             axes.set_xlabel("labels")
             axes.set_ylim(bottom=0)
-            figure.draw_without_rendering()
             name_ends(axes, ends)
         save_figure(figure, stem)
     return True
