@@ -58,11 +58,11 @@ def draw(found: dict[str, tuple[float, float]], stem: Path) -> None:
         for place, (name, (success, distance)) in enumerate(found.items()):
             colour = colour_of("calibration") if name.endswith("calibrated") else GREY
             axes.barh(place, 100 * success, color=colour)
-            told = f"{100 * success:.0f}%, {distance:.1f} cm from the goal"
+            told = f"{100 * success:.0f}%, {distance:.1f} cm off"
             axes.text(100 * success + 1.5, place, told, va="center", fontsize=9)
         axes.set_yticks(range(len(found)), [WORLDS[name] for name in found])
         axes.invert_yaxis()
-        axes.set(xlim=(0, 145), xlabel="success [%], 200 episodes")
+        axes.set(xlim=(0, 150), xlabel="success [%], 200 episodes")
         axes.set_xticks(range(0, 101, 20))
         axes.grid(visible=False, axis="y")
         axes.tick_params(axis="y", length=0)
