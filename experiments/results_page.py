@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 import _adaptation_overview as adaptation
+import arms_page
 import fetch_page
 import numpy as np
 from _pages import DOCS, image, interval_of, markdown, read_csv, rendered
@@ -179,6 +180,9 @@ def arms() -> list[list[str]]:
         json.loads((DATA / f"arms/reach_fetch_turned{end}.json").read_text())["rows"][0]["success"][0]
         for end in ("_calibrated", "")
     ]
+    steps = {(row["run"], row["labels"]): row["median"] for row in arms_page.studied(DATA / "arms", "reach")["steps"]}
+    title = "MJX `reach`, 100 relative labels: steps to 80% success, slower"
+    rows.append([title, f"{steps['by_value', 100]:,.0f}", f"{steps['alone', 0]:,.0f}", MORE["arms"]])
     title = "An MJX agent in Fetch, camera turned by 10 degrees, 200 labels: success"
     rows.append([title, *(f"{100 * value:.0f}%" for value in turned), MORE["arms"]])
     return rows
