@@ -20,7 +20,7 @@ Points = dict[tuple[str, str], tuple[list[int], np.ndarray]]
 
 
 def curve_points(known: Sequence[Line], metric: str, whole: Line | None = None) -> Points:
-    """What methods reach over labels or steps, from not adapted on, over the bases that all have."""
+    """Return what methods reach over labels or steps, from not adapted on, over the bases that all have."""
     start = [line for line in known if line.method == "none"]
     if not start:
         return {}
@@ -55,14 +55,14 @@ def gain_cells(points: Points) -> list[list[str]]:
             continue
         mine, theirs = (reached(values, labels, reference, own) for own in (True, False))
         unit = "steps" if method == "finetuning" else "labels"
-        own = "never gained" if not np.isfinite(mine.estimate) else f"{mine.told(labels[-1])} {unit}"
-        rows.append([named(method, variant), own, f"{theirs.told(labels[-1])} {unit}"])
+        own = "never gained" if not np.isfinite(mine.estimate) else f"{mine.in_words(labels[-1])} {unit}"
+        rows.append([named(method, variant), own, f"{theirs.in_words(labels[-1])} {unit}"])
     return rows
 
 
 def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[float, str] | None) -> None:
-    """Curves over labels and steps on one logarithmic axis, a panel a world."""
-    drawn = Figure(figsize=(3.2 * len(curves) + 0.6, 3.2), layout="constrained")
+    """Draw curves over labels and steps on one logarithmic axis, a panel a world."""
+    drawn = Figure(figsize=(max(3.2 * len(curves) + 0.6, 7.6), 3.4), layout="constrained")
     for axes, (world, points) in zip(drawn.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
         for (method, variant), (labels, values) in points.items():
             low, middle, high = np.quantile(values.mean(1), [0.25, 0.5, 0.75], axis=0)
@@ -78,6 +78,6 @@ def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[floa
         axes.xaxis.set_minor_formatter(NullFormatter())
     drawn.axes[0].set_ylabel(ylabel)
     handles, names = drawn.axes[0].get_legend_handles_labels()
-    columns = min(len(names), 5) if len(curves) > 1 else 1
+    columns = min(len(names), 5 if len(curves) > 1 else 3)
     drawn.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
     save_figure(drawn, stem)

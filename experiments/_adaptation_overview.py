@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +13,8 @@ from _adaptation import UNCHANGED
 from _adaptation_tables import Line, Row, lines, read, share
 from _pages import GREY, markdown, new_figure
 from adaptation_billiards import LEAST
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
 from cuelearner_jax.report.statistics import Interval, interval_of_groups
@@ -59,6 +62,7 @@ SCENARIOS = (
 )
 
 
+@cache
 def found_in(data: Path) -> list[Found]:
     """Return what was measured in every scenario of which there are data."""
     rows = {folder: read(data / folder) for folder in dict.fromkeys(scenario.folder for scenario in SCENARIOS)}
@@ -142,16 +146,14 @@ def draw(found: Sequence[Found], stem: Path) -> None:
         save_figure(figure, stem)
 
 
-def _point(
-    axes: matplotlib.axes.Axes, found: Interval, place: float, colour: str, marker: str, hollow: bool = False
-) -> None:
+def _point(axes: Axes, found: Interval, place: float, colour: str, marker: str, hollow: bool = False) -> None:
     if not np.isnan(found.lower):
         axes.plot([float(found.lower), float(found.upper)], [place, place], color=colour, linewidth=2.4, alpha=0.35)
     face = "white" if hollow else colour
     axes.plot(float(found.estimate), place, marker, color=colour, markerfacecolor=face, markersize=7, zorder=3)
 
 
-def _names(axes: matplotlib.axes.Axes, found: Sequence[Found]) -> None:
+def _names(axes: Axes, found: Sequence[Found]) -> None:
     """Name the rows, and above the axes what each mark means."""
     axes.set_yticks(
         range(len(found)), [f"{each.scenario.title}\n{each.scenario.measured}" for each in found], fontsize=9
@@ -168,7 +170,7 @@ def _names(axes: matplotlib.axes.Axes, found: Sequence[Found]) -> None:
     marks += [("o", colour_of("intent"), colour_of("intent"), "250, read as intent")]
     marks += [("D", TUNED, TUNED, "fine-tuning"), ("|", TEACHER, TEACHER, "the teacher itself")]
     handles = [
-        matplotlib.lines.Line2D([], [], linestyle="", marker=mark, color=colour, markerfacecolor=face, label=name)
+        Line2D([], [], linestyle="", marker=mark, color=colour, markerfacecolor=face, label=name)
         for mark, colour, face, name in marks
     ]
     axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.35, 1.0), ncols=5, fontsize=9, handletextpad=0.2)

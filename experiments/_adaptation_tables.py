@@ -30,7 +30,7 @@ Row = dict[str, Any]
 
 
 def named(method: str, variant: str) -> str:
-    """A method as tables and figures show it."""
+    """Return a method's name as tables and figures show it."""
     return NAMES[method] + (f" ({variant})" if variant else "")
 
 
@@ -47,12 +47,12 @@ class Line(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As tables show it."""
+        """The line's name in tables."""
         return named(self.method, self.variant)
 
 
 def read(folder: Path) -> list[Row]:
-    """The rows of all finished pieces of a task; none where there is no such folder."""
+    """Return the rows of all finished pieces of a task; none where the folder is missing."""
     rows = []
     for file in sorted(folder.rglob(SCHEMA.parquet)):
         rows += tables.read(file, SCHEMA).to_pylist()
@@ -60,7 +60,7 @@ def read(folder: Path) -> list[Row]:
 
 
 def lines(rows: Sequence[Row], world: str, split: str = "validation", least: float = 0.0) -> list[Line]:
-    """What is known of a world, in the order of `NAMES`.
+    """Return the lines of a world, in the order of `NAMES`.
 
     `least`: base agents that earn less in the unchanged world, on tuning episodes, are left out.
     """
@@ -90,7 +90,7 @@ def lines(rows: Sequence[Row], world: str, split: str = "validation", least: flo
 
 
 def spread(values: np.ndarray, digits: int = 3) -> str:
-    """The interquartile mean over bases with its interval; `values` (bases, label seeds), or (bases,)."""
+    """Return the interquartile mean over bases with its interval; `values` (bases, label seeds), or (bases,)."""
     values = values.reshape(len(values), -1)
     own = values[np.isfinite(values).all(-1)]
     if not len(own):
@@ -103,23 +103,23 @@ def spread(values: np.ndarray, digits: int = 3) -> str:
 
 
 def percent(values: np.ndarray) -> str:
-    """The same of shares, in percent."""
+    """Return the interquartile mean of shares with its interval, in percent."""
     return spread(100 * values, 1)
 
 
 def matched(line: Line, other: Line, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """A metric of two lines over the bases that both have."""
+    """Return a metric of two lines over the bases that both have."""
     _, mine, its = np.intersect1d(line.bases, other.bases, return_indices=True)
     return line.columns[name][mine], other.columns[name][its]  # of each (bases, label seeds)
 
 
 def tuned(rows: Sequence[Row], world: str) -> set[int]:
-    """The base agents on which settings of a world were chosen."""
+    """Return the base agents on which settings of a world were chosen."""
     return {row["base"] for row in rows if row["split"] == "tuning" and row["world"] == world}
 
 
 def held_out(line: Line, name: str, bases: set[int]) -> str:
-    """A metric over the base agents that are not among those, in percent; nothing where all are."""
+    """Return a metric over the base agents outside `bases`, in percent; empty where all are inside."""
     values = line.columns[name][~np.isin(line.bases, list(bases))]
     return percent(values) if len(values) else ""
 
@@ -128,7 +128,7 @@ PERIOD_S = 0.2  # of a step in navigation
 
 
 def rewarded_steps(line: Line, start: Line, study: Study) -> int | None:
-    """Environment steps an agent, rewards or outcomes of which a method used; None where that is not known.
+    """Return the environment steps an agent whose rewards or outcomes a method used; None where unknown.
 
     Of fine-tuning those it learned from. Of a model of labels those by which its use was decided, on tuning episodes:
     of the base and of the model within each bound that was tried. Where an outcome decided, an episode counts until its
@@ -154,7 +154,7 @@ def rewarded_steps(line: Line, start: Line, study: Study) -> int | None:
 
 
 def recovered(now: np.ndarray, before: np.ndarray, whole: np.ndarray) -> str:
-    """The share of a loss that has come back, in percent: a ratio of interquartile means over the same agents.
+    """Return the share of a loss that has come back, in percent: a ratio of interquartile means over the same agents.
 
     Args:
         now, before, whole: (bases, label seeds or 1) after, not adapted, and what could come back.
@@ -172,20 +172,20 @@ def recovered(now: np.ndarray, before: np.ndarray, whole: np.ndarray) -> str:
 
 
 def share(line: Line, whole: Line) -> np.ndarray:
-    """Reward as a share of the same base's in the unchanged world."""
+    """Return the reward as a share of the same base agent's in the unchanged world."""
     own, before = matched(line, whole, "reward")
     return own / np.maximum(before, 1e-9)
 
 
 class Reached(NamedTuple):
-    """After how many labels or steps a level is reached."""
+    """Labels or steps after which a level is reached."""
 
     estimate: float  # infinite: it is not
     lower: float
     upper: float
 
-    def told(self, last: int) -> str:
-        """In words; `last`: labels or steps of the longest."""
+    def in_words(self, last: int) -> str:
+        """Return the number with its interval as a cell; `last`: labels or steps of the longest run."""
 
         def number(value: float) -> str:
             return f"{value:,.0f}" if np.isfinite(value) else f"above {last:,}"
@@ -194,7 +194,7 @@ class Reached(NamedTuple):
 
 
 def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own: bool) -> Reached:
-    """When a method's curve has made `GAIN` of a gain.
+    """Return the labels or steps after which a method's curve has made `GAIN` of a gain.
 
     Args:
         curves: (bases, label seeds, points) of the method, the first at 0 labels or steps.
@@ -215,7 +215,7 @@ def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own
 
 
 def _crossing(curve: np.ndarray, after: Sequence[int], level: float) -> float:
-    """Where straight lines between points first come to a level."""
+    """Return where straight lines between points first reach a level."""
     at = np.flatnonzero(curve >= level)
     if not len(at):
         return np.inf

@@ -1,4 +1,4 @@
-"""How a report shows how far labels carry: its section in Markdown, and its two figures."""
+"""The section of a report on label efficiency, in Markdown, and its two figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Shown = Sequence[tuple[Variant, Interval]]
 
 
 def efficiency_lines(found: Efficiency) -> list[str]:
-    """Lines of Markdown: the figures, a row for each variant, and what budgets buy."""
+    """Return lines of Markdown: the figures, a row for each variant, and what budgets buy."""
     by_run = any(each.variant.run for each in found.carried)
     figures = {"labels_to_quality": of_guides(found), "steps_saved": of_ratios(found)}
     lines = ["", "## Label efficiency", ""]
@@ -43,7 +43,7 @@ def efficiency_lines(found: Efficiency) -> list[str]:
             [
                 [escaping.markdown(each.run)] * by_run
                 + [escaping.markdown(each.guidance), ", ".join(f"{budget:,}" for budget in each.budgets)]
-                + [told(each.labels, "{:,.0f}"), f"{each.reached:.0%}"]
+                + [known_cell(each.labels, "{:,.0f}"), f"{each.reached:.0%}"]
                 for each in found.labels_to_level
             ],
         )
@@ -55,7 +55,11 @@ def efficiency_lines(found: Efficiency) -> list[str]:
             [
                 [escaping.markdown(each.run)] * by_run
                 + [escaping.markdown(each.reference), f"{each.reference_labels:,}", f"{each.area:.3f}"]
-                + [escaping.markdown(each.guidance), told(each.labels, "{:,.0f}"), told(each.ratio, "{:.2f}")]
+                + [
+                    escaping.markdown(each.guidance),
+                    known_cell(each.labels, "{:,.0f}"),
+                    known_cell(each.ratio, "{:.2f}"),
+                ]
                 for each in found.equal_area
             ],
         )
@@ -74,8 +78,8 @@ NOTE = (
 )
 
 
-def told(known: Known, form: str) -> str:
-    """A quantity with its interval in words: `0.62 [0.54, 0.71]`, `above 1.40 [1.30, no bound]`."""
+def known_cell(known: Known, form: str) -> str:
+    """Return a quantity with its interval as a cell: `0.62 [0.54, 0.71]`, `above 1.40 [1.30, no bound]`."""
     low, high = (float(bound) for bound in known.bounds)
     if low == high:
         text = form.format(low)
@@ -93,13 +97,13 @@ def _cells(each: Carried, by_run: bool) -> list[str]:
     variant = each.variant
     cells = [escaping.markdown(variant.run)] if by_run else []
     cells += [escaping.markdown(variant.guidance), f"{variant.labels:,}", _interval(each.guide)]
-    cells += [told(each.steps, "{:,.0f}"), f"{each.reached:.0%}", _known(each.ratio, "{:.2f}")]
+    cells += [known_cell(each.steps, "{:,.0f}"), f"{each.reached:.0%}", _known(each.ratio, "{:.2f}")]
     cells += [_interval(variant.mean), _interval(each.area_difference, "{:+.3f}")]
     return [*cells, _interval(each.area_ratio, "{:.2f}")]
 
 
 def _known(known: Known | None, form: str) -> str:
-    return told(known, form) if known else ""
+    return known_cell(known, form) if known else ""
 
 
 def _interval(found: Interval | None, form: str = "{:.3f}") -> str:
@@ -113,13 +117,13 @@ def _interval(found: Interval | None, form: str = "{:.3f}") -> str:
 
 
 def of_guides(found: Efficiency) -> Shown:
-    """What the guides alone are worth; empty unless labels make a difference to be shown."""
+    """Return the value of each guide alone; empty where no variant has labels."""
     shown = [(each.variant, each.guide) for each in found.carried if each.guide is not None]
     return shown if any(variant.labels for variant, _ in shown) else []
 
 
 def of_ratios(found: Efficiency) -> Shown:
-    """Steps to the level over the unguided agents'; infinite where only a lower bound is known."""
+    """Return steps to the level over the unguided agents'; infinite where only a lower bound is known."""
     shown = []
     for each in found.carried:
         if each.ratio is None or (np.isinf(each.ratio.bounds.upper) and each.ratio.bounds.lower <= 0):
@@ -132,7 +136,7 @@ def of_ratios(found: Efficiency) -> Shown:
 
 
 def efficiency_figures(found: Efficiency, title: str, metric: str) -> dict[str, Figure]:
-    """The figures that there is something to show in, by the names of their files."""
+    """Return the figures that have something to show, by the names of their files."""
     figures = {}
     if guides := of_guides(found):
         figures["labels_to_quality"] = _panels(guides, f"{title}: the guide alone", axis_name(metric))
@@ -143,7 +147,7 @@ def efficiency_figures(found: Efficiency, title: str, metric: str) -> dict[str, 
 
 
 def _panels(shown: Shown, title: str, name: str, even: float | None = None) -> Figure:
-    """A panel for each run against labels; `even`: a height at which guidance makes no difference, of ratios."""
+    """Draw a panel for each run against labels; `even`: the ratio at which guidance makes no difference."""
     edge = np.inf
     if even is not None:
         heights = np.array([[found.estimate, found.upper] for _, found in shown])
@@ -176,7 +180,7 @@ def _panels(shown: Shown, title: str, name: str, even: float | None = None) -> F
 
 
 def _limit(axes: Axes, even: float, edge: float) -> None:
-    """Of ratios: a line where nothing is saved, and words at the edge where what never reaches the level is drawn."""
+    """Draw a line where no steps are saved, and name the edge that stands for agents that never reach the level."""
     axes.axhline(even, color=colour_of("none"), linewidth=1)
     axes.set_ylim(bottom=0)
     if np.isfinite(edge):

@@ -177,16 +177,19 @@ def name_ends(axes: Axes, ends: Sequence[tuple[float, str, str]], size: float = 
     """Write the name of each curve right of the axes, at the height of its end, moved apart where names would meet.
 
     Args:
-        axes: with its final limits.
+        axes: with its final limits; the figure is laid out first.
         ends: the height of each curve's end, its name and its colour.
         size: of the letters, in points.
     """
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.draw_without_rendering()
     low, high = axes.get_ylim()
     heights = axes.transData.transform([(1.0, end) for end, _, _ in ends])[:, 1]
     room = axes.bbox.height
     lowest = axes.transData.transform((1.0, low))[1]
     places = (heights - lowest) / room
-    gap = 1.35 * size * axes.figure.dpi / 72 / room
+    gap = 1.35 * size * figure.dpi / 72 / room
     order, rank = np.argsort(places, kind="stable"), gap * np.arange(len(ends))
     moved = scipy.optimize.isotonic_regression(places[order] - rank).x
     moved = np.clip(moved, 0.0, max(0.0, 1.0 - rank[-1])) + rank

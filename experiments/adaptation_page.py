@@ -90,13 +90,13 @@ def few_of(known: Sequence[Line]) -> list[Line]:
 
 
 def whole_of(rows: Sequence[Row], least: float) -> Line | None:
-    """The base agents in the unchanged world."""
+    """Return the line of the base agents in the unchanged world."""
     found = lines(rows, UNCHANGED, least=least)
     return found[0] if found else None
 
 
 def after(line: Line) -> str:
-    """Labels or steps, as a cell."""
+    """Return labels or steps as a cell."""
     if line.method == "finetuning":
         return f"{line.after:,} steps"
     return f"{line.after:,} labels" if line.after else ""
@@ -106,14 +106,14 @@ AMOUNTS = ["labels", "rewarded steps"]
 
 
 def amounts(line: Line, start: Line, study: Study) -> list[str]:
-    """Labels and rewarded steps, as cells."""
+    """Return labels and rewarded steps as cells."""
     labels = f"{line.after:,}" if line.after and line.method != "finetuning" else ""
     steps = rewarded_steps(line, start, study)
     return [labels, "" if steps is None else f"{steps:,}"]
 
 
 def shown(known: Sequence[Line]) -> list[Line]:
-    """What tables show: of fine-tuning a few of its measurements."""
+    """Return the lines of whole tables: of fine-tuning the first, a quarter and the last."""
     steps = [line.after for line in known if line.method == "finetuning" and line.after]
     few = {value for value in steps if value in (min(steps), max(steps)) or value * 4 == max(steps)} if steps else set()
     return [line for line in known if line.method != "finetuning" or line.after in few]

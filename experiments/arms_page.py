@@ -2,8 +2,8 @@
 
     python experiments/arms_page.py [--data docs/data/arms] [--page docs/results/arms.md]
 
-The data are what `cuelearner evaluate --out` wrote of one agent in MJX and in Fetch, and `reach_settings.json`. Two
-tables go between the lines `<!-- NAME -->` and `<!-- end of NAME -->` of the page.
+The data are `training_WORLD.json` of `arms.py`, what `cuelearner evaluate --out` wrote of one agent in MJX and in
+Fetch, and `reach_settings.json`. Three sections go between the lines `<!-- NAME -->` and `<!-- end of NAME -->` of the page.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import json
 from pathlib import Path
 
 import matplotlib
-from _pages import GREY, image, markdown, new_figure, rendered
+from _pages import GREY, image, markdown, name_ends, new_figure, rendered
+from matplotlib.ticker import EngFormatter
 
 from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
 
@@ -24,6 +25,60 @@ WORLDS = {
     "reach_fetch_turned_calibrated": "the same world, after 200 labels",
 }
 STEPS = (3_200, 6_400, 9_600, 12_800)
+
+
+RUNS = {"alone": "SAC alone", "by_value": "{labels} relative labels", "rlpd": "{labels} demonstrations, RLPD"}
+SHOWN_STEPS = 16_000  # of reach; all curves are level by then
+
+
+def studied(data: Path, world: str) -> dict[str, list[dict]]:
+    """Return the recorded rows of a world of the study: training, steps and guides."""
+    return json.loads((data / f"training_{world}.json").read_text(encoding="utf-8"))
+
+
+def run_name(row: dict) -> str:
+    """Return the name of a run of the study."""
+    return RUNS[row["run"]].format(labels=row["labels"])
+
+
+def training(data: Path) -> str:
+    """Return the table of steps to 80% success, with the ratio to the agent alone."""
+    cells = []
+    for world in ("reach", "push"):
+        found = studied(data, world)
+        guides = {(row["run"], row["labels"]): row["mean"] for row in found["guides"]}
+        for row in found["steps"]:
+            ratio = "{:.2f} [{:.2f}, {:.2f}]".format(*row["ratio"]) if "ratio" in row else ""
+            guide = guides.get((row["run"], row["labels"]))
+            alone = "" if guide is None else f"{100 * guide:.0f}%"
+            end = f"{100 * row['end']['mean']:.0f}%"
+            cells.append([f"`{world}`, {run_name(row)}", alone, f"{row['median']:,.0f}", ratio, end])
+    header = ["8 seeds", "guide alone", "steps to 80%, median", "of the steps alone", "success at the end"]
+    return markdown(header, cells)
+
+
+def draw_training(data: Path, stem: Path) -> None:
+    """Draw success over steps: reach with labels and without, push without."""
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(11, 3.8)
+        for axes, world in zip(figure.subplots(1, 2), ("reach", "push"), strict=True):
+            rows = studied(data, world)["training"]
+            ends = []
+            for run, guidance, labels in dict.fromkeys((row["run"], row["guidance"], row["labels"]) for row in rows):
+                own = [row for row in rows if (row["run"], row["labels"]) == (run, labels)]
+                own = [row for row in own if world == "push" or row["step"] <= SHOWN_STEPS]
+                steps, means = [row["step"] for row in own], [row["mean"] for row in own]
+                colour = GREY if run == "alone" else colour_of(guidance)
+                style = ":" if labels == 100 else "-"
+                low, high = [row["low"] for row in own], [row["high"] for row in own]
+                axes.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
+                axes.plot(steps, means, color=colour, linewidth=1.8, linestyle=style)
+                ends.append((means[-1], run_name(own[0]) + (" (dotted)" if style == ":" else ""), colour))
+            axes.set(xlim=(0, steps[-1]), ylim=(0, 1.03), xlabel="environment steps of a seed", ylabel="success")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.set_title(world, fontweight="bold", fontsize=11)
+            name_ends(axes, ends)
+        save_figure(figure, stem)
 
 
 def measured(data: Path) -> dict[str, tuple[float, float]]:
@@ -58,11 +113,11 @@ def draw(found: dict[str, tuple[float, float]], stem: Path) -> None:
         for place, (name, (success, distance)) in enumerate(found.items()):
             colour = colour_of("calibration") if name.endswith("calibrated") else GREY
             axes.barh(place, 100 * success, color=colour)
-            told = f"{100 * success:.0f}%, {distance:.1f} cm from the goal"
+            told = f"{100 * success:.0f}%, {distance:.1f} cm off"
             axes.text(100 * success + 1.5, place, told, va="center", fontsize=9)
         axes.set_yticks(range(len(found)), [WORLDS[name] for name in found])
         axes.invert_yaxis()
-        axes.set(xlim=(0, 145), xlabel="success [%], 200 episodes")
+        axes.set(xlim=(0, 150), xlabel="success [%], 200 episodes")
         axes.set_xticks(range(0, 101, 20))
         axes.grid(visible=False, axis="y")
         axes.tick_params(axis="y", length=0)
@@ -72,7 +127,9 @@ def draw(found: dict[str, tuple[float, float]], stem: Path) -> None:
 def sections(data: Path, page: Path) -> dict[str, str]:
     """Return the sections of the page."""
     picture = image("success of one agent in MJX and in Fetch", data / "transfer", page)
-    return {"transfer": f"{picture}\n\n{transfer(measured(data))}", "settings": settings(data)}
+    curves = image("success of an arm over steps, with labels and without", data / "training", page)
+    study = f"{curves}\n\n{training(data)}"
+    return {"training": study, "transfer": f"{picture}\n\n{transfer(measured(data))}", "settings": settings(data)}
 
 
 def main() -> int:
@@ -81,6 +138,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=Path("docs/data/arms"))
     parser.add_argument("--page", type=Path, default=Path("docs/results/arms.md"))
     given = parser.parse_args()
+    draw_training(given.data, given.data / "training")
     draw(measured(given.data), given.data / "transfer")
     page = rendered(given.page.read_text(encoding="utf-8"), sections(given.data, given.page))
     given.page.write_text(page, encoding="utf-8")

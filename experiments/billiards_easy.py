@@ -2,8 +2,8 @@
 
     python experiments/billiards_easy.py --out FOLDER [plain|mirrors ...]
 
-The sweeps of docs/results.md as data: eight seeds, 200,000 steps, labels by the shipped teacher. `plain` has the
-paper's strength of a label. `mirrors` differs from it in mirrored transitions alone.
+The sweeps of docs/results/training.md as data: eight seeds, 200,000 steps, labels by the shipped teacher. `plain` has
+the paper's strength of a label. `mirrors` differs from it in mirrored transitions alone.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> int:
             "easy",
             "--seeds",
             "8",
-            "--arbiter episodes",  # as what docs/results.md tells was made
+            "--arbiter episodes",  # as what docs/results/training.md tells was made
             *VARIANTS[name],
             *schedule,
             "--out",

@@ -224,7 +224,6 @@ def draw_overview(data: Path, stem: Path) -> bool:
             axes.minorticks_off()
             axes.set_xlabel("labels")
             axes.set_ylim(bottom=0)
-            figure.draw_without_rendering()
             name_ends(axes, ends)
         save_figure(figure, stem)
     return True
@@ -298,14 +297,15 @@ def findings(data: Path) -> str:
     return markdown(["guidance", "measured", "with guidance", "without"], rows)
 
 
+PRIOR_STUDIES = ("start", "ruled", "regulation", "easy", "halls")  # docs/data/prior_NAME.json
 PRIOR = {"any_aim": "all aims alike, no labels", "rule": "a rule by hand, no labels", "intent": "100 `intent` labels"}
 
 
 def prior(data: Path, page: Path) -> str:
     """Return the table of choices by labels alone, before training; write the CSV file of all recorded rows."""
-    files = {name: data / f"prior_{name}.json" for name in ("start", "ruled", "regulation")}
+    files = {name: data / f"prior_{name}.json" for name in PRIOR_STUDIES}
     told = {name: json.loads(file.read_text())["rows"] for name, file in files.items()}
-    columns = ["world", "run", "guidance", "labels", "step", "seeds", "mean", "low", "high"]
+    columns = ["world", "run", "guidance", "labels", "step", "seeds", "rewarded_steps", "mean", "low", "high"]
     cells = [[name, *(str(row[column]) for column in columns)] for name, rows in told.items() for row in rows]
     table = data.parent / "tables" / "prior.csv"
     write_csv(table, ["study", *columns], cells)

@@ -44,7 +44,7 @@ class Curve(NamedTuple):
     success: Float[np.ndarray, "seeds budgets"]
 
     def at(self, labels: int) -> statistics.Interval | None:
-        """The interquartile mean over seeds, with its interval; None: not measured."""
+        """Return the interquartile mean over seeds with its interval; None where not measured."""
         if labels not in self.budgets:
             return None
         return statistics.interval(self.success[:, self.budgets.index(labels)])
@@ -54,7 +54,7 @@ Curves = Mapping[tuple[str, str, str], Curve]  # by world, kind, teacher
 
 
 def read(folder: Path) -> dict[tuple[str, str, str], Curve]:
-    """All curves of the recorded pieces, but for conditions that some seeds lack."""
+    """Return all curves of the recorded pieces, without conditions that some seeds lack."""
     found = {}
     for world, kinds in KINDS.items():
         for kind in kinds:
@@ -72,7 +72,7 @@ def read(folder: Path) -> dict[tuple[str, str, str], Curve]:
 
 
 def ratio(kind: Curve, reference: Curve) -> tuple[Bounds, tuple[float, float]] | None:
-    """Labels of a kind that match `MATCHED` of the reference, over `MATCHED`; and their 95% interval over seeds.
+    """Return the labels of a kind that match `MATCHED` of the reference, over `MATCHED`, with their 95% interval.
 
     None where the reference never had so many, or the kind has one budget alone.
     """
@@ -88,7 +88,7 @@ def ratio(kind: Curve, reference: Curve) -> tuple[Bounds, tuple[float, float]] |
 
 
 def ratio_words(found: tuple[Bounds, tuple[float, float]] | None) -> str:
-    """A ratio as the table shows it."""
+    """Return a ratio as a cell."""
     if found is None:
         return ""
     (low, high), (lower, upper) = found
@@ -97,7 +97,7 @@ def ratio_words(found: tuple[Bounds, tuple[float, float]] | None) -> str:
 
 
 def percent(found: statistics.Interval | None) -> str:
-    """Success as the table shows it."""
+    """Return success as a cell, in percent."""
     if found is None:
         return ""
     bounds = "" if np.isnan(found.lower) else f" [{100 * found.lower:.0f}, {100 * found.upper:.0f}]"
@@ -105,7 +105,7 @@ def percent(found: statistics.Interval | None) -> str:
 
 
 def title_of(kind: str) -> str:
-    """What a kind is called."""
+    """Return the name of a kind."""
     known = registry.find_or_none(kind)
     return "no labels" if kind == "base" else (known.title or kind if known else kind)
 

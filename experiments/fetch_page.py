@@ -41,7 +41,7 @@ class Line(NamedTuple):
 
     @property
     def called(self) -> str:
-        """What the row is of."""
+        """The name of the row."""
         if not self.says:
             return {"unchanged": "camera in its place", "displaced": "camera displaced, no labels"}[self.what]
         told = f"{NAMES[self.what]}, {SAYS[self.says]}"
@@ -49,7 +49,7 @@ class Line(NamedTuple):
 
 
 def read(folder: Path) -> list[Row]:
-    """All rows of the recorded pieces, each with its environment."""
+    """Return all rows of the recorded pieces, each with its environment."""
     rows = []
     for file in sorted(folder.glob("*/*/*.json")):
         environment = file.parts[-3]
@@ -86,7 +86,7 @@ def _by_seed(rows: Sequence[Row], what: str, says: str, shuffled: bool) -> dict[
 
 
 def _share(after: np.ndarray, unchanged: np.ndarray, displaced: np.ndarray) -> tuple[float, float, float]:
-    """Percent of the loss that come back, with the ends of a bootstrap interval over episodes."""
+    """Return the percent of the loss that come back, with a bootstrap interval over episodes."""
     random = np.random.default_rng(0)
     drawn = random.integers(len(after), size=(DRAWS, len(after)))
     loss, gain = unchanged - displaced, after - displaced

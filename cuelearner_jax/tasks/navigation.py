@@ -28,7 +28,7 @@ NAVIGATION_SIZES = Sizes(num_envs=10)
 NAVIGATION_KINDS = {"scalar": scalar.Config(guide_directions=72)}
 
 # The paper's discount, eps, step size, and what scalar feedback calls good. The bound on the gradient's norm (0.5) and
-# the target network's rate (0.005) of its billiards code learn more slowly here, see docs/results.md.
+# the target network's rate (0.005) of its billiards code learn more slowly here, see docs/results/training.md.
 NAVIGATION_SCALARS = Scalars(discount=0.995, eps_deg=20.0, scalar_within_deg=20.0, max_grad_norm=10.0)
 NAVIGATION_AGENT = ddqn.Config(
     directions=360, target_directions=18, n_step=30, replay_capacity=100_000, learning_rate=0.001, polyak=0.05

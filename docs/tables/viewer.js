@@ -79,7 +79,7 @@ function showTable(text) {
   add(tools, "a", "CSV file", { href: file, download: "" });
   const page = knownTables[file];
   add(tools, "a", `to the page: ${page.title}`, { href: page.url });
-  const table = add(add(viewer, "div", "", { class: "scroll" }), "table");
+  const table = add(add(viewer, "div", "", { class: "scroll" }), "table", "", { class: "viewer" });
   const heads = add(add(table, "thead"), "tr");
   const body = add(table, "tbody");
   let sorted = -1;

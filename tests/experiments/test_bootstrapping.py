@@ -15,7 +15,6 @@ import label_efficiency
 import numpy as np
 import pytest
 from _efficiency import efficiency_of
-from _efficiency_document import efficiency_lines
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import Transferred
@@ -24,6 +23,7 @@ from cuelearner_jax.arbiters import paced
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.guides import registry
+from cuelearner_jax.report.tables import write_csv
 from cuelearner_jax.report.variants import read_groups, variants_of
 from cuelearner_jax.run_config import GROUPS
 from cuelearner_jax.runs.order import planned
@@ -187,22 +187,28 @@ def test_what_is_asked_of_a_report_is_what_its_runs_can_answer(experiment, modul
     assert "--reference" not in asked(experiment, world, tmp_path, "smoke")
 
 
-def test_a_page_shows_sections_between_their_marks_and_nothing_else_changes(modules):
+def test_what_a_report_says_is_missing_stands_behind_a_fold(modules):
     page = modules["bootstrapping_page"]
-    text = "# A\n\n<!-- easy -->\nold\n<!-- end of easy -->\n\nrest\n"
-    report = "# t\n\n## Label efficiency\n\n![steps saved](steps_saved.png)\n\n| a |\n\n## Missing\n\n- b\n\n"
-    report += "## Where the numbers come from\n\n- c\n"
-    shown = page.section(report, "../data/easy/report")
-    assert shown == "![steps saved](../data/easy/report/steps_saved.png)\n\n| a |\n\nMissing:\n\n- b"
-    once = page.rendered(text, {"easy": shown})
-    assert once == f"# A\n\n<!-- easy -->\n\n{shown}\n\n<!-- end of easy -->\n\nrest\n"
-    assert page.rendered(once, {"easy": shown}) == once
-    with pytest.raises(ValueError, match="no place for full"):
-        page.rendered(text, {"full": shown})
-    real = (FOLDER.parent / "docs" / "results" / "bootstrapping.md").read_text()
-    marks = [place.mark for place in page.places()]
-    assert marks == ["regulation", "easy", "full", "clutter-cpu", "clutter"]
-    page.rendered(real, dict.fromkeys(marks, "x"))  # every world has its place
+    report = "# t\n\n## Missing\n\n- nothing: all runs are complete\n\n## Where the numbers come from\n\n- c\n"
+    assert page.missing_lines(report) == []
+    (line,) = page.missing_lines(report.replace("nothing: all runs are complete", "b: at step 5 of 10"))
+    assert line == "- b: at step 5 of 10"
+
+
+def test_a_short_table_shows_the_budget_nearest_to_500_of_each_run_and_kind(modules):
+    page = modules["bootstrapping_page"]
+    rows = [
+        {"run": run, "guidance": kind, "labels": float(labels), "mean": mean}
+        for run, kind, labels, mean in (
+            ("frame", "relative", 100, 0.9),
+            ("frame", "relative", 600, 0.2),
+            ("frame", "none", 0, 0.1),
+            ("raw", "relative", 1_000, 0.3),
+        )
+    ]
+    chosen = [(row["run"], row["guidance"], row["labels"]) for row in page.chosen(rows)]
+    assert chosen == [("frame", "none", 0), ("raw", "relative", 1_000), ("frame", "relative", 600)]
+    assert page.named(rows[3], labels=True) == "relative, 1,000 labels, raw coordinates"
 
 
 @pytest.mark.long
@@ -225,21 +231,16 @@ def test_a_smoke_of_the_easy_table_runs_resumes_and_reports(modules, tmp_path, c
     assert data.main(asked) == 2  # begun already, and --resume was not given
 
 
-def said_of(mark, modules):
-    """What the page says of a world, and what the recorded runs of it give, as far as it is computed from them."""
-    page = modules["bootstrapping_page"]
-    text = (FOLDER.parent / "docs" / "results" / "bootstrapping.md").read_text(encoding="utf-8")
-    shown = text.split(f"<!-- {mark} -->\n")[1].split(f"<!-- end of {mark} -->")[0].strip()
-    (place,) = (place for place in page.places() if place.mark == mark)
-    data = FOLDER.parent / "docs" / "data" / "bootstrapping"
-    command = place.command(data)
-    if command is None:
-        return shown, ""
-    asked = label_efficiency.parsed(command[1:])
-    groups = read_groups(asked.folders, None, asked.metric, "validation", by_run=True)
-    lines = efficiency_lines(efficiency_of(variants_of(groups, asked.metric), asked.question, asked.lower_is_better))
-    seen = Path("../data/bootstrapping") / place.report(data).relative_to(data)
-    return shown, page.section("\n".join([*lines, page.LAST]), seen.as_posix())
+DOCS = FOLDER.parent / "docs"
+DATA, PAGE = DOCS / "data" / "bootstrapping", DOCS / "results" / "bootstrapping.md"
+
+
+def test_the_page_says_what_its_tables_say(modules):
+    page, text = modules["bootstrapping_page"], PAGE.read_text(encoding="utf-8")
+    places = list(page.places())
+    assert [place.mark for place in places] == ["regulation", "easy", "full", "clutter-cpu", "clutter"]
+    found = {place.mark: page.section(place, DATA, PAGE) for place in places} | {"findings": page.findings(DATA)}
+    assert page.rendered(text, found) == text
 
 
 MARKS = [
@@ -249,9 +250,15 @@ MARKS = [
 
 
 @pytest.mark.parametrize("mark", MARKS)
-def test_the_page_says_what_the_recorded_runs_give_and_nothing_where_there_are_none(mark, modules):
-    shown, given = said_of(mark, modules)
-    assert shown.split("\n\nMissing:")[0] == given
+def test_the_tables_hold_what_the_recorded_runs_give(mark, modules, tmp_path):
+    page = modules["bootstrapping_page"]
+    (place,) = (place for place in page.places() if place.mark == mark)
+    asked = label_efficiency.parsed(place.command(DATA)[1:])
+    groups = read_groups(asked.folders, None, asked.metric, "validation", by_run=True)
+    found = efficiency_of(variants_of(groups, asked.metric), asked.question, asked.lower_is_better)
+    for name, rows in found.tables().items():
+        write_csv(tmp_path / f"{name}.csv", rows)
+        assert (tmp_path / f"{name}.csv").read_bytes() == (place.report(DATA) / f"{name}.csv").read_bytes()
 
 
 def test_the_page_tells_what_aims_are_worth_without_a_label():

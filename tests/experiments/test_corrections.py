@@ -82,8 +82,13 @@ def test_labels_that_match_the_reference_are_read_between_budgets(page):
     assert page.ratio_words(page.ratio(fast, reference)) == "below 0.25 [0.00, 0.25]"
 
 
-def test_the_page_is_what_was_recorded(page):
-    assert page.table(page.read(DATA)) in PAGE.read_text(encoding="utf-8")
+def test_the_page_is_what_was_recorded(page, tmp_path):
+    curves, text = page.read(DATA), PAGE.read_text(encoding="utf-8")
+    assert page.section(curves, DATA, PAGE) in text
+    page.write_text_csv(tmp_path / "labels.csv", *page.table(curves))
+    page.write_all(curves, tmp_path / "success.csv")
+    for name in ("labels.csv", "success.csv"):
+        assert (tmp_path / name).read_bytes() == (DATA / name).read_bytes()
 
 
 def test_a_condition_that_was_interrupted_is_measured_anew(study):
