@@ -111,7 +111,7 @@ def test_a_port_in_use_is_refused_before_anything_is_made(refused, tmp_path):
         taken.listen()
         port = taken.getsockname()[1]
         command = ["label", OWN, "--out", tmp_path / "labels", "--port", str(port)]
-        refused(command, f"port {port} of 127.0.0.1 cannot be had", tmp_path)
+        refused(command, f"port {port} of 127.0.0.1 is not available", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -225,7 +225,7 @@ def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
     refused(["labels", "merge", labelled / "one", "--out", both], "both.parquet exists: give another --out", tmp_path)
     refused(["labels", "export", both, labelled / "one", "--out", "x.csv"], "takes one label file", tmp_path)
     refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
-    refused(["labels", "inspect", both, "--teacher"], "cannot be had again", tmp_path)
+    refused(["labels", "inspect", both, "--teacher"], "replay its situations", tmp_path)
     refused(["labels", "mend"], "unknown command 'labels mend'", tmp_path)
 
 
