@@ -67,7 +67,7 @@ def test_pieces_give_what_the_whole_gives_and_a_report_says_which_are_missing(wh
 def test_other_options_for_a_piece_that_has_begun_are_refused(refused, tmp_path):
     command = [*SWEEP, "--shard", "3/3", "--out", tmp_path / "run"]
     assert main([str(part) for part in command]) == 0
-    refused([*command, "--scalars.eps-deg", "3"], "was run with another scalars.eps_deg", tmp_path)
+    refused([*command, "--scalars.eps-deg", "3"], "was run with other values of scalars.eps_deg", tmp_path)
     second = [*SWEEP, "--shard", "2/3", "--out", tmp_path / "run"]
     refused([*second, "--scalars.eps-deg", "3"], "is a piece of a sweep with another scalars.eps_deg", tmp_path)
     refused([*second, "--seeds", "4"], "is a piece of a sweep with another shard.seeds: give the same", tmp_path)

@@ -88,7 +88,7 @@ def test_overwriting_never_deletes_what_is_no_run(tmp_path):
     ],
 )
 def test_resuming_with_another_option_names_it(out, name, other):
-    refused(out, rf"was run with another {name}: give the same options", other, resume=True)
+    refused(out, rf"was run with other values of {name}: give the same options", other, resume=True)
 
 
 def test_resuming_names_several_options_and_those_that_only_one_side_has(out):
