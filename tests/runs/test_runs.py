@@ -114,8 +114,8 @@ def not_loaded(folder, message):
 
 
 def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
-    not_loaded(tmp_path, "no run folder")
-    not_loaded(tmp_path / "missing", "no run folder")
+    not_loaded(tmp_path, "not a run folder")
+    not_loaded(tmp_path / "missing", "not a run folder")
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ def test_nothing_is_unpickled(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda info: info.update(codebase_version="v2.1"), "of the format 'v2.1', v3.0 is wanted"),
+        (lambda info: info.update(codebase_version="v2.1"), "of the format 'v2.1', v3.0 is needed"),
         (lambda info: info.update(features=[]), "is damaged"),
         (lambda info: info.pop("fps"), "is damaged"),
         (lambda info: info["features"].pop("action"), "has no feature action"),
