@@ -299,7 +299,7 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
 
 def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
-    refused(["adapt", "own_turned:straight", *new], "is to act in some task: name it, as --task", tmp_path)
+    refused(["adapt", "own_turned:straight", *new], "needs a task to act in: give one, for instance --task", tmp_path)
     plain = ["adapt", "own_turned:straight", *TASK, *new]
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
     refused([*plain, "--bound-deg", "200"], "bound_deg is 200: give a number above 0 and up to 180", tmp_path)

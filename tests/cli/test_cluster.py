@@ -121,7 +121,7 @@ REFUSED = [
     ([*SLURM, "--job.slurm", "qos"], "give KEY=VALUE"),
     ([*SLURM, "--job.slurm", "array=0-9"], "cannot set 'array'"),
     ([*SLURM, "--job.minutes", "2"], "give less than the 120 s"),
-    (SLURM, "no srun here"),
+    (SLURM, "srun is not installed here"),
 ]
 
 
