@@ -94,7 +94,7 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(there, capsys):
         (["evaluate", "logs:absent"], "there is no folder of situations at absent"),
         (
             ["export", "logs:situations", "--policy", "uniform", "--only-correction", "--out", "p"],
-            "corrects no other one",
+            "has no correction",
         ),
     ],
 )
