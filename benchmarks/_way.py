@@ -32,7 +32,7 @@ class Scene:
     """What a drawing shows; places as drawn (x to the right, y down) [m], the robot in the origin, facing up."""
 
     def __init__(self, svg: str) -> None:
-        """Reads the page's SVG element."""
+        """Read the page's SVG element."""
         root = xml.fromstring(svg)
         groups = {group.get("class", ""): group for group in root if _named(group) == "g"}
         still = list(groups["still"])

@@ -63,7 +63,7 @@ def reward(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def main() -> None:
-    """Plays the shots in both engines and prints a row a table and step."""
+    """Play the shots in both engines and prints a row a table and step."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shots", type=int, default=1000)
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")

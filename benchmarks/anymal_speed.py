@@ -82,7 +82,7 @@ def rates(env: LeggedNavigation, see: Callable, robots: int, steps: int, rounds:
 
 
 def main() -> None:
-    """Measures and prints the table."""
+    """Measure and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=[16], help="side by side")
     parser.add_argument("--control-steps", type=int, nargs="+", default=[10], help="in a step of navigation")

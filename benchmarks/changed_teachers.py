@@ -89,7 +89,7 @@ def compare(name: str, table: Any, tables: int, aim_error_deg: float) -> dict[st
 
 
 def main() -> int:
-    """Compares and writes the table."""
+    """Compare and writes the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--table", default="regulation", choices=("easy", "regulation"))
     parser.add_argument("--tables", type=int, default=24, help="situations")

@@ -169,7 +169,7 @@ def measure(systems: dict[str, System], envs: int, steps: int, repeats: int, sec
 
 
 def main() -> None:
-    """Races the systems and prints the table."""
+    """Race the systems and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", type=int, nargs="+", default=[256, 2048], help="side by side")
     parser.add_argument("--steps", type=int, default=8, help="of each environment in one call of the compiled loop")

@@ -46,7 +46,7 @@ AXES = {
 
 
 def main() -> int:
-    """Measures what is missing, prints a table, or draws."""
+    """Measure what is missing, prints a table, or draws."""
     asked = _arguments()
     if asked.draw:
         save_figure(_draw([json.loads(path.read_text()) for path in asked.draw]), asked.figure)

@@ -160,7 +160,7 @@ def lost(best: np.ndarray, rewards: np.ndarray) -> list[float]:
 
 
 def main() -> None:
-    """Compares and prints a table."""
+    """Compare and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("of", help=f"a finished run's folder with its checkpoint, or {SHIPPED}")
     parser.add_argument("--coarse", type=int, nargs="+", default=[360, 720, 1200])

@@ -50,7 +50,7 @@ def policies(env: Reach) -> dict[str, Policy]:
 
 
 def main(arguments: Sequence[str], steps: int = 8_000) -> dict[str, dict[str, jax.Array]]:
-    """Evaluates each on validation episodes, `steps` in all, and films the last in the folder that is named.
+    """Evaluate each on validation episodes, `steps` in all, and films the last in the folder that is named.
 
     Returns:
         Metrics by policy.

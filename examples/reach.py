@@ -97,7 +97,7 @@ class Reach(WholeObservations, struct.PyTreeNode):
         return boat, self.observe(boat)
 
     def step(self, key: PRNGKeyArray, state: Boat, action: Float[Array, "2"]) -> tuple[Boat, Step]:
-        """Sails for one period; a new episode follows an end."""
+        """Sail for one period; a new episode follows an end."""
         after = self.moved(state, action)
         reached = jnp.linalg.norm(after.buoy - after.place) < GOAL_RADIUS
         late = (after.steps >= self.max_steps) & ~reached

@@ -36,7 +36,7 @@ class Walk:
     """What is known of the robot, and what to do. Times in seconds, angles counterclockwise in radians."""
 
     def __init__(self, folder):
-        """Reads a decision. Raises ContractError for a damaged one, ValueError for one of another task."""
+        """Read a decision. Raises ContractError for a damaged one, ValueError for one of another task."""
         self.decide = Decision(folder)
         observed = self.decide.contract["observation"]["slices"]
         self.slices = {each["name"]: slice(each["from"], each["to"]) for each in observed}
@@ -70,7 +70,7 @@ class Walk:
         self.previous, self.direction = np.zeros((3, 2)), None
 
     def step(self, now):
-        """Decides where to walk until it is called again."""
+        """Decide where to walk until it is called again."""
         self.direction = None
         if self.goal is None or not self.awake(now):
             return
@@ -109,7 +109,7 @@ class Walk:
 
 
 def main(folder):
-    """Runs the node."""
+    """Run the node."""
     import rclpy  # of a ROS 2 installation
     from geometry_msgs.msg import PoseStamped, Twist
     from nav_msgs.msg import Odometry

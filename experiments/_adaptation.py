@@ -217,7 +217,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
 
 
 def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, resume: bool) -> None:
-    """Runs a piece and finishes its table. Raises UserError if it is there already and is not to be gone on with."""
+    """Run a piece and finishes its table. Raises UserError if it is there already and is not to be gone on with."""
     folder = out / study.task / piece.path
     if (folder / SCHEMA.parquet).exists() and resume:
         print(f"{piece.path}: finished")
@@ -240,7 +240,7 @@ def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, 
 
 
 def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int:
-    """Runs pieces, one after the other; returns the exit status."""
+    """Run pieces, one after the other; return the exit status."""
     parser = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

@@ -67,7 +67,7 @@ class Drawn:
     """A variant with the bootstrap of its seeds; values are signed so that larger ones are better."""
 
     def __init__(self, variant: Variant, sign: float, shared: int) -> None:
-        """Draws nothing yet; the area is taken to the step `shared`."""
+        """Draw nothing yet; the area is taken to the step `shared`."""
         self.variant, self.sign = variant, sign
         self.steps, self.values = variant.curve.steps, sign * variant.values
         self.last = float(self.steps[-1])

@@ -162,7 +162,7 @@ def listed(pieces: Sequence[Any]) -> str:
 
 
 def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = None) -> int:
-    """Runs pieces and reports on their worlds; stops at the first command that fails and returns its status."""
+    """Run pieces and reports on their worlds; stops at the first command that fails and return its status."""
     parser = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

@@ -61,7 +61,7 @@ class TeacherConfig:
 
 
 def check_config(config: TeacherConfig) -> None:
-    """Raises UserError for values that cannot work."""
+    """Raise UserError for values that cannot work."""
     for name in ("tables", "search", "directions", "memory", "updates", "batch_size", "rounds"):
         if not 1 <= getattr(config, name) <= LARGEST:
             raise UserError(f"--teacher.{name} is {getattr(config, name)}: give a positive number of at most {LARGEST}")

@@ -275,7 +275,7 @@ STUDY = Study("navigation", PIECES, SCALES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs what is asked for; returns the exit status."""
+    """Run what is asked for; return the exit status."""
     return run(STUDY, __doc__ or "", arguments)
 
 

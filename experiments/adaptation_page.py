@@ -324,7 +324,7 @@ def sections(data: Path, page: Path) -> dict[str, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Writes the page; returns the exit status."""
+    """Write the page; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("docs/data/adaptation"))
     parser.add_argument("--page", type=Path, default=Path("docs/results/adaptation.md"))

@@ -45,7 +45,7 @@ class AimAtRandom(PolicyNode):
 
 
 def main() -> None:
-    """Measures both tables, prints them, writes JSON."""
+    """Measure both tables, prints them, writes JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=10_000, help="shots of an evaluation")
     parser.add_argument("--split", choices=list(SPLITS), default="validation", help="episodes of the evaluation")

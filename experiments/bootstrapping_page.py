@@ -83,7 +83,7 @@ def rendered(page: str, sections: Mapping[str, str]) -> str:
 
 
 def main() -> int:
-    """Reports on every world and writes the page; returns the status of the first command that fails."""
+    """Report on every world and writes the page; return the status of the first command that fails."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("docs/data/bootstrapping"))
     parser.add_argument("--page", type=Path, default=Path("docs/results/bootstrapping.md"))

@@ -240,7 +240,7 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Calibrates each base in each world with each number of labels; prints a line each, then the table."""
+    """Calibrate each base in each world with each number of labels; prints a line each, then the table."""
     parser = arguments()
     asked = parser.parse_args()
     number, of = asked.shard
@@ -265,7 +265,7 @@ def main() -> None:
 
 
 def table(rows: list[dict[str, Any]]) -> None:
-    """Prints the mean worth, and how often each verdict was found, by world and number of labels."""
+    """Print the mean worth, and how often each verdict was found, by world and number of labels."""
     for world, labels in dict.fromkeys((row["world"], row["labels"]) for row in rows):
         own = [row for row in rows if (row["world"], row["labels"]) == (world, labels)]
         worths = [row["worth"] for row in own if "worth" in row]

@@ -24,7 +24,7 @@ STRENGTHS_DEG = (1, 2, 5)
 
 
 def main() -> int:
-    """Runs the sweeps, prints a table and writes it as JSON."""
+    """Run the sweeps, prints a table and writes it as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/label_strength"))
     arguments = parser.parse_args()

@@ -57,7 +57,7 @@ def told(values: np.ndarray) -> str:
 
 
 def main() -> int:
-    """Runs the sweeps and prints a table; stops at the first that fails."""
+    """Run the sweeps and prints a table; stops at the first that fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

@@ -141,7 +141,7 @@ def begin(clone: Clone, scale: Scale, adam: Any, seed: Array) -> Cloning:
 
 
 def stretch(clone: Clone, scale: Scale, adam: Any, teacher: Any, seed: Array, done: Array, cloning: Cloning) -> Cloning:
-    """Walks for `scale.each` actions, which the road map comments on, and learns from all of them so far.
+    """Walk for `scale.each` actions, which the road map comments on, and learns from all of them so far.
 
     Until the first stretch of learning the road map walks itself.
     """
@@ -234,7 +234,7 @@ def table(rows: Sequence[dict[str, Any]], count: int) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the variants; returns the exit status."""
+    """Run the variants; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scale", choices=list(SCALES), default="paper", help="smoke: a minute on a CPU")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))

@@ -41,7 +41,7 @@ def folder(out: Path, search: str) -> Path:
 
 
 def begin(out: Path, search: str, steps: int, seeds: int, rest: list[str]) -> subprocess.Popen:
-    """Starts or resumes a sweep in a process of its own, whose output goes to a file beside its folder."""
+    """Start or resumes a sweep in a process of its own, whose output goes to a file beside its folder."""
     own = folder(out, search)
     options = [part for name, value in SEARCHES[search].items() for part in (f"--sizes.{name}", str(value))]
     command = [sys.executable, "-m", "cuelearner_jax.cli", "sweep", "billiards", "--preset", "regulation"]
@@ -87,7 +87,7 @@ def told(values: np.ndarray) -> str:
 
 
 def main() -> int:
-    """Runs the sweeps and prints a table; returns 1 if one fails."""
+    """Run the sweeps and prints a table; return 1 if one fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

@@ -65,7 +65,7 @@ class Asked(Generic[TaskT]):
 
 
 def check(task: Task, asked: Asked) -> None:
-    """Raises UserError for values that cannot work, or for more memory than is free."""
+    """Raise UserError for values that cannot work, or for more memory than is free."""
     check_config(asked.teacher)
     if not 0 <= asked.seed <= LARGEST:
         raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST}")

@@ -112,7 +112,7 @@ LARGEST_ROBOTS = 1 << 20  # each keeps some kilobytes of physics
 
 
 def check(config: Training) -> None:
-    """Raises UserError for values that cannot work."""
+    """Raise UserError for values that cannot work."""
     configuration.check_part(config, "train")
     for name in ("robots", "measured_robots"):
         if getattr(config, name) > LARGEST_ROBOTS:
@@ -150,7 +150,7 @@ def train(
     command: str,
     tell: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Trains a walking policy, measures it and writes it.
+    """Train a walking policy, measures it and writes it.
 
     Returns:
         What is written beside it: settings, history, figures.

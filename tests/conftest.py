@@ -52,12 +52,12 @@ def pytest_collection():
 
 
 def pytest_addoption(parser):
-    """Adds what `make durations` asks for."""
+    """Add what `make durations` asks for."""
     parser.addoption("--durations-to", type=Path, help="write the seconds of each file of tests there")
 
 
 def pytest_terminal_summary(terminalreporter, exitstatus, config):
-    """Writes the seconds of each file of tests, with set-up, the longest first."""
+    """Write the seconds of each file of tests, with set-up, the longest first."""
     path = config.getoption("--durations-to")
     if path is None:
         return
@@ -77,7 +77,7 @@ def pytest_terminal_summary(terminalreporter, exitstatus, config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Makes implicit rank promotion an error, but in the tests of `LOOSE_RANKS`.
+    """Make implicit rank promotion an error, but in the tests of `LOOSE_RANKS`.
 
     For all threads and before any fixture: what is traced with another setting is traced and compiled once more.
     """
@@ -120,7 +120,7 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 def pytest_collection_modifyitems(items):
-    """Marks slow files, and begins with those that take longest: what is left for the end is shared out evenly."""
+    """Mark slow files, and begins with those that take longest: what is left for the end is shared out evenly."""
     files = {item: item.nodeid.partition("::")[0] for item in items}
     for item, file in files.items():
         if SECONDS.get(file, 0.0) > SLOW:

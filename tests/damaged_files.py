@@ -215,7 +215,7 @@ FILE_DAMAGES = {**DAMAGES, "swapped": _swapped, "zeroed": _zeroed, "repeated": _
 
 
 def make_folders(home: Path) -> dict[str, Any]:
-    """Writes a folder of each kind; returns what their readers give."""
+    """Write a folder of each kind; return what their readers give."""
     for name, kind in KINDS.items():
         kind.write(home / name)
     return {name: _read(kind, home / name)[0] for name, kind in KINDS.items()}

@@ -265,7 +265,7 @@ def files_of(folder):
 
 
 def edit_json(path, change):
-    """Rewrites a JSON file by a function of its values; one with a digest gets that of the new ones."""
+    """Rewrite a JSON file by a function of its values; one with a digest gets that of the new ones."""
     values = json.loads(path.read_text())
     sealed = values.pop("digest", None) is not None
     change(values)
@@ -273,7 +273,7 @@ def edit_json(path, change):
 
 
 def edit_contract(folder, change=lambda contract: None):
-    """Rewrites an export's contract by a function of its values, with the digests of the files as they are now."""
+    """Rewrite an export's contract by a function of its values, with the digests of the files as they are now."""
     contract = json.loads((folder / runner.CONTRACT).read_text())
     contract.pop(runner.DIGEST, None)
     change(contract)

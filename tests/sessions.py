@@ -44,7 +44,7 @@ def give(session, count, eps_deg=probes.SCALARS.eps_deg):
 
 
 def settled(session, fits=None):
-    """Waits until nothing is fitted any more and the questions know of it."""
+    """Wait until nothing is fitted any more and the questions know of it."""
     for _ in range(20_000):
         status = session.status()
         if not status.fitting and (fits is None or status.newest.number >= fits):

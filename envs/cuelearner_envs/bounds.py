@@ -24,7 +24,7 @@ def check_number(
     whole: bool = False,
     unit: str = "",
 ) -> None:
-    """Raises UserError unless a field holds a number that stays one in single precision, and lies within bounds.
+    """Raise UserError unless a field holds a number that stays one in single precision, and lies within bounds.
 
     Args:
         name: of the field.
@@ -47,7 +47,7 @@ def check_number(
 
 
 def check_word(name: str, value: Any, known: Iterable[str]) -> None:
-    """Raises UserError unless a field holds one of the words that it can."""
+    """Raise UserError unless a field holds one of the words that it can."""
     if not isinstance(value, str) or value not in tuple(known):
         raise UserError(f"task.{name} is {shown(value)}{closest(str(value), known)}")
 

@@ -52,7 +52,7 @@ class Judge:
         return self.down
 
     def place(self, number: int, pose: Float[np.ndarray, "3"]) -> None:
-        """Stands a robot at a pose [m, rad], its joints at home."""
+        """Stand a robot at a pose [m, rad], its joints at home."""
         data = self.data[number]
         mujoco.mj_resetDataKeyframe(self.models[number], data, 0)
         data.qpos[:2] = pose[:2]
@@ -61,7 +61,7 @@ class Judge:
         self.down[number] = False
 
     def push(self, number: int, change: Float[np.ndarray, "2"]) -> None:
-        """Changes the trunk's velocity at once [m/s]."""
+        """Change the trunk's velocity at once [m/s]."""
         self.data[number].qvel[:2] += change
 
     def control(self, actions: Float[np.ndarray, "robots 12"]) -> None:

@@ -133,7 +133,7 @@ class Locomotion(envs.Env):
         return "mjx"
 
     def reset(self, rng: jax.Array) -> Any:
-        """Stands at the origin with its joints a little off; ground and command are random."""
+        """Stand at the origin with its joints a little off; ground and command are random."""
         k_body, k_yaw, k_command, k_ground, k_noise, k_next = jax.random.split(rng, 6)
         body = standing(jnp.zeros(2), jax.random.uniform(k_yaw, (), minval=-jnp.pi, maxval=jnp.pi))
         off = jax.random.uniform(k_body, (2, robot.JOINTS), minval=-1.0, maxval=1.0)

@@ -87,7 +87,7 @@ def from_brax(params: Any) -> WalkingPolicy:
 
 
 def save(folder: Path, policy: WalkingPolicy, about: dict[str, Any]) -> None:
-    """Writes a policy and what is to be known about it; replaces an earlier one in one step each."""
+    """Write a policy and what is to be known about it; replaces an earlier one in one step each."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {"mean": policy.mean, "std": policy.std}
     for number, (kernel, bias) in enumerate(policy.layers):

@@ -76,7 +76,7 @@ class Studio:
         self._gl.free()
 
     def pose(self, qpos: Float[np.ndarray, " qpos"]) -> None:
-        """Puts the model into a configuration."""
+        """Put the model into a configuration."""
         self.data.qpos[:] = qpos
         mujoco.mj_forward(self.model, self.data)
 
@@ -116,7 +116,7 @@ class Studio:
 
 
 def above(extent: Float[np.ndarray, "2"]) -> mujoco.MjvCamera:
-    """Looks down on the whole hall, x to the right."""
+    """Look down on the whole hall, x to the right."""
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.azimuth, camera.elevation = (0, 0, 0), 90, -90
     camera.distance = 1.3 * float(np.max(extent))
@@ -124,7 +124,7 @@ def above(extent: Float[np.ndarray, "2"]) -> mujoco.MjvCamera:
 
 
 def beside(qpos: Float[np.ndarray, "19"], azimuth: float = AZIMUTH, distance: float = 3.2) -> mujoco.MjvCamera:
-    """Looks at the robot from the side [deg, m], whatever stands in between."""
+    """Look at the robot from the side [deg, m], whatever stands in between."""
     camera = mujoco.MjvCamera()
     camera.lookat[:] = qpos[0], qpos[1], 0.35
     camera.azimuth, camera.elevation, camera.distance = azimuth, -22, distance
@@ -134,7 +134,7 @@ def beside(qpos: Float[np.ndarray, "19"], azimuth: float = AZIMUTH, distance: fl
 def unobstructed(
     model: mujoco.MjModel, data: mujoco.MjData, azimuth: float = AZIMUTH, distance: float = 3.2
 ) -> mujoco.MjvCamera:
-    """Looks at the robot from the side nearest to `azimuth` where no solid stands in between [deg, m]."""
+    """Look at the robot from the side nearest to `azimuth` where no solid stands in between [deg, m]."""
     turns = sorted(range(-180, 180, SIDES_APART), key=abs)
     cameras = [beside(data.qpos, azimuth + turn, distance) for turn in turns]
     return next((camera for camera in cameras if _sees(model, data, camera)), cameras[0])

@@ -43,7 +43,7 @@ class ArmConfig:
     """Changed wish, where a post stands: the teacher pushes the cube past it on this side."""
 
     def __post_init__(self) -> None:
-        """Raises UserError with one line for the first value that cannot work."""
+        """Raise UserError with one line for the first value that cannot work."""
         check(self)
 
     @property
@@ -53,7 +53,7 @@ class ArmConfig:
 
 
 def check(config: ArmConfig) -> None:
-    """Raises UserError with one line for the first value that cannot work."""
+    """Raise UserError with one line for the first value that cannot work."""
     check_word("skill", config.skill, get_args(Skill))
     check_word("reward", config.reward, REWARDS)
     check_word("preferred_side", config.preferred_side, SIDES)

@@ -40,12 +40,12 @@ class BilliardsConfig:
     """Search teacher: directions that it tries in every state."""
 
     def __post_init__(self) -> None:
-        """Raises UserError with one line for the first value that cannot work."""
+        """Raise UserError with one line for the first value that cannot work."""
         check(self)
 
 
 def check(config: BilliardsConfig) -> None:
-    """Raises UserError with one line for the first value that cannot work."""
+    """Raise UserError with one line for the first value that cannot work."""
     check_word("table", config.table, SHOTS)
     check_number("action_turn_deg", config.action_turn_deg, -360, 360, unit="degrees")
     check_vector("observation_bias", config.observation_bias, 2, -1, 1, "metres")

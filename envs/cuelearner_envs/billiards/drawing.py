@@ -44,7 +44,7 @@ def draw_table(
     angle: float | None = None,
     path: Trajectory | None = None,
 ) -> None:
-    """Draws a table and its balls, filling the axes.
+    """Draw a table and its balls, filling the axes.
 
     Args:
         axes: matplotlib axes; their limits and aspect are set and their frame is hidden.
@@ -63,7 +63,7 @@ def draw_table(
 
 
 def still(table: Table, path: Trajectory, file: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Writes a picture of one shot: pale balls where it began, the way of each, solid balls where they came to rest.
+    """Write a picture of one shot: pale balls where it began, the way of each, solid balls where they came to rest.
 
     Args:
         table: one table (no batch).
@@ -87,7 +87,7 @@ def question(
     file: str | os.PathLike[str],
     dpi: int = 160,
 ) -> None:
-    """Writes a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it.
+    """Write a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it.
 
     Args:
         table: one table (no batch).
@@ -106,7 +106,7 @@ def question(
 def animate(
     table: Table, shots: Sequence[Trajectory], file: str | os.PathLike[str], fps: float = 30.0, speed: float = 1.0
 ) -> None:
-    """Writes an animation of shots, one after the other; before each, an arrow shows its direction.
+    """Write an animation of shots, one after the other; before each, an arrow shows its direction.
 
     Args:
         table: one table (no batch).
@@ -151,7 +151,7 @@ def _figure(table: Table, dpi: float) -> tuple[Figure, Axes]:
 
 
 def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
-    """Writes a picture with no date: the same drawing, the same bytes."""
+    """Write a picture with no date: the same drawing, the same bytes."""
     with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
         figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
 
@@ -217,7 +217,7 @@ class _Balls:
             self.numbers.append(axes.text(0, 0, number, fontsize=1.05 * points, animated=animated, **style))
 
     def place(self, positions: Float[np.ndarray, "balls 2"], pocketed: Bool[np.ndarray, "balls"]) -> None:
-        """Moves the balls; pocketed ones to the tray, or out of sight where they are the ghosts of a start."""
+        """Move the balls; pocketed ones to the tray, or out of sight where they are the ghosts of a start."""
         for ball, (disc, number) in enumerate(zip(self.discs, self.numbers, strict=True)):
             centre = self.tray[ball] if pocketed[ball] else positions[ball]
             disc.set_center(tuple(centre))
@@ -225,7 +225,7 @@ class _Balls:
             number.set_position(tuple(centre))
 
     def draw(self, renderer: Any) -> None:
-        """Draws them alone, over what is there."""
+        """Draw them alone, over what is there."""
         for disc, number in zip(self.discs, self.numbers, strict=True):
             disc.draw(renderer)
             number.draw(renderer)

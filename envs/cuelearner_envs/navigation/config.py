@@ -57,12 +57,12 @@ class NavigationConfig:
     """Changed wish, in a corridor: the teacher passes every obstacle on this side."""
 
     def __post_init__(self) -> None:
-        """Raises UserError with one line for the first value that cannot work."""
+        """Raise UserError with one line for the first value that cannot work."""
         check(self)
 
 
 def check(config: NavigationConfig) -> None:
-    """Raises UserError with one line for the first value that cannot work."""
+    """Raise UserError with one line for the first value that cannot work."""
     check_word("style", config.style, STYLES)
     check_word("preferred_side", config.preferred_side, SIDES)
     if config.preferred_side != "none" and config.style != "corridor":

@@ -87,12 +87,12 @@ class Navigation(Described, struct.PyTreeNode):
         return jax.tree.map(lambda leaf: leaf[index], self.worlds)
 
     def reset(self, key: PRNGKeyArray) -> tuple[AnyWalker, Float[Array, " obs"]]:
-        """Stands still, turned at random, at the start of a random route of a random world."""
+        """Stand still, turned at random, at the start of a random route of a random world."""
         state = self._start(key)
         return state, self.observe(state)
 
     def step(self, key: PRNGKeyArray, state: AnyWalker, action: Float[Array, "2"]) -> tuple[AnyWalker, Step]:
-        """Walks for one period in the direction; a new episode follows an end."""
+        """Walk for one period in the direction; a new episode follows an end."""
         after = self.counted(state, self.moved(state, action))
         outcome, terminated, truncated = self.ends(after)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), self._start(key), after)

@@ -35,7 +35,7 @@ class PooltoolBilliards(Billiards, kw_only=True):
     processes: int = struct.field(pytree_node=False, default=0)  # that play; 0: one for each processor
 
     def shot(self, balls: Balls, angle: Float[Array, ""]) -> Shot:
-        """Plays one shot; batches are shared out."""
+        """Play one shot; batches are shared out."""
         count = self.table.balls
         shapes = (
             jax.ShapeDtypeStruct((count, 2), jnp.float32),
