@@ -53,7 +53,7 @@ def check_word(name: str, value: Any, known: Iterable[str]) -> None:
 
 
 def check_vector(name: str, value: Any, size: int, least: float, most: float, unit: str = "") -> None:
-    """The same of a field that holds `size` numbers."""
+    """Like `check_number`, for a field that holds `size` numbers."""
     if not isinstance(value, (tuple, list)) or len(value) != size:
         raise UserError(f"task.{name} is {shown(value)}: give {size} numbers")
     for entry in value:

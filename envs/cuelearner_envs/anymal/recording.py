@@ -32,7 +32,7 @@ COLOURS = 200  # of a GIF
 
 
 class LeggedFrame(NamedTuple):
-    """One step of navigation, in arrays of numpy."""
+    """One navigation step, in NumPy arrays."""
 
     world: World  # the one walked in, no batch
     goal: Float[np.ndarray, "2"]  # [m]
@@ -106,7 +106,7 @@ def portrait(file: str | os.PathLike[str]) -> None:
 
 
 def _perceived(env: LeggedNavigation, state: Any) -> tuple[jax.Array, jax.Array, World]:
-    """Where the lidar's beams end in space, by what it reads (beams, 3) [m], which met something, and the world."""
+    """Return the perceived ends of the lidar's beams (beams, 3) [m], which beams hit something, and the world."""
     turn = robot.rotation(state.body.qpos[3:7])
     angles = BEAM_ANGLES + jnp.asarray(env.lidar.rotation)
     ahead = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)

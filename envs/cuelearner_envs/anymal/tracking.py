@@ -1,8 +1,8 @@
-"""How well a walking policy tracks random commands, in MJX and in C MuJoCo: one protocol, one way to count.
+"""Measure how well a walking policy tracks random commands, in MJX and in C MuJoCo, by one protocol.
 
-Commands change every 4 s. The last 2 s of each are settled. An error is a mean over all settled stretches of robots
-that stand: `error` of the stretch's mean velocity, `momentary_error` of the velocity at each moment, the sway of the
-gait included.
+Commands change every 4 s. The last 2 s of each count as settled. An error is a mean over all settled stretches of
+robots that stand: `error` is that of the stretch's mean velocity, `momentary_error` that of the velocity at each
+moment, which includes the gait's sway.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cuelearner_envs.anymal.locomotion import Trial, pushed, random_command, ran
 from cuelearner_envs.anymal.physics import Body, Ground, control, standing
 from cuelearner_envs.anymal.policy import WalkingPolicy, noisy, observe
 
-HELD, SETTLING = 200, 100  # steps of control that a command is held for, and of those that are no settled ones
+HELD, SETTLING = 200, 100  # control steps for which a command is held, and how many of them are not yet settled
 SECONDS = 20.0  # a robot walks for
 
 CLEAN = Trial()
@@ -52,7 +52,7 @@ def walk(
         action = policy(obs)
         after, felt = control(pushed(k_push, body, trial), action, ground)
         down = down | felt.fallen
-        body = jax.tree.map(partial(jnp.where, down), body, after)  # who has fallen stays there
+        body = jax.tree.map(partial(jnp.where, down), body, after)  # a fallen robot stays where it is
         return (body, action, down), (robot.planar_velocity(body.qpos, body.qvel), command, down)
 
     keys = jax.random.split(k_run, robots)

@@ -157,7 +157,7 @@ def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
 
 
 def _draw_room(axes: Axes, table: Table) -> None:
-    """Everything that does not move."""
+    """Draw everything that does not move."""
     w, h, r, rail = float(table.width), float(table.height), float(table.ball_radius), rail_width(table)
     left, right, bottom, top = _limits(table)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
@@ -189,7 +189,7 @@ def _draw_room(axes: Axes, table: Table) -> None:
 
 
 def _tray(table: Table) -> Float[np.ndarray, "balls 2"]:
-    """Where pocketed balls are drawn, below the table, the cue ball last [m]."""
+    """Return the drawn positions of pocketed balls, below the table, the cue ball last [m]."""
     left, _, bottom, _ = _limits(table)
     r = float(table.ball_radius)
     x = left + 0.008 + 1.3 * r + 2.4 * r * ((np.arange(table.balls) - 1) % table.balls)
@@ -232,7 +232,7 @@ class _Balls:
 
 
 def ball_colour(ball: int) -> str:
-    """Of a ball, as a hexadecimal code."""
+    """Return a ball's colour as a hexadecimal code."""
     return CUE if ball == 0 else TARGETS[(ball - 1) % len(TARGETS)]
 
 
@@ -257,7 +257,7 @@ def _arrow_ends(table: Table, cue: np.ndarray, angle: float) -> tuple[tuple[floa
 
 
 def _draw_tracks(axes: Axes, table: Table, path: Trajectory) -> None:
-    """One line for each ball that moves, from its start to where it rests or falls."""
+    """Draw one line for each ball that moves, from its start to where it rests or falls."""
     times, positions, pocketed = np.asarray(path.times), np.asarray(path.positions), np.asarray(path.pocketed)
     for ball in range(table.balls):
         alive = int((~pocketed[:, ball]).sum())

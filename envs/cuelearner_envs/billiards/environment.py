@@ -101,7 +101,7 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         return jax.tree.map(lambda new, old: jnp.where(ended, new, old), racked, after), step
 
     def shot(self, balls: Balls, angle: Float[Array, ""]) -> Shot:
-        """What striking the cue ball in the direction `angle` [rad] leads to."""
+        """Simulate striking the cue ball in the direction `angle` [rad]."""
         return simulate(self.table, balls.positions, balls.pocketed, angle)
 
     def observe(self, balls: Balls) -> Float[Array, " obs"]:

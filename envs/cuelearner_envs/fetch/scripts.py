@@ -26,7 +26,7 @@ CLEAR, ROUND = 0.05, 0.12  # behind the object, or from it: as far, it may trave
 
 
 class Gains(NamedTuple):
-    """How `push` pushes. Lengths in metres."""
+    """Parameters of `push`. Lengths in metres."""
 
     along: Amount = 8.0  # per metre of the way along the line to the goal
     side: Amount = 14.0  # per metre that the gripper is off that line

@@ -65,7 +65,7 @@ def rule_of(aims: Aims) -> Float[Array, " ways"]:
 
 
 def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Array, "radii n"]:
-    """How far a disc of each radius could walk in directions before it touches what the lidar sees [m], to 10 m."""
+    """Return how far a disc of each radius can go in directions before it touches what the lidar sees [m], to 10 m."""
     points = points_of(obs)
     along = ways[:, :1] * points[None, :, 0] + ways[:, 1:] * points[None, :, 1]
     across = ways[:, :1] * points[None, :, 1] - ways[:, 1:] * points[None, :, 0]
@@ -73,7 +73,7 @@ def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Arr
 
 
 def points_of(obs: Float[Array, " obs"]) -> Float[Array, "271 2"]:
-    """What each beam hits, in the body's frame [m]; `FAR_AWAY` where it hits nothing."""
+    """Return each beam's hit in the body's frame [m]; `FAR_AWAY` without a hit."""
     ranges = -jnp.log(jnp.maximum(obs[:BEAMS], math.exp(-MAX_RANGE)))
     hit = ranges < MAX_RANGE - 0.01
     return jnp.where(hit[:, None], ranges[:, None] * from_angle(jnp.asarray(BEAM_ANGLES)), FAR_AWAY)
@@ -82,7 +82,7 @@ def points_of(obs: Float[Array, " obs"]) -> Float[Array, "271 2"]:
 def _lengths(
     ways: Float[Array, "ways 2"], free: Float[Array, " ways"], goal: Float[Array, "2"], away: Float[Array, ""]
 ) -> list[Float[Array, " ways"]]:
-    """What a way is worth as a detour: to its end, or past what stops its neighbours, and on straight to the goal."""
+    """Return each way's length as a detour: to its end or past its neighbours' obstacle, then straight to the goal."""
     end = jnp.minimum(free, away)
     corners = [jnp.minimum(jnp.minimum(jnp.roll(free, side), jnp.roll(free, 2 * side)), end) for side in (-1, 1)]
 

@@ -194,7 +194,7 @@ def outline(robot: Robot, pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "po
 
 
 def hits(frame: Frame) -> Float[np.ndarray, "271 2"]:
-    """Where the robot takes the lidar's beams to end [m]; a sensor mounted askew is mistaken."""
+    """Return the lidar's beam ends as the robot takes them [m], wrong for a sensor that is mounted rotated."""
     angles = np.asarray(BEAM_ANGLES, float)
     beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     return _to_world(frame.pose, np.asarray(frame.ranges)[:, None] * beams)
@@ -249,7 +249,7 @@ def _draw_goal(axes: Axes, frame: Frame) -> None:
 
 
 def _draw_course(axes: Axes, frame: Frame) -> None:
-    """Everything that stays as it is in an episode: the world, the goal, and the start, which is the frame's pose."""
+    """Draw what stays constant in an episode: the world, the goal, and the start, which is the frame's pose."""
     draw_world(axes, frame.world)
     _draw_goal(axes, frame)
     axes.plot(*frame.pose[:2], marker="o", markersize=6, color="white", markeredgecolor=START, zorder=3)
@@ -368,7 +368,7 @@ def _spread(way: Float[np.ndarray, "poses 3"], middle: Float[np.ndarray, "3"]) -
 
 
 class _Stage:
-    """One episode's figure. What stands still is drawn once; each picture draws only what moves over it."""
+    """One episode's figure. Constant parts are drawn once; each picture draws only what moves."""
 
     def __init__(self, robot: Robot, first: Frame, extent: Float[np.ndarray, "2"]) -> None:
         self.figure, axes, strip = _figure(extent, dpi=100)
@@ -383,14 +383,14 @@ class _Stage:
         self.empty = self.canvas.copy_from_bbox(self.figure.bbox)
 
     def step(self, frame: Frame, way: Float[np.ndarray, "poses 3"], words: str) -> UInt8[np.ndarray, "height width 3"]:
-        """What the robot sees and chooses before a step, and the way so far."""
+        """Draw what the robot sees and chooses before a step, and the path so far."""
         self.lidar.place(frame)
         self.body.place(frame.pose)
         self.arrow.set_positions(*_arrow_ends(frame))
         return self._picture(way, words, INK, self.lidar, self.trail, self.body, self.arrow)
 
     def end(self, last: Frame, way: Float[np.ndarray, "poses 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Where an episode ended, and how."""
+        """Draw where an episode ended, and how."""
         body = self.crashed if last.outcome in ("collision", "fall") else self.body
         body.place(last.next_pose)
         words = f"{WORDS[last.outcome]} {last.seconds:.1f} s"
@@ -406,12 +406,12 @@ class _Stage:
 
 
 def _extent(frames: Sequence[Frame]) -> Float[np.ndarray, "2"]:
-    """Of the largest world [m]."""
+    """Return the extent of the largest world [m]."""
     return np.max([np.asarray(frame.world.extent) for frame in frames], axis=0)
 
 
 def _pictures(robot: Robot, frames: Sequence[Frame], hold: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """One picture of each step, and `hold` of the end of each episode that ends."""
+    """Yield one picture per step, and the end of each finished episode for `hold`."""
     extent = _extent(frames)
     for number, group in itertools.groupby(frames, key=lambda frame: frame.episode):
         episode = list(group)

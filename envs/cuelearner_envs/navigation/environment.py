@@ -83,7 +83,7 @@ class Navigation(Described, struct.PyTreeNode):
         return self.replace(worlds=None)
 
     def world(self, index: Int[ArrayLike, "*n"]) -> World:
-        """One of the worlds, or as many as there are indices."""
+        """Return one world, or one for each index."""
         return jax.tree.map(lambda leaf: leaf[index], self.worlds)
 
     def reset(self, key: PRNGKeyArray) -> tuple[AnyWalker, Float[Array, " obs"]]:
@@ -151,15 +151,15 @@ class Navigation(Described, struct.PyTreeNode):
         )
 
     def arrived(self, state: AnyWalker) -> Bool[Array, ""]:
-        """Is the goal reached?"""
+        """Whether the goal is reached."""
         return jnp.linalg.norm(state.goal - state.pose[:2]) < self.goal_radius
 
     def failures(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
-        """What ends an episode in failure, by name; at most one holds."""
+        """Return the failures that end an episode, by name; at most one holds."""
         return {"collision": self.collided(state)}
 
     def place(self, state: AnyWalker) -> Float[Array, " place"]:
-        """Where the sensor is, with the body: what replay keeps of it."""
+        """Return the sensor's place on the body, which replay stores."""
         return state.pose
 
     def placed(
@@ -174,7 +174,7 @@ class Navigation(Described, struct.PyTreeNode):
         return Walker(place, jnp.zeros(2), goal, previous, world, route, jnp.zeros((), jnp.int32))
 
     def collided(self, state: AnyWalker) -> Bool[Array, ""]:
-        """Does the body touch anything?"""
+        """Whether the body touches anything."""
         return collides(self.robot, self.world(state.world), state.pose)
 
     def ranges(self, state: AnyWalker) -> Float[Array, "271"]:
@@ -182,7 +182,7 @@ class Navigation(Described, struct.PyTreeNode):
         return self.lidar.read(self.world(state.world), state.pose)
 
     def observe(self, state: AnyWalker) -> Float[Array, " obs"]:
-        """What the robot perceives; everything is of the order of one.
+        """Return the robot's observation; every entry is of the order of 1.
 
         - 271 entries: how near the lidar's beams end, from right behind to left behind, exp(-distance / 1 m) of
         - 2: direction to the goal in the body's frame; 1: distance to the goal over 15 m
@@ -199,7 +199,7 @@ class Navigation(Described, struct.PyTreeNode):
         return obs[BEAMS : BEAMS + 2]
 
     def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]) -> Features:
-        """What lies ahead, to the left and to the right of a robot that walks in the direction.
+        """Return features of what lies ahead, to the left and to the right of a robot that walks in the direction.
 
         - own, 1: the distance to the goal
         - turned, 370: nearness all round in steps of one degree, from behind by way of the right, the direction itself

@@ -33,7 +33,7 @@ BLOCKED = 1e4  # added to the length of a way that begins with a blocked line [m
 
 
 class RoadMap(struct.PyTreeNode):
-    """One world's graph."""
+    """The road map of one world, as a graph."""
 
     nodes: Float[Array, "nodes 2"]  # [m]
     lengths: Float[Array, "nodes nodes"]  # of the line between two nodes [m]; infinite where it is blocked
@@ -76,7 +76,7 @@ def way(
     position: Float[Array, "2"],
     goal: Float[Array, "2"],
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Where to walk next from a place, and how long the whole way is.
+    """Return the next point to walk to from a place, and the length of the whole way.
 
     Args:
         to_goal: `distances` of the same goal.
@@ -193,7 +193,7 @@ def _mapped(env: Navigation, key: PRNGKeyArray, world: World) -> tuple[RoadMap, 
 
 
 def _each(env: Navigation, mapped: Callable[[PRNGKeyArray, World], Any]) -> Any:
-    """What `mapped` gives of each world (leading axis: worlds)."""
+    """Return `mapped` of each world (leading axis: worlds)."""
     count = env.worlds.starts.shape[0]
     keys = jax.random.split(jax.random.key(0), count)
     return jax.lax.map(lambda pair: mapped(*pair), (keys, env.worlds), batch_size=min(count, 16))

@@ -30,7 +30,7 @@ WORDS = {"success": "the goal is reached", "collision": "collision", "fall": "it
 
 
 def sketch(env: Navigation, state: Any) -> Sketch:
-    """What lies round the robot, from above."""
+    """Return the robot's surroundings as a sketch, from above."""
     world, goal, pose, ranges = jax.device_get(_seen(env, state))
     parts = [svg.rectangle(-AROUND, -AROUND, 2 * AROUND, 2 * AROUND, "fill:var(--floor)")]
     boxes = zip(world.boxes, world.box_heights.tolist(), strict=True)
@@ -104,7 +104,7 @@ def _placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def _shown(points: np.ndarray, beyond: float = 0.0) -> bool:
-    """May something of what lies between these points be seen, on a page of any width?"""
+    """Whether anything between these points may be visible on a page of any width."""
     low, high = points.min(axis=0) - beyond, points.max(axis=0) + beyond
     return bool((low < AROUND).all() and (high > -AROUND).all())
 

@@ -41,7 +41,7 @@ SIDE_POCKET = 0.1  # radius of the circle that stands for the straight edge betw
 
 @lru_cache(maxsize=1)
 def engine() -> PhysicsEngine:
-    """Its models by name: what a user's configuration of pooltool says does not count."""
+    """Return pooltool's physics engine with models by name, independent of the user's pooltool configuration."""
     return PhysicsEngine(
         Resolver.from_config(
             ResolverConfig(
@@ -97,7 +97,7 @@ def table(outline: Outline) -> Table:
 
 
 def _corner_reach(outline: Outline) -> float:
-    """How far from a corner a ball's centre can be when it leaves the table there [m]."""
+    """Return the largest distance from a corner at which a ball's centre can leave the table there [m]."""
     along = outline.corner_gap - outline.ball_radius - outline.cushion_radius
     return math.hypot(along, outline.pocket_margin)
 
