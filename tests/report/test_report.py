@@ -142,7 +142,7 @@ def test_says_what_is_missing(runs, tmp_path):
     text = report(runs, tmp_path / "report").read_text()
     missing = text.split("## Missing")[1].split("## Where")[0]
     assert "scalar-a: at step 50 of 100 (50%)" in missing
-    assert "scalar, 100 labels: some seeds have reached step 100; shown to 50" in missing
+    assert "scalar, 100 labels: some seeds have reached step 100; the curve ends at 50" in missing
     assert "heuristic: a single seed, so there is no interval" in missing
     assert "nan" not in text
     assert "planned: no results" in missing
@@ -272,7 +272,7 @@ def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path)
     for name in ("curves.csv", "label_efficiency.svg"):
         assert (tmp_path / "after" / name).read_text() == (tmp_path / "before" / name).read_text()
     marked, plain = ((tmp_path / out / "curves.svg").read_text() for out in ("after", "before"))
-    note = "a seed failed, and is left out"
+    note = "a failed seed, left out"
     assert note in marked
     crosses = marked.count("<use ") - plain.count("<use ") - len(note)  # letters are drawn so too
     assert crosses == 3 + 1  # one for each lane that a curve lacks, and the legend's

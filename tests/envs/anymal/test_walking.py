@@ -78,8 +78,8 @@ def test_a_damaged_policy_is_the_same_or_refused_in_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("name", "values", "told"),
     [
-        ("std", np.zeros(policy.OBS), "numbers that cannot be"),
-        ("bias_1", np.full(robot.JOINTS, np.nan), "numbers that cannot be"),
+        ("std", np.zeros(policy.OBS), "invalid numbers"),
+        ("bias_1", np.full(robot.JOINTS, np.nan), "invalid numbers"),
         ("mean", np.zeros(3), "no walking policy of this robot"),
         ("kernel_1", np.zeros((5, robot.JOINTS)), "no walking policy of this robot"),
         ("bias_0", np.zeros(()), "no walking policy of this robot"),
