@@ -1,4 +1,4 @@
-"""How long an exported decision takes: one observation at a time on one core, in every format.
+"""Time of an exported decision: one observation at a time on one core, in every format.
 
     python benchmarks/export_speed.py docs/data/navigation_agent
 

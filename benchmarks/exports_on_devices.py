@@ -64,7 +64,7 @@ def called(folder: Path) -> list[dict[str, Any]]:
 
 
 def on(device: str, *arguments: str) -> str:
-    """What this file prints last in a process that has one kind of device; raises SystemExit if that fails."""
+    """Return what this file prints last in a process on one kind of device; raise SystemExit if it fails."""
     done = subprocess.run(
         [sys.executable, __file__, *arguments, "--device", device],
         env={**os.environ, "JAX_PLATFORMS": device},

@@ -35,7 +35,7 @@ class Leaning(PolicyNode):
 
 
 def by_hand(obs: np.ndarray) -> np.ndarray:
-    """The same in plain NumPy, (n, 4) -> (n, 2): any Python can be a policy. What it returns is made unit vectors."""
+    """Act as `Leaning` in plain NumPy, (n, 4) -> (n, 2). The package makes returned vectors unit vectors."""
     towards = obs[:, :2] / np.maximum(np.linalg.norm(obs[:, :2], axis=-1, keepdims=True), 1e-6)
     return towards - 0.5 * obs[:, 2:]
 

@@ -1,4 +1,4 @@
-"""What the experiments on adaptation have in common: pieces of a study, who adapts, and the tables that they leave.
+"""Shared parts of the experiments on adaptation: pieces of a study, base agents and recorded tables.
 
 A piece is one method in one changed world, over all base agents of a run folder and all its budgets (or steps), in
 lanes of one program. Its rows go to FOLDER/TASK/WORLD/PIECE/adaptation.jsonl while it runs, .parquet once it is done.
@@ -83,20 +83,20 @@ class Piece(NamedTuple):
 
     @property
     def place(self) -> str:
-        """What tables call the changed world."""
+        """The changed world's name in tables."""
         if self.robot is None:
             return self.world
         return self.robot if self.world == UNCHANGED else f"{self.world}_{self.robot}"
 
     @property
     def path(self) -> str:
-        """Of its folder, and what it is called on the command line."""
+        """The piece's folder and name on the command line."""
         name = f"{self.method}-{self.variant}" if self.variant else self.method
         return f"{'tuning/' if self.split == 'tuning' else ''}{self.place}/{name}"
 
     @property
     def lanes(self) -> int:
-        """For each base agent."""
+        """Number of lanes per base agent."""
         return self.seeds * max(1, len(self.labels)) * max(1, len(self.rates)) * max(1, len(self.noises_deg))
 
 
@@ -125,12 +125,12 @@ class Study(NamedTuple):
 
 @lru_cache(maxsize=4)
 def environment(task: str, world: Any, split: str, robot: str | None = None) -> Any:
-    """That of a world; made once, for a thousand halls take a while."""
+    """Return a world's environment; cached, since a thousand halls take a while."""
     return registry.find(task).on(robot).environment(world, split)
 
 
 class Bench(NamedTuple):
-    """Where a piece is run: its base agents, and the world."""
+    """The base agents and world of a piece."""
 
     task: Task
     config: RunConfig  # of the base agents' run
@@ -194,7 +194,7 @@ def bases_of(piece: Piece, scale: Scale, seeds: tuple[int, ...]) -> tuple[int, .
 
 
 def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) -> Bench:
-    """Where a piece is run. Raises UserError if the folder holds no such agents."""
+    """Open the base agents and world of a piece. Raises UserError if the folder holds no such agents."""
     source = PolicySource.of_run(folder, registry.find)
     if source.task.name != study.task:
         raise UserError(f"{folder} holds agents of {source.task.name}: give --bases a run of {study.task}")

@@ -1,4 +1,4 @@
-"""Tables of recorded adaptation: what methods reach, and after how many labels or steps."""
+"""Tables of recorded adaptation: what methods reach, by number of labels or steps."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Line(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As tables show it."""
+        """The line's name in tables."""
         return named(self.method, self.variant)
 
 
@@ -60,7 +60,7 @@ def read(folder: Path) -> list[Row]:
 
 
 def lines(rows: Sequence[Row], world: str, split: str = "validation", least: float = 0.0) -> list[Line]:
-    """What is known of a world, in the order of `NAMES`.
+    """Return the lines recorded for a world, in the order of `NAMES`.
 
     `least`: base agents that earn less in the unchanged world, on tuning episodes, are left out.
     """
@@ -103,12 +103,12 @@ def spread(values: np.ndarray, digits: int = 3) -> str:
 
 
 def percent(values: np.ndarray) -> str:
-    """The same of shares, in percent."""
+    """Format an interval of shares in percent."""
     return spread(100 * values, 1)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """As Markdown."""
+    """Format lines as a Markdown table."""
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows])
 
 
@@ -190,7 +190,7 @@ class Reached(NamedTuple):
     upper: float
 
     def told(self, last: int) -> str:
-        """In words; `last`: labels or steps of the longest."""
+        """Describe the result in words; `last`: labels or steps of the longest measurement."""
 
         def number(value: float) -> str:
             return f"{value:,.0f}" if np.isfinite(value) else f"above {last:,}"
@@ -199,7 +199,7 @@ class Reached(NamedTuple):
 
 
 def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own: bool) -> Reached:
-    """When a method's curve has made `GAIN` of a gain.
+    """Return the number of labels or steps after which a method's curve has made `GAIN` of a gain.
 
     Args:
         curves: (bases, label seeds, points) of the method, the first at 0 labels or steps.
@@ -220,7 +220,7 @@ def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own
 
 
 def _crossing(curve: np.ndarray, after: Sequence[int], level: float) -> float:
-    """Where straight lines between points first come to a level."""
+    """Return where straight lines between points first reach a level."""
     at = np.flatnonzero(curve >= level)
     if not len(at):
         return np.inf

@@ -1,4 +1,4 @@
-"""How a report shows how far labels carry: its section in Markdown, and its two figures."""
+"""A report's section on label efficiency in Markdown, and its two figures."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def _interval(found: Interval | None, form: str = "{:.3f}") -> str:
 
 
 def of_guides(found: Efficiency) -> Shown:
-    """What the guides alone are worth; empty unless labels make a difference to be shown."""
+    """Describe the guides' own performance; empty unless it varies with labels."""
     shown = [(each.variant, each.guide) for each in found.carried if each.guide is not None]
     return shown if any(variant.labels for variant, _ in shown) else []
 
@@ -176,7 +176,7 @@ def _panels(shown: Shown, title: str, name: str, even: float | None = None) -> F
 
 
 def _limit(axes: Axes, even: float, edge: float) -> None:
-    """Of ratios: a line where nothing is saved, and words at the edge where what never reaches the level is drawn."""
+    """Draw the limits of ratios: a line where nothing is saved, and words at the edge for levels never reached."""
     axes.axhline(even, color=colour_of("none"), linewidth=1)
     axes.set_ylim(bottom=0)
     if np.isfinite(edge):

@@ -1,4 +1,4 @@
-"""What sweeps have in common that are cut into pieces: which pieces, at which scale, resumed, and reported together."""
+"""Sweeps cut into pieces: which pieces, at which scale, resumed, and reported together."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Piece(NamedTuple):
 
     @property
     def path(self) -> str:
-        """Of its folder, and what it is called on the command line."""
+        """The piece's folder and name on the command line."""
         return f"{self.world}/{self.run}/{self.name}"
 
     @property
@@ -106,7 +106,7 @@ def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]
 
 
 def folder_at(out: Path, scale: str) -> Path:
-    """Where the worlds of a scale are: those of `paper` in the folder itself, others below it."""
+    """Return the folder of a scale's worlds: the folder itself for `paper`, one below for others."""
     return out if scale == "paper" else out / scale
 
 

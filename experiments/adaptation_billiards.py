@@ -1,4 +1,4 @@
-"""Finished billiards agents in three changed worlds: labels about their shots against fine-tuning and other baselines.
+"""Adapt trained billiards agents in three changed worlds: labels against fine-tuning and other baselines.
 
     python experiments/adaptation_billiards.py --list
     python experiments/adaptation_billiards.py --bases RUN --out FOLDER [--pieces tilted_table] [--resume]
@@ -123,7 +123,7 @@ PIECES = (
 
 
 def bases(**options: Any) -> list[str]:
-    """How tiny base agents are trained."""
+    """Return the command-line options for training tiny base agents."""
     own = {**TRAINING["smoke"].options, "preset": "regulation", "guidance": "none", "seeds": 2, **options}
     return [word for name, value in own.items() for word in option(name, value)]
 

@@ -102,7 +102,7 @@ def played(env: Any, policy: Any, racks: int, shots: int, split: str = "validati
 
 
 def near(base: Any, env: Any) -> NearbyTeacher:
-    """Who answers: plays shots near what the base policy does."""
+    """Return the teacher, which plays shots near the base policy's."""
     return NearbyTeacher(Teaching(base), env, jnp.deg2rad(AIM_DEG), jnp.deg2rad(REACH_DEG), TRIED)
 
 
@@ -151,7 +151,7 @@ def adapted(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int,
 
 
 def measured(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> Iterator[Row]:
-    """All measurements but the known ones, each as soon as it is there."""
+    """Yield all measurements but the known ones, each as soon as it is made."""
     own, world = cl.make("billiards", table=TABLE), cl.make("billiards", table=TABLE, robot="pooltool")
     env = world.env.replace(processes=processes)  # pyright: ignore[reportAttributeAccessIssue]
     done = {(row["what"], row["seed"], row["labels"]) for row in known}
@@ -184,7 +184,7 @@ def mean(values: Any) -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """What was measured, seeds together; gains are of each rack."""
+    """Print the measurements, seeds together; gains are paired by rack."""
     kinds = dict.fromkeys((row["what"], row["labels"]) for row in sorted(rows, key=lambda row: row["labels"]))
     rewards = {
         kind: np.mean([row["rewards"] for row in rows if (row["what"], row["labels"]) == kind], axis=0)

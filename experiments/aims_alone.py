@@ -1,4 +1,4 @@
-"""What the aims of the billiards tables are worth without a single label.
+"""Measure the aims of the billiards tables without any label.
 
     python experiments/aims_alone.py --out docs/data/aims_alone.json
 
@@ -28,7 +28,7 @@ TABLES = ("easy", "regulation")
 
 
 class AimAtRandom(PolicyNode):
-    """One of the possible aims, each as likely; where there is none, any direction."""
+    """Policy that chooses a possible aim uniformly; any direction where there is no aim."""
 
     env: Any
 

@@ -55,7 +55,7 @@ PEERS = ("bdcoach", "clic")
 
 
 def steps(total: int, every: int) -> Options:
-    """How long is trained, and how often evaluated."""
+    """Return options for a number of training steps and an interval between evaluations."""
     return {
         "preset": "paper",
         "schedule.total-steps": total,
@@ -92,7 +92,7 @@ ONE: Options = {"scalars.says": "one"}
 
 
 def variants(world: str, options: Options) -> list[Piece]:
-    """What is compared in one world."""
+    """Return the variants compared in one world."""
     minutes = 3 if world == "reach" else 9
     valued, plain, alone = {**options, **BY_VALUE}, {**options, **EPISODES}, {**options, **UNLEARNED}
     rows: list[tuple[str, str, tuple[int, ...], Options, str]] = [
@@ -170,7 +170,7 @@ SCALES = {
 
 
 def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
-    """What pieces of training have come to so far: a row for each variant and evaluation, over its seeds."""
+    """Return the results of the trained pieces so far: a row per variant and evaluation, over its seeds."""
     found = []
     for piece, arbiter, row, own in evaluations(out, pieces):
         judged = len(by_value.ARMS) * arbiter.get("judge_steps", 0) if piece.kinds != ("none",) else 0

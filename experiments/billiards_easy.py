@@ -1,4 +1,4 @@
-"""Does guidance speed learning up on the easy table (three balls)? Minutes a variant on one GPU.
+"""Measure whether guidance speeds up learning on the easy table (three balls). Minutes a variant on one GPU.
 
     python experiments/billiards_easy.py --out FOLDER [plain|mirrors ...]
 

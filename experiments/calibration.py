@@ -1,4 +1,4 @@
-"""What answers tell about a changed world, and what the policy is worth behind it: calibration by 10 to 100 labels.
+"""Calibration by 10 to 100 labels: what answers tell about a changed world, and the policy's gain.
 
     python experiments/calibration.py --task billiards --bases RUN
     python experiments/calibration.py --task navigation --bases docs/data/navigation_agent
@@ -90,7 +90,7 @@ def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, fault
 
 
 def family_of(task: Any, own: Any, world: World, tilt: bool) -> tuple[Distortion, ...]:
-    """What may have changed, as the world declares it; `tilt`: and the table, as a simulator has it."""
+    """Return what may have changed, as the world declares; with `tilt` also the table, by a simulator."""
     if not tilt:
         return declared(world.env)
     known, space = task.environment(own), actions_of(world.env)
@@ -197,7 +197,7 @@ class Study(NamedTuple):
 
     @property
     def worlds(self) -> Sequence[str]:
-        """Those that are asked for."""
+        """Return the worlds that the command line asks for."""
         return self.asked.worlds or WORLDS[self.task.name]
 
     def compared(self, rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -219,7 +219,7 @@ class Study(NamedTuple):
 
 
 def arguments() -> argparse.ArgumentParser:
-    """What can be asked for."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=list(WORLDS), default="billiards")
     parser.add_argument("--bases", type=Path, help="run folder of the base agents")

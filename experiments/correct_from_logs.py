@@ -37,7 +37,7 @@ LABELS, RECORDED, OTHERS = 200, 400, 2000
 
 
 def wanted(obs):
-    """What the teacher has in mind."""
+    """Return the teacher's intended actions."""
     return np.stack([0.06 * obs[:, 0], 0.06 * obs[:, 1], 0.6 * np.tanh(obs[:, 2] * obs[:, 0])], -1).astype(np.float32)
 
 
@@ -47,7 +47,7 @@ def off(obs):
 
 
 class Row(NamedTuple):
-    """One correction."""
+    """Result of one correction."""
 
     guidance: str
     questions: str  # "rounds" or "at random"
@@ -103,7 +103,7 @@ def in_rounds(seed: int, guidance: str, folder: Path, control: bool):
 
 
 def corrected(guidance: str, questions: str, answers: str, seed: int, folder: Path) -> Row:
-    """One correction, judged."""
+    """Correct a policy once and judge it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a control is not used
         if questions == "rounds":
@@ -118,7 +118,7 @@ def corrected(guidance: str, questions: str, answers: str, seed: int, folder: Pa
 
 
 def main(seeds: int = 5, out: Path | None = None) -> list[Row]:
-    """All corrections.
+    """Run all corrections.
 
     Args:
         seeds: of situations, questions and fits.

@@ -1,4 +1,4 @@
-"""How many corrections a policy needs where nothing is rewarded: seven kinds, four worlds, three teachers.
+"""Number of corrections a policy needs without any reward: seven kinds, four worlds, three teachers.
 
     python experiments/corrections_alone.py --list
     python experiments/corrections_alone.py --scale quick --out runs/corrections [--pieces halls grasp/clic] [--resume]

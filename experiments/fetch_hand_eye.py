@@ -56,7 +56,7 @@ class Scale(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """What is measured beside the policy as it was."""
+    """A variant measured beside the uncorrected policy."""
 
     says: str  # which cues the teacher speaks of
     shuffled: bool = False  # a control: labels have each other's answers
@@ -140,7 +140,7 @@ def adapted(environment: str, kind: str, condition: Condition, labels: int, seed
 
 
 def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iterator[Row]:
-    """All measurements of a piece but the known ones, each as soon as it is there."""
+    """Yield all measurements of a piece but the known ones, each as soon as it is made."""
     environment, kind, number = piece.split("/")
     done = {(row["what"], row["says"], row["shuffled"]) for row in known}
     first = FIRST_EPISODE[split] + int(number) * scale.episodes

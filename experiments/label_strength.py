@@ -1,4 +1,4 @@
-"""How strong should a relative label be? The guide alone on one ball, for several strengths. Minutes on 2 cores.
+"""Compare strengths of a relative label, by the guide alone on one ball. Minutes on 2 cores.
 
     python experiments/label_strength.py --out FOLDER
 

@@ -1,4 +1,4 @@
-"""What a guide costs or brings when guidance is paced and when it is not. One ball; minutes on 2 cores.
+"""Measure the effect of a guide with and without pacing. One ball; minutes on 2 cores.
 
     python experiments/pace.py --out FOLDER
 

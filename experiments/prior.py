@@ -1,4 +1,4 @@
-"""What labels add to the agent's choice, beside the same choice without labels.
+"""Measure what labels add as a prior of the agent's choice, against the same choice without labels.
 
     python experiments/prior.py --list
     python experiments/prior.py --scale start --out FOLDER                 # before the first step: minutes on two cores
@@ -153,7 +153,7 @@ SCALES = {
 
 
 def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
-    """What pieces have come to so far: a row for each variant and evaluation, over its seeds."""
+    """Return the results of the pieces so far: a row per variant and evaluation, over its seeds."""
     found = []
     for piece, arbiter, row, own in evaluations(out, pieces):
         judged = len(ARMS) * arbiter.get("judge_steps", 0)
@@ -167,7 +167,7 @@ def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """One line a variant: at the start, after a tenth and at the end, and in navigation the steps to the level."""
+    """Print a line per variant: start, a tenth and end; in navigation also the steps to the level."""
     groups = defaultdict(list)
     for row in rows:
         groups[row["world"], row["run"], row["guidance"], row["labels"]].append(row)

@@ -1,4 +1,4 @@
-"""How well rooms can be walked by what the robot sees: policies cloned from very many of the road map's actions.
+"""Estimate the best success in rooms from the robot's observation: clones of very many road-map actions.
 
     python experiments/rooms_ceilings.py --out FOLDER [--variants network ways] [--scale smoke]
 
@@ -44,7 +44,7 @@ FROM_HERE_DEG = 5.0  # a way is as likely as it lies near what the road map does
 
 
 class Scale(NamedTuple):
-    """How much of it is run."""
+    """How much of the study is run."""
 
     worlds: int
     walkers: int  # of each seed
@@ -97,7 +97,7 @@ class Clone(PolicyNode):
         return DIRECTIONS.outward(applied(residual_network(self.layers, 2))(params, *seen), goals)
 
     def loss(self, params: Any, obs: Float[Array, "n obs"], best: Float[Array, "n 2"]) -> Float[Array, ""]:
-        """How far the clone is from what the road map does."""
+        """Return the clone's distance from the road map's actions."""
         if not self.ways:
             return jnp.mean(jnp.sum(jnp.square(self.towards(params, obs) - best), -1))
         aims, likely = self.weighed(params, obs)
@@ -106,7 +106,7 @@ class Clone(PolicyNode):
         return -jnp.mean(jnp.sum(wanted * likely, -1))
 
     def act(self, key: Array, states: Any, obs: Float[Array, "n obs"]) -> Float[Array, "n 2"]:
-        """What the road map would do, as far as it has learned."""
+        """Return the clone's actions."""
         if not self.ways:
             return DIRECTIONS.retract(self.towards(self.params, obs))
         aims, likely = self.weighed(self.params, obs)

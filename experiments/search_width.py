@@ -36,7 +36,7 @@ FULL = "all 3,600"
 
 
 def folder(out: Path, search: str) -> Path:
-    """Where the sweep of a search lies."""
+    """Return the folder of a search's sweep."""
     return out / search.replace(",", "").replace(" ", "-")
 
 

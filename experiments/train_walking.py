@@ -37,7 +37,7 @@ VALUE_LAYERS = (256, 256, 256, 256)
 
 
 class Walker(NamedTuple):
-    """What training has to know of a robot that learns to walk. Figures are numbers by name."""
+    """What training needs to know about a robot that learns to walk. Figures are numbers by name."""
 
     environment: Any  # brax.envs.Env: velocity commands are to be tracked
     policy: Callable[[Any], Any]  # brax's parameters -> a policy
@@ -49,7 +49,7 @@ class Walker(NamedTuple):
 
 @dataclass(frozen=True)
 class Training:
-    """How walking is learned (brax's PPO)."""
+    """Settings of training to walk (brax's PPO)."""
 
     steps: int = 100_000_000
     """Steps of control, over all robots."""

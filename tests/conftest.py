@@ -36,13 +36,13 @@ install_import_hook(PACKAGES, "checked.checked")  # before anything of them is i
 
 @cache
 def lies_in(path, places):
-    """Is a file one of these files, or in one of these folders of tests?"""
+    """Whether a file is one of these files, or lies in one of these folders of tests."""
     return any(TESTS / place in (path, *path.parents) for place in places)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """What is imported stays: the garbage collector does not look through it, neither here nor during the tests."""
+    """Freeze imported objects, so that the garbage collector never traverses them during collection and tests."""
     gc.disable()
     try:
         return (yield)

@@ -189,7 +189,7 @@ LARGEST = 60  # labels of the largest budget in the tests' loop
 
 @cache
 def window_program(kind):
-    """One compiled loop on the bandit for all tests; four lanes in each of them compile one program."""
+    """Return one training program on the bandit for all tests, so that it compiles once."""
     guide = guidances.make(kind, SIZES, Window())
     return make_program(CONFIG, guide, Window(), LARGEST if guide.asks else 0)
 
@@ -216,7 +216,7 @@ def long_but(few, names):
 
 
 def stored(state, lane, steps):
-    """What a lane's environments met: columns (steps, ...) of its replay in the order of time."""
+    """Return the columns (steps, ...) of a lane's replay in the order of time."""
     rows = np.asarray(state.agent.replay[lane, :steps])
     names = {"obs": slice(0, 2), "action": slice(2, 4), "reward": 4}
     if rows.shape[1] > 5:  # something bootstraps
@@ -237,12 +237,12 @@ def label_set(obs, action, answer, valid):
 
 
 def compilations(*functions):
-    """How often each jitted function has been compiled."""
+    """Return how often each jitted function has been compiled."""
     return [function._cache_size() for function in functions]
 
 
 def lane(tree, index):
-    """One lane of a block, as NumPy."""
+    """Return one lane of a block as NumPy arrays."""
     raw = partial(jax.tree.map, lambda leaf: words(leaf)[index])
     return jax.tree.map(np.asarray, raw(tree))
 
