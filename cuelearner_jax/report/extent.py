@@ -67,7 +67,7 @@ def failed_lanes(failed: pa.Table, variants: Sequence[Variant]) -> list[str]:
     return [
         f"{failures.variant_name(*key)}: {seeds} failed, no longer finite: "
         + (f"curve and means are over the other {left[key]}" if key in left else "no lane is left")
-        for key, seeds in failures.told(failed).items()
+        for key, seeds in failures.describe_failed(failed).items()
     ]
 
 

@@ -23,7 +23,7 @@ def variant_name(guidance: str, labels: int) -> str:
     return f"{guidance}, {labels:,} labels" if labels else guidance
 
 
-def told(table: pa.Table) -> dict[tuple[str, int], str]:
+def describe_failed(table: pa.Table) -> dict[tuple[str, int], str]:
     """Describe failed lanes by kind of guidance and budget: seeds, and the step by which each failed."""
     steps: dict[tuple[str, int], list[str]] = {}
     for (guidance, labels, seed), step in results.failures(table).items():
@@ -34,7 +34,7 @@ def told(table: pa.Table) -> dict[tuple[str, int], str]:
 def summary(table: pa.Table) -> str:
     """Return a sentence on the failed lanes of a results table; empty if no lane failed."""
     failed = results.failures(table)
-    which = "; ".join(f"{variant_name(*variant)}: {seeds}" for variant, seeds in told(table).items())
+    which = "; ".join(f"{variant_name(*variant)}: {seeds}" for variant, seeds in describe_failed(table).items())
     return f"{len(failed)} of {results.lanes(table)} lanes failed, no longer finite ({which})" if failed else ""
 
 
