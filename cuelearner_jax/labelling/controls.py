@@ -206,7 +206,7 @@ def keys_of(control: Control) -> str:
     return ", ".join(dict.fromkeys(map(_shown, control.keys)))
 
 
-def given(
+def answer_of(
     space: Space, pressed: Control | None, angle_deg: float | None, said: Mapping[int, float]
 ) -> np.ndarray | None:
     """Return the answer in the form's encoding, (width,); None for "don't know".

@@ -184,7 +184,7 @@ class Page:
                     taken = await run.io_bound(self.session.undo, number)
                 else:
                     said = self._said if self._said_of == number else {}
-                    answer = controls.given(self.space, pressed, angle, said)
+                    answer = controls.answer_of(self.space, pressed, angle, said)
                     taken = await run.io_bound(self.session.answer, number, answer, told.get("seconds"))
             except UserError as error:
                 why = str(error)

@@ -137,7 +137,7 @@ def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
         assert sorted(answers) == sorted((value,) for value in (form.values(DIRECTIONS) if form.values else ()))
     left, _, right = controls.answers(RELATIVE, DIRECTIONS)
     assert (left.answer, left.keys, right.keys) == ((1.0,), ("ArrowLeft", "a", "A"), ("ArrowRight", "d", "D"))
-    assert controls.given(DIRECTIONS, controls.UNSURE, None, {}) is None
+    assert controls.answer_of(DIRECTIONS, controls.UNSURE, None, {}) is None
 
 
 def test_practice_is_marked_and_can_be_skipped(opened, tmp_path):
