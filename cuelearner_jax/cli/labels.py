@@ -85,7 +85,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _inspect(asked: Inspect) -> None:
-    files = [comparing.checked(path) for path in asked.files]
+    files = [comparing.read_checked(path) for path in asked.files]
     table = Table("", *(one_line(str(path)) for path in asked.files))
     told = [_told(path, file, asked.teacher) for path, file in zip(asked.files, files, strict=True)]
     for name in dict.fromkeys(name for one in told for name in one):
@@ -161,7 +161,7 @@ def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
 def _merge(asked: Merge) -> None:
     if asked.out is None or asked.out.suffix != ".parquet":
         raise UserError("merge needs --out: give it a name that ends in .parquet")
-    file, left_out = comparing.merged([comparing.checked(path) for path in asked.files])
+    file, left_out = comparing.merged([comparing.read_checked(path) for path in asked.files])
     sources = [f"{path.name} {label_files.digest(path)}" for path in asked.files]
     label_files.write_file(asked.out, file, merged_from=sources)
     twice = f"; {left_out} duplicates of an earlier file's labels were left out" if left_out else ""
@@ -174,7 +174,7 @@ def _export(asked: LabelsExport) -> None:
     place = asked.out
     if place is None or place.suffix not in (".csv", ".parquet"):
         raise UserError("export needs --out: give it a name that ends in .csv or .parquet")
-    file = comparing.checked(asked.files[0])
+    file = comparing.read_checked(asked.files[0])
     if place.suffix == ".parquet":
         label_files.write_file(place, file)
     else:

@@ -30,7 +30,7 @@ def form_of(file: LabelFile) -> AnswerForm | None:
     return forms.get(file.answers)
 
 
-def checked(path: Path) -> LabelFile:
+def read_checked(path: Path) -> LabelFile:
     """Read a label file and check it as training does. Raises UserError for an empty or invalid file."""
     file = label_files.read(path)
     given.check_file(file, None, form_of(file), str(path))
