@@ -161,7 +161,7 @@ def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
 def _merge(asked: Merge) -> None:
     if asked.out is None or asked.out.suffix != ".parquet":
         raise UserError("merge needs --out: give it a name that ends in .parquet")
-    file, left_out = comparing.merged([comparing.read_checked(path) for path in asked.files])
+    file, left_out = comparing.merge([comparing.read_checked(path) for path in asked.files])
     sources = [f"{path.name} {label_files.digest(path)}" for path in asked.files]
     label_files.write_file(asked.out, file, merged_from=sources)
     twice = f"; {left_out} duplicates of an earlier file's labels were left out" if left_out else ""

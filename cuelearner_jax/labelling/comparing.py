@@ -122,7 +122,7 @@ def _questions(file: LabelFile) -> Iterator[tuple[bytes, np.ndarray]]:
         yield b"".join(part.tobytes() for part in asked), answer
 
 
-def merged(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
+def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     """Concatenate the labels of several files; return the merged file and the number of duplicates left out.
 
     A label is a duplicate if an earlier file has a label of equal observation, action and answer, and of equal person
