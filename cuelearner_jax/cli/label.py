@@ -145,7 +145,7 @@ def run(arguments: list[str]) -> None:
     again = shlex.join(["cuelearner", "label", *typed])
     commands = server.Commands(again, partial(_following, task, chosen, config, asked, named))
     # The port comes first, so that nothing has been written where it is refused.
-    with server.bound(asked.port) as port, claimed(asked.out), interruptible("the answer of the moment") as stopping:
+    with server.bind(asked.port) as port, claimed(asked.out), interruptible("the answer of the moment") as stopping:
         finished = _served(server, plan, asked, port, stopping, commands)
     if finished is None:
         raise Interrupted(f"stopped; every answer is in {asked.out}: repeat the same command to continue")

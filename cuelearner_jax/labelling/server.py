@@ -78,7 +78,7 @@ this.textContent = 'copied'">copy</button></p>
 </body></html>"""
 
 
-def bound(port: int) -> socket.socket:
+def bind(port: int) -> socket.socket:
     """Return a socket bound to this machine only (port 0: any free port). Raises UserError if the port is taken."""
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
