@@ -112,11 +112,11 @@ class EvidenceLearner(Learner):
             doubt = ties(self._known.meaning, (), np.zeros(0), beside, self._known.eps)[: len(obs)]
             self._known.learn(obs, action, answer, doubt)
             self._rows = rows
-        told = told_of(self._known.result(), len(rows)) if len(rows) >= LEAST else ()
+        told = describe_result(self._known.result(), len(rows)) if len(rows) >= LEAST else ()
         self.newest = Fitted(self._theory(), len(rows), self.newest.number + 1, told=told)
 
 
-def told_of(result: Result, labels: int) -> tuple[str, ...]:
+def describe_result(result: Result, labels: int) -> tuple[str, ...]:
     """Return lines that report what the answers so far show."""
     if result.verdict == CHANGED:
         return tuple(result.words())
