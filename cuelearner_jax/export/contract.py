@@ -96,7 +96,7 @@ def write(
             for name, contents in {**files, runner.CONTRACT: sealed.encode()}.items():
                 with replacing(folder / name, "wb") as file:
                     file.write(contents)
-            return {**contract, "difference": checked(folder)}
+            return {**contract, "difference": replay_golden_cases(folder)}
 
 
 def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:
     ]
 
 
-def checked(folder: Path) -> float:
+def replay_golden_cases(folder: Path) -> float:
     """Replay a folder's golden cases; return the largest difference.
 
     Raises UserError for a folder that is damaged, cannot be run here, or gives other actions.

@@ -146,18 +146,18 @@ def test_a_folder_that_is_damaged_or_changed_is_refused(folder, tmp_path):
         before = (there / name).read_bytes()
         (there / name).write_bytes(before[:50] + bytes([before[50] ^ 1]) + before[51:])
         with pytest.raises(UserError, match=name):
-            contract.checked(there)
+            contract.replay_golden_cases(there)
         (there / name).write_bytes(before)
     text = (there / runner.CONTRACT).read_text()
     (there / runner.CONTRACT).write_text(text.replace('"unit": "1"', '"unit": "m"'))
     with pytest.raises(UserError, match="was changed"):
-        contract.checked(there)
+        contract.replay_golden_cases(there)
     (there / runner.CONTRACT).write_text(text)
     (there / "golden.npz").unlink()
     with pytest.raises(UserError, match=r"golden.npz cannot be read"):
-        contract.checked(there)
+        contract.replay_golden_cases(there)
     with pytest.raises(UserError, match="cannot be read"):
-        contract.checked(tmp_path / "nowhere")
+        contract.replay_golden_cases(tmp_path / "nowhere")
 
 
 JUNK = [None, -1, 1e30, True, "/etc/passwd", [], {"a": 1}, float("nan")]
@@ -202,7 +202,7 @@ def test_an_artefact_is_a_file_that_the_contract_lists(folder, tmp_path, name):
                 shutil.copy(folder / "numpy" / "decision.npz", place / other)
     edit_contract(there, lambda told: told["artefact"].update(file=name))
     with pytest.raises(UserError, match="is invalid"):
-        contract.checked(there)
+        contract.replay_golden_cases(there)
 
 
 def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(folder, tmp_path):
@@ -220,7 +220,7 @@ def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(fold
         np.savez(there / runner.GOLDEN, **spoiled)
         edit_contract(there)
         with pytest.raises(UserError, match="cannot be run here"):
-            contract.checked(there)
+            contract.replay_golden_cases(there)
     np.savez(there / runner.GOLDEN, obs=obs, actions=actions)
     with np.load(there / "decision.npz") as stored:
         arrays = dict(stored)
@@ -235,7 +235,7 @@ def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(fold
         np.savez(there / "decision.npz", **{**arrays, "graph": np.frombuffer(json.dumps(graph).encode(), np.uint8)})
         edit_contract(there)
         with pytest.raises(UserError, match=r"cannot be run here|golden cases differ|not give finite numbers"):
-            contract.checked(there)
+            contract.replay_golden_cases(there)
 
 
 def test_what_the_contract_does_not_list_is_told(folder, tmp_path):
@@ -255,7 +255,7 @@ def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_
     (there / "decision.stablehlo").write_bytes(changed.serialize())
     edit_contract(there)
     with pytest.raises(UserError, match="calls Python functions"):
-        contract.checked(there)
+        contract.replay_golden_cases(there)
 
 
 def test_of_two_exports_at_once_the_second_is_refused(folder, tmp_path):
@@ -271,7 +271,7 @@ def test_of_two_exports_at_once_the_second_is_refused(folder, tmp_path):
     contract.write(Heuristic(ENV), ENV, meanwhile, "numpy", out, {})
     assert len(second) == 1
     assert "\n" not in second[0]
-    assert contract.checked(out) <= 1e-5
+    assert contract.replay_golden_cases(out) <= 1e-5
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
@@ -283,7 +283,7 @@ def test_a_decision_that_is_another_one_is_found_by_its_golden_cases(folder, tmp
     np.savez(there / runner.GOLDEN, obs=obs, actions=actions)
     edit_contract(there)
     with pytest.raises(UserError, match="golden cases differ by"):
-        contract.checked(there)
+        contract.replay_golden_cases(there)
 
 
 def test_what_this_program_cannot_run_is_told_in_one_line(folder, tmp_path):
@@ -291,11 +291,11 @@ def test_what_this_program_cannot_run_is_told_in_one_line(folder, tmp_path):
     (there / "decision.stablehlo").write_bytes((there / "decision.stablehlo").read_bytes()[:3000])
     edit_contract(there, lambda told: told["artefact"].update(jax="0.99.1"))
     with pytest.raises(UserError, match=r"exported with JAX 0\.99\.1, and JAX .* cannot call it") as refused:
-        contract.checked(there)
+        contract.replay_golden_cases(there)
     assert "\n" not in str(refused.value)
     edit_contract(there, lambda told: told.update(version=runner.VERSION + 1))
     with pytest.raises(UserError, match="newer cuelearner"):
-        contract.checked(there)
+        contract.replay_golden_cases(there)
 
 
 @pytest.mark.parametrize(
@@ -416,10 +416,10 @@ def test_what_declares_more_than_a_decision_has_is_refused_before_it_is_unpacked
     monkeypatch.setattr(runner, "RUNNERS", dict.fromkeys(runner.RUNNERS, lambda *_: lambda batch: batch))
     monkeypatch.setattr(np, "load", None)
     with pytest.raises(UserError, match=r"golden.npz declares more than 200,000 bytes"):
-        contract.checked(there)
+        contract.replay_golden_cases(there)
     monkeypatch.setattr(runner, "LARGEST_CONTRACT", 100)
     with pytest.raises(UserError, match=r"contract.json is damaged or was changed"):
-        contract.checked(there)
+        contract.replay_golden_cases(there)
     for name, attributes in (("broadcast", {"shape": [1 << 33, 2]}), ("pad", {"low": [0], "high": [1 << 40]})):
         with pytest.raises(runner.ContractError, match=r"makes an array of [\d,]* entries"):
             operations.compiled([[name, ["obs", "zero"], ["wide"], attributes]])
