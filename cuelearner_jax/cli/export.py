@@ -75,6 +75,6 @@ def run(arguments: list[str]) -> None:
 
 def _check(folder: Path) -> None:
     difference = contract.replay_golden_cases(folder)
-    if others := contract.unlisted(folder):
+    if others := contract.unlisted_files(folder):
         out.print(f"{folder} also holds files that its contract does not list: {', '.join(others)}")
     out.print(f"{folder} is unchanged since its export; golden cases replayed, largest difference {difference:.1e}")

@@ -135,7 +135,7 @@ def replay_golden_cases(folder: Path) -> float:
         raise UserError(str(error)) from error
 
 
-def unlisted(folder: Path) -> list[str]:
+def unlisted_files(folder: Path) -> list[str]:
     """Return the names of files in a folder that its contract does not list. Raises UserError if it is damaged."""
     try:
         return runner.Decision(folder).unlisted

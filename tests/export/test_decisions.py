@@ -240,9 +240,9 @@ def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(fold
 
 def test_what_the_contract_does_not_list_is_told(folder, tmp_path):
     there = copied(folder / "numpy", tmp_path)
-    assert contract.unlisted(there) == []
+    assert contract.unlisted_files(there) == []
     (there / "helper.py").write_text("print()")
-    assert contract.unlisted(there) == ["helper.py"]
+    assert contract.unlisted_files(there) == ["helper.py"]
 
 
 def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_path):
