@@ -56,7 +56,7 @@ def _numpy(policy: Policy, traced: Traced, obs_size: int, action_size: int, base
 
 def _onnx(policy: Policy, traced: Traced, obs_size: int, action_size: int, base_size: int) -> Artefact:
     _of_graph(traced, "onnx")
-    contents = onnx_graph.serialized(traced, obs_size, action_size, base_size)
+    contents = onnx_graph.serialize(traced, obs_size, action_size, base_size)
     about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET, "input": "obs", "output": "action"}
     about |= {"base_input": onnx_graph.BASE} if base_size else {}
     return Artefact("decision.onnx", contents, about)

@@ -21,7 +21,7 @@ OPSET, IR_VERSION = 18, 8  # of 2022, supported by runtimes of several years
 BASE = "base_action"  # the second input of a correction alone
 
 
-def serialized(traced: Traced, obs_size: int, action_size: int, base_size: int = 0) -> bytes:
+def serialize(traced: Traced, obs_size: int, action_size: int, base_size: int = 0) -> bytes:
     """Return the bytes of a model with input `obs` (n, obs_size) and output `action` (n, action_size).
 
     For a correction alone, the last `base_size` entries of the input are a second input, `base_action`. Raises

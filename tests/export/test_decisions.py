@@ -78,7 +78,7 @@ def test_numpy_and_onnx_decide_as_jax_does(name):
         values = {**traced.constants, "obs": obs}
         run(values)
         found.append(np.array(values[result]))
-    session = onnxruntime.InferenceSession(onnx_graph.serialized(traced, 2, 2))
+    session = onnxruntime.InferenceSession(onnx_graph.serialize(traced, 2, 2))
     for actions in (np.stack(found), session.run(None, {"obs": DRAWN})[0]):
         apart = np.abs(actions - wanted).max(-1)
         assert (apart <= 1e-5).mean() >= 0.9, apart  # where two values tie, either is right

@@ -111,7 +111,7 @@ def test_numpy_and_onnx_say_what_jax_says(name):
     np.testing.assert_allclose(np.stack(found), wanted, rtol=2e-6, atol=2e-6)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(onnx_graph.serialized(traced, SIZE, wanted.shape[1]), options)
+    session = onnxruntime.InferenceSession(onnx_graph.serialize(traced, SIZE, wanted.shape[1]), options)
     np.testing.assert_allclose(session.run(None, {"obs": drawn})[0], wanted, rtol=5e-6, atol=5e-6)
 
 
