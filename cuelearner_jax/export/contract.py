@@ -26,7 +26,7 @@ from cuelearner_jax.environment import Quantity, action_of, actions_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.export import operations, runner
 from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
-from cuelearner_jax.export.formats import FORMATS, traced
+from cuelearner_jax.export.formats import FORMATS, trace_policy
 from cuelearner_jax.policies import Policy, describe
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
@@ -72,7 +72,7 @@ def write(
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
         base = getattr(env, "base_size", 0)  # only for a correction alone
         sizes = env.obs_size, actions_of(env).size, base
-        artefact = FORMATS[format].make(policy, traced(policy, env.obs_size), *sizes)
+        artefact = FORMATS[format].make(policy, trace_policy(policy, env.obs_size), *sizes)
         golden, cases = golden_cases(policy, drawn()), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {artefact.file: artefact.contents, runner.GOLDEN: cases.getvalue(), "decide.py": decide_source()}

@@ -81,7 +81,7 @@ FORMATS = {
 }
 
 
-def traced(policy: Policy, obs_size: int) -> Traced:
+def trace_policy(policy: Policy, obs_size: int) -> Traced:
     """Trace a policy's decision as a graph.
 
     Raises UserError for a policy with random actions, or with code other than JAX's.

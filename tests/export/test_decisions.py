@@ -71,7 +71,7 @@ def test_numpy_and_onnx_decide_as_jax_does(name):
     policy = POLICIES[name]()
     wanted = np.asarray(jax.jit(policy.act)(jax.random.key(0), None, jnp.asarray(DRAWN)))
     assert np.ptp(wanted, 0).max() > 0.1
-    traced = formats.traced(policy, DRAWN.shape[1])
+    traced = formats.trace_policy(policy, DRAWN.shape[1])
     run, (result,) = operations.compiled(traced.graph.ops, set(traced.graph.outputs)), traced.graph.outputs
     found = []
     for obs in DRAWN:
