@@ -152,7 +152,7 @@ def serve(
     tell: Callable[[str], None],
     commands: Commands,
 ) -> Ending | None:
-    """Serve the page on a socket of `bound` until the session ends.
+    """Serve the page on a socket of `bind` until the session ends.
 
     Args:
         session: the session to show.

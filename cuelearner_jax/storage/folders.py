@@ -20,7 +20,7 @@ from typing import Any
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import formats
-from cuelearner_jax.storage.locks import held
+from cuelearner_jax.storage.locks import hold
 from cuelearner_jax.storage.whole import TEMPORARY
 
 CONFIG = "config.json"
@@ -92,7 +92,7 @@ def claimed(out: Path) -> Iterator[None]:
     Raises UserError if another process has claimed the folder.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with held(out / LOCK, out, stays=True):
+    with hold(out / LOCK, out, stays=True):
         yield
 
 

@@ -15,7 +15,7 @@ from cuelearner_jax.errors import UserError
 
 
 @contextmanager
-def held(lock: Path, what: Path, stays: bool) -> Iterator[None]:
+def hold(lock: Path, what: Path, stays: bool) -> Iterator[None]:
     """Hold a lock file that claims the folder `what`; the lock ends however the process ends.
 
     A file is locked, not the folder, since NFS passes only file locks on between machines. The file is made if

@@ -23,7 +23,7 @@ from typing import IO, Any
 
 from cuelearner_jax.errors import UserError, no_space
 from cuelearner_jax.signals import saving
-from cuelearner_jax.storage.locks import held, locked
+from cuelearner_jax.storage.locks import hold, locked
 from cuelearner_jax.terminal import console
 
 TEMPORARY = ".tmp"  # suffix of an incomplete file
@@ -198,7 +198,7 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
         with contextlib.ExitStack() as stack:
             with _writable(told):
                 folder.parent.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(held(beside(folder, "lock"), told, stays=False))
+                stack.enter_context(hold(beside(folder, "lock"), told, stays=False))
             place = Place(folder, lambda: check(told), overwrite)
             place.recover()
             check(told)  # no other process that claims places can change it any more
