@@ -24,7 +24,7 @@ def hold(lock: Path, what: Path, stays: bool) -> Iterator[None]:
     Raises UserError if another process holds the lock.
     """
     try:
-        descriptor = locked(lock, wait=False)
+        descriptor = open_locked(lock, wait=False)
     except BlockingIOError:
         by = f" ({found})" if (found := holder(lock)) else ""
         raise UserError(f"{what} is being written by another process{by}: wait for it, or give another --out") from None
@@ -38,7 +38,7 @@ def hold(lock: Path, what: Path, stays: bool) -> Iterator[None]:
         os.close(descriptor)
 
 
-def locked(file: Path, wait: bool) -> int:
+def open_locked(file: Path, wait: bool) -> int:
     """Open a file, made if missing, that this process alone has locked; return its descriptor.
 
     Raises BlockingIOError if another process has the lock and `wait` is false.

@@ -23,7 +23,7 @@ from typing import IO, Any
 
 from cuelearner_jax.errors import UserError, no_space
 from cuelearner_jax.signals import saving
-from cuelearner_jax.storage.locks import hold, locked
+from cuelearner_jax.storage.locks import hold, open_locked
 from cuelearner_jax.terminal import console
 
 TEMPORARY = ".tmp"  # suffix of an incomplete file
@@ -50,7 +50,7 @@ def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[A
     try:
         if fresh:
             path.parent.mkdir(parents=True, exist_ok=True)
-        with open(locked(temporary, wait=True), mode, encoding=None if "b" in mode else "utf-8") as file:
+        with open(open_locked(temporary, wait=True), mode, encoding=None if "b" in mode else "utf-8") as file:
             try:
                 file.truncate(0)
                 if fresh and os.path.lexists(path):
