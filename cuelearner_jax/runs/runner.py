@@ -67,7 +67,7 @@ class Runner:
             with (
                 TableWriter(self.folder, results.SCHEMA, constants) as writer,
                 TableWriter(self.folder, results.GUIDES, constants) if asks else nullcontext() as guides,
-                tracking.opened(self.order.track, self.folder, self.described, self.training.step) as tracker,
+                tracking.open_tracker(self.order.track, self.folder, self.described, self.training.step) as tracker,
             ):
                 if guides is not None:
                     self._label(saved, guides, teacher, labels)

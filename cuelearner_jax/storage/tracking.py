@@ -85,7 +85,7 @@ def check(name: str | None) -> None:
 
 
 @contextmanager
-def opened(name: str | None, folder: Path, described: dict[str, Any], step: int) -> Iterator[Tracker | None]:
+def open_tracker(name: str | None, folder: Path, described: dict[str, Any], step: int) -> Iterator[Tracker | None]:
     """Open a tracker that writes below a folder, continuing after `step`; yields None without a name."""
     if name is None:
         yield None
