@@ -35,7 +35,7 @@ class Declared(NamedTuple):
     strings: tuple[str, ...]  # names of columns
 
 
-def declared(path: Path) -> Declared:
+def read_declared(path: Path) -> Declared:
     """Return what a Parquet file declares.
 
     Raises:

@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import lines
-from cuelearner_jax.storage.footer import declared
+from cuelearner_jax.storage.footer import read_declared
 from cuelearner_jax.storage.lines import Row
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.storage.whole import replacing, unreadable
@@ -245,7 +245,7 @@ def _typed(table: pa.Table, schema: Schema) -> pa.Table:
 
 def _finished(path: Path, schema: Schema) -> pa.Table:
     """Read the table of a Parquet file. Raises ValueError if it differs from what was written."""
-    held = declared(path)
+    held = read_declared(path)
     what, remedy = f"{path} declares {held.rows:,} rows with {held.values:,} values", f"it {schema.remedy}"
     check_room(what, VALUE * held.values + held.page_bytes, remedy)
     # Equal strings are stored once in the file, but possibly many times in memory.
