@@ -44,7 +44,7 @@ class Recording(NamedTuple):
     frames: Callable[[int], Picture] | None  # row -> the first camera's picture; None: no camera
 
 
-def is_one(path: Path) -> bool:
+def is_dataset(path: Path) -> bool:
     """Whether a folder is a LeRobot dataset."""
     return (path / INFO).is_file()
 

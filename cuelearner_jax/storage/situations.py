@@ -58,7 +58,7 @@ def read(path: Path) -> Situations:
     Raises:
         UserError: nothing to read, missing columns, sizes that do not fit, or a number that is not finite.
     """
-    if lerobot.is_one(path):
+    if lerobot.is_dataset(path):
         found = lerobot.read(path)
         slices = named_slices(found.observation_entries, found.observations.shape[1])
         return _whole(path, found.observations, found.actions, slices, found.action_entries, found.frames)
