@@ -62,7 +62,7 @@ class Plan:
         return all((self.order.out / kind / results.PARQUET).exists() for kind in self.order.grid.guidance)
 
 
-def checked(request: RequestT) -> RequestT:
+def resolve_request(request: RequestT) -> RequestT:
     """Check a request; return it with its kinds of guidance by name. Raises UserError for an invalid request."""
     run_config.check(request.config)
     # loads the code of kinds from outside
@@ -84,7 +84,7 @@ def labels_of(request: TrainRequest) -> label_files.LabelFile | None:
 def planned(order: Order) -> Plan:
     """Check what `run` would refuse, except for memory; return the plan. Raises UserError."""
     tracking.check(order.track)
-    order = checked(order)
+    order = resolve_request(order)
     piece, sweep = None, order.out
     if order.shard:
         piece = order.shard.described(order.grid.seeds)

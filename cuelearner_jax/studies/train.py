@@ -26,7 +26,7 @@ from cuelearner_jax.runs.judging import judges_world
 from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
-from cuelearner_jax.runs.order import Order, TrainRequest, checked, labels_of, planned
+from cuelearner_jax.runs.order import Order, TrainRequest, labels_of, planned, resolve_request
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.storage import formats
@@ -117,7 +117,7 @@ def in_memory(
     Raises:
         UserError: invalid configuration, no teacher where one is needed, or too little memory.
     """
-    request = checked(request)
+    request = resolve_request(request)
     labels, mesh = labels_of(request), lane_mesh()
     groups = _groups(request, place(mesh, env, SHARED), lambda told: None)
     asking = [group.guidance.name for group in groups if group.guidance.asks]
