@@ -10,7 +10,7 @@ from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset
 from cuelearner_jax.runs import cluster
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
-from cuelearner_jax.runs.order import Plan, planned
+from cuelearner_jax.runs.order import Plan, make_plan
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.studies import train
 
@@ -49,7 +49,7 @@ def run(arguments: list[str]) -> None:
     if asked.cluster:
 
         def plan(shard: Shard) -> Plan:
-            return planned(asked.order(task, grid, shard))
+            return make_plan(asked.order(task, grid, shard))
 
         assert asked.shards  # `cluster.check`
         cluster.submit(asked.shards, asked.job, asked.out, arguments, plan, out.print)

@@ -81,7 +81,7 @@ def labels_of(request: TrainRequest) -> label_files.LabelFile | None:
     return read_labels(request.labels_from, request.task, config.task, config.sizes, config.scalars, request.grid)
 
 
-def planned(order: Order) -> Plan:
+def make_plan(order: Order) -> Plan:
     """Check what `run` would refuse, except for memory; return the plan. Raises UserError."""
     tracking.check(order.track)
     order = resolve_request(order)

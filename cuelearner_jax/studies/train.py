@@ -26,7 +26,7 @@ from cuelearner_jax.runs.judging import judges_world
 from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
-from cuelearner_jax.runs.order import Order, TrainRequest, labels_of, planned, resolve_request
+from cuelearner_jax.runs.order import Order, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.storage import formats
@@ -69,7 +69,7 @@ def run(order: Order) -> None:
         Interrupted: Ctrl-C or SIGTERM; everything is saved.
         NotFinite: everything is finished, but some lanes stopped being finite.
     """
-    plan = planned(order)
+    plan = make_plan(order)
     order = plan.order
     task, config = order.task, order.config
     _groups(order, shape_of(task, config.task), console.print)  # before any large array is made
