@@ -58,7 +58,7 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
     loaded = [load(file.parent, find) for file in files]
     task, config, first = loaded[0]
     for file, other in zip(files, described, strict=True):
-        if found := shards.apart(described[0], other, defaults(task)):
+        if found := shards.differing_options(described[0], other, defaults(task)):
             raise UserError(
                 f"{files[0].parent} and {file.parent} are shards of different sweeps (they differ "
                 f"in {found}): give the "

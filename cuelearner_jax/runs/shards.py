@@ -55,7 +55,7 @@ class Shard(NamedTuple):
                 )
             if folder == self.folder(out) or not (folder / CONFIG).is_file():
                 continue
-            if found := apart(formats.read("config", folder / CONFIG), described, defaults):
+            if found := differing_options(formats.read("config", folder / CONFIG), described, defaults):
                 raise UserError(
                     f"{folder} is a shard of a sweep with another {found}: give the same options for all shards, or "
                     "another --out"
@@ -87,7 +87,7 @@ class Shard(NamedTuple):
         return tuple(int(seed) for seed in np.array_split(np.array(seeds), self.count)[self.index - 1])
 
 
-def apart(before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any]) -> str:
+def differing_options(before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any]) -> str:
     """Return at most four options in which the sweeps of two descriptions differ, see `folders.differences`."""
     return ", ".join(sorted({*differences(before, now, defaults)} - set(OWN))[:4])
 
