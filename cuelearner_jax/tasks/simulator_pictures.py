@@ -47,7 +47,7 @@ def pose_of(state: Running) -> Pose:
     return Pose(physics.q, None)
 
 
-def drawn(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
+def draw_poses(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
     """Return a picture of each pose. Raises UserError for an environment without a MuJoCo model, or without OpenGL."""
     model = model_of(env.simulator())
     if model is None:
@@ -68,7 +68,7 @@ def drawn(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
 
 def picture(env: JaxEnvironment, state: Running) -> Frame:
     """Return a picture of a state. Raises UserError as `drawn`."""
-    return drawn(env, [jax.device_get(pose_of(state))])[0]
+    return draw_poses(env, [jax.device_get(pose_of(state))])[0]
 
 
 def sketch(env: JaxEnvironment, state: Running) -> Sketch:
@@ -91,7 +91,7 @@ def _clip(env: JaxEnvironment, state: Running, action: Any) -> list[Frame]:
     """Return pictures from a state on while an action is held, up to the end of the episode."""
     poses, ended = jax.device_get(_held(env, state, jax.numpy.asarray(action)))
     whole = int(np.flatnonzero(ended)[0]) if ended.any() else HELD
-    return drawn(env, [jax.device_get(pose_of(state)), *_rows(poses, whole)])
+    return draw_poses(env, [jax.device_get(pose_of(state)), *_rows(poses, whole)])
 
 
 def _rows(poses: Pose, count: int) -> list[Pose]:
@@ -124,7 +124,7 @@ def record(env: JaxEnvironment, policy: Any, key: PRNGKeyArray, steps: int) -> t
 
     poses, rewards = jax.device_get(play(env, key))
     user_code.tell()
-    return drawn(env, _rows(poses, steps)), rewards.tolist()
+    return draw_poses(env, _rows(poses, steps)), rewards.tolist()
 
 
 def question(env: JaxEnvironment, state: Running, obs: Any, action: Any, file: Path) -> None:
