@@ -14,7 +14,14 @@ from cuelearner_envs.bounds import check_word
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.task import Body, Task
-from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, pictures, presets
+from cuelearner_jax.tasks.simulators import (
+    SimulatorConfig,
+    check_layout,
+    config_fields,
+    environment_of,
+    pictures,
+    presets,
+)
 
 FAMILY = "brax"
 Backend = Literal["generalized", "spring", "positional", "mjx"]
@@ -74,5 +81,5 @@ BRAX = Task(
 @cache
 def task_of(name: str) -> Task:
     """Return the task of a brax environment with its whole box of actions. Raises UserError for an unknown name."""
-    config = BraxConfig(**described(FAMILY, name, _made(name, BraxConfig.backend)))
+    config = BraxConfig(**config_fields(FAMILY, name, _made(name, BraxConfig.backend)))
     return dataclasses.replace(BRAX, about=f"brax's {name}", default=config, presets=presets(config))

@@ -10,7 +10,14 @@ from typing import Any
 from cuelearner_jax.bridges import playground
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout
 from cuelearner_jax.task import Body, Task
-from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, pictures, presets
+from cuelearner_jax.tasks.simulators import (
+    SimulatorConfig,
+    check_layout,
+    config_fields,
+    environment_of,
+    pictures,
+    presets,
+)
 
 FAMILY = "playground"
 
@@ -56,5 +63,5 @@ PLAYGROUND = Task(
 @cache
 def task_of(name: str) -> Task:
     """Return one of Playground's dm_control tasks with its whole box of actions. Raises UserError if unavailable."""
-    config = PlaygroundConfig(**described(FAMILY, name, _made(name)))
+    config = PlaygroundConfig(**config_fields(FAMILY, name, _made(name)))
     return dataclasses.replace(PLAYGROUND, about=f"Playground's {name}", default=config, presets=presets(config))

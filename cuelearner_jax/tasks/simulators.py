@@ -83,7 +83,7 @@ def pictures() -> Pictures:
     return simulator_pictures.PICTURES
 
 
-def described(family: str, name: str, simulator: Any) -> dict[str, Any]:
+def config_fields(family: str, name: str, simulator: Any) -> dict[str, Any]:
     """Return the fields of a configuration that follow from a simulator."""
     slices, sizes, entries = layout_of(simulator, name)
     return {"environment": name, "slices": slices, "slice_sizes": sizes, "entries": entries}
