@@ -48,7 +48,7 @@ def layout_of(environment: str) -> tuple[Quantity, ...] | None:
     return None
 
 
-def drawn_with(environment: str, arguments: str) -> str:
+def picture_arguments(environment: str, arguments: str) -> str:
     """Return an environment's arguments (JSON) for pictures: with this camera, where Fetch is given none."""
     named: dict[str, Any] = json.loads(arguments)
     if not environment.startswith(FETCH) or "default_camera_config" in named:

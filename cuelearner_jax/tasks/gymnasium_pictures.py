@@ -30,7 +30,7 @@ def frames_of(env: GymnasiumTask, slot: int, seed: int, actions: Any, first: int
     rows = np.asarray(actions, np.float32).reshape(-1, env.actions.size)
     source = env.source
     if source.factory is None:
-        source = dataclasses.replace(source, arguments=fetch_layout.drawn_with(source.name, source.arguments))
+        source = dataclasses.replace(source, arguments=fetch_layout.picture_arguments(source.name, source.arguments))
     return pool_of(dataclasses.replace(source, drawn=True)).filmed(slot, seed, rows, first)
 
 
