@@ -140,7 +140,7 @@ def run(arguments: list[str]) -> None:
         questions=UNIFORM if named is not None else _usual_questions(task),
     )
     asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
-    plan = planned(task, preset.config, asked, named, source)
+    plan = make_plan(task, preset.config, asked, named, source)
     config = preset.config if source is None else dataclasses.replace(preset.config, task=world)
     again = shlex.join(["cuelearner", "label", *typed])
     commands = server.Commands(again, partial(_following, task, chosen, config, asked, named))
@@ -163,7 +163,7 @@ def _reads_evidence(arguments: list[str]) -> bool:
     return name is not None and guidances.resolve(name).by_evidence
 
 
-def planned(
+def make_plan(
     task: Task, config: RunConfig, asked: Label[Any], named: str | None, source: PolicySource | None = None
 ) -> Plan:
     """Return the plan of the session. Raises UserError for an invalid request."""

@@ -23,7 +23,7 @@ def planned(**options):
     sizes, scalars = label._part(GuideSizes, config.sizes), label._part(GuideScalars, SCALARS)
     options = {"labels": 20, "guidance": "relative", **options}
     asked = label.Label(config.task, sizes, scalars, label.Path("labels"), **options)
-    return label.planned(TASK, config, asked, None)
+    return label.make_plan(TASK, config, asked, None)
 
 
 def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():

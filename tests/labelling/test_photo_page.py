@@ -150,7 +150,7 @@ def test_one_cue_a_press_on_a_folder_of_pictures(folder, tmp_path):
         questions="proposed",
         one_cue=True,
     )
-    plan = label.planned(task, config, asked, None)
+    plan = label.make_plan(task, config, asked, None)
     with Session(plan, tmp_path / "labels") as session:
 
         async def acts(user, pages):
