@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from cuelearner_envs.navigation.aims import aims_of, rule_of
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
-from cuelearner_envs.navigation.sides import heading, passed
+from cuelearner_envs.navigation.sides import count_passed, heading
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.environment import Aims, Described, Features, Quantity
@@ -38,7 +38,9 @@ class Walker(struct.PyTreeNode):
     world: Int[Array, ""]
     route: Int[Array, ""]  # of that world
     steps: Int[Array, ""]  # taken in this episode
-    passed: Float[Array, "2"] | None = None  # obstacles on the left and on the right in this episode, where they count
+    count_passed: Float[Array, "2"] | None = (
+        None  # obstacles on the left and on the right in this episode, where they count
+    )
 
 
 AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal, previous, world, route and steps
@@ -128,7 +130,7 @@ class Navigation(Described, struct.PyTreeNode):
         if not self.sides:
             return after
         world, ahead = self.world(before.world), heading(self.worlds.starts[before.world, before.route], before.goal)
-        return after.replace(passed=before.passed + passed(world, ahead, before.pose[:2], after.pose[:2]))
+        return after.replace(passed=before.passed + count_passed(world, ahead, before.pose[:2], after.pose[:2]))
 
     def sides_taken(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
         """Whether all obstacles passed so far were passed on one side, or some on either; none holds before the first.

@@ -26,7 +26,7 @@ def obstacles(world: World) -> tuple[Float[Array, "obstacles 2"], Bool[Array, " 
     return middles, (jnp.abs(middles) < world.extent[None] / 2).all(-1)
 
 
-def passed(
+def count_passed(
     world: World, ahead: Float[Array, ""], before: Float[Array, "2"], after: Float[Array, "2"]
 ) -> Float[Array, "2"]:
     """Return how many obstacles a straight step passes, on the left and on the right.
