@@ -33,7 +33,7 @@ NO_OPENGL = (
 )
 
 
-def furnished(world: World, goal: Float[np.ndarray, "2"], goal_radius: float) -> mujoco.MjModel:
+def furnish(world: World, goal: Float[np.ndarray, "2"], goal_radius: float) -> mujoco.MjModel:
     """Return the robot's model with a world's solids and the goal, for drawing only."""
     spec = mujoco.MjSpec.from_file(str(robot.FILE))
     look: dict[str, Any] = {"contype": 0, "conaffinity": 0}
