@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.physics import Body, Felt, Ground, control, standing
-from cuelearner_envs.anymal.policy import OBS, noisy, observe
+from cuelearner_envs.anymal.policy import OBS, add_noise, observe
 from cuelearner_jax.spaces.directions import from_angle
 
 Scalar = float | Float[Array, ""]
@@ -148,7 +148,7 @@ class Locomotion(envs.Env):
         zero = jnp.zeros(())
         return envs.State(
             pipeline_state=walk,
-            obs=noisy(k_noise, observe(body.qpos, body.qvel, walk.last_action, walk.command), self.trial.noise),
+            obs=add_noise(k_noise, observe(body.qpos, body.qvel, walk.last_action, walk.command), self.trial.noise),
             reward=zero,
             done=zero,
             metrics={"error": zero},
@@ -172,7 +172,7 @@ class Locomotion(envs.Env):
         error = jnp.linalg.norm(robot.planar_velocity(body.qpos, body.qvel)[:2] - before.command[:2])
         return state.replace(
             pipeline_state=walk,
-            obs=noisy(k_noise, observe(body.qpos, body.qvel, action, command), self.trial.noise),
+            obs=add_noise(k_noise, observe(body.qpos, body.qvel, action, command), self.trial.noise),
             reward=total,
             done=felt.fallen.astype(jnp.float32),
             metrics={**state.metrics, "error": error},

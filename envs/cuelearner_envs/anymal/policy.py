@@ -72,7 +72,7 @@ def observe(
     )
 
 
-def noisy(key: PRNGKeyArray, obs: Float[Array, "48"], level: float | Float[Array, ""]) -> Float[Array, "48"]:
+def add_noise(key: PRNGKeyArray, obs: Float[Array, "48"], level: float | Float[Array, ""]) -> Float[Array, "48"]:
     """Add uniform errors to an observation, at `level` 1 up to `NOISE`."""
     return obs + level * jnp.asarray(NOISE, jnp.float32) * jax.random.uniform(key, (OBS,), minval=-1.0, maxval=1.0)
 

@@ -19,7 +19,7 @@ from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.judge import Judge
 from cuelearner_envs.anymal.locomotion import Trial, pushed, random_command, random_ground
 from cuelearner_envs.anymal.physics import Body, Ground, control, standing
-from cuelearner_envs.anymal.policy import WalkingPolicy, noisy, observe
+from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe
 
 HELD, SETTLING = 200, 100  # control steps for which a command is held, and how many of them are not yet settled
 SECONDS = 20.0  # a robot walks for
@@ -48,7 +48,7 @@ def walk(
         body, last_action, down = state
         command = random_command(jax.random.fold_in(key, index // HELD), trial)
         k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
-        obs = noisy(k_noise, observe(body.qpos, body.qvel, last_action, command), trial.noise)
+        obs = add_noise(k_noise, observe(body.qpos, body.qvel, last_action, command), trial.noise)
         action = policy(obs)
         after, felt = control(pushed(k_push, body, trial), action, ground)
         down = down | felt.fallen
@@ -82,7 +82,7 @@ def judged(
         def one(key: PRNGKeyArray, qpos: jax.Array, qvel: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
             command = random_command(jax.random.fold_in(key, index // HELD), trial)
             k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
-            action = policy(noisy(k_noise, observe(qpos, qvel, last, command), trial.noise))
+            action = policy(add_noise(k_noise, observe(qpos, qvel, last, command), trial.noise))
             after = pushed(k_push, Body(qpos, qvel, qvel), trial).qvel
             return action, command, after[:2] - qvel[:2]
 
