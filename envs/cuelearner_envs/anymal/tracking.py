@@ -66,7 +66,7 @@ def walk(
     return jax.lax.scan(everyone, states, jnp.arange(steps))[1]
 
 
-def judged(
+def walk_in_mujoco(
     policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, robots: int, steps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`walk` in C MuJoCo at its finer step."""
@@ -144,5 +144,5 @@ def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> Iterator[t
 
 def measure(policy: WalkingPolicy, engine: str, trial: Trial, key: PRNGKeyArray, robots: int) -> dict[str, float]:
     """Figures of 20 s of random commands in `mjx` or `mujoco`."""
-    play = {"mjx": walk, "mujoco": judged}[engine]
+    play = {"mjx": walk, "mujoco": walk_in_mujoco}[engine]
     return figures(*jax.device_get(play(policy, trial, key, robots=robots, steps=steps_of(SECONDS))))
