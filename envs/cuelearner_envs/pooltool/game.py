@@ -102,7 +102,7 @@ def _corner_reach(outline: Outline) -> float:
     return math.hypot(along, outline.pocket_margin)
 
 
-def apart(outline: Outline, positions: np.ndarray, pocketed: np.ndarray) -> np.ndarray:
+def separate(outline: Outline, positions: np.ndarray, pocketed: np.ndarray) -> np.ndarray:
     """Places (balls, 2) at which no ball touches another or a cushion: those that do are moved by `CLEAR`, no more.
 
     Positions are kept in single precision; pooltool lets balls that overlap by a rounding error pass.
@@ -134,7 +134,7 @@ def struck(outline: Outline, positions: np.ndarray, pocketed: np.ndarray, angle:
         angle: of the strike, counterclockwise from x [rad].
     """
     params, balls = ball_params(outline.ball_radius), {}
-    for number, (place, out) in enumerate(zip(apart(outline, positions, pocketed), pocketed, strict=True)):
+    for number, (place, out) in enumerate(zip(separate(outline, positions, pocketed), pocketed, strict=True)):
         motion = np.zeros((3, 3))  # place, velocity, spin
         motion[0] = *place, outline.ball_radius
         state = POCKETED if out else RESTING
