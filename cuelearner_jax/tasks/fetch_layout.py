@@ -12,7 +12,7 @@ from typing import Any
 from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
 from cuelearner_jax.environment import OWN, Quantity
 
-__all__ = ["CUES", "CUE_NAMES", "drawn_with", "layout_of", "points_of"]
+__all__ = ["CUES", "CUE_NAMES", "layout_of", "picture_arguments", "points_of"]
 
 # A camera measures object and goal in metres, shifted with the camera. The robot's measurements of itself are not
 # shifted.

@@ -67,7 +67,7 @@ def draw_poses(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
 
 
 def picture(env: JaxEnvironment, state: Running) -> Frame:
-    """Return a picture of a state. Raises UserError as `drawn`."""
+    """Return a picture of a state. Raises UserError as `draw_poses`."""
     return draw_poses(env, [jax.device_get(pose_of(state))])[0]
 
 
@@ -107,7 +107,7 @@ def reel(env: JaxEnvironment, state: Running, action: Float[Array, " action"]) -
 
 
 def record(env: JaxEnvironment, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
-    """Return a picture before each step, and each step's reward. Raises UserError as `drawn`."""
+    """Return a picture before each step, and each step's reward. Raises UserError as `draw_poses`."""
 
     @jax.jit
     def play(env: JaxEnvironment, key: PRNGKeyArray) -> Any:
