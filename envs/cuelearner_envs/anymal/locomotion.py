@@ -68,7 +68,7 @@ def random_ground(key: PRNGKeyArray, trial: Trial) -> Ground:
     return Ground(jnp.asarray(friction), jax.random.uniform(k_payload) * trial.payload)
 
 
-def pushed(key: PRNGKeyArray, body: Body, trial: Trial) -> Body:
+def push_randomly(key: PRNGKeyArray, body: Body, trial: Trial) -> Body:
     """Apply a random push with some probability: the trunk's velocity changes at once."""
     k_when, k_angle, k_speed = jax.random.split(key, 3)
     now = jax.random.bernoulli(k_when, robot.CONTROL_PERIOD / PUSH_EVERY)
@@ -159,7 +159,7 @@ class Locomotion(envs.Env):
         """A step of control, perhaps a push, perhaps a new command. A fall ends the episode."""
         before: Walk = state.pipeline_state
         k_push, k_when, k_command, k_noise, k_next = jax.random.split(state.info["rng"], 5)
-        body, felt = control(pushed(k_push, before.body, self.trial), action, before.ground)
+        body, felt = control(push_randomly(k_push, before.body, self.trial), action, before.ground)
         # A body whose numbers diverged counts as fallen; NaN must not reach the network.
         body = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(body.qvel).all(), new, old), body, before.body)
         in_air, landed = _steps(before.in_air, felt.foot_heights < TOUCHING)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.judge import Judge
-from cuelearner_envs.anymal.locomotion import Trial, pushed, random_command, random_ground
+from cuelearner_envs.anymal.locomotion import Trial, push_randomly, random_command, random_ground
 from cuelearner_envs.anymal.physics import Body, Ground, control, standing
 from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe
 
@@ -50,7 +50,7 @@ def walk(
         k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
         obs = add_noise(k_noise, observe(body.qpos, body.qvel, last_action, command), trial.noise)
         action = policy(obs)
-        after, felt = control(pushed(k_push, body, trial), action, ground)
+        after, felt = control(push_randomly(k_push, body, trial), action, ground)
         down = down | felt.fallen
         body = jax.tree.map(partial(jnp.where, down), body, after)  # a fallen robot stays where it is
         return (body, action, down), (robot.planar_velocity(body.qpos, body.qvel), command, down)
@@ -83,7 +83,7 @@ def walk_in_mujoco(
             command = random_command(jax.random.fold_in(key, index // HELD), trial)
             k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
             action = policy(add_noise(k_noise, observe(qpos, qvel, last, command), trial.noise))
-            after = pushed(k_push, Body(qpos, qvel, qvel), trial).qvel
+            after = push_randomly(k_push, Body(qpos, qvel, qvel), trial).qvel
             return action, command, after[:2] - qvel[:2]
 
         return jax.vmap(one)(keys, qpos, qvel, last)
