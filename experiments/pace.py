@@ -48,7 +48,7 @@ def measured(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
     return curves.mean(1), curves[:, -1], float(np.mean(shares)) if shares else np.nan
 
 
-def told(values: np.ndarray) -> str:
+def format_values(values: np.ndarray) -> str:
     """A mean over seeds with its interval."""
     rng = np.random.default_rng(0)
     means = rng.choice(values, (2000, len(values))).mean(1)
@@ -77,7 +77,9 @@ def main() -> int:
     for name, (mean, last, share) in found.items():
         middle = interval(mean)
         own = f"{middle.estimate:.3f} [{middle.lower:.3f}, {middle.upper:.3f}]"
-        print(f"{name:36}  {own}  {told(mean - unguided[0])}  {told(last - unguided[1])}  {share:.3f}")
+        print(
+            f"{name:36}  {own}  {format_values(mean - unguided[0])}  {format_values(last - unguided[1])}  {share:.3f}"
+        )
     return 0
 
 
