@@ -69,8 +69,8 @@ def table(out: Path, steps: int) -> list[dict[str, Any]]:
         for search, reached in found.items():
             if step in reached:
                 full = found[FULL].get(step)
-                against = "" if full is None else told(full - reached[step])
-                rows.append({"step": step, "search": search, "reward": told(reached[step]), "lost": against})
+                against = "" if full is None else format_values(full - reached[step])
+                rows.append({"step": step, "search": search, "reward": format_values(reached[step]), "lost": against})
     return rows
 
 
@@ -80,7 +80,7 @@ def origin(out: Path) -> dict[str, str]:
     return {name: row[name] for name in ("commit", "versions", "hardware")}
 
 
-def told(values: np.ndarray) -> str:
+def format_values(values: np.ndarray) -> str:
     """An interquartile mean with its interval."""
     found = interval(values)
     return f"{found.estimate:.3f} [{found.lower:.3f}, {found.upper:.3f}]"
