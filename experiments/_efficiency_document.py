@@ -43,7 +43,7 @@ def efficiency_lines(found: Efficiency) -> list[str]:
             [
                 [escaping.markdown(each.run)] * by_run
                 + [escaping.markdown(each.guidance), ", ".join(f"{budget:,}" for budget in each.budgets)]
-                + [told(each.labels, "{:,.0f}"), f"{each.reached:.0%}"]
+                + [format_known(each.labels, "{:,.0f}"), f"{each.reached:.0%}"]
                 for each in found.labels_to_level
             ],
         )
@@ -55,7 +55,11 @@ def efficiency_lines(found: Efficiency) -> list[str]:
             [
                 [escaping.markdown(each.run)] * by_run
                 + [escaping.markdown(each.reference), f"{each.reference_labels:,}", f"{each.area:.3f}"]
-                + [escaping.markdown(each.guidance), told(each.labels, "{:,.0f}"), told(each.ratio, "{:.2f}")]
+                + [
+                    escaping.markdown(each.guidance),
+                    format_known(each.labels, "{:,.0f}"),
+                    format_known(each.ratio, "{:.2f}"),
+                ]
                 for each in found.equal_area
             ],
         )
@@ -74,7 +78,7 @@ NOTE = (
 )
 
 
-def told(known: Known, form: str) -> str:
+def format_known(known: Known, form: str) -> str:
     """A quantity with its interval in words: `0.62 [0.54, 0.71]`, `above 1.40 [1.30, no bound]`."""
     low, high = (float(bound) for bound in known.bounds)
     if low == high:
@@ -93,13 +97,13 @@ def _cells(each: Carried, by_run: bool) -> list[str]:
     variant = each.variant
     cells = [escaping.markdown(variant.run)] if by_run else []
     cells += [escaping.markdown(variant.guidance), f"{variant.labels:,}", _interval(each.guide)]
-    cells += [told(each.steps, "{:,.0f}"), f"{each.reached:.0%}", _known(each.ratio, "{:.2f}")]
+    cells += [format_known(each.steps, "{:,.0f}"), f"{each.reached:.0%}", _known(each.ratio, "{:.2f}")]
     cells += [_interval(variant.mean), _interval(each.area_difference, "{:+.3f}")]
     return [*cells, _interval(each.area_ratio, "{:.2f}")]
 
 
 def _known(known: Known | None, form: str) -> str:
-    return told(known, form) if known else ""
+    return format_known(known, form) if known else ""
 
 
 def _interval(found: Interval | None, form: str = "{:.3f}") -> str:
