@@ -129,7 +129,7 @@ def worth(world: World, policy: Any, split: str, steps: int) -> float:
     return float(evaluate_policy(world.shown, policy, episodes(split), ENVS, steps)[name])
 
 
-def told(found: Result) -> dict[str, Any]:
+def to_row(found: Result) -> dict[str, Any]:
     """A result in plain values; `theta`: the unknowns behind which the policy acts."""
     estimates = {one.name: [round(number, 5) for number in (one.mean, one.low, one.high)] for one in found.estimates}
     evidence = {" + ".join(names) or "none": round(value, 2) for names, value in found.evidence.items()}
@@ -181,7 +181,7 @@ class Study(NamedTuple):
             self.bases[base], family, walk.situations, walk.answers, labels, key,
             space=actions_of(world.env), eps_deg=float(world.scalars.eps_deg),
         )  # fmt: skip
-        row = {"world": name, "base": base, "labels": labels, "seed": seed, **told(found)}
+        row = {"world": name, "base": base, "labels": labels, "seed": seed, **to_row(found)}
         row["eps_deg"] = float(world.scalars.eps_deg)
         row["seconds"] = round(time.time() - start, 1)
         return {**row, "cpu_seconds": round(time.process_time() - used, 1)}
