@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from _adaptation_methods import METHODS, Row
-from _pieces import chosen, listed
+from _pieces import chosen, list_pieces
 
 from cuelearner_jax.adaptation import adapting
 from cuelearner_jax.adaptation.lanes import side_by_side
@@ -261,7 +261,7 @@ def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int
     if not asked.pieces:
         pieces = [piece for piece in pieces if piece.split != "tuning" or piece.world == UNCHANGED]
     if asked.list:
-        print(listed(pieces))
+        print(list_pieces(pieces))
         return 0
     scale = study.scales[asked.scale]
     if asked.labels:

@@ -152,7 +152,7 @@ def _below(piece: Any, name: str) -> bool:
     return f"{piece.path}/".startswith(f"{name.rstrip('/')}/")
 
 
-def listed(pieces: Sequence[Any]) -> str:
+def list_pieces(pieces: Sequence[Any]) -> str:
     """Pieces with what they take and serve, a line each."""
     width = max(len(piece.path) for piece in pieces)
     rows = [f"{piece.path:<{width}} {piece.lanes:4} lanes  {piece.minutes:3} min  {piece.serves}" for piece in pieces]
@@ -180,7 +180,7 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
     except ValueError as error:
         parser.error(str(error))
     if asked.list:
-        print(listed(pieces))
+        print(list_pieces(pieces))
         return 0
     out = folder_at(asked.out, asked.scale)
     commands = []

@@ -30,7 +30,7 @@ from _pieces import (
     asked_of,
     evaluations,
     folder_at,
-    listed,
+    list_pieces,
     scaled,
     spread,
     steps_to,
@@ -194,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run, then tell; returns the exit status, 0 also where the time was up."""
     asked, pieces = asked_of(__doc__ or "", PIECES, SCALES, "prior", arguments)
     if asked.list:
-        print(listed(pieces))
+        print(list_pieces(pieces))
         return 0
     out = folder_at(asked.out, asked.scale)
     status = 0 if asked.report else within(asked.minutes, lambda: trained(pieces, SCALES[asked.scale], out))
