@@ -136,7 +136,7 @@ SCALES = {
 
 
 @cache
-def opened(world: str, split: str) -> Opened:
+def open_world(world: str, split: str) -> Opened:
     """A world that is ready, made once."""
     return WORLDS[world].opened(split)
 
@@ -174,14 +174,14 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
     seeds = [FIRST_SEED[split] + number for number in range(scale.seeds_in(world))]
     if kind == "base":
         if not known:
-            yield without_labels(opened(world, split), seeds, scale.episodes)
+            yield without_labels(open_world(world, split), seeds, scale.episodes)
         return
     conditions = [one for one in CONDITIONS if (one.name,) not in known]
     if kind == "calibration":
         if not tuning:
             yield from calibrated(world, conditions, scale, split)
         return
-    place = WORLDS[world], opened(world, split), kind
+    place = WORLDS[world], open_world(world, split), kind
     if not tuning:
         settings = {**CHOSEN.get(WORLDS[world].tuned_in or world, {}).get(kind, {}), **(scale.settings or {})}
         yield from measured(*place, settings, conditions, seeds, scale.budgets, scale.episodes, max(scale.budgets))
