@@ -101,7 +101,7 @@ def played(env: Any, policy: Any, racks: int, shots: int, split: str = "validati
     return np.mean(rewards, axis=0)
 
 
-def near(base: Any, env: Any) -> NearbyTeacher:
+def nearby_teacher(base: Any, env: Any) -> NearbyTeacher:
     """Return the teacher, which plays shots near the base policy's."""
     return NearbyTeacher(Teaching(base), env, jnp.deg2rad(AIM_DEG), jnp.deg2rad(REACH_DEG), TRIED)
 
@@ -117,7 +117,7 @@ def asked(base: Any, env: Any, scale: Scale, seed: int) -> cl.Labels:
     rows = []
     for shot in range(scale.shots):
         key = jax.random.fold_in(k_play, shot)
-        action, answer = _answered(base, near(base, env), key, state, obs)
+        action, answer = _answered(base, nearby_teacher(base, env), key, state, obs)
         rows.append((obs, action, answer))
         state, obs, _ = _shot(env, base, key, state, obs)
     columns = (np.concatenate([np.asarray(row[part]) for row in rows]) for part in range(3))
@@ -158,7 +158,7 @@ def measured(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> I
     plain = [
         ("own table", own.env, base, scale.racks),
         ("not adapted", env, base, scale.racks),
-        ("teacher", env, Taught(near(base, env)), scale.taught),
+        ("teacher", env, Taught(nearby_teacher(base, env)), scale.taught),
     ]
     for what, where, policy, racks in plain:
         if (what, 0, 0) not in done:
