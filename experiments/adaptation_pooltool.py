@@ -106,7 +106,7 @@ def nearby_teacher(base: Any, env: Any) -> NearbyTeacher:
     return NearbyTeacher(Teaching(base), env, jnp.deg2rad(AIM_DEG), jnp.deg2rad(REACH_DEG), TRIED)
 
 
-def asked(base: Any, env: Any, scale: Scale, seed: int) -> cl.Labels:
+def ask(base: Any, env: Any, scale: Scale, seed: int) -> cl.Labels:
     """Labels about the base policy's own shots, ten on each of as many racks as it takes, in random order.
 
     One pass of refinement asks about nothing else, so all racks are played at once.
@@ -133,7 +133,7 @@ def _answered(base: Any, teacher: NearbyTeacher, key: Any, state: Any, obs: Any)
 
 def adapted(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int, cl.AdaptedPolicy]]:
     """The policy after the largest number of labels, then after the first ones of these."""
-    labels = asked(base, env, scale, seed)
+    labels = ask(base, env, scale, seed)
     for budget in scale.labels[::-1]:
         yield (
             budget,
