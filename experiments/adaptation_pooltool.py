@@ -131,7 +131,7 @@ def _answered(base: Any, teacher: NearbyTeacher, key: Any, state: Any, obs: Any)
     return action, relative_feedback(DIRECTIONS, action, best_actions(teacher, state, obs), jnp.deg2rad(EPS_DEG))
 
 
-def adapted(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int, cl.AdaptedPolicy]]:
+def adapt(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int, cl.AdaptedPolicy]]:
     """The policy after the largest number of labels, then after the first ones of these."""
     labels = ask(base, env, scale, seed)
     for budget in scale.labels[::-1]:
@@ -166,7 +166,7 @@ def measured(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> I
     for seed in scale.seeds:
         if all(("adapted", seed, budget) in done for budget in scale.labels):
             continue
-        for budget, policy in adapted(base, env, scale, seed):
+        for budget, policy in adapt(base, env, scale, seed):
             answers = np.bincount(np.asarray(policy.labels.answer, int).ravel() + 1, minlength=3).tolist()
             told = {"used": policy.used, "judged": list(policy.judged[1:]), "answers": answers}
             if ("adapted", seed, budget) not in done:
