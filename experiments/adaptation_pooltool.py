@@ -150,7 +150,7 @@ def adapt(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int, c
         )
 
 
-def measured(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> Iterator[Row]:
+def measure(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> Iterator[Row]:
     """Yield all measurements but the known ones, each as soon as it is made."""
     own, world = cl.make("billiards", table=TABLE), cl.make("billiards", table=TABLE, robot="pooltool")
     env = world.env.replace(processes=processes)  # pyright: ignore[reportAttributeAccessIssue]
@@ -219,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         base = cl.load_policy(given.policy).policy if given.policy else shipped()
         came, begun = provenance(), time.monotonic()
-        for row in measured(base, SCALES[given.scale], given.processes, rows):
+        for row in measure(base, SCALES[given.scale], given.processes, rows):
             took, begun = time.monotonic() - begun, time.monotonic()
             row |= {"rewards": np.round(row["rewards"], 4).tolist(), "seconds": round(took), "commit": came["commit"]}
             rows.append(row)
