@@ -181,7 +181,7 @@ def fetch(environment: str) -> Callable[[str], Opened]:
 
         def played(policy: Any, offset: Sequence[float], seed: int, count: int) -> np.ndarray:
             first = study.FIRST_EPISODE[split] + (seed - FIRST_SEED[split]) * count
-            return study.played(environment, policy, offset, range(first, first + count))
+            return study.play(environment, policy, offset, range(first, first + count))
 
         def play(policies: Any, seeds: Sequence[int], count: int) -> np.ndarray:
             each = enumerate(seeds)

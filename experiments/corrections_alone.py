@@ -162,7 +162,7 @@ def calibrated(world: str, conditions: Sequence[Condition], scale: Scale, split:
             how: dict[str, Any] = {"guidance": "calibration", "judge_by": "labels", "seed": seed}
             found = cl.adapt(script, study.world_of(environment), teacher, labels=labels, scalars=scalars, **how)
             first = study.FIRST_EPISODE[split] + number * scale.episodes
-            success = study.played(environment, found.policy, study.OFFSET, range(first, first + scale.episodes))
+            success = study.play(environment, found.policy, study.OFFSET, range(first, first + scale.episodes))
             about = {"condition": condition.name, "labels": labels, "seed": seed}
             yield [{**about, "success": round(float(success.mean()), 4)}]
 

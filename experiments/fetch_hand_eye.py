@@ -89,7 +89,7 @@ def world_of(environment: str) -> cl.World:
     )
 
 
-def played(environment: str, policy: Any, offset: Sequence[float], episodes: Sequence[int]) -> np.ndarray:
+def play(environment: str, policy: Any, offset: Sequence[float], episodes: Sequence[int]) -> np.ndarray:
     """Success (episodes,) at the end of episodes of these seeds; a policy's own random numbers are always the same."""
     act = jax.jit(lambda obs: policy.act(jax.random.key(0), None, obs))
     found = []
@@ -149,7 +149,7 @@ def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iter
         script = in_space(policy_of(jax.jit(SCRIPTS[environment])), world_of(environment).actions)
         for what, offset in (("unchanged", (0.0, 0.0, 0.0)), ("displaced", OFFSET)):
             if (what, "", False) not in done:
-                success = played(environment, script, offset, episodes)
+                success = play(environment, script, offset, episodes)
                 yield {"what": what, "says": "", "shuffled": False, "seed": seed, "success": success}
         return
     for condition in CONDITIONS:
@@ -159,7 +159,7 @@ def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iter
         told: Row = {"used": policy.used, "judged": [round(value, 4) for value in policy.judged[1:]]}
         if kind == "calibration":
             told["estimates"] = [one.words() for one in policy.estimates if one.changed]
-        success = played(environment, policy.policy, OFFSET, episodes)
+        success = play(environment, policy.policy, OFFSET, episodes)
         row = {"what": kind, "says": condition.says, "shuffled": condition.shuffled, "seed": seed}
         yield {**row, **told, "rewarded_steps": policy.rewarded_steps, "success": success}
 
