@@ -122,7 +122,7 @@ def settings(kind: str, says: str, shuffled: bool, space: Any) -> Scalars:
     return dataclasses.replace(plain_scalars(space), eps_deg=EPS, tau_deg=EPS / 20, says=says, answer=answer)
 
 
-def adapted(environment: str, kind: str, condition: Condition, labels: int, seed: int) -> cl.AdaptedPolicy:
+def adapt(environment: str, kind: str, condition: Condition, labels: int, seed: int) -> cl.AdaptedPolicy:
     """The script after labels of one seed; held-out labels decide whether it is changed."""
     from cuelearner_envs.fetch.hand_eye import onlooker
 
@@ -155,7 +155,7 @@ def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iter
     for condition in CONDITIONS:
         if (kind, *condition) in done:
             continue
-        policy = adapted(environment, kind, condition, scale.labels, seed)
+        policy = adapt(environment, kind, condition, scale.labels, seed)
         told: Row = {"used": policy.used, "judged": [round(value, 4) for value in policy.judged[1:]]}
         if kind == "calibration":
             told["estimates"] = [one.words() for one in policy.estimates if one.changed]
