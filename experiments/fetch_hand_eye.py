@@ -139,7 +139,7 @@ def adapt(environment: str, kind: str, condition: Condition, labels: int, seed: 
     return cl.adapt(script, world, labels=given._replace(answer=answer), scalars=scalars, **how)
 
 
-def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iterator[Row]:
+def measure(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iterator[Row]:
     """Yield all measurements of a piece but the known ones, each as soon as it is made."""
     environment, kind, number = piece.split("/")
     done = {(row["what"], row["says"], row["shuffled"]) for row in known}
@@ -175,7 +175,7 @@ def run(piece: str, scale: str, split: str, out: Path, resume: bool) -> None:
             raise UserError(f"{file} exists: give another --out, or --resume with what it was made by")
         rows = found["rows"]
     begun = time.monotonic()
-    for row in measured(piece, SCALES[scale], split, rows):
+    for row in measure(piece, SCALES[scale], split, rows):
         took, begun = time.monotonic() - begun, time.monotonic()
         rows.append({**row, "success": [int(value) for value in row["success"]], "seconds": round(took)})
         file.parent.mkdir(parents=True, exist_ok=True)
