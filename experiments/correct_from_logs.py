@@ -36,14 +36,14 @@ BOUND = 0.25  # shares of the ranges
 LABELS, RECORDED, OTHERS = 200, 400, 2000
 
 
-def wanted(obs):
+def intended_actions(obs):
     """Return the teacher's intended actions."""
     return np.stack([0.06 * obs[:, 0], 0.06 * obs[:, 1], 0.6 * np.tanh(obs[:, 2] * obs[:, 0])], -1).astype(np.float32)
 
 
 def off(obs):
     """The policy: the same, wrong by a constant."""
-    return wanted(obs) + OFFSET
+    return intended_actions(obs) + OFFSET
 
 
 class Row(NamedTuple):
@@ -66,7 +66,7 @@ class Row(NamedTuple):
 def error(policy, seed: int) -> float:
     """Mean distance from what is wanted, in shares of the ranges, in situations that were not recorded."""
     obs = np.random.default_rng((seed, 1)).uniform(-1, 1, (OTHERS, 3)).astype(np.float32)
-    return float((np.abs(policy(obs) - wanted(obs)) / RANGE).mean())
+    return float((np.abs(policy(obs) - intended_actions(obs)) / RANGE).mean())
 
 
 def recorded(seed: int) -> np.ndarray:
@@ -81,7 +81,7 @@ def at_random(seed: int, eps: float) -> cl.Labels:
     moved = off(obs) + BOUND * RANGE * random.uniform(-1, 1, obs.shape)
     actions = np.clip(moved, LOW, HIGH).astype(np.float32)
     told = jax.vmap(lambda action, best: relative_feedback(BOX, action, best, eps))
-    return cl.Labels(obs, actions, np.array(told(jnp.asarray(actions), jnp.asarray(wanted(obs)))))
+    return cl.Labels(obs, actions, np.array(told(jnp.asarray(actions), jnp.asarray(intended_actions(obs)))))
 
 
 def shuffled(labels: cl.Labels, seed: int) -> cl.Labels:
@@ -99,7 +99,7 @@ def in_rounds(seed: int, guidance: str, folder: Path, control: bool):
         scalars = dataclasses.replace(plain_scalars(BOX), answer="shuffled")
     bound = None if guidance == "calibration" else BOUND
     how: dict[str, Any] = {"labels": LABELS, "guidance": guidance, "judge_by": "labels", "seed": seed}
-    return cl.adapt(off, cl.World(task, task.plain()), wanted, bound_deg=bound, scalars=scalars, **how)
+    return cl.adapt(off, cl.World(task, task.plain()), intended_actions, bound_deg=bound, scalars=scalars, **how)
 
 
 def corrected(guidance: str, questions: str, answers: str, seed: int, folder: Path) -> Row:
