@@ -102,7 +102,7 @@ def in_rounds(seed: int, guidance: str, folder: Path, control: bool):
     return cl.adapt(off, cl.World(task, task.plain()), intended_actions, bound_deg=bound, scalars=scalars, **how)
 
 
-def corrected(guidance: str, questions: str, answers: str, seed: int, folder: Path) -> Row:
+def correct(guidance: str, questions: str, answers: str, seed: int, folder: Path) -> Row:
     """Correct a policy once and judge it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a control is not used
@@ -131,9 +131,7 @@ def main(seeds: int = 5, out: Path | None = None) -> list[Row]:
                 for answers in ("own", "shuffled"):
                     if (guidance, questions, answers) == ("calibration", "rounds", "shuffled"):
                         continue  # calibration asks by what was answered: there is nothing to shuffle beforehand
-                    own = [
-                        corrected(guidance, questions, answers, seed, Path(folder) / "there") for seed in range(seeds)
-                    ]
+                    own = [correct(guidance, questions, answers, seed, Path(folder) / "there") for seed in range(seeds)]
                     left = [row.left for row in own]
                     used = sum(row.used for row in own)
                     print(
