@@ -235,7 +235,7 @@ def means(cues: int, condition: Condition, kind: Kind) -> bool:
     return (relative or not condition.of_relative) and (cues > 1 or not condition.of_cues)
 
 
-def measured(
+def measure(
     world: World,
     opened: Opened,
     name: str,

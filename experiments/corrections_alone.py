@@ -37,7 +37,7 @@ from _corrections import (
     fetch,
     grasp,
     halls,
-    measured,
+    measure,
     without_labels,
 )
 
@@ -184,12 +184,12 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
     place = WORLDS[world], open_world(world, split), kind
     if not tuning:
         settings = {**CHOSEN.get(WORLDS[world].tuned_in or world, {}).get(kind, {}), **(scale.settings or {})}
-        yield from measured(*place, settings, conditions, seeds, scale.budgets, scale.episodes, max(scale.budgets))
+        yield from measure(*place, settings, conditions, seeds, scale.budgets, scale.episodes, max(scale.budgets))
         return
     budgets = (min(TUNED_LABELS, max(scale.budgets)),)
     for settings in settings_of(world, kind):
         tried = {**settings, **(scale.settings or {})}
-        for rows in measured(*place, tried, CONDITIONS[:1], seeds, budgets, scale.episodes, max(scale.budgets)):
+        for rows in measure(*place, tried, CONDITIONS[:1], seeds, budgets, scale.episodes, max(scale.budgets)):
             yield [{**row, "settings": settings} for row in rows]
 
 
