@@ -193,7 +193,7 @@ def bases_of(piece: Piece, scale: Scale, seeds: tuple[int, ...]) -> tuple[int, .
     return seeds[: scale.tuning_bases] if piece.split == "tuning" else seeds[scale.tuning_bases :]
 
 
-def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) -> Bench:
+def open_bench(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) -> Bench:
     """Open the base agents and world of a piece. Raises UserError if the folder holds no such agents."""
     source = PolicySource.of_run(folder, registry.find)
     if source.task.name != study.task:
@@ -225,7 +225,7 @@ def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, 
     if folder.exists() and not resume:
         raise UserError(f"{folder} exists: give --resume to go on, or another --out")
     shutil.rmtree(folder, ignore_errors=True)  # what was begun is begun anew: it takes minutes
-    bench = opened(bases, study, piece, scale, folder)
+    bench = open_bench(bases, study, piece, scale, folder)
     about = {"task": study.task, "world": piece.place, "method": piece.method, "variant": piece.variant}
     constants = {**about, "split": piece.split, "bound_deg": piece.bound_deg, **provenance()}
     with tables.TableWriter(folder, SCHEMA, constants) as writer:
