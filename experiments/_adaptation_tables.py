@@ -29,7 +29,7 @@ GAIN = 0.95  # of a gain, after how many labels it is asked for
 Row = dict[str, Any]
 
 
-def named(method: str, variant: str) -> str:
+def name_of(method: str, variant: str) -> str:
     """A method as tables and figures show it."""
     return NAMES[method] + (f" ({variant})" if variant else "")
 
@@ -48,7 +48,7 @@ class Line(NamedTuple):
     @property
     def name(self) -> str:
         """The line's name in tables."""
-        return named(self.method, self.variant)
+        return name_of(self.method, self.variant)
 
 
 def read(folder: Path) -> list[Row]:

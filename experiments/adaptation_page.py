@@ -26,7 +26,7 @@ from _adaptation_tables import (
     held_out,
     lines,
     matched,
-    named,
+    name_of,
     percent,
     reached,
     read,
@@ -157,7 +157,7 @@ def _gains(points: Points) -> str:
         mine, theirs = (reached(values, labels, reference, own) for own in (True, False))
         unit = "steps" if method == "finetuning" else "labels"
         told = ["never gained" if not np.isfinite(mine.estimate) else f"{mine.told(labels[-1])} {unit}"]
-        rows.append([named(method, variant), *told, f"{theirs.told(labels[-1])} {unit}"])
+        rows.append([name_of(method, variant), *told, f"{theirs.told(labels[-1])} {unit}"])
     header = ["", f"{GAIN:.0%} of its own gain", f"{GAIN:.0%} of the gain of relative labels"]
     return table(header, rows)
 
@@ -171,7 +171,7 @@ def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[floa
             colour = COLOURS.get(method) or colour_of(method)
             x = np.maximum(labels, 10)  # the first point, of no labels, at the left end
             style = {"color": colour, "linestyle": "--" if variant else "-", "marker": "o", "markersize": 3}
-            axes.plot(x, middle, label=named(method, variant), **style)
+            axes.plot(x, middle, label=name_of(method, variant), **style)
             axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
         if level:
             axes.axhline(level[0], color="#999999", linestyle="--", linewidth=1, label=level[1])
