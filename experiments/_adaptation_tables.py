@@ -198,7 +198,7 @@ class Reached(NamedTuple):
         return f"{number(self.estimate)} [{number(self.lower)}, {number(self.upper)}]"
 
 
-def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own: bool) -> Reached:
+def first_reaching(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own: bool) -> Reached:
     """Return the number of labels or steps after which a method's curve has made `GAIN` of a gain.
 
     Args:

@@ -23,12 +23,12 @@ from _adaptation_tables import (
     NAMES,
     Line,
     Row,
+    first_reaching,
     held_out,
     lines,
     matched,
     name_of,
     percent,
-    reached,
     read,
     recovered,
     rewarded_steps,
@@ -154,7 +154,7 @@ def _gains(points: Points) -> str:
     for (method, variant), (labels, values) in points.items():
         if len(values) != len(reference):
             continue
-        mine, theirs = (reached(values, labels, reference, own) for own in (True, False))
+        mine, theirs = (first_reaching(values, labels, reference, own) for own in (True, False))
         unit = "steps" if method == "finetuning" else "labels"
         told = ["never gained" if not np.isfinite(mine.estimate) else f"{mine.told(labels[-1])} {unit}"]
         rows.append([name_of(method, variant), *told, f"{theirs.told(labels[-1])} {unit}"])
