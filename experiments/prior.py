@@ -182,7 +182,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def trained(pieces: Sequence[Piece], scale: Scale, out: Path) -> int:
+def train_pieces(pieces: Sequence[Piece], scale: Scale, out: Path) -> int:
     """Run pieces, each from where it stands; the status of the first that did not end well."""
     for piece in filter(None, (scaled(piece, scale) for piece in pieces)):
         if status := cuelearner(sweep_command(TASKS[piece.world], piece, out, resume=True)):
@@ -197,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(list_pieces(pieces))
         return 0
     out = folder_at(asked.out, asked.scale)
-    status = 0 if asked.report else within(asked.minutes, lambda: trained(pieces, SCALES[asked.scale], out))
+    status = 0 if asked.report else within(asked.minutes, lambda: train_pieces(pieces, SCALES[asked.scale], out))
     if rows := rows_of(out, PIECES):
         told = {**provenance(), "scale": asked.scale, "rows": rows}
         (out / "prior.json").write_text(json.dumps(told, indent=1) + "\n")
