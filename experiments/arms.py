@@ -247,7 +247,7 @@ def _line(row: dict[str, Any]) -> str:
     return f"{names}  {row['mean']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
 
 
-def done(pieces: Sequence[Piece | Corrected], scale: str, out: Path) -> int:
+def count_done(pieces: Sequence[Piece | Corrected], scale: str, out: Path) -> int:
     """Run pieces, each from where it stands; the status of the first that did not end well."""
     for piece in pieces:
         if isinstance(piece, Corrected):
@@ -268,7 +268,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(list_pieces(pieces))
         return 0
     out = folder_at(asked.out, asked.scale)
-    status = 0 if asked.report else within(asked.minutes, lambda: done(pieces, asked.scale, out))
+    status = 0 if asked.report else within(asked.minutes, lambda: count_done(pieces, asked.scale, out))
     rows, guides, shown = rows_of(out, TRAINED), guides_of(out, TRAINED), measured(out, CORRECTED)
     if rows or shown:
         steps_taken = compared(rows)
