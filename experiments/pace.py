@@ -39,7 +39,7 @@ VARIANTS = {
 }  # fmt: skip
 
 
-def measured(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
+def read_values(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
     """Mean over the curve (seeds,) and last reward (seeds,), by seed; share of guided steps while there is guidance."""
     rows = sorted(results.read(folder).to_pylist(), key=lambda row: (row["seed"], row["step"]))
     seeds = sorted({row["seed"] for row in rows})
@@ -71,7 +71,7 @@ def main() -> int:
         status = cuelearner([*common, *options, "--out", str(out), *resume])
         if status:
             return status
-        found[name] = measured(out)
+        found[name] = read_values(out)
     unguided = found["none"]
     print(f"{'':36}  IQM over the curve      mean - unguided's          last - unguided's          guided")
     for name, (mean, last, share) in found.items():
