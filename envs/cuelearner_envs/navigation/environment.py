@@ -38,7 +38,7 @@ class Walker(struct.PyTreeNode):
     world: Int[Array, ""]
     route: Int[Array, ""]  # of that world
     steps: Int[Array, ""]  # taken in this episode
-    count_passed: Float[Array, "2"] | None = (
+    passed: Float[Array, "2"] | None = (
         None  # obstacles on the left and on the right in this episode, where they count
     )
 
