@@ -112,7 +112,7 @@ def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
 def decide_source() -> bytes:
     """Return `runner` with the contents of `operations` in place of their import: one file that needs only NumPy."""
     own, other = (inspect.getsource(module) for module in (runner, operations))
-    imported = "from cuelearner_jax.export.operations import ContractError, compiled\n"
+    imported = "from cuelearner_jax.export.operations import ContractError, compile_ops\n"
     return own.replace(imported, other.partition("from __future__ import annotations\n\n")[2]).encode()
 
 

@@ -20,7 +20,7 @@ class ContractError(ValueError):
     """Raised for an invalid decision folder, or an observation that violates the contract. One line."""
 
 
-def compiled(ops: list[list[Any]], kept: set[str] | None = None) -> Run:
+def compile_ops(ops: list[list[Any]], kept: set[str] | None = None) -> Run:
     """Return a graph's operations as one function, which adds their results to the values it is given.
 
     Args:
@@ -127,7 +127,7 @@ def _loop(
     body: dict[str, Any],
 ) -> Run:
     """Repeat `body` on the carried values (of these types and shapes) while `test` of them is true."""
-    look, work = compiled(test["ops"]), compiled(body["ops"])
+    look, work = compile_ops(test["ops"]), compile_ops(body["ops"])
 
     def run(values: Values) -> None:
         values.update(zip(carried, [values[name] for name in inputs], strict=True))

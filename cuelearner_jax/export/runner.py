@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from cuelearner_jax.export.operations import ContractError, compiled
+from cuelearner_jax.export.operations import ContractError, compile_ops
 
 CONTRACT, GOLDEN = "contract.json", "golden.npz"
 VERSION = 1  # of contracts and graphs
@@ -253,7 +253,7 @@ def _of_numpy(folder: Path, contract: dict[str, Any]) -> Batch:
         graph = json.loads(stored["graph"].tobytes())
         constants = {name: stored[name] for name in stored.files if name != "graph"}
     (given,), (result,) = graph["inputs"], graph["outputs"]
-    run, alone = compiled(graph["ops"], {result}), threading.Lock()
+    run, alone = compile_ops(graph["ops"], {result}), threading.Lock()
 
     def decide(batch: np.ndarray) -> np.ndarray:
         actions = np.empty((len(batch), contract["action"]["size"]), np.float32)

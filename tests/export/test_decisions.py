@@ -72,7 +72,7 @@ def test_numpy_and_onnx_decide_as_jax_does(name):
     wanted = np.asarray(jax.jit(policy.act)(jax.random.key(0), None, jnp.asarray(DRAWN)))
     assert np.ptp(wanted, 0).max() > 0.1
     traced = formats.trace_policy(policy, DRAWN.shape[1])
-    run, (result,) = operations.compiled(traced.graph.ops, set(traced.graph.outputs)), traced.graph.outputs
+    run, (result,) = operations.compile_ops(traced.graph.ops, set(traced.graph.outputs)), traced.graph.outputs
     found = []
     for obs in DRAWN:
         values = {**traced.constants, "obs": obs}
@@ -422,4 +422,4 @@ def test_what_declares_more_than_a_decision_has_is_refused_before_it_is_unpacked
         contract.replay_golden_cases(there)
     for name, attributes in (("broadcast", {"shape": [1 << 33, 2]}), ("pad", {"low": [0], "high": [1 << 40]})):
         with pytest.raises(runner.ContractError, match=r"makes an array of [\d,]* entries"):
-            operations.compiled([[name, ["obs", "zero"], ["wide"], attributes]])
+            operations.compile_ops([[name, ["obs", "zero"], ["wide"], attributes]])

@@ -38,9 +38,7 @@ class Walker(struct.PyTreeNode):
     world: Int[Array, ""]
     route: Int[Array, ""]  # of that world
     steps: Int[Array, ""]  # taken in this episode
-    passed: Float[Array, "2"] | None = (
-        None  # obstacles on the left and on the right in this episode, where they count
-    )
+    passed: Float[Array, "2"] | None = None  # obstacles on the left and on the right in this episode, where they count
 
 
 AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal, previous, world, route and steps
