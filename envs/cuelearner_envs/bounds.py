@@ -1,4 +1,4 @@
-"""Whether a number of a task's configuration can be worked with: refused in one line, before anything is made of it."""
+"""Validate numbers and words of a task's configuration; an invalid one is refused in one line."""
 
 from __future__ import annotations
 

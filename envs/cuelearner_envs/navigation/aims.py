@@ -21,14 +21,14 @@ from cuelearner_jax.environment import Aims
 from cuelearner_jax.spaces.directions import from_angle, rotate, to_angle
 
 WAYS = 72  # every 5 degrees
-RADII = (0.28, 0.42, 0.55)  # of the discs: the body's own, nearly its reach, what a road map keeps clear [m]
-BESIDE = (0, 1, -1, 2, -2, 4, -4, 8, -8)  # neighbours that a way sees, in steps of 5 degrees
+RADII = (0.28, 0.42, 0.55)  # of the discs: the body's own, nearly its reach, and what a road map keeps clear [m]
+BESIDE = (0, 1, -1, 2, -2, 4, -4, 8, -8)  # neighbours that a way takes into account, in steps of 5 degrees
 # A way on which the first two discs are stopped sooner is not open [m]: the body's front is 0.2 m ahead, a step is
 # 0.2 m, and a body that turns needs more room than one that goes straight.
 ROOM = (0.6, 0.1)
 SCALE = 5.0  # of lengths among the features [m]
 CLOSE = 0.1  # of two ways by the rule, the one that leaves so much less is likelier by a factor of e [m]
-UNSEEN = -1.0  # nearness where the lidar does not look
+UNSEEN = -1.0  # nearness in directions that the lidar does not cover
 
 
 def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
@@ -56,7 +56,7 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
 
 
 def rule_of(aims: Aims) -> Float[Array, " ways"]:
-    """log-weights by a rule that somebody wrote down at once: least is left to the goal after two legs.
+    """Return log-weights by a simple hand-written rule: the shortest rest to the goal after two legs.
 
     `aims` with the features of a look ahead. Of ways that leave as much the shorter plan counts.
     """
@@ -94,6 +94,6 @@ def _lengths(
 
 
 def _seen_from(ways: Float[Array, "ways 2"], vectors: Float[Array, "n 2"]) -> list[Float[Array, "n ways"]]:
-    """Vectors along and across the ways."""
+    """Rotate vectors into the frame of the ways: along and across."""
     x, y = vectors[:, :1], vectors[:, 1:]
     return [x * ways[None, :, 0] + y * ways[None, :, 1], y * ways[None, :, 0] - x * ways[None, :, 1]]

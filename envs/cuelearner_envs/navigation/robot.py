@@ -42,7 +42,7 @@ class Motion(struct.PyTreeNode):
 
 
 def walk(robot: Robot, motion: Motion, direction: Float[Array, "2"], duration: Scalar) -> Motion:
-    """The motion after `duration` [s] of being told to walk in `direction` (unit vector in the body's frame).
+    """Return the motion after `duration` [s] of the command to walk in `direction` (unit vector in the body's frame).
 
     The command is held in the world's frame meanwhile: the body turns under it.
     """

@@ -21,9 +21,9 @@ from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Reel, Sketch
 
-AHEAD, BEHIND, ASIDE = 9.0, 4.0, 6.5  # that is shown at least [m]
-AROUND = 2 * (AHEAD + BEHIND)  # that is drawn: a page wider or higher than the sketch shows more of it [m]
-INSET = 0.5  # of a goal that lies farther away, from the edge [m]
+AHEAD, BEHIND, ASIDE = 9.0, 4.0, 6.5  # extent that is shown at least [m]
+AROUND = 2 * (AHEAD + BEHIND)  # extent that is drawn; a page of another shape than the sketch shows more of it [m]
+INSET = 0.5  # distance of a far goal's mark from the edge [m]
 STEPS = 15  # of a film
 DOT = 0.05  # radius of a beam's end [m]
 WORDS = {"success": "the goal is reached", "collision": "collision", "fall": "it falls", "timeout": "out of time"}
