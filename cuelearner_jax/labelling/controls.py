@@ -51,7 +51,7 @@ FILM = Control("film", "film", ("f", "F", "v", "V"))
 CORRECTED = Control("film-refined", "film of the correction", ("x", "X"))
 HELP = Control("help", "help", ("h", "H", "?"))
 AS_IT_IS = Control("0", "already right", ("ArrowUp", "w", "W", " "), (0.0,), "asked")
-REST_UNSAID = Control("send", "send, of the others nothing is said", ("Enter",), (UNSAID,))
+REST_UNSAID = Control("send", "send, nothing is said of the others", ("Enter",), (UNSAID,))
 REST_RIGHT = Control("rest", "send, the others are already right", (" ", "ArrowUp"), (0.0,))
 ALL_RIGHT = REST_RIGHT._replace(words="all already right", colour="asked")
 

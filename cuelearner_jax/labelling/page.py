@@ -119,7 +119,7 @@ class Page:
         with ui.element("div").classes("hide-small"):
             turned = [one for one in self.controls.values() if one.colour in ("left", "right") and one.cue is None]
             swatches = {"asked": "the action in question", **{one.colour: one.words for one in turned}}
-            refined = "the policy as corrected so far" if self._by_evidence else "what the model makes of it"
+            refined = "the corrected policy" if self._by_evidence else "the model's correction"
             for name, about in {**swatches, "refined": refined}.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
             ui.label(self.session.legend).classes("text-caption")
@@ -297,7 +297,7 @@ class Page:
         self._model.text = f"{fitted}; {doing} the next" if status.fitting else fitted
         if newest.problem:
             self._model.text = f"{fitted}; {newest.problem}"
-        apart = f"agrees with labels kept apart: {newest.quality}" if newest.quality else ""
+        apart = f"agreement with held-out labels: {newest.quality}" if newest.quality else ""
         self._quality.text = "\n".join(newest.told) or apart
         place = "/".join(self.session.place.parts[-2:])
         self._saved.text = f"{place}: {status.answered + status.unsure} answers saved"

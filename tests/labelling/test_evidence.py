@@ -76,6 +76,6 @@ def test_the_page_shows_the_estimate(opened):
     async def acts(user, pages):
         await user.should_see("estimate 1, of 10 labels")
         await user.should_see("direction: turn: ")
-        await user.should_see("the policy as corrected so far")
+        await user.should_see("the corrected policy")
 
     shown(session, acts)

@@ -55,7 +55,7 @@ def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, t
         await user.should_see("1 not known")
         await press(user, "undo", lambda: session.number == 10)
         await user.should_see("model 1, of 10 labels", retries=600)
-        await user.should_see("labels kept apart")
+        await user.should_see("held-out labels")
         user.find(marker="help").click()
         await user.should_see("more to the left: ←, A")
         (page,) = pages
