@@ -26,7 +26,7 @@ class Operations(NamedTuple):
 
     @property
     def total(self) -> int:
-        """All of them together."""
+        """Sum of all parts."""
         return sum(self)
 
 

@@ -1,4 +1,4 @@
-"""What several benchmarks share: rounds of labels in `speed.Timed`, and rows with the share of the matmul rate."""
+"""Shared parts of benchmarks: rounds of labels in `speed.Timed`, and rows with the share of the matmul rate."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def best(obs: np.ndarray) -> np.ndarray:
 
 
 def write(folder: Path, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Writes so many situations; returns what is seen in them (count, 4), and what the policy did (count, 3)."""
+    """Write so many situations; return what is seen in them (count, 4), and what the policy did (count, 3)."""
     random = np.random.default_rng(seed)
     (folder / "pictures").mkdir(parents=True)
     obs = random.uniform(-1, 1, (count, 4)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What a script presses on the labelling page: it sees the page alone."""
+"""A script that presses keys on the labelling page and sees only the page."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Presses(NamedTuple):
 
 
 def chosen(page: Any, task: str, rng: random.Random, seen: np.ndarray | None = None) -> Presses:
-    """What the script presses; `seen` (situations, 4): what a folder's pictures show."""
+    """Return the script's key; `seen` (situations, 4): contents of a folder's pictures."""
     named = page.evaluate("cue.keys")
     cues = sorted({int(name.split("-")[1]) for name in named.values() if name.startswith(("pick-", "only-"))})
     if not cues:
@@ -65,7 +65,7 @@ def _turned(page: Any, task: str, rng: random.Random) -> str:
 
 
 def _wanted(page: Any, seen: np.ndarray) -> list[float]:
-    """Which way each entry of the action on the page should change, of what its picture shows."""
+    """Return the direction in which each entry of the page's action should change, by its picture."""
     side, note = page.evaluate(SEEN)
     row = int(re.search(r"situation (\d+)", side)[1])  # pyright: ignore[reportOptionalSubscript]
     action = [float(re.search(rf"{name} (-?[\d.e-]*\d)", note)[1]) for name in ENTRIES]  # pyright: ignore[reportOptionalSubscript]

@@ -29,10 +29,10 @@ def _named(element: xml.Element) -> str:
 
 
 class Scene:
-    """What a drawing shows; places as drawn (x to the right, y down) [m], the robot in the origin, facing up."""
+    """Contents of a drawing; places as drawn (x to the right, y down) [m], the robot at the origin, facing up."""
 
     def __init__(self, svg: str) -> None:
-        """Reads the page's SVG element."""
+        """Read the page's SVG element."""
         root = xml.fromstring(svg)
         groups = {group.get("class", ""): group for group in root if _named(group) == "g"}
         still = list(groups["still"])
@@ -68,7 +68,7 @@ class Scene:
         return found
 
     def to_goal(self) -> float:
-        """Where to walk: counterclockwise from ahead [deg]."""
+        """Return the direction to walk in, counterclockwise from ahead [deg]."""
         left, top, width, height = self.box
         shape = round(height / CELL) + 1, round(width / CELL) + 1
         rows, columns = np.indices(shape)
@@ -121,5 +121,5 @@ class Scene:
 
 
 def _angle(place: np.ndarray) -> float:
-    """Of a place as drawn, counterclockwise from ahead [deg]."""
+    """Return the angle of a place as drawn, counterclockwise from ahead [deg]."""
     return math.degrees(math.atan2(-place[0], -place[1]))

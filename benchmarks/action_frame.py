@@ -1,4 +1,4 @@
-"""What it costs to see from the action: time of a training step in the action's frame over one in the raw frame.
+"""Cost of the action frame: time of a training step in the action's frame over one in the raw frame.
 
     python benchmarks/action_frame.py --lanes 1 8 64 --out frame.json
 

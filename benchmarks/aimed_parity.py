@@ -1,4 +1,4 @@
-"""What aims earn in Chipmunk, where this simulator's contact law is not exact: at the public code's step of 0.02 s.
+"""Success of aims in Chipmunk, where this simulator's contact law is not exact, at the public code's step of 0.02 s.
 
     python benchmarks/aimed_parity.py --out aimed_parity.json
 
@@ -50,7 +50,7 @@ def situations(env: Any, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def in_chipmunk(table: Table, step: float, places: np.ndarray, gone: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Which balls are pocketed after each shot (count, balls); those that were before stay so."""
+    """Return which balls are pocketed after each shot (count, balls), those pocketed before included."""
     world, after = PymunkTable(table, step), gone.copy()
     for number, (place, before, angle) in enumerate(zip(places, gone, angles, strict=True)):
         after[number, ~before] = world.play(place[~before], float(angle))[1]
@@ -63,7 +63,7 @@ def reward(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def main() -> None:
-    """Plays the shots in both engines and prints a row a table and step."""
+    """Play the shots in both engines and prints a row a table and step."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shots", type=int, default=1000)
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")

@@ -32,7 +32,7 @@ RESULTS = Path(__file__).parent / "results" / "anymal_speed.json"
 
 
 def environment(folder: Path, control_steps: int, worlds: int) -> LeggedNavigation:
-    """Cluttered halls with the quadruped, which walks by the policy in a folder."""
+    """Return cluttered halls with the quadruped, which walks by the policy in a folder."""
     plain = make_navigation(NavigationConfig(style="clutter", worlds=worlds))
     return LeggedNavigation(
         worlds=plain.worlds,
@@ -45,12 +45,12 @@ def environment(folder: Path, control_steps: int, worlds: int) -> LeggedNavigati
 
 
 def see_all(done: Any) -> jax.Array:
-    """Everything that an agent gets to see."""
+    """Return a sum that needs the whole observation."""
     return done.obs.sum() + done.reward
 
 
 def see_reward(done: Any) -> jax.Array:
-    """The reward alone: the lidar is then never computed."""
+    """Return the reward alone, so that the lidar is never computed."""
     return done.reward
 
 
@@ -82,7 +82,7 @@ def rates(env: LeggedNavigation, see: Callable, robots: int, steps: int, rounds:
 
 
 def main() -> None:
-    """Measures and prints the table."""
+    """Measure and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=[16], help="side by side")
     parser.add_argument("--control-steps", type=int, nargs="+", default=[10], help="in a step of navigation")

@@ -49,7 +49,7 @@ def whole(env: Arm, grippers: int, steps: int) -> tuple[Callable, Any]:
 
 
 def bare(env: Arm, grippers: int, steps: int) -> tuple[Callable, Any]:
-    """As many steps of the physics in a plain loop, under random targets that hold for a step of control."""
+    """Step the physics equally often in a plain loop, with random targets held for a control step."""
     from mujoco import mjx
 
     model, data, _ = compiled(env.has_object)

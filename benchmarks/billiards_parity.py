@@ -31,7 +31,7 @@ def engine(case: tuple[Table, np.ndarray, np.ndarray, float]) -> list[tuple[np.n
 
 
 def compare(table: Table, count: int, seed: int, pool) -> dict:
-    """One row of the table: shares and distances over `count` random scenes."""
+    """Return one row of the table: shares and distances over `count` random scenes."""
     places, angles = scenes(table, count, seed)
     shares = np.array_split(np.arange(count), 16)
     played = pool.map(engine, [(table, places[s], angles[s], FINE_STEP) for s in shares], chunksize=1)

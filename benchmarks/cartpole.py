@@ -34,12 +34,12 @@ class CartPole(WholeObservations, struct.PyTreeNode):
     )
 
     def reset(self, key: jax.Array) -> tuple[CartState, jax.Array]:
-        """All four entries uniform in +-0.05."""
+        """Start with all four entries uniform in +-0.05."""
         obs = jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05)
         return CartState(obs, jnp.zeros((), jnp.int32)), obs
 
     def step(self, key: jax.Array, state: CartState, action: jax.Array) -> tuple[CartState, Step]:
-        """One Euler step; reward 1."""
+        """Take one Euler step; the reward is 1."""
         _, speed, angle, turning = state.obs
         push = self.force * jnp.sign(action[0])
         total, sin, cos = CART + POLE, jnp.sin(angle), jnp.cos(angle)

@@ -57,12 +57,12 @@ def chosen(teacher: Any, state: Any, obs: Any) -> Any:
 
 @jax.jit
 def worths(teacher: SearchTeacher, state: Any) -> Any:
-    """Expected reward of every direction in every situation."""
+    """Return the expected reward of every direction in every situation."""
     return jax.lax.map(lambda one: expected_values(teacher.rewards(one), teacher.aim_error), state)
 
 
 def compare(name: str, table: Any, tables: int, aim_error_deg: float) -> dict[str, Any]:
-    """One world's row."""
+    """Return one world's row."""
     before = BilliardsConfig(table, teacher="local_search", aim_error_deg=aim_error_deg)
     config = SCENARIOS[name].apply(before) if name in SCENARIOS else before
     env, plain = make_environment(config), make_environment(before)
@@ -89,7 +89,7 @@ def compare(name: str, table: Any, tables: int, aim_error_deg: float) -> dict[st
 
 
 def main() -> int:
-    """Compares and writes the table."""
+    """Compare and writes the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--table", default="regulation", choices=("easy", "regulation"))
     parser.add_argument("--tables", type=int, default=24, help="situations")

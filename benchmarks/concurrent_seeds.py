@@ -30,7 +30,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def measure(config: RunConfig, env: Any, seeds: int, devices: int, iterations: int, repeats: int) -> dict[str, float]:
-    """Trains `seeds` lanes on so many devices and times stretches of `iterations`."""
+    """Train `seeds` lanes on so many devices and times stretches of `iterations`."""
     timed = Timed(config, env, "none", seeds, mesh=lane_mesh(jax.local_devices()[:devices]))
     (block,) = timed.blocks
     at_rest, row_bytes = state_bytes(block), block.agent.replay.shape[-1] * 4

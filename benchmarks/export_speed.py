@@ -1,4 +1,4 @@
-"""How long an exported decision takes: one observation at a time on one core, in every format.
+"""Time of an exported decision: one observation at a time on one core, in every format.
 
     python benchmarks/export_speed.py docs/data/navigation_agent
 
@@ -53,7 +53,7 @@ def measured(folder: Path, calls: int, repeats: int) -> dict[str, float]:
 
 
 def run() -> None:
-    """Exports a run's policies in every format, and times them."""
+    """Export a run's policies in every format, and times them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("policy", help="a run folder")
     parser.add_argument("--policies", nargs="+", default=["agent", "guided"], help="which of the run's policies")

@@ -28,7 +28,7 @@ CALLS = 200
 
 
 def written(run: str, policies: list[str], folder: Path, device: str) -> None:
-    """Exports policies of a run on this process's device."""
+    """Export policies of a run on this process's device."""
     from cuelearner_jax.cli import main
 
     for policy in policies:
@@ -37,7 +37,7 @@ def written(run: str, policies: list[str], folder: Path, device: str) -> None:
 
 
 def called(folder: Path) -> list[dict[str, Any]]:
-    """Calls every decision below a folder on this process's device."""
+    """Call every decision below a folder on this process's device."""
     rows = []
     for contract in sorted(folder.glob("*/*/contract.json")):
         decide = Decision(contract.parent)
@@ -64,7 +64,7 @@ def called(folder: Path) -> list[dict[str, Any]]:
 
 
 def on(device: str, *arguments: str) -> str:
-    """What this file prints last in a process that has one kind of device; raises SystemExit if that fails."""
+    """Return what this file prints last in a process on one kind of device; raise SystemExit if it fails."""
     done = subprocess.run(
         [sys.executable, __file__, *arguments, "--device", device],
         env={**os.environ, "JAX_PLATFORMS": device},
@@ -78,7 +78,7 @@ def on(device: str, *arguments: str) -> str:
 
 
 def main() -> None:
-    """Writes and calls on every device, and prints a table."""
+    """Write and calls on every device, and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", help="a run folder with a guided lane")
     parser.add_argument("--policies", nargs="+", default=["agent", "guided"])

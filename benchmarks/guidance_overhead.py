@@ -25,7 +25,7 @@ from cuelearner_jax.tasks.billiards import BILLIARDS
 
 
 class Run(Labelled):
-    """One kind of guidance, its labels given, ready to train."""
+    """A run with one kind of guidance, its labels given, ready to train."""
 
     def __init__(self, kind: str, config: Any, seeds: int, labels: int) -> None:
         env = BILLIARDS.environment(config.task)

@@ -1,4 +1,4 @@
-"""One step of a Gymnasium environment through us, over the plain vector environment (Sync or Async, the faster).
+"""Time of a Gymnasium environment's step in this package, over the plain vector environment (the faster of two).
 
     python benchmarks/gymnasium_speed.py --out benchmarks/results/gymnasium_speed.json
 
@@ -59,7 +59,7 @@ def ours(name: str, num_envs: int, steps: int, processes: int) -> Callable[[int]
 
 
 def plain(name: str, num_envs: int, steps: int, mode: str) -> Callable[[int], float]:
-    """The same of `gymnasium.vector`."""
+    """Return a function that times `gymnasium.vector`."""
     source.find_spec(name)  # registers gymnasium_robotics, and mends it beside the MuJoCo here
     vector = [lambda: source.make_registered(name, {}, 0)] * num_envs
     kind = gymnasium.vector.SyncVectorEnv if mode == "sync" else gymnasium.vector.AsyncVectorEnv

@@ -116,19 +116,19 @@ def entered(browser: Browser, address: str, **look: Any) -> Page:
 
 
 def moved(page: Page, item: int, seconds: float = 30.0) -> None:
-    """Waits for another question than this one, until it takes an answer."""
+    """Wait for another question than this one, until it takes an answer."""
     page.wait_for_function(f"({ITEM})() !== {item} && cue.ready()", timeout=seconds * 1000)
 
 
 def press(page: Page, presses: Presses) -> None:
-    """Presses keys, one after the other."""
+    """Press keys, one after the other."""
     for number, key in enumerate(presses.keys):
         time.sleep(0.05 if number else 0.0)  # nobody presses two at once
         page.keyboard.press(key)
 
 
 def check(folder: Path, pressed: dict[int, Presses], saved: int) -> dict[str, int]:
-    """Presses that the file lacks or has otherwise, and rows that nobody pressed."""
+    """Press that the file lacks or has otherwise, and rows that nobody pressed."""
     found = label_files.found_in(folder)
     assert found is not None
     rows = label_files.history(found)
@@ -182,7 +182,7 @@ def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
 
 
 def blind(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, Any]:
-    """Presses at a pace whatever the page shows: each is in the file once, or told as not taken."""
+    """Press at a pace whatever the page shows: each is in the file once, or told as not taken."""
     (task,) = asked.task
     folder = asked.keep or work / "labels"
     with served(asked, task, folder, "--labels", str(2 * asked.labels)) as (_, address):
@@ -275,7 +275,7 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
 
 
 def main() -> None:
-    """Runs one of them."""
+    """Run one of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("paced", "blind", "kills", "pictures"))
     parser.add_argument("--task", nargs="+", default=["navigation"])

@@ -35,7 +35,7 @@ scan_all = jax.jit(jax.vmap(jax.vmap(scan, (None, 0))))
 
 
 def compare(style: Style, worlds: int, poses: int, seed: int) -> dict[str, float]:
-    """One row of the table: shares and differences over random poses in validation worlds."""
+    """Return one row of the table: shares and differences over random poses in validation worlds."""
     many = make_environment(NavigationConfig(style=style, worlds=worlds), "validation").worlds
     rng = np.random.default_rng(seed)
     singles = [jax.tree.map(lambda leaf, number=number: np.asarray(leaf[number]), many) for number in range(worlds)]

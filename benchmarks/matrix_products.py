@@ -1,4 +1,4 @@
-"""Who makes a GPU's matrix products: XLA's own compiled kernels or NVIDIA's library, by lanes at once.
+"""Compare a GPU's matrix products by XLA's own compiled kernels and by NVIDIA's library, by number of lanes.
 
     python benchmarks/matrix_products.py --task billiards --lanes 1 8 16 75 512 --out products.json
 

@@ -1,4 +1,4 @@
-"""Our navigation worlds in MuJoCo, and a lidar of MuJoCo's rays in them: another engine's answer to one question."""
+"""This package's navigation worlds in MuJoCo, with a lidar of MuJoCo's rays, as an independent reference."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's compiled module has no stubs)

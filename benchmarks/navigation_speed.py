@@ -50,7 +50,7 @@ class System(NamedTuple):
 
 
 def ours(env: Navigation, see: Callable[[Any], Any]) -> System:
-    """Our environment, of whose steps `see` is looked at."""
+    """Return this package's environment as a contender; `see` reads its steps."""
 
     def reset(env: Any, key: jax.Array) -> Any:
         k_reset, k_step = jax.random.split(key)
@@ -90,7 +90,7 @@ def jaxnav(automatic_reset: bool = True, **options: Any) -> System:
 
 
 def contenders(parts: bool) -> dict[str, System]:
-    """What is raced; with `parts` also what shows where the time goes."""
+    """Return the contenders; with `parts` also variants that show where the time goes."""
     env = make_environment(NavigationConfig(style="clutter", worlds=256))
     hall = {"map_params": {"map_size": (22, 22), "fill": 0.3}, "lidar_max_range": 10.0}
     raced = {
@@ -148,7 +148,7 @@ class Race:
 
 
 def measure(systems: dict[str, System], envs: int, steps: int, repeats: int, seconds: float) -> list[dict[str, Any]]:
-    """One row for each system at one number of environments."""
+    """Return one row for each system at one number of environments."""
     races = {name: Race(system, envs, steps) for name, system in systems.items()}
     rates = {name: [] for name in races}
     for _ in range(repeats):
@@ -169,7 +169,7 @@ def measure(systems: dict[str, System], envs: int, steps: int, repeats: int, sec
 
 
 def main() -> None:
-    """Races the systems and prints the table."""
+    """Race the systems and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", type=int, nargs="+", default=[256, 2048], help="side by side")
     parser.add_argument("--steps", type=int, default=8, help="of each environment in one call of the compiled loop")

@@ -41,14 +41,14 @@ class Pendulum(WholeObservations, struct.PyTreeNode):
     action = Quantity("torque", 1, "N m", "torque of the motor")
 
     def reset(self, key: jax.Array) -> tuple[Swing, jax.Array]:
-        """Any angle; up to 1 rad/s."""
+        """Start at any angle, with up to 1 rad/s."""
         k_angle, k_speed = jax.random.split(key)
         angle = jax.random.uniform(k_angle, minval=-jnp.pi, maxval=jnp.pi)
         state = Swing(angle, jax.random.uniform(k_speed, minval=-1.0, maxval=1.0), jnp.zeros((), jnp.int32))
         return state, seen(state)
 
     def step(self, key: jax.Array, state: Swing, action: jax.Array) -> tuple[Swing, Step]:
-        """One Euler step; the reward is what the state before it and the torque cost."""
+        """Take one Euler step; the reward is the negative cost of the state before it and the torque."""
         torque = jnp.clip(action[0], -STRONGEST, STRONGEST)
         off = jnp.mod(state.angle + jnp.pi, 2 * jnp.pi) - jnp.pi
         cost = off**2 + 0.1 * state.speed**2 + 0.001 * torque**2

@@ -1,4 +1,4 @@
-"""How short the road map's ways are, and how its policy fares, in validation worlds of each style.
+"""Length of the road map's ways and success of its policy, in validation worlds of each style.
 
     python benchmarks/roadmap_paths.py --write
 
@@ -79,7 +79,7 @@ def to_points(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.nd
 
 
 def free_lines(boxes: np.ndarray, circles: np.ndarray, radius: float, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which lines from a to b (lines, 2) stay out of the polygons' innermost circles and flanks."""
+    """Return which lines from a to b (lines, 2) stay out of the polygons' innermost circles and flanks."""
     to_circles = to_points(circles[:, :2], a[:, None], b[:, None])
     free = (to_circles >= (circles[:, 2] + radius) * np.cos(HALF) - SLACK).all(-1)
     p, q = (turned(ends[:, None] - boxes[:, :2], -boxes[:, 2]) for ends in (a, b))  # in the boxes' frames

@@ -58,7 +58,7 @@ Way = Callable[[int], Rows]  # by the seed
 
 @dataclass(frozen=True)
 class Setting:
-    """What all ways have in common."""
+    """Settings that all implementations share."""
 
     layers: tuple[int, ...] = (256, 256)
     batch_size: int = 256
@@ -78,7 +78,7 @@ class Setting:
 
 
 def environment_of(name: str, backend: str) -> tuple[Any, Any, int]:
-    """Ours, brax's, and the steps of an episode."""
+    """Return this package's environment, brax's, and the steps of an episode."""
     if name == PENDULUM:
         env = Pendulum(jnp.array(STEPS))
         return env, to_brax(env), STEPS
@@ -90,7 +90,7 @@ def environment_of(name: str, backend: str) -> tuple[Any, Any, int]:
 
 
 def configuration(setting: Setting) -> RunConfig:
-    """Our options."""
+    """Return this package's options."""
     agent = sac.Config(
         actor_layers=setting.layers,
         critic_layers=setting.layers,
@@ -108,7 +108,7 @@ def configuration(setting: Setting) -> RunConfig:
 
 
 def ours(env: Any, setting: Setting, seeds: int, length: int) -> Way:
-    """Our loop, that of `cuelearner sweep`, with so many seeds side by side."""
+    """Return this package's loop, that of `cuelearner sweep`, with several seeds side by side."""
     mesh, config = lane_mesh(), configuration(setting)
     env = place(mesh, env, SHARED)
     functions, guide = config.agent_in(env), config.guide_in(env, "none")
@@ -206,7 +206,7 @@ def of_gymnasium(library: str, python: str, setting: Setting) -> Way | None:
 
 
 def ways_of(name: str, asked: argparse.Namespace, setting: Setting) -> dict[str, Way]:
-    """Ours, and the peers that are asked for and can be had."""
+    """Return this package's implementation, and those of the peers asked for that are installed."""
     env, its, length = environment_of(name, asked.backend)
     ways: dict[str, Way] = {OURS: ours(env, setting, asked.seeds, length)}
     if "brax" in asked.ways:
@@ -242,7 +242,7 @@ def summary(trainings: dict[str, list[Rows]], seeds: int) -> dict[str, Any]:
 
 
 def measured(name: str, asked: argparse.Namespace, setting: Setting) -> dict[str, Any]:
-    """All ways in turns on one environment."""
+    """Return the measurements of all implementations, taken in turns on one environment."""
     ways = ways_of(name, asked, setting)
     trainings: dict[str, list[Rows]] = {way: [] for way in ways}
     for turn in range(asked.turns):
@@ -255,7 +255,7 @@ def measured(name: str, asked: argparse.Namespace, setting: Setting) -> dict[str
 
 
 def arguments() -> argparse.Namespace:
-    """What is asked for."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--environments", nargs="+", default=list(ENVIRONMENTS), choices=list(ENVIRONMENTS))
     parser.add_argument("--ways", nargs="*", default=list(PEERS), choices=list(PEERS), help="peers (default: all)")

@@ -1,4 +1,4 @@
-"""How cost grows with seeds, labels, directions and the width of the networks, on whatever machine.
+"""Growth of cost with seeds, labels, directions and the width of the networks, on any machine.
 
     python benchmarks/scaling.py --out scaling.json                                    # minutes on 2 cores
     python benchmarks/scaling.py --preset paper --seeds 1 8 64 256 --out scaling.json  # an accelerator
@@ -46,7 +46,7 @@ AXES = {
 
 
 def main() -> int:
-    """Measures what is missing, prints a table, or draws."""
+    """Measure what is missing, prints a table, or draws."""
     asked = _arguments()
     if asked.draw:
         save_figure(_draw([json.loads(path.read_text()) for path in asked.draw]), asked.figure)
@@ -108,7 +108,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def _points(asked: argparse.Namespace, rows: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
-    """What is still to be measured."""
+    """Return the points still to be measured."""
     grid = {"seeds": asked.seeds, "directions": asked.directions, "width": asked.widths, "labels": asked.labels}
     measured = {(row["axis"], row["value"]) for row in rows}
     return [(axis, value) for axis, values in grid.items() for value in values if (axis, value) not in measured]
@@ -165,7 +165,7 @@ def _print(rows: Sequence[dict[str, Any]]) -> None:
 
 
 def _draw(measured: Sequence[dict[str, Any]]) -> Figure:
-    """One panel for each thing varied, one line a machine; straight lines of slope 1 are proportional growth."""
+    """Draw one panel for each varied quantity, one line a machine; slope 1 is proportional growth."""
     with matplotlib.rc_context(STYLE):
         counts = Counter(row["axis"] for contents in measured for row in contents["rows"])
         drawn = {axis: about for axis, about in AXES.items() if counts[axis] > 1}

@@ -1,4 +1,4 @@
-"""How much the rough argmax (a first look at some directions, then closely near its peaks) loses against the full one.
+"""Loss of the rough argmax (a first look at some directions, then near its peaks) against the full one.
 
     python benchmarks/search_agreement.py runs/regulation --out agreement.json    # the agents of a finished run
     python benchmarks/search_agreement.py shipped --out agreement.json            # the shipped teacher's network
@@ -103,7 +103,7 @@ def met(agent: Searching) -> jax.Array:
 
 
 def compare(agents: Agents, way: ddqn.Config, steps: int, precise: bool) -> dict[str, np.ndarray]:
-    """One way to search against the full one: NAMES, each (agents,), and "rewards" (agents, parts of the episodes)."""
+    """Compare one search with the full one: NAMES, each (agents,), and "rewards" (agents, parts of the episodes)."""
     env, options = agents.env, geometry.evenly_spaced(way.directions)
     searching = dataclasses.replace(agents.functions, options=way)
     full = dataclasses.replace(searching, options=dataclasses.replace(way, coarse_directions=0))
@@ -160,7 +160,7 @@ def lost(best: np.ndarray, rewards: np.ndarray) -> list[float]:
 
 
 def main() -> None:
-    """Compares and prints a table."""
+    """Compare and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("of", help=f"a finished run's folder with its checkpoint, or {SHIPPED}")
     parser.add_argument("--coarse", type=int, nargs="+", default=[360, 720, 1200])

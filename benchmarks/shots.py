@@ -37,7 +37,7 @@ def scattered(table: Table, tables: int, block: int) -> tuple[jax.Array, jax.Arr
 
 @partial(jax.jit, static_argnames="block")
 def play(table: Table, positions: jax.Array, pocketed: jax.Array, key: jax.Array, block: int) -> Shot:
-    """One shot on every table."""
+    """Play one shot on every table."""
     angles = jax.random.uniform(key, (len(positions),), maxval=2 * jnp.pi)
     return simulate_many(table, positions, pocketed, angles, block=block)
 

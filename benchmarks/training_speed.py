@@ -1,4 +1,4 @@
-"""How much of the machine's matmul rate training reaches, on the work of the peers' comparison.
+"""Share of the machine's matmul rate that training reaches, on the work of the peers' comparison.
 
     python benchmarks/training_speed.py --seeds 8 32 --out speed.json
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 LANES = "lanes"
@@ -199,7 +200,7 @@ def settled(tree: Any) -> Any:
     """
 
     def put(leaf: Any) -> Any:
-        if not isinstance(leaf, jax.Array) or isinstance(leaf, jax.core.Tracer) or len(leaf.devices()) > 1:
+        if not isinstance(leaf, jax.Array) or isinstance(leaf, Tracer) or len(leaf.devices()) > 1:
             return leaf
         return jax.device_put(leaf, SingleDeviceSharding(next(iter(leaf.devices()))))
 

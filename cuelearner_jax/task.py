@@ -219,7 +219,7 @@ class Task:
         return jax.jit(lambda: view_of(make()))()
 
     def make_teacher(self, config: Any, env: Environment, questions: int | None = None) -> Teacher:
-        """Return the teacher of a world; `questions`: their number, if known. Raises UserError if there is no teacher."""
+        """Return the teacher of a world, who gets so many questions, if known. Raises UserError if there is none."""
         if self.teacher is None:
             raise UserError(f"{self.name} has no teacher to ask: give --labels-from, or a guidance without labels")
         if questions is not None and self.brief_teacher is not None:

@@ -39,12 +39,12 @@ class PendulumConfig:
     max_steps: int = 200
     """Steps after which an episode is truncated."""
     backend: Literal["spring", "positional", "generalized"] = "spring"
-    """Which of brax's physics."""
+    """Physics backend of brax."""
 
 
 @cache
 def _made(backend: str) -> envs.Env:
-    """One object for each physics: it is a constant of what is compiled, and another one is compiled anew."""
+    """Return one object for each physics: it is a compilation constant, so another object compiles again."""
     with jax.ensure_compile_time_eval():  # it holds arrays, and may be asked for while something is traced
         return envs.get_environment("inverted_pendulum", backend=backend)
 

@@ -1,4 +1,4 @@
-"""Any function of observations, corrected by a teacher's "more to the left", "more to the right", "already right".
+"""Correct any function of observations by a teacher's "more to the left", "more to the right", "already right".
 
     python examples/correct_a_policy.py
 
@@ -22,7 +22,7 @@ def compass(obs):
 
 
 def main(worlds=64, labels=200, episodes_judged=100, episodes_measured=100):
-    """Success rates before and after so many answers."""
+    """Return the success rates before and after so many answers."""
     world = cl.make("navigation", style="clutter", worlds=worlds)
     teacher = cl.teacher_of(world)
     better = cl.adapt(

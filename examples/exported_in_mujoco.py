@@ -30,7 +30,7 @@ MODEL = f"""<mujoco><option gravity="0 0 0" timestep="0.01"/><worldbody>
 
 
 def drive(folder, longest=200):
-    """How a walk ends, as "goal", "collision" or "timeout", and the places [m] it leads through, one each 0.2 s."""
+    """Return a walk's end ("goal", "collision" or "timeout") and its places [m], one each 0.2 s."""
     decide, model = Decision(folder), mujoco.MjModel.from_xml_string(MODEL)
     data, previous, places = mujoco.MjData(model), np.zeros((3, 2)), [START]
     for _ in range(longest):

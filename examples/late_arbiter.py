@@ -36,9 +36,9 @@ class Config:
 
 
 class Running(NamedTuple):
-    """What is known of the running episodes."""
+    """State of the running episodes."""
 
-    chosen: Bool[Array, " num_envs"]  # does the guide take over?
+    chosen: Bool[Array, " num_envs"]  # whether the guide takes over
     steps: Int[Array, " num_envs"]  # since the episode began
 
 

@@ -55,7 +55,7 @@ def drawn(block, action):
 
 
 def record(folder, count, random):
-    """Writes a folder of situations; returns their observations."""
+    """Write a folder of situations; return their observations."""
     (folder / "pictures").mkdir(parents=True)
     obs = blocks(count, random)
     actions, names = arm(obs), [f"pictures/{number}.png" for number in range(count)]

@@ -35,7 +35,7 @@ class Leaning(PolicyNode):
 
 
 def by_hand(obs: np.ndarray) -> np.ndarray:
-    """The same in plain NumPy, (n, 4) -> (n, 2): any Python can be a policy. What it returns is made unit vectors."""
+    """Act as `Leaning` in plain NumPy, (n, 4) -> (n, 2). The package makes returned vectors unit vectors."""
     towards = obs[:, :2] / np.maximum(np.linalg.norm(obs[:, :2], axis=-1, keepdims=True), 1e-6)
     return towards - 0.5 * obs[:, 2:]
 
@@ -50,7 +50,7 @@ def policies(env: Reach) -> dict[str, Policy]:
 
 
 def main(arguments: Sequence[str], steps: int = 8_000) -> dict[str, dict[str, jax.Array]]:
-    """Evaluates each on validation episodes, `steps` in all, and films the last in the folder that is named.
+    """Evaluate each on validation episodes, `steps` in all, and films the last in the folder that is named.
 
     Returns:
         Metrics by policy.

@@ -51,18 +51,18 @@ BOAT, BUOY, WIND, ARROW, WATER = "#0072B2", "#009E73", "#7f7f7f", "#E69F00", "#f
 
 @dataclass(frozen=True)
 class ReachConfig:
-    """A lake and the boat on it. Every field is an option `--task.…`, the line below it its help."""
+    """A lake and the boat on it. Every field is an option `--task.…`, its docstring is the help."""
 
     wind: float = 0.5
-    """Speed of the wind's drift; its direction changes with every episode [m/s]."""
+    """Speed of the wind's drift [m/s]; its direction changes with every episode."""
     speed: float = 1.0
     """Speed of the boat through the water [m/s]."""
     rudder_deg: float = 0.0
-    """Changed world: the boat heads this much counterclockwise of where it is sent [deg]."""
+    """Changed world: the boat's heading is rotated counterclockwise by this angle [deg]."""
     max_steps: int = 40
     """Steps of 0.1 s after which an episode is truncated."""
     mirrors: bool = False
-    """Multiply labels and transitions by their quarter turns, whatever the guidance."""
+    """Add the quarter turns of labels and transitions to the data, whatever the guidance."""
 
 
 class Boat(struct.PyTreeNode):
@@ -89,7 +89,7 @@ class Reach(WholeObservations, struct.PyTreeNode):
     )
 
     def reset(self, key: PRNGKeyArray) -> tuple[Boat, Float[Array, "4"]]:
-        """A buoy 1 to 1.5 m away and a wind, each in a random direction."""
+        """Start with a buoy 1 to 1.5 m away and a wind, each in a random direction."""
         k_far, k_buoy, k_wind = jax.random.split(key, 3)
         far = jax.random.uniform(k_far, (), minval=1.0, maxval=1.5)
         towards, blowing = (from_angle(jax.random.uniform(k, (), maxval=2 * jnp.pi)) for k in (k_buoy, k_wind))
@@ -97,7 +97,7 @@ class Reach(WholeObservations, struct.PyTreeNode):
         return boat, self.observe(boat)
 
     def step(self, key: PRNGKeyArray, state: Boat, action: Float[Array, "2"]) -> tuple[Boat, Step]:
-        """Sails for one period; a new episode follows an end."""
+        """Sail for one period; a new episode follows an end."""
         after = self.moved(state, action)
         reached = jnp.linalg.norm(after.buoy - after.place) < GOAL_RADIUS
         late = (after.steps >= self.max_steps) & ~reached
@@ -116,33 +116,33 @@ class Reach(WholeObservations, struct.PyTreeNode):
         return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after), step
 
     def moved(self, state: Boat, action: Float[Array, "2"]) -> Boat:
-        """The state after a step, without a reset."""
+        """Return the state after a step, without a reset."""
         velocity = self.speed * rotate(action, self.rudder) + state.wind
         return state.replace(place=state.place + PERIOD * velocity, steps=state.steps + 1)
 
     def observe(self, state: Boat) -> Float[Array, "4"]:
-        """What `observation` names."""
+        """Return the observation (4,): buoy from the boat [m], wind [m/s]."""
         return jnp.concatenate([state.buoy - state.place, state.wind])
 
     def heuristic(self, obs: Float[Array, "4"]) -> Float[Array, "2"]:
-        """Straight at the buoy, whatever the wind: an obvious action makes `--guidance heuristic` possible."""
+        """Head straight for the buoy, whatever the wind; this action makes `--guidance heuristic` possible."""
         return retract(obs[:2])
 
     @property
     def symmetries(self) -> int:
-        """Quarter turns of the lake."""
+        """Number of symmetries: the quarter turns of the lake."""
         return 4 if self.mirrors else 1
 
     def mirror(
         self, which: Int[Array, ""], obs: Float[Array, "4"], vector: Float[Array, "2"]
     ) -> tuple[Float[Array, "4"], Float[Array, "2"]]:
-        """Buoy, wind and action turned together."""
+        """Rotate buoy, wind and action together by a number of quarter turns."""
         turn = which * (jnp.pi / 2)
         return rotate(obs.reshape(2, 2), turn).ravel(), rotate(vector, turn)
 
 
 def make_environment(config: ReachConfig, split: str = "training") -> Reach:
-    """The lake of a configuration; its episodes are random, so that splits need differ in nothing."""
+    """Return the environment of a configuration; splits need not differ, since episodes are random."""
     check_number("wind", config.wind, 0, unit="m/s")
     check_number("speed", config.speed, 0, unit="m/s")
     check_number("rudder_deg", config.rudder_deg, unit="degrees")
@@ -165,7 +165,7 @@ class Skipper(struct.PyTreeNode):
     env: Reach
 
     def best_action(self, state: Boat, obs: Float[Array, "4"]) -> Float[Array, "2"]:
-        """Of the boat's own motion, what lies across the way cancels the wind's; the rest goes along it."""
+        """Return the heading whose part across the way cancels the wind's drift."""
         along = retract(state.buoy - state.place)
         across = rotate(along, jnp.pi / 2)
         into = jnp.clip(-jnp.dot(state.wind, across) / self.env.speed, -1.0, 1.0)
@@ -177,7 +177,7 @@ class Skipper(struct.PyTreeNode):
 
 
 class Frame(NamedTuple):
-    """One step of an episode, in arrays of NumPy."""
+    """One step of an episode, in NumPy arrays."""
 
     place: np.ndarray  # before the step [m]
     after: np.ndarray  # and after it
@@ -188,7 +188,7 @@ class Frame(NamedTuple):
 
 
 def record(env: Reach, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
-    """Frames and rewards of some steps of a policy; a new episode follows the end of one."""
+    """Return frames and rewards of some steps of a policy, over several episodes if needed."""
 
     @jax.jit
     def play(env: Reach, key: PRNGKeyArray) -> Any:
@@ -212,13 +212,13 @@ def record(env: Reach, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[l
 
 
 def still(env: Reach, frames: list[Frame], file: Path) -> None:
-    """The way of the first episode, and what was chosen on it."""
+    """Write a picture of the first episode's path and chosen directions."""
     last = next((number for number, frame in enumerate(frames) if frame.ended), len(frames) - 1)
     _drawn(frames[: last + 1], "chosen").savefig(file)
 
 
 def animate(env: Reach, frames: list[Frame], file: Path) -> None:
-    """All episodes, a picture a step."""
+    """Write a film of all episodes, one picture per step."""
 
     def pictures(rate: float) -> Iterator[np.ndarray]:
         way: list[Frame] = []
@@ -233,14 +233,14 @@ def animate(env: Reach, frames: list[Frame], file: Path) -> None:
 
 
 def question(env: Reach, state: Boat, obs: Float[Array, "4"], action: Float[Array, "2"], file: Path) -> None:
-    """The situation and the action in question, as a person is asked about it."""
+    """Write the situation with the asked action, as the labelling page shows it."""
     seen = jax.device_get(state)
     frame = Frame(seen.place, seen.place, seen.buoy, seen.wind, np.asarray(action), "")
     _drawn([frame], "in question").savefig(file)
 
 
 def _drawn(way: list[Frame], arrow: str) -> Figure:
-    """An episode's steps so far on the lake, the latest action as an arrow."""
+    """Draw an episode's steps so far on the lake, the latest action as an arrow."""
     figure = Figure(figsize=(4.8, 4.8), dpi=100)
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), facecolor=WATER, xlim=(-1.8, 1.8), ylim=(-1.8, 1.8), aspect="equal")
@@ -269,7 +269,7 @@ def _pixels(way: list[Frame]) -> np.ndarray:
 
 
 def sketch(env: Reach, state: Boat) -> Sketch:
-    """The lake as a person sees it in a browser; y points down there. Boat and buoy are in view."""
+    """Return the lake as a sketch for the labelling page (y points down), with boat and buoy in view."""
     boat, buoy, wind = (np.asarray(each, float) * [1, -1] for each in (state.place, state.buoy, state.wind))
     half = max(1.4, 0.5 + 0.6 * float(np.linalg.norm(buoy - boat)))
     left, top = (boat + buoy) / 2 - half
@@ -294,7 +294,7 @@ def sketch(env: Reach, state: Boat) -> Sketch:
 
 
 def reel(env: Reach, state: Boat, action: Float[Array, "2"]) -> Reel:
-    """Where the boat gets if it is sent there again and again."""
+    """Return the boat's path if the same action is repeated."""
     frames, heading = [], -np.degrees(np.arctan2(*np.asarray(action)[::-1]))
     for _ in range(FILM):
         frames.append({"boat": (float(state.place[0]), -float(state.place[1]), float(heading))})

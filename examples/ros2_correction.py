@@ -26,7 +26,7 @@ class Beside:
     """A correction and what was seen last. Times in seconds."""
 
     def __init__(self, folder):
-        """Reads a correction. Raises ContractError for a damaged one, ValueError for a whole policy."""
+        """Read a correction. Raises ContractError for a damaged one, ValueError for a whole policy."""
         self.decide = Decision(folder)
         contract = self.decide.contract
         if "base" not in contract:
@@ -61,7 +61,7 @@ class Beside:
 
 
 def main(folder):
-    """Runs the node."""
+    """Run the node."""
     import rclpy  # of a ROS 2 installation
     from rclpy.node import Node
     from std_msgs.msg import Float32MultiArray

@@ -27,16 +27,16 @@ STILL = (0.0, 0.0, 0.0)
 
 
 def yaw_of(quaternion):
-    """Of a geometry_msgs/Quaternion [rad]."""
+    """Return the yaw of a geometry_msgs/Quaternion [rad]."""
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 class Walk:
-    """What is known of the robot, and what to do. Times in seconds, angles counterclockwise in radians."""
+    """The robot's state, and the decision. Times in seconds, angles counterclockwise in radians."""
 
     def __init__(self, folder):
-        """Reads a decision. Raises ContractError for a damaged one, ValueError for one of another task."""
+        """Read a decision. Raises ContractError for a damaged one, ValueError for one of another task."""
         self.decide = Decision(folder)
         observed = self.decide.contract["observation"]["slices"]
         self.slices = {each["name"]: slice(each["from"], each["to"]) for each in observed}
@@ -70,7 +70,7 @@ class Walk:
         self.previous, self.direction = np.zeros((3, 2)), None
 
     def step(self, now):
-        """Decides where to walk until it is called again."""
+        """Decide where to walk until it is called again."""
         self.direction = None
         if self.goal is None or not self.awake(now):
             return
@@ -92,14 +92,14 @@ class Walk:
         self.direction, self.turning = turn @ action, np.clip(np.arctan2(action[1], action[0]), -limit, limit) / PERIOD
 
     def command(self, now):
-        """Of a Twist: linear.x and linear.y [m/s] and angular.z [rad/s], in the body's frame as it is now."""
+        """Return a Twist's linear.x and linear.y [m/s] and angular.z [rad/s], in the body's present frame."""
         if self.direction is None or not self.awake(now):
             return STILL
         ahead, left = SPEED * self.direction @ self.turned(self.pose[0][2])
         return float(ahead), float(left), float(self.turning)
 
     def awake(self, now):
-        """Is what was heard fresh?"""
+        """Whether the last observation is fresh."""
         return all(heard is not None and now - heard[1] <= STALE for heard in (self.scan, self.pose))
 
     @staticmethod
@@ -109,7 +109,7 @@ class Walk:
 
 
 def main(folder):
-    """Runs the node."""
+    """Run the node."""
     import rclpy  # of a ROS 2 installation
     from geometry_msgs.msg import PoseStamped, Twist
     from nav_msgs.msg import Odometry

@@ -86,7 +86,7 @@ class LidConfig:
     """The jars, and how the gripper is mounted."""
 
     mount: float = 0.0
-    """Changed world: the gripper is mounted this much counterclockwise of where it was [half turns]."""
+    """Changed world: the gripper is mounted rotated counterclockwise by this angle [half turns]."""
 
 
 class Lids(WholeObservations, struct.PyTreeNode):

@@ -1,4 +1,4 @@
-"""What the experiments on adaptation have in common: pieces of a study, who adapts, and the tables that they leave.
+"""Shared parts of the experiments on adaptation: pieces of a study, base agents and recorded tables.
 
 A piece is one method in one changed world, over all base agents of a run folder and all its budgets (or steps), in
 lanes of one program. Its rows go to FOLDER/TASK/WORLD/PIECE/adaptation.jsonl while it runs, .parquet once it is done.
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from _adaptation_methods import METHODS, Row
-from _pieces import chosen, listed
+from _pieces import chosen, list_pieces
 
 from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.lanes import side_by_side
@@ -83,20 +83,20 @@ class Piece(NamedTuple):
 
     @property
     def place(self) -> str:
-        """What tables call the changed world."""
+        """The changed world's name in tables."""
         if self.robot is None:
             return self.world
         return self.robot if self.world == UNCHANGED else f"{self.world}_{self.robot}"
 
     @property
     def path(self) -> str:
-        """Of its folder, and what it is called on the command line."""
+        """The piece's folder and name on the command line."""
         name = f"{self.method}-{self.variant}" if self.variant else self.method
         return f"{'tuning/' if self.split == 'tuning' else ''}{self.place}/{name}"
 
     @property
     def lanes(self) -> int:
-        """For each base agent."""
+        """Number of lanes per base agent."""
         return self.seeds * max(1, len(self.labels)) * max(1, len(self.rates)) * max(1, len(self.noises_deg))
 
 
@@ -125,12 +125,12 @@ class Study(NamedTuple):
 
 @lru_cache(maxsize=4)
 def environment(task: str, world: Any, split: str, robot: str | None = None) -> Any:
-    """That of a world; made once, for a thousand halls take a while."""
+    """Return a world's environment; cached, since a thousand halls take a while."""
     return registry.find(task).on(robot).environment(world, split)
 
 
 class Bench(NamedTuple):
-    """Where a piece is run: its base agents, and the world."""
+    """The base agents and world of a piece."""
 
     task: Task
     config: RunConfig  # of the base agents' run
@@ -193,8 +193,8 @@ def bases_of(piece: Piece, scale: Scale, seeds: tuple[int, ...]) -> tuple[int, .
     return seeds[: scale.tuning_bases] if piece.split == "tuning" else seeds[scale.tuning_bases :]
 
 
-def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) -> Bench:
-    """Where a piece is run. Raises UserError if the folder holds no such agents."""
+def open_bench(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) -> Bench:
+    """Open the base agents and world of a piece. Raises UserError if the folder holds no such agents."""
     source = PolicySource.of_run(folder, registry.find)
     if source.task.name != study.task:
         raise UserError(f"{folder} holds agents of {source.task.name}: give --bases a run of {study.task}")
@@ -217,7 +217,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
 
 
 def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, resume: bool) -> None:
-    """Runs a piece and finishes its table. Raises UserError if it is there already and is not to be gone on with."""
+    """Run a piece and finishes its table. Raises UserError if it is there already and is not to be gone on with."""
     folder = out / study.task / piece.path
     if (folder / SCHEMA.parquet).exists() and resume:
         print(f"{piece.path}: finished")
@@ -225,7 +225,7 @@ def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, 
     if folder.exists() and not resume:
         raise UserError(f"{folder} exists: give --resume to go on, or another --out")
     shutil.rmtree(folder, ignore_errors=True)  # what was begun is begun anew: it takes minutes
-    bench = opened(bases, study, piece, scale, folder)
+    bench = open_bench(bases, study, piece, scale, folder)
     about = {"task": study.task, "world": piece.place, "method": piece.method, "variant": piece.variant}
     constants = {**about, "split": piece.split, "bound_deg": piece.bound_deg, **provenance()}
     with tables.TableWriter(folder, SCHEMA, constants) as writer:
@@ -240,7 +240,7 @@ def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, 
 
 
 def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int:
-    """Runs pieces, one after the other; returns the exit status."""
+    """Run pieces, one after the other; return the exit status."""
     parser = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
@@ -261,7 +261,7 @@ def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int
     if not asked.pieces:
         pieces = [piece for piece in pieces if piece.split != "tuning" or piece.world == UNCHANGED]
     if asked.list:
-        print(listed(pieces))
+        print(list_pieces(pieces))
         return 0
     scale = study.scales[asked.scale]
     if asked.labels:

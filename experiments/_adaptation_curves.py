@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from _adaptation_tables import GAIN, Line, matched, named, reached, share
+from _adaptation_tables import GAIN, Line, first_reaching, matched, name_of, share
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
@@ -53,10 +53,10 @@ def gain_cells(points: Points) -> list[list[str]]:
     for (method, variant), (labels, values) in points.items():
         if len(values) != len(reference):
             continue
-        mine, theirs = (reached(values, labels, reference, own) for own in (True, False))
+        mine, theirs = (first_reaching(values, labels, reference, own) for own in (True, False))
         unit = "steps" if method == "finetuning" else "labels"
         own = "never gained" if not np.isfinite(mine.estimate) else f"{mine.in_words(labels[-1])} {unit}"
-        rows.append([named(method, variant), own, f"{theirs.in_words(labels[-1])} {unit}"])
+        rows.append([name_of(method, variant), own, f"{theirs.in_words(labels[-1])} {unit}"])
     return rows
 
 
@@ -69,7 +69,7 @@ def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[floa
             colour = COLOURS.get(method) or colour_of(method)
             x = np.maximum(labels, 10)  # the first point, of no labels, at the left end
             style = {"color": colour, "linestyle": "--" if variant else "-", "marker": "o", "markersize": 3}
-            axes.plot(x, middle, label=named(method, variant), **style)
+            axes.plot(x, middle, label=name_of(method, variant), **style)
             axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
         if level:
             axes.axhline(level[0], color="#999999", linestyle="--", linewidth=1, label=level[1])

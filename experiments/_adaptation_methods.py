@@ -1,4 +1,4 @@
-"""Who adapts in the studies of adaptation: each method gives the rows of a piece, for all base agents and budgets.
+"""Methods of the studies of adaptation: each returns a piece's rows, for all base agents and budgets.
 
 A row is a dictionary of columns, each a number for all lanes or an array (lanes,). `_adaptation.Bench` says where a
 piece is run.
@@ -45,7 +45,7 @@ def measured_as_they_are(bench: Bench) -> Iterator[Row]:
 
 
 def corrected(bench: Bench) -> Iterator[Row]:
-    """Under the teacher's own answers, refined as a model of them would, within the same bound."""
+    """Correct by the teacher's own answers, refined as by a model of them, within the same bound."""
     env = bench.env(bench.piece.split)
     scalars = dataclasses.replace(bench.scalars(), tau_max_deg=bench.piece.bound_deg)
     teacher = bench.task.make_teacher(bench.world, env)
@@ -54,7 +54,7 @@ def corrected(bench: Bench) -> Iterator[Row]:
 
 
 def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
-    """Adapted by labels of a kind of guidance, every budget a lane of its own."""
+    """Adapt by labels of a kind of guidance, with every budget as a lane."""
     piece, env = bench.piece, bench.env("training")
     sizes = bench.set("sizes.", GuideSizes(frame=bench.config.sizes.frame))
     scalars = bench.scalars()
@@ -134,7 +134,7 @@ def _kind(name: str) -> Callable[[Bench], Iterator[Row]]:
 
 
 def calibrated(bench: Bench) -> Iterator[Row]:
-    """By what answers tell of the world: held-out answers judge. Variant `SHUFFLED`: with answers of other rows."""
+    """Calibrate by answers, judged on held-out answers. The control `SHUFFLED` uses answers of other rows."""
     piece, env = bench.piece, bench.env("training")
     kind, scalars = guidances.find("calibration"), calibration.settling(bench.scalars(), None)
     guidance = kind.make(by_model.SIZES, spaces_of(env), None)

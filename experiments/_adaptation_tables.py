@@ -1,4 +1,4 @@
-"""Tables of recorded adaptation: what methods reach, and after how many labels or steps."""
+"""Tables of recorded adaptation: what methods reach, by number of labels or steps."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GAIN = 0.95  # of a gain, after how many labels it is asked for
 Row = dict[str, Any]
 
 
-def named(method: str, variant: str) -> str:
+def name_of(method: str, variant: str) -> str:
     """Return a method's name as tables and figures show it."""
     return NAMES[method] + (f" ({variant})" if variant else "")
 
@@ -48,7 +48,7 @@ class Line(NamedTuple):
     @property
     def name(self) -> str:
         """The line's name in tables."""
-        return named(self.method, self.variant)
+        return name_of(self.method, self.variant)
 
 
 def read(folder: Path) -> list[Row]:
@@ -193,7 +193,7 @@ class Reached(NamedTuple):
         return f"{number(self.estimate)} [{number(self.lower)}, {number(self.upper)}]"
 
 
-def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own: bool) -> Reached:
+def first_reaching(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own: bool) -> Reached:
     """Return the labels or steps after which a method's curve has made `GAIN` of a gain.
 
     Args:

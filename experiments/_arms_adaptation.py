@@ -48,7 +48,7 @@ NOWHERE: Options = {}
 
 
 class Corrected(NamedTuple):
-    """One policy measured, corrected before or not. Its folder is world/run/name."""
+    """One policy to measure, adapted first or not. Its folder is world/run/name."""
 
     world: str
     run: str
@@ -66,7 +66,7 @@ class Corrected(NamedTuple):
 
     @property
     def path(self) -> str:
-        """Of its folder, and what it is called on the command line."""
+        """The piece's folder and name on the command line."""
         return f"{self.world}/{self.run}/{self.name}"
 
     @property
@@ -166,7 +166,7 @@ def commands(piece: Corrected, out: Path, scale: str) -> list[list[str]]:
 
 
 def _judge(piece: Corrected) -> Options:
-    """Who decides whether a model is used: held-out answers, or a few tuning episodes where answers are no cues."""
+    """Return what decides on using a model: held-out answers, or a few tuning episodes for answers without cues."""
     form = registry.find(piece.kinds[0]).form
     if form is not None and form.by_eps:
         return {"judge-by": "labels"}
@@ -196,6 +196,6 @@ def measured(out: Path, pieces: Sequence[Corrected]) -> list[dict[str, Any]]:
 
 
 def _paid(folder: Path) -> int:
-    """Rewarded steps of a lane that judged a model."""
+    """Return the rewarded steps of a lane spent on judging a model."""
     file = folder / "policy" / "policy.json"
     return max(json.loads(file.read_text())["judged"]["rewarded_steps"]) if file.exists() else 0

@@ -57,7 +57,7 @@ class CoachedCorrection(dcoach.DeepCoach):
     def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
     ) -> Refinement:
-        """What the corrected policy does where labels (n, ...) are about."""
+        """Return the corrected policy's actions in the situations of labels (n, ...)."""
         assert labels.base is not None
         return self.act(model, env, labels.obs, labels.base, active, scalars)
 

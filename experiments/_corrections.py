@@ -47,7 +47,7 @@ Row = dict[str, Any]
 
 
 class Condition(NamedTuple):
-    """How the teacher answers."""
+    """A teacher's way of answering."""
 
     name: str
     scalars: Settings
@@ -64,7 +64,7 @@ CONDITIONS = (
 
 
 class World(NamedTuple):
-    """Where corrections are given."""
+    """A world in which corrections are given."""
 
     name: str
     about: str
@@ -91,7 +91,7 @@ class Opened(NamedTuple):
 
 
 def halls(split: str) -> Opened:
-    """Cluttered halls: a robot that walks straight for its goal is told which way to turn."""
+    """Return cluttered halls with a policy that walks straight for its goal."""
     from cuelearner_envs.navigation.config import NavigationConfig, make_environment
     from cuelearner_jax.tasks.navigation import NAVIGATION_SCALARS, make_teacher
 
@@ -119,7 +119,7 @@ GRASPED_WITHIN = 0.1  # of each cue's range
 
 
 class Grasp(WholeObservations, struct.PyTreeNode):
-    """One grasp an episode, of an object that is seen by a bent mirror: success within a tenth of every cue's range."""
+    """One grasp per episode of an object seen by a bent mirror; success within a tenth of every cue's range."""
 
     actions: Box = struct.field(pytree_node=False, default=GRIP)
 
@@ -136,7 +136,7 @@ class Grasp(WholeObservations, struct.PyTreeNode):
         return self.actions.middle()
 
     def best_action(self, state: Array, obs: Float[Array, "3"]) -> Float[Array, "3"]:
-        """What its teacher has in mind."""
+        """Return the teacher's intended action."""
         return self.best(obs)
 
     def reset(self, key: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -153,7 +153,7 @@ class Grasp(WholeObservations, struct.PyTreeNode):
 
 
 def grasp(split: str) -> Opened:
-    """One grasp in a box of three cues."""
+    """Return the world of one grasp, in a box of three cues."""
     env = Grasp()
     scalars = dataclasses.replace(plain_scalars(GRIP), eps_deg=0.1, tau_deg=0.005, scalar_within_deg=0.15)
     scalars = dataclasses.replace(scalars, max_grad_norm=10.0)
@@ -181,7 +181,7 @@ def fetch(environment: str) -> Callable[[str], Opened]:
 
         def played(policy: Any, offset: Sequence[float], seed: int, count: int) -> np.ndarray:
             first = study.FIRST_EPISODE[split] + (seed - FIRST_SEED[split]) * count
-            return study.played(environment, policy, offset, range(first, first + count))
+            return study.play(environment, policy, offset, range(first, first + count))
 
         def play(policies: Any, seeds: Sequence[int], count: int) -> np.ndarray:
             each = enumerate(seeds)
@@ -235,7 +235,7 @@ def means(cues: int, condition: Condition, kind: Kind) -> bool:
     return (relative or not condition.of_relative) and (cues > 1 or not condition.of_cues)
 
 
-def measured(
+def measure(
     world: World,
     opened: Opened,
     name: str,
@@ -277,7 +277,7 @@ def without_labels(opened: Opened, seeds: Sequence[int], count: int) -> list[Row
         policy: Any
 
         def lane(self, index: int) -> Any:
-            """It."""
+            """Return the lane."""
             return self.policy
 
     policies = Common(opened.base) if opened.at_once else Alone(opened.base)

@@ -1,4 +1,4 @@
-"""How far labels carry: steps to a level, areas under the curve, and the labels that buy either, with intervals.
+"""Label efficiency: steps to a level, areas under the curve, and the labels that buy either, with intervals.
 
 Intervals are 95% percentile bootstraps over seeds: the seeds of every variant are drawn with replacement, independently
 of those of others, 2,000 times; what is computed of the interquartile means of the real seeds is computed of each
@@ -27,7 +27,7 @@ from cuelearner_jax.report.variants import Variant
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of label budgets."""
+    """Question that a study asks about label budgets."""
 
     level: float | None = None  # of the metric; None: see `level_at`
     level_at: int | None = None  # or what the first unguided agents have at this step; None: at the last shared by all
@@ -44,14 +44,14 @@ class Question:
 
 
 class Known(NamedTuple):
-    """What is known of a quantity, and its interval; the ends of the interval are NaN where a variant has one seed."""
+    """An estimate with its interval; the interval's ends are NaN for a variant with one seed."""
 
     bounds: Bounds  # of the estimate, each ()
     lower: float
     upper: float
 
     def columns(self, name: str) -> Row:
-        """As columns of a table: `name` is empty where only `name_above` or `name_below` is known."""
+        """Return the table columns; `name` is empty where only `name_above` or `name_below` is known."""
         low, high = float(self.bounds.lower), float(self.bounds.upper)
         row = interval_columns(name, Interval(*map(np.array, (low if low == high else np.nan, self.lower, self.upper))))
         exact = low == high or np.isnan(low)
@@ -59,7 +59,7 @@ class Known(NamedTuple):
 
 
 def interval_columns(name: str, found: Interval) -> Row:
-    """As columns of a table, empty where there is no number."""
+    """Return the interval's table columns, empty without a number."""
     return {name + end: _number(value) for end, value in zip(("", "_lower", "_upper"), found, strict=True)}
 
 
@@ -67,7 +67,7 @@ class Drawn:
     """A variant with the bootstrap of its seeds; values are signed so that larger ones are better."""
 
     def __init__(self, variant: Variant, sign: float, shared: int) -> None:
-        """Draws nothing yet; the area is taken to the step `shared`."""
+        """Draw nothing yet; the area is taken to the step `shared`."""
         self.variant, self.sign = variant, sign
         self.steps, self.values = variant.curve.steps, sign * variant.values
         self.last = float(self.steps[-1])
@@ -84,7 +84,7 @@ class Drawn:
 
     @cached_property
     def curves(self) -> np.ndarray:
-        """Of each draw, (resamples, steps)."""
+        """Return the curve of each draw, (resamples, steps)."""
         return statistics.resampled(self.values, seed=self.stream)
 
     @cached_property
@@ -113,7 +113,7 @@ def exactly(values: np.ndarray | float) -> Bounds:
 
 
 class Carried(NamedTuple):
-    """How far one variant's labels carry."""
+    """Label efficiency of one variant."""
 
     variant: Variant
     against: Variant | None  # the unguided agents that it is compared with; None: it is unguided, or there are none
@@ -125,7 +125,7 @@ class Carried(NamedTuple):
     area_ratio: Interval | None
 
     def row(self) -> Row:
-        """As a row of `efficiency.csv`."""
+        """Return the row of `efficiency.csv`."""
         row: Row = {**named(self.variant), "seeds": len(self.variant.seeds)}
         row |= {"against": self.against.name if self.against else ""}
         row |= interval_columns("guide", self.guide or NOTHING)
@@ -164,7 +164,7 @@ class EqualArea(NamedTuple):
 
 @dataclass(frozen=True)
 class Efficiency:
-    """What was found."""
+    """Result of a study of label efficiency."""
 
     question: Question
     level: float
@@ -175,7 +175,7 @@ class Efficiency:
     equal_area: tuple[EqualArea, ...]
 
     def tables(self) -> dict[str, list[Row]]:
-        """By the name of the file."""
+        """Tables by file name."""
         found = {"efficiency": [each.row() for each in self.carried]}
         if self.labels_to_level:
             found["labels_to_level"] = [
@@ -196,7 +196,7 @@ class Efficiency:
 
 
 def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_better: bool = False) -> Efficiency:
-    """What the recorded curves say.
+    """Return the label efficiency of recorded curves.
 
     Args:
         variants: of one task and metric.

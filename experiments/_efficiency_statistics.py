@@ -14,7 +14,7 @@ def step_at_level(
     curves: Float[np.ndarray, "*curves steps"],
     level: Float[np.ndarray, "*curves"] | float,
 ) -> Float[np.ndarray, "*curves"]:
-    """Where each curve first reaches its level, on straight lines between evaluations; infinity if it never does.
+    """Return the step at which each curve first reaches its level, by linear interpolation; infinity if never.
 
     A curve that begins at its level or above gives the first step, so it may have reached it earlier.
     """
@@ -30,7 +30,7 @@ def step_at_level(
 
 
 class Bounds(NamedTuple):
-    """What is known of a quantity: it lies between these; they are equal where it is known exactly.
+    """Bounds of a quantity; they are equal where it is known exactly.
 
     A curve that ended below its level is right-censored: all that is known of its steps to the level is that they are
     more than its last step. Bounds carry that through ratios and percentiles.
@@ -47,7 +47,7 @@ def censored(found: Float[np.ndarray, "*samples"] | float, last: float) -> Bound
 
 
 def ratio_bounds(above: Bounds, below: Bounds) -> Bounds:
-    """What is then known of the ratio of two quantities that are not negative; nothing (0 to infinity) of 0 to 0."""
+    """Return the bounds of the ratio of two non-negative quantities; 0 to infinity for 0 over 0."""
 
     def divided(numerator: np.ndarray, denominator: np.ndarray, otherwise: float) -> np.ndarray:
         unknown = ((numerator == 0) & (denominator == 0)) | (np.isinf(numerator) & np.isinf(denominator))

@@ -38,7 +38,7 @@ from cuelearner_jax.run_config import RunConfig, Settings, check
 
 
 class Lanes(NamedTuple):
-    """What is fine-tuned, and how: one row a lane."""
+    """The policies to fine-tune and their settings, one row per lane."""
 
     base: np.ndarray  # (lanes,) int: which of the base agents
     seed: np.ndarray  # (lanes,) int: of everything random
@@ -107,7 +107,7 @@ def _begin(lane: Lane, env: Any, params: Any, columns: Any) -> Tuned:
 def _stretch(
     lane: Lane, env: Any, settings: Settings, clock: Clock, block: Tuned, iterations: int
 ) -> tuple[Tuned, Clock, Float[Array, " lanes"]]:
-    """So many iterations of all lanes: (block, clock, mean reward of each lane's own steps)."""
+    """Train all lanes for some iterations; return (block, clock, mean reward of each lane's own steps)."""
 
     def one(tuned: Tuned) -> tuple[Tuned, Clock, Array]:
         agent = dataclasses.replace(settings.agent, learning_rate=tuned.learning_rate, noise_deg=tuned.noise_deg)
@@ -125,10 +125,10 @@ def _stretch(
 
 
 class FineTuning:
-    """Finished agents that go on learning in a changed world; lanes differ by base, seed, step size and noise."""
+    """Trained agents fine-tuned in a changed world; lanes differ in base, seed, step size and noise."""
 
     def __init__(self, config: RunConfig, env: Environment, agents: Agent, lanes: Lanes) -> None:
-        """At the beginning.
+        """Start at the beginning.
 
         Args:
             config: sizes, scalars and schedule of the learning; the two numbers that lanes have of their own are
@@ -164,11 +164,11 @@ class FineTuning:
 
     @property
     def failed(self) -> np.ndarray:
-        """Which lanes (lanes,) are no longer finite: they stand where they last were."""
+        """Mask (lanes,) of lanes that are no longer finite; they keep their last finite state."""
         return np.asarray(self.block.state.failed)
 
     def train(self, steps: int) -> np.ndarray:
-        """So many steps more of every lane; gives the mean reward (lanes,) of these.
+        """Train every lane for some more steps; return the mean reward (lanes,) of these steps.
 
         Raises UserError unless they are a multiple of the environments of a lane.
         """

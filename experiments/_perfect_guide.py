@@ -48,7 +48,7 @@ class Perfect(Untaught):
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refinement:
-        """Its best action in active rows; searched near the peaks, as agents search theirs: it is asked often."""
+        """Return the teacher's best action in active rows, searched near the peaks, as agents do."""
         told = teacher(self.name.removeprefix("perfect-"))
         agent = replace(AGENT, q_layers=told.layers, directions=told.directions)
         functions = agent.make("action", spaces_of(env))

@@ -1,4 +1,4 @@
-"""What sweeps have in common that are cut into pieces: which pieces, at which scale, resumed, and reported together."""
+"""Sweeps cut into pieces: which pieces, at which scale, resumed, and reported together."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Piece(NamedTuple):
 
     @property
     def path(self) -> str:
-        """Of its folder, and what it is called on the command line."""
+        """The piece's folder and name on the command line."""
         return f"{self.world}/{self.run}/{self.name}"
 
     @property
@@ -106,7 +106,7 @@ def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]
 
 
 def folder_at(out: Path, scale: str) -> Path:
-    """Where the worlds of a scale are: those of `paper` in the folder itself, others below it."""
+    """Return the folder of a scale's worlds: the folder itself for `paper`, one below for others."""
     return out if scale == "paper" else out / scale
 
 
@@ -152,7 +152,7 @@ def _below(piece: Any, name: str) -> bool:
     return f"{piece.path}/".startswith(f"{name.rstrip('/')}/")
 
 
-def listed(pieces: Sequence[Any]) -> str:
+def list_pieces(pieces: Sequence[Any]) -> str:
     """Pieces with what they take and serve, a line each."""
     width = max(len(piece.path) for piece in pieces)
     rows = [f"{piece.path:<{width}} {piece.lanes:4} lanes  {piece.minutes:3} min  {piece.serves}" for piece in pieces]
@@ -162,7 +162,7 @@ def listed(pieces: Sequence[Any]) -> str:
 
 
 def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = None) -> int:
-    """Runs pieces and reports on their worlds; stops at the first command that fails and returns its status."""
+    """Run pieces and reports on their worlds; stops at the first command that fails and return its status."""
     parser = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
@@ -180,7 +180,7 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
     except ValueError as error:
         parser.error(str(error))
     if asked.list:
-        print(listed(pieces))
+        print(list_pieces(pieces))
         return 0
     out = folder_at(asked.out, asked.scale)
     commands = []

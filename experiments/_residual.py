@@ -27,10 +27,10 @@ from cuelearner_jax.types import Label
 
 
 class _Shown(Guide):
-    """Mixed into a guide that corrects: the needed correction is shown, not answered."""
+    """Mixin for a guide that learns the difference between the teacher's action and the action asked about."""
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
-        """The needed correction, cut off at the bound."""
+        """Return the correction to the teacher's action, clipped at the bound."""
         space = self.spaces.actions
         return space.clip(label.answer, label.action, space.from_unit(scalars.tau_max_deg)) - label.action
 

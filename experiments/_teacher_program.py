@@ -32,7 +32,7 @@ SHARPNESS = 0.05  # values that differ by this are told apart when promising dir
 
 @dataclass(frozen=True)
 class TeacherConfig:
-    """How the teacher is trained."""
+    """Settings of a teacher's training."""
 
     layers: tuple[int, ...] = (512, 512, 512, 512)
     """Hidden layers."""
@@ -61,7 +61,7 @@ class TeacherConfig:
 
 
 def check_config(config: TeacherConfig) -> None:
-    """Raises UserError for values that cannot work."""
+    """Raise UserError for values that cannot work."""
     for name in ("tables", "search", "directions", "memory", "updates", "batch_size", "rounds"):
         if not 1 <= getattr(config, name) <= LARGEST:
             raise UserError(f"--teacher.{name} is {getattr(config, name)}: give a positive number of at most {LARGEST}")
@@ -84,7 +84,7 @@ def check_config(config: TeacherConfig) -> None:
 
 
 class TeacherState(struct.PyTreeNode):
-    """Everything of a teacher's training."""
+    """The whole state of a teacher's training."""
 
     params: Params
     average: Params  # exponential moving average: what becomes the teacher
@@ -99,7 +99,7 @@ class TeacherState(struct.PyTreeNode):
 
 
 class TeacherProgram(NamedTuple):
-    """Jitted functions."""
+    """The jitted functions of a teacher's training."""
 
     init: Callable[[Any, PRNGKeyArray], TeacherState]  # (env, key) -> state
     # (env, state, rounds) -> state, metrics
@@ -135,7 +135,7 @@ class Trainer(NamedTuple):
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
     def value(self, env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
-        """Expected reward of actions in one state."""
+        """Return the expected reward of actions in one state."""
         return expected_reward(self.config.layers, env, params, obs, actions)
 
     def init(self, env: Any, key: PRNGKeyArray) -> TeacherState:
@@ -171,7 +171,7 @@ class Trainer(NamedTuple):
         return jnp.concatenate([options[best][None], near, geometry.uniform(k_uniform, (2,))])
 
     def play(self, env: Any, state: TeacherState) -> tuple[TeacherState, jax.Array]:
-        """One round: every table tries its directions, then goes on from one of them."""
+        """Play one round: every table tries its directions, then continues from one of them."""
         c = self.config
         k_propose, k_try, k_choice, key = jax.random.split(state.key, 4)
         tried = jax.vmap(partial(self.propose, env, state.params))(state.current, jax.random.split(k_propose, c.tables))
@@ -194,7 +194,7 @@ class Trainer(NamedTuple):
         return state, steps.reward[:, 0].mean()
 
     def learn(self, env: Any, state: TeacherState, key: PRNGKeyArray) -> tuple[TeacherState, jax.Array]:
-        """One gradient step on tries drawn from memory, each under a random symmetry of the environment."""
+        """Take one gradient step on tries from memory, each under a random symmetry of the environment."""
         c = self.config
         k_round, k_table, k_try, k_mirror = jax.random.split(key, 4)
         shape = (c.batch_size,)

@@ -43,7 +43,7 @@ def walked(env: Any, policy: Any, split: str, steps: int) -> list[list[list[floa
 
 
 def write(folder: Path, env: Any, policies: Mapping[str, Any], split: str, steps: int) -> None:
-    """Keeps the ways of policies by name, and the world that they are in."""
+    """Keep the ways of policies by name, and the world that they are in."""
     world = jax.tree.map(lambda leaf: np.asarray(leaf[0]).tolist(), env.worlds)
     ways = {name: walked(env, policy, split, steps) for name, policy in policies.items()}
     told = {"world": {name: getattr(world, name) for name in World.__dataclass_fields__}, "ways": ways}

@@ -1,4 +1,4 @@
-"""Finished billiards agents in three changed worlds: labels about their shots against fine-tuning and other baselines.
+"""Adapt trained billiards agents in three changed worlds: labels against fine-tuning and other baselines.
 
     python experiments/adaptation_billiards.py --list
     python experiments/adaptation_billiards.py --bases RUN --out FOLDER [--pieces tilted_table] [--resume]
@@ -123,7 +123,7 @@ PIECES = (
 
 
 def bases(**options: Any) -> list[str]:
-    """How tiny base agents are trained."""
+    """Return the command-line options for training tiny base agents."""
     own = {**TRAINING["smoke"].options, "preset": "regulation", "guidance": "none", "seeds": 2, **options}
     return [word for name, value in own.items() for word in option(name, value)]
 
@@ -162,7 +162,7 @@ STUDY = Study("billiards", PIECES, SCALES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs what is asked for; returns the exit status."""
+    """Run what is asked for; return the exit status."""
     return run(STUDY, __doc__ or "", arguments)
 
 

@@ -1,4 +1,4 @@
-"""Finished navigation agents with a turned lidar, in rooms, in a corridor with a preferred side, and on a quadruped.
+"""Adapt trained navigation agents to a turned lidar, rooms, a corridor with a preferred side, and a quadruped.
 
     python experiments/adaptation_navigation.py --list
     python experiments/adaptation_navigation.py --bases RUN --out FOLDER [--pieces turned_lidar] [--resume]
@@ -235,7 +235,7 @@ PIECES = tuple(
 
 
 def bases() -> list[str]:
-    """How tiny base agents are trained."""
+    """Return the command-line options for training tiny base agents."""
     own = {**TRAINING["smoke"].options, "preset": "paper", "sizes.num-envs": 10, "guidance": "none", "seeds": 2}
     return [word for name, value in own.items() for word in option(name, value)]
 
@@ -275,7 +275,7 @@ STUDY = Study("navigation", PIECES, SCALES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs what is asked for; returns the exit status."""
+    """Run what is asked for; return the exit status."""
     return run(STUDY, __doc__ or "", arguments)
 
 

@@ -101,12 +101,12 @@ def played(env: Any, policy: Any, racks: int, shots: int, split: str = "validati
     return np.mean(rewards, axis=0)
 
 
-def near(base: Any, env: Any) -> NearbyTeacher:
-    """Who answers: plays shots near what the base policy does."""
+def nearby_teacher(base: Any, env: Any) -> NearbyTeacher:
+    """Return the teacher, which plays shots near the base policy's."""
     return NearbyTeacher(Teaching(base), env, jnp.deg2rad(AIM_DEG), jnp.deg2rad(REACH_DEG), TRIED)
 
 
-def asked(base: Any, env: Any, scale: Scale, seed: int) -> cl.Labels:
+def ask(base: Any, env: Any, scale: Scale, seed: int) -> cl.Labels:
     """Labels about the base policy's own shots, ten on each of as many racks as it takes, in random order.
 
     One pass of refinement asks about nothing else, so all racks are played at once.
@@ -117,7 +117,7 @@ def asked(base: Any, env: Any, scale: Scale, seed: int) -> cl.Labels:
     rows = []
     for shot in range(scale.shots):
         key = jax.random.fold_in(k_play, shot)
-        action, answer = _answered(base, near(base, env), key, state, obs)
+        action, answer = _answered(base, nearby_teacher(base, env), key, state, obs)
         rows.append((obs, action, answer))
         state, obs, _ = _shot(env, base, key, state, obs)
     columns = (np.concatenate([np.asarray(row[part]) for row in rows]) for part in range(3))
@@ -131,9 +131,9 @@ def _answered(base: Any, teacher: NearbyTeacher, key: Any, state: Any, obs: Any)
     return action, relative_feedback(DIRECTIONS, action, best_actions(teacher, state, obs), jnp.deg2rad(EPS_DEG))
 
 
-def adapted(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int, cl.AdaptedPolicy]]:
+def adapt(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int, cl.AdaptedPolicy]]:
     """The policy after the largest number of labels, then after the first ones of these."""
-    labels = asked(base, env, scale, seed)
+    labels = ask(base, env, scale, seed)
     for budget in scale.labels[::-1]:
         yield (
             budget,
@@ -150,15 +150,15 @@ def adapted(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int,
         )
 
 
-def measured(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> Iterator[Row]:
-    """All measurements but the known ones, each as soon as it is there."""
+def measure(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> Iterator[Row]:
+    """Yield all measurements but the known ones, each as soon as it is made."""
     own, world = cl.make("billiards", table=TABLE), cl.make("billiards", table=TABLE, robot="pooltool")
     env = world.env.replace(processes=processes)  # pyright: ignore[reportAttributeAccessIssue]
     done = {(row["what"], row["seed"], row["labels"]) for row in known}
     plain = [
         ("own table", own.env, base, scale.racks),
         ("not adapted", env, base, scale.racks),
-        ("teacher", env, Taught(near(base, env)), scale.taught),
+        ("teacher", env, Taught(nearby_teacher(base, env)), scale.taught),
     ]
     for what, where, policy, racks in plain:
         if (what, 0, 0) not in done:
@@ -166,7 +166,7 @@ def measured(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> I
     for seed in scale.seeds:
         if all(("adapted", seed, budget) in done for budget in scale.labels):
             continue
-        for budget, policy in adapted(base, env, scale, seed):
+        for budget, policy in adapt(base, env, scale, seed):
             answers = np.bincount(np.asarray(policy.labels.answer, int).ravel() + 1, minlength=3).tolist()
             told = {"used": policy.used, "judged": list(policy.judged[1:]), "answers": answers}
             if ("adapted", seed, budget) not in done:
@@ -184,7 +184,7 @@ def mean(values: Any) -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """What was measured, seeds together; gains are of each rack."""
+    """Print the measurements, seeds together; gains are paired by rack."""
     kinds = dict.fromkeys((row["what"], row["labels"]) for row in sorted(rows, key=lambda row: row["labels"]))
     rewards = {
         kind: np.mean([row["rewards"] for row in rows if (row["what"], row["labels"]) == kind], axis=0)
@@ -219,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         base = cl.load_policy(given.policy).policy if given.policy else shipped()
         came, begun = provenance(), time.monotonic()
-        for row in measured(base, SCALES[given.scale], given.processes, rows):
+        for row in measure(base, SCALES[given.scale], given.processes, rows):
             took, begun = time.monotonic() - begun, time.monotonic()
             row |= {"rewards": np.round(row["rewards"], 4).tolist(), "seconds": round(took), "commit": came["commit"]}
             rows.append(row)

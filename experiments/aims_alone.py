@@ -1,4 +1,4 @@
-"""What the aims of the billiards tables are worth without a single label.
+"""Measure the aims of the billiards tables without any label.
 
     python experiments/aims_alone.py --out docs/data/aims_alone.json
 
@@ -28,7 +28,7 @@ TABLES = ("easy", "regulation")
 
 
 class AimAtRandom(PolicyNode):
-    """One of the possible aims, each as likely; where there is none, any direction."""
+    """Policy that chooses a possible aim uniformly; any direction where there is no aim."""
 
     env: Any
 
@@ -45,7 +45,7 @@ class AimAtRandom(PolicyNode):
 
 
 def main() -> None:
-    """Measures both tables, prints them, writes JSON."""
+    """Measure both tables, prints them, writes JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=10_000, help="shots of an evaluation")
     parser.add_argument("--split", choices=list(SPLITS), default="validation", help="episodes of the evaluation")

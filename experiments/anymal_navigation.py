@@ -70,7 +70,7 @@ def bodies(simple: Navigation, legged: LeggedNavigation, fitted: dict[str, float
 
 
 def main() -> int:
-    """Evaluates and prints the table."""
+    """Evaluate and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, default=AGENT, help="run folder of the agent")
     parser.add_argument("--styles", nargs="+", default=["clutter", "rooms", "corridor"])

@@ -35,7 +35,7 @@ from _pieces import (
     evaluations,
     folder_at,
     grouped,
-    listed,
+    list_pieces,
     scaled,
     spread,
     steps_to,
@@ -55,7 +55,7 @@ PEERS = ("bdcoach", "clic")
 
 
 def steps(total: int, every: int) -> Options:
-    """How long is trained, and how often evaluated."""
+    """Return options for a number of training steps and an interval between evaluations."""
     return {
         "preset": "paper",
         "schedule.total-steps": total,
@@ -92,7 +92,7 @@ ONE: Options = {"scalars.says": "one"}
 
 
 def variants(world: str, options: Options) -> list[Piece]:
-    """What is compared in one world."""
+    """Return the variants compared in one world."""
     minutes = 3 if world == "reach" else 9
     valued, plain, alone = {**options, **BY_VALUE}, {**options, **EPISODES}, {**options, **UNLEARNED}
     rows: list[tuple[str, str, tuple[int, ...], Options, str]] = [
@@ -170,7 +170,7 @@ SCALES = {
 
 
 def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
-    """What pieces of training have come to so far: a row for each variant and evaluation, over its seeds."""
+    """Return the results of the trained pieces so far: a row per variant and evaluation, over its seeds."""
     found = []
     for piece, arbiter, row, own in evaluations(out, pieces):
         judged = len(by_value.ARMS) * arbiter.get("judge_steps", 0) if piece.kinds != ("none",) else 0
@@ -247,7 +247,7 @@ def _line(row: dict[str, Any]) -> str:
     return f"{names}  {row['mean']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
 
 
-def done(pieces: Sequence[Piece | Corrected], scale: str, out: Path) -> int:
+def count_done(pieces: Sequence[Piece | Corrected], scale: str, out: Path) -> int:
     """Run pieces, each from where it stands; the status of the first that did not end well."""
     for piece in pieces:
         if isinstance(piece, Corrected):
@@ -265,10 +265,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run, then tell; returns the exit status, 0 also where the time was up."""
     asked, pieces = asked_of(__doc__ or "", PIECES, SCALES, "arms", arguments)
     if asked.list:
-        print(listed(pieces))
+        print(list_pieces(pieces))
         return 0
     out = folder_at(asked.out, asked.scale)
-    status = 0 if asked.report else within(asked.minutes, lambda: done(pieces, asked.scale, out))
+    status = 0 if asked.report else within(asked.minutes, lambda: count_done(pieces, asked.scale, out))
     rows, guides, shown = rows_of(out, TRAINED), guides_of(out, TRAINED), measured(out, CORRECTED)
     if rows or shown:
         steps_taken = compared(rows)

@@ -1,4 +1,4 @@
-"""How far labels carry on the billiards tables: every form of feedback, its budgets, faults and ways to ask.
+"""Label efficiency on the billiards tables: every form of feedback, with budgets, faults and ways to ask.
 
     python experiments/billiards_bootstrapping.py --list
     python experiments/billiards_bootstrapping.py --out FOLDER --pieces regulation/frame [--resume]
@@ -110,7 +110,7 @@ def again(world: str, options: Options, minutes: int) -> list[Piece]:
 
 
 def curves(world: str, options: Options, minutes: int) -> list[Piece]:
-    """The same with more labels than anybody gives."""
+    """Return the pieces with more labels than people would give, to find the number from which labels pay."""
     options = {**options, **FRAME, **MANY, **GUIDED}
     serves = "the number from which labels pay"
     pieces = []
@@ -125,7 +125,7 @@ def curves(world: str, options: Options, minutes: int) -> list[Piece]:
 
 
 def variations(world: str, options: Options, minutes: int) -> list[Piece]:
-    """Five hundred labels of a faulty teacher, and other ways to ask and to answer; then paced."""
+    """Return the pieces with a faulty teacher, with other ways to ask and to answer, and with pacing."""
     options = {**options, **FRAME}
     pieces = [
         Piece(world, name, "relative", ("relative",), (500,), 8, {**options, **fault}, minutes // 2, "faulty teachers")
@@ -152,7 +152,7 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
 
 
 def longer(world: str, options: Options, minutes: int) -> list[Piece]:
-    """Guided to the end, in as many episodes as it pays, by the rule of `intent` that earns most by itself."""
+    """Return the pieces guided to the end, in as many episodes as pays, by the best rule of `intent` alone."""
     options = {
         **options,
         **FRAME,
@@ -166,7 +166,7 @@ def longer(world: str, options: Options, minutes: int) -> list[Piece]:
 
 
 def raw(world: str, options: Options, minutes: int) -> list[Piece]:
-    """What networks on raw coordinates make of it."""
+    """Return the pieces whose networks see raw coordinates."""
     options, serves = {**options, **RAW}, "the frame against raw coordinates"
     return [
         Piece(world, "raw", "none", ("none",), (), 8, options, minutes // 2, serves),
@@ -253,7 +253,7 @@ EXPERIMENT = Experiment(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs what is asked for; returns the exit status."""
+    """Run what is asked for; return the exit status."""
     return run(EXPERIMENT, __doc__ or "", arguments)
 
 

@@ -1,4 +1,4 @@
-"""Does guidance speed learning up on the easy table (three balls)? Minutes a variant on one GPU.
+"""Measure whether guidance speeds up learning on the easy table (three balls). Minutes a variant on one GPU.
 
     python experiments/billiards_easy.py --out FOLDER [plain|mirrors ...]
 
@@ -27,7 +27,7 @@ VARIANTS = {"plain": [*RAW, *LABELS], "mirrors": [*RAW, *LABELS, "--task.mirrors
 
 
 def main() -> int:
-    """Runs and reports each variant; stops at the first that fails."""
+    """Run and reports each variant; stops at the first that fails."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("variants", nargs="*", help=f"of {', '.join(VARIANTS)} (default: all)")
     parser.add_argument("--out", type=Path, default=Path("runs/billiards_easy"))

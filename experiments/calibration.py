@@ -1,4 +1,4 @@
-"""What answers tell about a changed world, and what the policy is worth behind it: calibration by 10 to 100 labels.
+"""Calibration by 10 to 100 labels: what answers tell about a changed world, and the policy's gain.
 
     python experiments/calibration.py --task billiards --bases RUN
     python experiments/calibration.py --task navigation --bases docs/data/navigation_agent
@@ -90,7 +90,7 @@ def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, fault
 
 
 def family_of(task: Any, own: Any, world: World, tilt: bool) -> tuple[Distortion, ...]:
-    """What may have changed, as the world declares it; `tilt`: and the table, as a simulator has it."""
+    """Return what may have changed, as the world declares; with `tilt` also the table, by a simulator."""
     if not tilt:
         return declared_distortions(world.env)
     known, space = task.environment(own), actions_of(world.env)
@@ -132,7 +132,7 @@ def worth(world: World, policy: Any, split: str, steps: int) -> float:
     return float(evaluate_policy(world.shown, policy, episodes(split), ENVS, steps)[name])
 
 
-def told(found: Result) -> dict[str, Any]:
+def to_row(found: Result) -> dict[str, Any]:
     """A result in plain values; `theta`: the unknowns behind which the policy acts."""
     estimates = {one.name: [round(number, 5) for number in (one.mean, one.low, one.high)] for one in found.estimates}
     evidence = {" + ".join(names) or "none": round(value, 2) for names, value in found.evidence.items()}
@@ -184,7 +184,7 @@ class Study(NamedTuple):
             self.bases[base], family, walk.situations, walk.answers, labels, key,
             space=actions_of(world.env), eps_deg=float(world.scalars.eps_deg),
         )  # fmt: skip
-        row = {"world": name, "base": base, "labels": labels, "seed": seed, **told(found)}
+        row = {"world": name, "base": base, "labels": labels, "seed": seed, **to_row(found)}
         row["eps_deg"] = float(world.scalars.eps_deg)
         row["seconds"] = round(time.time() - start, 1)
         return {**row, "cpu_seconds": round(time.process_time() - used, 1)}
@@ -200,7 +200,7 @@ class Study(NamedTuple):
 
     @property
     def worlds(self) -> Sequence[str]:
-        """Those that are asked for."""
+        """Return the worlds that the command line asks for."""
         return self.asked.worlds or WORLDS[self.task.name]
 
     def compared(self, rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -222,7 +222,7 @@ class Study(NamedTuple):
 
 
 def arguments() -> argparse.ArgumentParser:
-    """What can be asked for."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=list(WORLDS), default="billiards")
     parser.add_argument("--bases", type=Path, help="run folder of the base agents")
@@ -243,7 +243,7 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Calibrates each base in each world with each number of labels; prints a line each, then the table."""
+    """Calibrate each base in each world with each number of labels; prints a line each, then the table."""
     parser = arguments()
     asked = parser.parse_args()
     number, of = asked.shard
@@ -268,7 +268,7 @@ def main() -> None:
 
 
 def table(rows: list[dict[str, Any]]) -> None:
-    """Prints the mean worth, and how often each verdict was found, by world and number of labels."""
+    """Print the mean worth, and how often each verdict was found, by world and number of labels."""
     for world, labels in dict.fromkeys((row["world"], row["labels"]) for row in rows):
         own = [row for row in rows if (row["world"], row["labels"]) == (world, labels)]
         worths = [row["worth"] for row in own if "worth" in row]

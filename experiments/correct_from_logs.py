@@ -36,18 +36,18 @@ BOUND = 0.25  # shares of the ranges
 LABELS, RECORDED, OTHERS = 200, 400, 2000
 
 
-def wanted(obs):
-    """What the teacher has in mind."""
+def intended_actions(obs):
+    """Return the teacher's intended actions."""
     return np.stack([0.06 * obs[:, 0], 0.06 * obs[:, 1], 0.6 * np.tanh(obs[:, 2] * obs[:, 0])], -1).astype(np.float32)
 
 
 def off(obs):
     """The policy: the same, wrong by a constant."""
-    return wanted(obs) + OFFSET
+    return intended_actions(obs) + OFFSET
 
 
 class Row(NamedTuple):
-    """One correction."""
+    """Result of one correction."""
 
     guidance: str
     questions: str  # "rounds" or "at random"
@@ -66,7 +66,7 @@ class Row(NamedTuple):
 def error(policy, seed: int) -> float:
     """Mean distance from what is wanted, in shares of the ranges, in situations that were not recorded."""
     obs = np.random.default_rng((seed, 1)).uniform(-1, 1, (OTHERS, 3)).astype(np.float32)
-    return float((np.abs(policy(obs) - wanted(obs)) / RANGE).mean())
+    return float((np.abs(policy(obs) - intended_actions(obs)) / RANGE).mean())
 
 
 def recorded(seed: int) -> np.ndarray:
@@ -81,7 +81,7 @@ def at_random(seed: int, eps: float) -> cl.Labels:
     moved = off(obs) + BOUND * RANGE * random.uniform(-1, 1, obs.shape)
     actions = np.clip(moved, LOW, HIGH).astype(np.float32)
     told = jax.vmap(lambda action, best: relative_feedback(BOX, action, best, eps))
-    return cl.Labels(obs, actions, np.array(told(jnp.asarray(actions), jnp.asarray(wanted(obs)))))
+    return cl.Labels(obs, actions, np.array(told(jnp.asarray(actions), jnp.asarray(intended_actions(obs)))))
 
 
 def shuffled(labels: cl.Labels, seed: int) -> cl.Labels:
@@ -99,11 +99,11 @@ def in_rounds(seed: int, guidance: str, folder: Path, control: bool):
         scalars = dataclasses.replace(plain_scalars(BOX), answer="shuffled")
     bound = None if guidance == "calibration" else BOUND
     how: dict[str, Any] = {"labels": LABELS, "guidance": guidance, "judge_by": "labels", "seed": seed}
-    return cl.adapt(off, cl.World(task, task.plain()), wanted, bound_deg=bound, scalars=scalars, **how)
+    return cl.adapt(off, cl.World(task, task.plain()), intended_actions, bound_deg=bound, scalars=scalars, **how)
 
 
-def corrected(guidance: str, questions: str, answers: str, seed: int, folder: Path) -> Row:
-    """One correction, judged."""
+def correct(guidance: str, questions: str, answers: str, seed: int, folder: Path) -> Row:
+    """Correct a policy once and judge it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a control is not used
         if questions == "rounds":
@@ -118,7 +118,7 @@ def corrected(guidance: str, questions: str, answers: str, seed: int, folder: Pa
 
 
 def main(seeds: int = 5, out: Path | None = None) -> list[Row]:
-    """All corrections.
+    """Run all corrections.
 
     Args:
         seeds: of situations, questions and fits.
@@ -131,9 +131,7 @@ def main(seeds: int = 5, out: Path | None = None) -> list[Row]:
                 for answers in ("own", "shuffled"):
                     if (guidance, questions, answers) == ("calibration", "rounds", "shuffled"):
                         continue  # calibration asks by what was answered: there is nothing to shuffle beforehand
-                    own = [
-                        corrected(guidance, questions, answers, seed, Path(folder) / "there") for seed in range(seeds)
-                    ]
+                    own = [correct(guidance, questions, answers, seed, Path(folder) / "there") for seed in range(seeds)]
                     left = [row.left for row in own]
                     used = sum(row.used for row in own)
                     print(

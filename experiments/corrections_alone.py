@@ -1,4 +1,4 @@
-"""How many corrections a policy needs where nothing is rewarded: seven kinds, four worlds, three teachers.
+"""Number of corrections a policy needs without any reward: seven kinds, four worlds, three teachers.
 
     python experiments/corrections_alone.py --list
     python experiments/corrections_alone.py --scale quick --out runs/corrections [--pieces halls grasp/clic] [--resume]
@@ -37,7 +37,7 @@ from _corrections import (
     fetch,
     grasp,
     halls,
-    measured,
+    measure,
     without_labels,
 )
 
@@ -136,7 +136,7 @@ SCALES = {
 
 
 @cache
-def opened(world: str, split: str) -> Opened:
+def open_world(world: str, split: str) -> Opened:
     """A world that is ready, made once."""
     return WORLDS[world].opened(split)
 
@@ -162,7 +162,7 @@ def calibrated(world: str, conditions: Sequence[Condition], scale: Scale, split:
             how: dict[str, Any] = {"guidance": "calibration", "judge_by": "labels", "seed": seed}
             found = cl.adapt(script, study.world_of(environment), teacher, labels=labels, scalars=scalars, **how)
             first = study.FIRST_EPISODE[split] + number * scale.episodes
-            success = study.played(environment, found.policy, study.OFFSET, range(first, first + scale.episodes))
+            success = study.play(environment, found.policy, study.OFFSET, range(first, first + scale.episodes))
             about = {"condition": condition.name, "labels": labels, "seed": seed}
             yield [{**about, "success": round(float(success.mean()), 4)}]
 
@@ -174,22 +174,22 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
     seeds = [FIRST_SEED[split] + number for number in range(scale.seeds_in(world))]
     if kind == "base":
         if not known:
-            yield without_labels(opened(world, split), seeds, scale.episodes)
+            yield without_labels(open_world(world, split), seeds, scale.episodes)
         return
     conditions = [one for one in CONDITIONS if (one.name,) not in known]
     if kind == "calibration":
         if not tuning:
             yield from calibrated(world, conditions, scale, split)
         return
-    place = WORLDS[world], opened(world, split), kind
+    place = WORLDS[world], open_world(world, split), kind
     if not tuning:
         settings = {**CHOSEN.get(WORLDS[world].tuned_in or world, {}).get(kind, {}), **(scale.settings or {})}
-        yield from measured(*place, settings, conditions, seeds, scale.budgets, scale.episodes, max(scale.budgets))
+        yield from measure(*place, settings, conditions, seeds, scale.budgets, scale.episodes, max(scale.budgets))
         return
     budgets = (min(TUNED_LABELS, max(scale.budgets)),)
     for settings in settings_of(world, kind):
         tried = {**settings, **(scale.settings or {})}
-        for rows in measured(*place, tried, CONDITIONS[:1], seeds, budgets, scale.episodes, max(scale.budgets)):
+        for rows in measure(*place, tried, CONDITIONS[:1], seeds, budgets, scale.episodes, max(scale.budgets)):
             yield [{**row, "settings": settings} for row in rows]
 
 

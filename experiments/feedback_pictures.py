@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from matplotlib.figure import Figure
 
 import cuelearner_jax as cl
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Aims, Quantity, WholeObservations
 from cuelearner_jax.guides import registry
@@ -141,7 +141,7 @@ def prior() -> Drawn:
 
 def plot(what: Drawn, kind: str) -> Figure:
     """Draw the one picture that all kinds share; readable on white and on black."""
-    found = registry.registered(kind)
+    found = registry.find_or_none(kind)
     colour = found.colour if found else "#0072B2"
     figure = Figure(figsize=(4.2, 2.5), layout="constrained", facecolor="none")
     axes = figure.subplots()

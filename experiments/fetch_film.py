@@ -21,7 +21,7 @@ from cuelearner_envs.fetch.hand_eye import HandEye
 from cuelearner_envs.fetch.scripts import SCRIPTS
 from cuelearner_jax import pictures
 from cuelearner_jax.bridges.gymnasium.layout import flatten, leaves_of
-from cuelearner_jax.bridges.gymnasium.source import made
+from cuelearner_jax.bridges.gymnasium.source import make_registered
 from cuelearner_jax.policies import in_space, policy_of
 from cuelearner_jax.tasks import fetch_layout
 
@@ -32,7 +32,7 @@ FPS = 25.0  # a step a frame
 def filmed(policy: Any, seeds: list[int], to: Path) -> list[bool]:
     """Write a film of the episodes of these seeds; return which of them succeed."""
     drawn = {"render_mode": "rgb_array", "default_camera_config": fetch_layout.CAMERA}
-    env = made(ENVIRONMENT, drawn, fetch_hand_eye.STEPS)
+    env = make_registered(ENVIRONMENT, drawn, fetch_hand_eye.STEPS)
     seen = HandEye(env, fetch_hand_eye.OFFSET, fetch_hand_eye.WITHIN[ENVIRONMENT])
     leaves = leaves_of(ENVIRONMENT, seen.observation_space)
     act = jax.jit(lambda obs: policy.act(jax.random.key(0), None, obs))
@@ -56,7 +56,7 @@ def main() -> None:
     asked = parser.parse_args()
     script = in_space(policy_of(jax.jit(SCRIPTS[ENVIRONMENT])), fetch_hand_eye.world_of(ENVIRONMENT).actions)
     print(f"before: {filmed(script, asked.seeds, asked.out / 'before' / 'push.gif')}", flush=True)
-    found = fetch_hand_eye.adapted(ENVIRONMENT, "calibration", fetch_hand_eye.Condition("all"), 100, 0)
+    found = fetch_hand_eye.adapt(ENVIRONMENT, "calibration", fetch_hand_eye.Condition("all"), 100, 0)
     print("\n".join(one.words() for one in found.estimates if one.changed))
     print(f"after: {filmed(found.policy, asked.seeds, asked.out / 'after' / 'push.gif')}")
 

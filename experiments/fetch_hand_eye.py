@@ -56,7 +56,7 @@ class Scale(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """What is measured beside the policy as it was."""
+    """A variant measured beside the uncorrected policy."""
 
     says: str  # which cues the teacher speaks of
     shuffled: bool = False  # a control: labels have each other's answers
@@ -89,7 +89,7 @@ def world_of(environment: str) -> cl.World:
     )
 
 
-def played(environment: str, policy: Any, offset: Sequence[float], episodes: Sequence[int]) -> np.ndarray:
+def play(environment: str, policy: Any, offset: Sequence[float], episodes: Sequence[int]) -> np.ndarray:
     """Success (episodes,) at the end of episodes of these seeds; a policy's own random numbers are always the same."""
     act = jax.jit(lambda obs: policy.act(jax.random.key(0), None, obs))
     found = []
@@ -122,7 +122,7 @@ def settings(kind: str, says: str, shuffled: bool, space: Any) -> Scalars:
     return dataclasses.replace(plain_scalars(space), eps_deg=EPS, tau_deg=EPS / 20, says=says, answer=answer)
 
 
-def adapted(environment: str, kind: str, condition: Condition, labels: int, seed: int) -> cl.AdaptedPolicy:
+def adapt(environment: str, kind: str, condition: Condition, labels: int, seed: int) -> cl.AdaptedPolicy:
     """The script after labels of one seed; held-out labels decide whether it is changed."""
     from cuelearner_envs.fetch.hand_eye import onlooker
 
@@ -139,8 +139,8 @@ def adapted(environment: str, kind: str, condition: Condition, labels: int, seed
     return cl.adapt(script, world, labels=given._replace(answer=answer), scalars=scalars, **how)
 
 
-def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iterator[Row]:
-    """All measurements of a piece but the known ones, each as soon as it is there."""
+def measure(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iterator[Row]:
+    """Yield all measurements of a piece but the known ones, each as soon as it is made."""
     environment, kind, number = piece.split("/")
     done = {(row["what"], row["says"], row["shuffled"]) for row in known}
     first = FIRST_EPISODE[split] + int(number) * scale.episodes
@@ -149,17 +149,17 @@ def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iter
         script = in_space(policy_of(jax.jit(SCRIPTS[environment])), world_of(environment).actions)
         for what, offset in (("unchanged", (0.0, 0.0, 0.0)), ("displaced", OFFSET)):
             if (what, "", False) not in done:
-                success = played(environment, script, offset, episodes)
+                success = play(environment, script, offset, episodes)
                 yield {"what": what, "says": "", "shuffled": False, "seed": seed, "success": success}
         return
     for condition in CONDITIONS:
         if (kind, *condition) in done:
             continue
-        policy = adapted(environment, kind, condition, scale.labels, seed)
+        policy = adapt(environment, kind, condition, scale.labels, seed)
         told: Row = {"used": policy.used, "judged": [round(value, 4) for value in policy.judged[1:]]}
         if kind == "calibration":
             told["estimates"] = [one.words() for one in policy.estimates if one.changed]
-        success = played(environment, policy.policy, OFFSET, episodes)
+        success = play(environment, policy.policy, OFFSET, episodes)
         row = {"what": kind, "says": condition.says, "shuffled": condition.shuffled, "seed": seed}
         yield {**row, **told, "rewarded_steps": policy.rewarded_steps, "success": success}
 
@@ -175,7 +175,7 @@ def run(piece: str, scale: str, split: str, out: Path, resume: bool) -> None:
             raise UserError(f"{file} exists: give another --out, or --resume with what it was made by")
         rows = found["rows"]
     begun = time.monotonic()
-    for row in measured(piece, SCALES[scale], split, rows):
+    for row in measure(piece, SCALES[scale], split, rows):
         took, begun = time.monotonic() - begun, time.monotonic()
         rows.append({**row, "success": [int(value) for value in row["success"]], "seconds": round(took)})
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -42,7 +42,7 @@ class Responses(NamedTuple):
 
 
 def responses(robots: int, steps: int, turn_deg: float, seed: int) -> tuple[Responses, float]:
-    """What the quadruped does when told directions, and the share of robots that fell."""
+    """Return the quadruped's responses to commanded directions, and the share of robots that fell."""
     env = make_environment(NavigationConfig(worlds=1))
     course = Course(env, jax.random.split(jax.random.key(seed), robots))
     poses, velocities, actions = [course.poses], [np.zeros((robots, 2))], []
@@ -62,7 +62,7 @@ def responses(robots: int, steps: int, turn_deg: float, seed: int) -> tuple[Resp
 
 @jax.jit
 def misses(parameters: jax.Array, seen: Any, period: float) -> tuple[jax.Array, jax.Array]:
-    """How far the simple robot's next places (steps, robots, 2) [m] and headings [rad] lie from the quadruped's."""
+    """Return the simple robot's errors of place (steps, robots, 2) [m] and heading [rad] against the quadruped."""
     robot = Robot(speed=parameters[0], lag=parameters[1], turn_rate=parameters[2])
 
     def one(pose: jax.Array, velocity: jax.Array, action: jax.Array, after: jax.Array) -> tuple[jax.Array, jax.Array]:

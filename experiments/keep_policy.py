@@ -22,7 +22,7 @@ from cuelearner_jax.tasks import registry
 
 
 def keep(run: Path, out: Path, seeds: Sequence[int], kind: str | None, labels: int | None) -> None:
-    """Writes the run folder `out`. Raises UserError if the run has not these lanes or `out` is in use."""
+    """Write the run folder `out`. Raises UserError if the run has not these lanes or `out` is in use."""
     if out.exists():
         raise UserError(f"{out} exists: give another --out")
     task, config, grid = load(run, registry.find)
@@ -50,7 +50,7 @@ def write(folder: Path, lanes: RunLanes, rows: np.ndarray) -> None:
 
 
 def main() -> int:
-    """Reads the arguments."""
+    """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, required=True)

@@ -1,4 +1,4 @@
-"""How strong should a relative label be? The guide alone on one ball, for several strengths. Minutes on 2 cores.
+"""Compare strengths of a relative label, by the guide alone on one ball. Minutes on 2 cores.
 
     python experiments/label_strength.py --out FOLDER
 
@@ -24,7 +24,7 @@ STRENGTHS_DEG = (1, 2, 5)
 
 
 def main() -> int:
-    """Runs the sweeps, prints a table and writes it as JSON."""
+    """Run the sweeps, prints a table and writes it as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/label_strength"))
     arguments = parser.parse_args()

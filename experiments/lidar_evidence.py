@@ -1,4 +1,4 @@
-"""How much an answer can tell of a turned lidar: how far a walker and its teacher differ, under each turn assumed.
+"""Measure how much an answer tells about a turned lidar: walker against teacher, under each assumed turn.
 
     python experiments/lidar_evidence.py [--situations 1200] [--out FILE]
 

@@ -58,7 +58,7 @@ def commands(out: Path, piece: str, resume: bool, extra: list[str]) -> list[list
 
 
 def main() -> int:
-    """Runs the commands; stops at the first that fails."""
+    """Run the commands; stops at the first that fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

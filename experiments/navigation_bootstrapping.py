@@ -1,4 +1,4 @@
-"""How far labels carry in navigation: every form of feedback, its budgets, faults and ways to ask, in both frames.
+"""Label efficiency in navigation: every form of feedback, with budgets, faults and ways to ask, in both frames.
 
     python experiments/navigation_bootstrapping.py --list
     python experiments/navigation_bootstrapping.py --out FOLDER --pieces clutter/frame [--resume]
@@ -176,7 +176,7 @@ EXPERIMENT = Experiment(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs what is asked for; returns the exit status."""
+    """Run what is asked for; return the exit status."""
     return run(EXPERIMENT, __doc__ or "", arguments)
 
 

@@ -1,4 +1,4 @@
-"""What a guide costs or brings when guidance is paced and when it is not. One ball; minutes on 2 cores.
+"""Measure the effect of a guide with and without pacing. One ball; minutes on 2 cores.
 
     python experiments/pace.py --out FOLDER
 
@@ -39,7 +39,7 @@ VARIANTS = {
 }  # fmt: skip
 
 
-def measured(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
+def read_values(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
     """Mean over the curve (seeds,) and last reward (seeds,), by seed; share of guided steps while there is guidance."""
     rows = sorted(results.read(folder).to_pylist(), key=lambda row: (row["seed"], row["step"]))
     seeds = sorted({row["seed"] for row in rows})
@@ -48,7 +48,7 @@ def measured(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
     return curves.mean(1), curves[:, -1], float(np.mean(shares)) if shares else np.nan
 
 
-def told(values: np.ndarray) -> str:
+def format_values(values: np.ndarray) -> str:
     """A mean over seeds with its interval."""
     rng = np.random.default_rng(0)
     means = rng.choice(values, (2000, len(values))).mean(1)
@@ -57,7 +57,7 @@ def told(values: np.ndarray) -> str:
 
 
 def main() -> int:
-    """Runs the sweeps and prints a table; stops at the first that fails."""
+    """Run the sweeps and prints a table; stops at the first that fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
@@ -71,13 +71,15 @@ def main() -> int:
         status = cuelearner([*common, *options, "--out", str(out), *resume])
         if status:
             return status
-        found[name] = measured(out)
+        found[name] = read_values(out)
     unguided = found["none"]
     print(f"{'':36}  IQM over the curve      mean - unguided's          last - unguided's          guided")
     for name, (mean, last, share) in found.items():
         middle = interval(mean)
         own = f"{middle.estimate:.3f} [{middle.lower:.3f}, {middle.upper:.3f}]"
-        print(f"{name:36}  {own}  {told(mean - unguided[0])}  {told(last - unguided[1])}  {share:.3f}")
+        print(
+            f"{name:36}  {own}  {format_values(mean - unguided[0])}  {format_values(last - unguided[1])}  {share:.3f}"
+        )
     return 0
 
 

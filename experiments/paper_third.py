@@ -65,7 +65,7 @@ EXPERIMENT = Experiment("_agent_teacher:TASK", PIECES, SCALES, REPORT, folder="p
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs what is asked for; returns the exit status."""
+    """Run what is asked for; return the exit status."""
     return run(EXPERIMENT, __doc__ or "", arguments)
 
 

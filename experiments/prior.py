@@ -1,4 +1,4 @@
-"""What labels add to the agent's choice, beside the same choice without labels.
+"""Measure what labels add as a prior of the agent's choice, against the same choice without labels.
 
     python experiments/prior.py --list
     python experiments/prior.py --scale start --out FOLDER                 # before the first step: minutes on two cores
@@ -30,7 +30,7 @@ from _pieces import (
     asked_of,
     evaluations,
     folder_at,
-    listed,
+    list_pieces,
     scaled,
     spread,
     steps_to,
@@ -155,7 +155,7 @@ SCALES = {
 
 
 def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
-    """What pieces have come to so far: a row for each variant and evaluation, over its seeds."""
+    """Return the results of the pieces so far: a row per variant and evaluation, over its seeds."""
     found = []
     for piece, arbiter, row, own in evaluations(out, pieces):
         judged = len(ARMS) * arbiter.get("judge_steps", 0)
@@ -169,7 +169,7 @@ def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """One line a variant: at the start, after a tenth and at the end, and in navigation the steps to the level."""
+    """Print a line per variant: start, a tenth and end; in navigation also the steps to the level."""
     groups = defaultdict(list)
     for row in rows:
         groups[row["world"], row["run"], row["guidance"], row["labels"]].append(row)
@@ -184,7 +184,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def trained(pieces: Sequence[Piece], scale: Scale, out: Path) -> int:
+def train_pieces(pieces: Sequence[Piece], scale: Scale, out: Path) -> int:
     """Run pieces, each from where it stands; the status of the first that did not end well."""
     for piece in filter(None, (scaled(piece, scale) for piece in pieces)):
         if status := cuelearner(sweep_command(TASKS[piece.world], piece, out, resume=True)):
@@ -196,10 +196,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run, then tell; returns the exit status, 0 also where the time was up."""
     asked, pieces = asked_of(__doc__ or "", PIECES, SCALES, "prior", arguments)
     if asked.list:
-        print(listed(pieces))
+        print(list_pieces(pieces))
         return 0
     out = folder_at(asked.out, asked.scale)
-    status = 0 if asked.report else within(asked.minutes, lambda: trained(pieces, SCALES[asked.scale], out))
+    status = 0 if asked.report else within(asked.minutes, lambda: train_pieces(pieces, SCALES[asked.scale], out))
     if rows := rows_of(out, PIECES):
         told = {**provenance(), "scale": asked.scale, "rows": rows}
         (out / "prior.json").write_text(json.dumps(told, indent=1) + "\n")

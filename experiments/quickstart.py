@@ -20,7 +20,7 @@ FILM = "relative"
 
 
 def main() -> int:
-    """Runs the commands in turn; stops at the first that fails."""
+    """Run the commands in turn; stops at the first that fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

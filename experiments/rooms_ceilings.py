@@ -1,4 +1,4 @@
-"""How well rooms can be walked by what the robot sees: policies cloned from very many of the road map's actions.
+"""Estimate the best success in rooms from the robot's observation: clones of very many road-map actions.
 
     python experiments/rooms_ceilings.py --out FOLDER [--variants network ways] [--scale smoke]
 
@@ -44,7 +44,7 @@ FROM_HERE_DEG = 5.0  # a way is as likely as it lies near what the road map does
 
 
 class Scale(NamedTuple):
-    """How much of it is run."""
+    """How much of the study is run."""
 
     worlds: int
     walkers: int  # of each seed
@@ -97,7 +97,7 @@ class Clone(PolicyNode):
         return DIRECTIONS.outward(as_function(residual_network(self.layers, 2))(params, *seen), goals)
 
     def loss(self, params: Any, obs: Float[Array, "n obs"], best: Float[Array, "n 2"]) -> Float[Array, ""]:
-        """How far the clone is from what the road map does."""
+        """Return the clone's distance from the road map's actions."""
         if not self.ways:
             return jnp.mean(jnp.sum(jnp.square(self.towards(params, obs) - best), -1))
         aims, likely = self.weighed(params, obs)
@@ -106,7 +106,7 @@ class Clone(PolicyNode):
         return -jnp.mean(jnp.sum(wanted * likely, -1))
 
     def act(self, key: Array, states: Any, obs: Float[Array, "n obs"]) -> Float[Array, "n 2"]:
-        """What the road map would do, as far as it has learned."""
+        """Return the clone's actions."""
         if not self.ways:
             return DIRECTIONS.retract(self.towards(self.params, obs))
         aims, likely = self.weighed(self.params, obs)
@@ -141,7 +141,7 @@ def begin(clone: Clone, scale: Scale, adam: Any, seed: Array) -> Cloning:
 
 
 def stretch(clone: Clone, scale: Scale, adam: Any, teacher: Any, seed: Array, done: Array, cloning: Cloning) -> Cloning:
-    """Walks for `scale.each` actions, which the road map comments on, and learns from all of them so far.
+    """Walk for `scale.each` actions, which the road map comments on, and learns from all of them so far.
 
     Until the first stretch of learning the road map walks itself.
     """
@@ -234,7 +234,7 @@ def table(rows: Sequence[dict[str, Any]], count: int) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the variants; returns the exit status."""
+    """Run the variants; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scale", choices=list(SCALES), default="paper", help="smoke: a minute on a CPU")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))

@@ -36,12 +36,12 @@ FULL = "all 3,600"
 
 
 def folder(out: Path, search: str) -> Path:
-    """Where the sweep of a search lies."""
+    """Return the folder of a search's sweep."""
     return out / search.replace(",", "").replace(" ", "-")
 
 
 def begin(out: Path, search: str, steps: int, seeds: int, rest: list[str]) -> subprocess.Popen:
-    """Starts or resumes a sweep in a process of its own, whose output goes to a file beside its folder."""
+    """Start or resumes a sweep in a process of its own, whose output goes to a file beside its folder."""
     own = folder(out, search)
     options = [part for name, value in SEARCHES[search].items() for part in (f"--sizes.{name}", str(value))]
     command = [sys.executable, "-m", "cuelearner_jax.cli", "sweep", "billiards", "--preset", "regulation"]
@@ -69,8 +69,8 @@ def table(out: Path, steps: int) -> list[dict[str, Any]]:
         for search, reached in found.items():
             if step in reached:
                 full = found[FULL].get(step)
-                against = "" if full is None else told(full - reached[step])
-                rows.append({"step": step, "search": search, "reward": told(reached[step]), "lost": against})
+                against = "" if full is None else format_values(full - reached[step])
+                rows.append({"step": step, "search": search, "reward": format_values(reached[step]), "lost": against})
     return rows
 
 
@@ -80,14 +80,14 @@ def origin(out: Path) -> dict[str, str]:
     return {name: row[name] for name in ("commit", "versions", "hardware")}
 
 
-def told(values: np.ndarray) -> str:
+def format_values(values: np.ndarray) -> str:
     """An interquartile mean with its interval."""
     found = interval(values)
     return f"{found.estimate:.3f} [{found.lower:.3f}, {found.upper:.3f}]"
 
 
 def main() -> int:
-    """Runs the sweeps and prints a table; returns 1 if one fails."""
+    """Run the sweeps and prints a table; return 1 if one fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

@@ -50,14 +50,14 @@ TaskT = TypeVar("TaskT")
 
 @dataclass(frozen=True)
 class Asked(Generic[TaskT]):
-    """Options."""
+    """Options of the command."""
 
     task: TaskT
     out: Path
     """Folder for the teacher."""
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
     seed: int = 0
-    """Seed."""
+    """Seed of the training."""
     eval_steps: int = 10_000
     """Validation steps at the end (a multiple of 100)."""
     resume: bool = False
@@ -65,7 +65,7 @@ class Asked(Generic[TaskT]):
 
 
 def check(task: Task, asked: Asked) -> None:
-    """Raises UserError for values that cannot work, or for more memory than is free."""
+    """Raise UserError for values that cannot work, or for more memory than is free."""
     check_config(asked.teacher)
     if not 0 <= asked.seed <= LARGEST:
         raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST}")
@@ -128,7 +128,7 @@ def train(task: Task, asked: Asked, command: str) -> float:
 
 
 def _learn(env: Any, config: TeacherConfig, out: Path, seed: int) -> tuple[LearnedTeacher, list[list[float]]]:
-    """All rounds, from wherever the folder's newest checkpoint is. Returns the teacher and `COLUMNS` a stretch."""
+    """Train all rounds from the folder's newest checkpoint on; return the teacher and `COLUMNS` per stretch."""
     program = make_program(config)
     with checkpoints(out / TRAINING) as saved, interruptible() as stopping, progress_bars() as bars:
         state = program.init(env, jax.random.key(seed))

@@ -37,7 +37,7 @@ VALUE_LAYERS = (256, 256, 256, 256)
 
 
 class Walker(NamedTuple):
-    """What training has to know of a robot that learns to walk. Figures are numbers by name."""
+    """What training needs to know about a robot that learns to walk. Figures are numbers by name."""
 
     environment: Any  # brax.envs.Env: velocity commands are to be tracked
     policy: Callable[[Any], Any]  # brax's parameters -> a policy
@@ -49,7 +49,7 @@ class Walker(NamedTuple):
 
 @dataclass(frozen=True)
 class Training:
-    """How walking is learned (brax's PPO)."""
+    """Settings of training to walk (brax's PPO)."""
 
     steps: int = 100_000_000
     """Steps of control, over all robots."""
@@ -112,7 +112,7 @@ LARGEST_ROBOTS = 1 << 20  # each keeps some kilobytes of physics
 
 
 def check(config: Training) -> None:
-    """Raises UserError for values that cannot work."""
+    """Raise UserError for values that cannot work."""
     configuration.check_part(config, "train")
     for name in ("robots", "measured_robots"):
         if getattr(config, name) > LARGEST_ROBOTS:
@@ -150,7 +150,7 @@ def train(
     command: str,
     tell: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Trains a walking policy, measures it and writes it.
+    """Train a walking policy, measures it and writes it.
 
     Returns:
         What is written beside it: settings, history, figures.

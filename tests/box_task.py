@@ -34,7 +34,7 @@ class Reach(WholeObservations, struct.PyTreeNode):
     action = Quantity("reach", 3, "1", "a vector of the box")
 
     def best(self, obs):
-        """The middle of the box, and a fifth of the range of its first two entries along the observation."""
+        """Return the best action: the middle of the box, and a fifth of its first two ranges along the observation."""
         shares = jnp.zeros(self.actions.size).at[:2].set(0.2 * obs) + self.offset
         return self.actions.exp(self.actions.spread(1)[0], shares)
 
@@ -65,7 +65,7 @@ class ArmConfig:
     """The bandit as a task's configuration."""
 
     offset: float = 0.0
-    """How far the goal lies from where it lay in training [shares]."""
+    """Distance of the goal from its place in training [shares]."""
 
 
 def _sketch(env, state):
@@ -75,7 +75,7 @@ def _sketch(env, state):
 
 
 def _reel(env, state, action):
-    """The dot stays; the words say how far the action is from the goal."""
+    """Film without motion; its words give the action's distance from the goal."""
     x, y = map(float, state)
     return Reel(
         0.05, [{"dot": (x, -y, 0.0)}], f"{float(env.actions.distance(env.best(state), jnp.asarray(action))):.2f}"

@@ -1,4 +1,4 @@
-"""Settings of every test: the CPU, compiled programs kept between runs, shapes in signatures checked."""
+"""Settings of all tests: the CPU, a cache of compiled programs, checked shapes in signatures."""
 
 import gc
 import os
@@ -23,7 +23,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 flags = ["--xla_backend_optimization_level=0"]
 if jaxlib.version.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
     flags += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
-os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # nobody reads where an operation came from
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # no test reads where an operation came from
 os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
 
 # What starts the tests may ignore signals, as a shell does for work in the background, and processes pass that on.
@@ -36,13 +36,13 @@ install_import_hook(PACKAGES, "checked.checked")  # before anything of them is i
 
 @cache
 def lies_in(path, places):
-    """Is a file one of these files, or in one of these folders of tests?"""
+    """Whether a file is one of these files, or lies in one of these folders of tests."""
     return any(TESTS / place in (path, *path.parents) for place in places)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """What is imported stays: the garbage collector does not look through it, neither here nor during the tests."""
+    """Freeze imported objects, so that the garbage collector never traverses them during collection and tests."""
     gc.disable()
     try:
         return (yield)
@@ -52,12 +52,12 @@ def pytest_collection():
 
 
 def pytest_addoption(parser):
-    """Adds what `make durations` asks for."""
+    """Add the option of `make durations`."""
     parser.addoption("--durations-to", type=Path, help="write the seconds of each file of tests there")
 
 
 def pytest_terminal_summary(terminalreporter, exitstatus, config):
-    """Writes the seconds of each file of tests, with set-up, the longest first."""
+    """Write the seconds of each file of tests, with set-up, the longest first."""
     path = config.getoption("--durations-to")
     if path is None:
         return
@@ -77,7 +77,7 @@ def pytest_terminal_summary(terminalreporter, exitstatus, config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Makes implicit rank promotion an error, but in the tests of `LOOSE_RANKS`.
+    """Make implicit rank promotion an error, except in the tests of `LOOSE_RANKS`.
 
     For all threads and before any fixture: what is traced with another setting is traced and compiled once more.
     """
@@ -120,7 +120,7 @@ for file, seconds in SECONDS.items():
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Shares out the tests by file, those of `SHARING` by what they share."""
+    """Distribute the tests by file, those of `SHARING` by the program that they share."""
     from xdist.scheduler import LoadFileScheduling
 
     class ByProgram(LoadFileScheduling):
@@ -132,7 +132,7 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 def pytest_collection_modifyitems(items):
-    """Marks slow files, and begins with those that take longest: what is left for the end is shared out evenly."""
+    """Mark slow files and run the longest first, so that workers finish at about the same time."""
     files = {item: item.nodeid.partition("::")[0] for item in items}
     for item, file in files.items():
         if SECONDS.get(file, 0.0) > SLOW:

@@ -1,4 +1,4 @@
-"""Damaged policy folders, exports, label files, teachers, tables: each reader says so, or gives what it gave before.
+"""Damaged policy folders, exports, label files, teachers and tables: a reader raises, or returns the whole contents.
 
 python tests/damaged_files.py [--cases 2000] [--seed 0]   tries many cases and prints what went wrong
 
@@ -50,7 +50,7 @@ ROW = {"seed": 0, "said": "answer", "seconds": 1.5, "who": "Ada", "when": "2026-
 
 
 class Case(NamedTuple):
-    """What is done to which file."""
+    """A damage of one file."""
 
     kind: str
     file: str  # relative to the folder
@@ -215,7 +215,7 @@ FILE_DAMAGES = {**DAMAGES, "swapped": _swapped, "zeroed": _zeroed, "repeated": _
 
 
 def make_folders(home: Path) -> dict[str, Any]:
-    """Writes a folder of each kind; returns what their readers give."""
+    """Write a folder of each kind; return what their readers give."""
     for name, kind in KINDS.items():
         kind.write(home / name)
     return {name: _read(kind, home / name)[0] for name, kind in KINDS.items()}
@@ -243,14 +243,14 @@ def _what_is_signed(kind: str, file: str, rng: np.random.Generator) -> tuple[str
 
 
 def _read(kind: Kind, folder: Path) -> tuple[Any, str]:
-    """What a reader gives, and what it tells meanwhile."""
+    """Return a reader's result, and its console output."""
     told = io.StringIO()
     with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
         return kind.read(folder), told.getvalue()
 
 
 def wrong(home: Path, expected: dict[str, Any], case: Case) -> str | None:
-    """What goes wrong with a case; None: nothing."""
+    """Return what is wrong with a case; None if nothing is."""
     kind = KINDS[case.kind]
     with tempfile.TemporaryDirectory() as work:
         folder = Path(shutil.copytree(home / case.kind, Path(work) / "folder"))

@@ -1,4 +1,4 @@
-"""Damaged run folders, given to every command that reads them: each says so, or gives the numbers of a whole one.
+"""Damaged run folders for every command that reads them: each raises, or gives the results of the whole folder.
 
 python tests/damaged_folders.py [--cases 2000] [--seed 0] [--workers 2]   tries many cases and prints what went wrong
 
@@ -42,7 +42,7 @@ VOLATILE = ("wall_s", "commit", "command", "folder", "run")
 
 
 class Case(NamedTuple):
-    """What is done to which file, and who meets it."""
+    """A damage of one file, and the command that reads it."""
 
     run: str
     file: str  # relative to the run's folder
@@ -52,7 +52,7 @@ class Case(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a command did."""
+    """The outcome of a command."""
 
     status: int
     told: str  # on standard error
@@ -175,7 +175,7 @@ def cases(folder: Path, count: int, seed: int) -> list[Case]:
 
 
 def baselines(folder: Path, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Outcome]:
-    """What commands do with whole runs, for the (run, command) that are wanted."""
+    """Return the outcomes of commands on whole runs, for the wanted (run, command)."""
     found = {}
     for run, command in sorted(wanted):
         with _copied(folder, run) as (copy, work):
@@ -191,7 +191,7 @@ def _copied(folder: Path, run: str) -> Iterator[tuple[Path, Path]]:
 
 
 def wrong(folder: Path, expected: dict[tuple[str, str], Outcome], case: Case) -> str | None:
-    """What goes wrong with a case; None: nothing."""
+    """Return what is wrong with a case; None if nothing is."""
     with _copied(folder, case.run) as (copy, work):
         DAMAGES[case.damage](copy / case.file, case.bit)
         before = files_of(copy)

@@ -37,7 +37,7 @@ class Adder(gymnasium.Env):
 
 
 def start_of(seed):
-    """What `Adder` adds to, with a seed."""
+    """Return the number that `Adder` starts from, for a seed."""
     env = Adder()
     return env.reset(seed=int(seed))[0][0]
 

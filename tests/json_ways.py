@@ -1,4 +1,4 @@
-"""Nested JSON values with one thing changed: what tests of damaged and of hostile files try."""
+"""Change one entry of nested JSON values, for tests of damaged and hostile files."""
 
 import copy
 import functools
@@ -15,7 +15,7 @@ def ways(values, way=()):
 
 
 def at(values, way):
-    """What lies there."""
+    """Return the entry at a path."""
     return functools.reduce(lambda part, name: part[name], way, values)
 
 

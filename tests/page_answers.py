@@ -16,7 +16,7 @@ VALUES = {1.0: "more", 0.0: "right", -1.0: "less"}
 
 
 def labelled(arguments, ask):
-    """Runs `cuelearner label ARGUMENTS` to its end.
+    """Run `cuelearner label ARGUMENTS` to its end.
 
     Args:
         arguments: of the command line, as a shell would give them.
@@ -51,7 +51,7 @@ def labelled(arguments, ask):
 
 
 async def answer(user, page, session, said):
-    """Presses what says an answer, and waits for the next question."""
+    """Press what says an answer, and waits for the next question."""
     number = session.number
     for name in pressed(page.controls, np.atleast_1d(said)):
         user.find(marker=name).click()

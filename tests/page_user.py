@@ -8,7 +8,7 @@ from cuelearner_jax.labelling.page import Page
 
 
 def shown(session, acts, finish=None):
-    """Opens the page of a session in a browser that is none, and has `acts` use it."""
+    """Open the page of a session in a browser that is none, and has `acts` use it."""
 
     async def used():
         pages = set()
@@ -20,7 +20,7 @@ def shown(session, acts, finish=None):
 
 
 async def press(user, name, moved):
-    """Presses a button and waits until that has moved the session on."""
+    """Press a button and waits until that has moved the session on."""
     user.find(marker=name).click()
     for _ in range(400):
         await asyncio.sleep(0.01)

@@ -1,4 +1,4 @@
-"""What is looked at in drawings: colours of pixels, pictures of films."""
+"""Read drawings: colours of pixels, pictures of films."""
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -6,7 +6,7 @@ from PIL import Image, ImageSequence
 
 
 def is_colour(found, name, tolerance=0.02):
-    """Which pixels (..., 3) have a colour."""
+    """Return a mask of the pixels (..., 3) with a colour."""
     return np.abs(np.asarray(found) - to_rgb(name)).max(axis=-1) < tolerance
 
 

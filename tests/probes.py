@@ -189,7 +189,7 @@ LARGEST = 60  # labels of the largest budget in the tests' loop
 
 @cache
 def window_program(kind):
-    """One compiled loop on the bandit for all tests; four lanes in each of them compile one program."""
+    """Return one training program on the bandit for all tests, so that it compiles once."""
     guide = guidances.make(kind, SIZES, Window())
     return make_program(CONFIG, guide, Window(), LARGEST if guide.asks else 0)
 
@@ -216,7 +216,7 @@ def long_but(few, names):
 
 
 def stored(state, lane, steps):
-    """What a lane's environments met: columns (steps, ...) of its replay in the order of time."""
+    """Return the columns (steps, ...) of a lane's replay in the order of time."""
     rows = np.asarray(state.agent.replay[lane, :steps])
     names = {"obs": slice(0, 2), "action": slice(2, 4), "reward": 4}
     if rows.shape[1] > 5:  # something bootstraps
@@ -237,12 +237,12 @@ def label_set(obs, action, answer, valid):
 
 
 def compilations(*functions):
-    """How often each jitted function has been compiled."""
+    """Return how often each jitted function has been compiled."""
     return [function._cache_size() for function in functions]
 
 
 def lane(tree, index):
-    """One lane of a block, as NumPy."""
+    """Return one lane of a block as NumPy arrays."""
     raw = partial(jax.tree.map, lambda leaf: words(leaf)[index])
     return jax.tree.map(np.asarray, raw(tree))
 
@@ -265,7 +265,7 @@ def files_of(folder):
 
 
 def edit_json(path, change):
-    """Rewrites a JSON file by a function of its values; one with a digest gets that of the new ones."""
+    """Rewrite a JSON file by a function of its values; one with a digest gets that of the new ones."""
     values = json.loads(path.read_text())
     sealed = values.pop("digest", None) is not None
     change(values)
@@ -273,7 +273,7 @@ def edit_json(path, change):
 
 
 def edit_contract(folder, change=lambda contract: None):
-    """Rewrites an export's contract by a function of its values, with the digests of the files as they are now."""
+    """Rewrite an export's contract by a function of its values, with the digests of the files as they are now."""
     contract = json.loads((folder / runner.CONTRACT).read_text())
     contract.pop(runner.DIGEST, None)
     change(contract)

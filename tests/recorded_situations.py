@@ -20,7 +20,7 @@ def arrays(rows=12, seed=0):
 
 
 def write(folder, rows=12, form="parquet", pictures=True):
-    """Writes a folder of situations, each with a picture whose red is the row's number; returns its arrays."""
+    """Write a folder of situations, each with a picture whose red is the row's number; return its arrays."""
     folder.mkdir(parents=True, exist_ok=True)
     observations, actions = arrays(rows)
     names = [f"pictures/{row}.png" for row in range(rows)] if pictures else None
@@ -47,7 +47,7 @@ def write(folder, rows=12, form="parquet", pictures=True):
 
 
 def write_lerobot(folder, lengths=(5, 7), fps=10, version="v3.0", names=True):
-    """Writes a LeRobot dataset of the format v3.0, a camera's frames as bright as they are far; returns its arrays.
+    """Write a LeRobot dataset of the format v3.0, a camera's frames as bright as they are far; return its arrays.
 
     Two data files, one video file in which the episodes follow one another, as the format has it.
     """

@@ -21,13 +21,13 @@ ENV = page_task.TASK.environment(probes.CONFIG.task)
 
 
 def plan(labels=20, kind="relative", base=None, config=probes.CONFIG, **others):
-    """Of a session on the bandit."""
+    """Return the plan of a session on the bandit."""
     guidance = guidances.make(kind, probes.SIZES, ENV)
     return Plan(page_task.TASK, config, guidance, base or Base(Uniform(), "uniform"), labels, **others)
 
 
 def expert(item, eps_deg=probes.SCALARS.eps_deg):
-    """What the expert answers: which way its best action lies, unless it is within half of eps (by angles)."""
+    """Return the expert's answer: the side of its best action, or 0 within half of eps (by angles)."""
     best = np.asarray(ENV.best(item.guide.obs), float)
     cross = item.action[0] * best[1] - item.action[1] * best[0]
     apart = np.degrees(np.arctan2(cross, item.action @ best))
@@ -44,7 +44,7 @@ def give(session, count, eps_deg=probes.SCALARS.eps_deg):
 
 
 def settled(session, fits=None):
-    """Waits until nothing is fitted any more and the questions know of it."""
+    """Wait until nothing is fitted any more and the questions know of it."""
     for _ in range(20_000):
         status = session.status()
         if not status.fitting and (fits is None or status.newest.number >= fits):

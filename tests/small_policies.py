@@ -38,7 +38,7 @@ def agent():
 
 
 def write(folder, overwrite=False, origin="run", calibrated=False):
-    """Writes the folder; `origin`: what policy.json says was adapted."""
+    """Write the folder; `origin`: what policy.json says was adapted."""
     kind, family = ("calibration", (declared_distortions(ENV),)) if calibrated else ("relative", ())
     guidance = guidances.make(kind, SIZES, ENV)
     of = (Calibrating if calibrated else Adaptation)(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), *family)

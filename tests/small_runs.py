@@ -21,7 +21,7 @@ SWEEP += ["--guidance", "none", "relative"]
 
 
 def rows(*folders):
-    """What runs measured and learned, lane by lane and step by step."""
+    """Return the results and parameters of runs, lane by lane and step by step."""
     names = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
     found = [{name: row.get(name) for name in names} for row in results.read(folders).to_pylist()]
     return sorted(found, key=lambda row: tuple(str(row[name]).zfill(6) for name in names[:4]))

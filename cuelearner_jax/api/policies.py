@@ -127,7 +127,7 @@ def source_of(policy: Any, world: World) -> trained.PolicySource:
 
 @user_code.report_user_errors
 def load_policy(
-    folder: str | Path,
+    folder: str | os.PathLike[str],
     *,
     policy: str | None = None,
     guidance: str | None = None,

@@ -1,4 +1,4 @@
-"""The command `cuelearner`: dispatch, and one file a command with its options."""
+"""The command `cuelearner`: dispatch, and one file per command with its options."""
 
 import os
 import sys
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs a command line (by default this process's own). Returns the exit status, see `dispatch`."""
+    """Run a command line (default: this process's own). Returns the exit status, see `dispatch`."""
     if argv is None:
         _open_streams()
         from cuelearner_jax import signals  # before anything else, which takes seconds to load
@@ -18,10 +18,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Opens to nowhere what this process was started without (as by `2>&-`), or other files would take its place."""
+    """Open to null any standard stream this process lacks (`2>&-`), so that no other file gets its number."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # uses the lowest free number
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w"))

@@ -1,4 +1,4 @@
-"""`python -m cuelearner_jax.cli`: the same as `cuelearner`."""
+"""`python -m cuelearner_jax.cli`: runs `cuelearner`."""
 
 import sys
 

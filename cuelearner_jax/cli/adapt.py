@@ -26,20 +26,20 @@ class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
     observations, or a file in ONNX. With --labels-from of a page about recorded situations, no task is needed."""
 
     out: Path
-    """The policy folder that is written."""
+    """Policy folder to write."""
     overwrite: Flag[bool] = False
-    """Delete the policy folder that is there. (Beside all these: --changes package.module:NAME gives calibration
-    distortions of your own in place of those that the world declares.)"""
+    """Delete an existing policy folder. (A further option: --changes package.module:NAME gives calibration distortions
+    of your own in place of those that the world declares.)"""
     base: BaseLanes = field(default_factory=BaseLanes)
 
 
 OPTIONS = {"adapt": Adapt}
-# Options on which the defaults of others depend.
+# Options that determine the defaults of others.
 FIRST = {"scenario": "NAME", "guidance": "KIND", "judge_by": "METRIC", "labels_from": "a labels.parquet"}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises UserError for what cannot be adapted, NotFinite if a model could not be fitted."""
+    """Run the command. Raises UserError for what cannot be adapted, NotFinite if a model could not be fitted."""
     source, code, named, rest = _source(arguments)
     changed, _ = taken(arguments, "--changes", "package.module:NAME")
     first = {name: taken(rest, f"--{name.replace('_', '-')}", wanted)[0] for name, wanted in FIRST.items()}
@@ -57,7 +57,8 @@ def run(arguments: list[str]) -> None:
     asked = parse(kind, rest, f"adapt {subject.typed}", default, told, subject)
     asked = replace(asked, kinds=vars(asked.kinds))
     subject = Subject(source.on(asked.robot), asked.base, code, named)
-    if changed is not None and (adapt.reads_evidence(asked) or source.adapted is None):  # else the folder's code
+    # otherwise the changes stand for the folder's code
+    if changed is not None and (adapt.reads_evidence(asked) or source.adapted is None):
         subject = subject._replace(changes=changes.load(changed), changes_named=changed)
     with (
         policy_folders.place_of(asked.out, asked.overwrite) as place,
@@ -69,13 +70,13 @@ def run(arguments: list[str]) -> None:
         out.print(line)
     out.print(f"wrote {asked.out} (measure it with: cuelearner evaluate {asked.out})")
     if outcome.found.failed.any():
-        raise NotFinite("a fit is no longer finite, its model is not used: lower --scalars.feedback-learning-rate")
+        raise NotFinite("a fit is no longer finite, so its model is not used: lower --scalars.feedback-learning-rate")
 
 
 def _source(arguments: list[str]) -> tuple[PolicySource, Any, str | None, list[str]]:
-    """Where policies come from, code in place of one of them, how that is named, and the other arguments.
+    """Return the policies' source, the code given in place of a policy, its name, and the other arguments.
 
-    Raises UserError if they cannot be had.
+    Raises UserError if they are not available.
     """
     if arguments and is_code(arguments[0]):
         named, rest = arguments[0], arguments[1:]
@@ -90,10 +91,12 @@ def _source(arguments: list[str]) -> tuple[PolicySource, Any, str | None, list[s
 
 
 def _of_labels(named: str, path: str | None) -> PolicySource:
-    """The situations of a label file in place of a task. Raises UserError unless its labels are about a recording."""
+    """Return the situations of a label file as a task. Raises UserError unless its labels are about a recording."""
     found = None if path is None else correction.labels_from_file(Path(path))
     if found is None or found.config is None:
-        why = "" if path is None else f", of which {path} does not hold labels of a recording"
-        raise UserError(f"{named} is to act in some task{why}: name it, as --task navigation or --env gymnasium:NAME")
+        why = "" if path is None else f", since {path} does not hold labels of a recording"
+        raise UserError(
+            f"{named} needs a task to act in{why}: give one, for instance --task navigation or --env gymnasium:NAME"
+        )
     world = correction.world_of(found)
     return PolicySource(world.task, world.task.start(), None, Path(world.task.name))

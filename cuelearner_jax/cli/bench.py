@@ -29,7 +29,7 @@ from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible, progress_bars
 
-COLUMNS = {  # of the table: what is measured and its format
+COLUMNS = {  # column -> name and format of its measurement
     "steps/s": ("steps_a_second", ",.0f"),
     "ms/step": ("ms_a_step", ".3f"),
     "MB/seed": ("mb_a_seed", ".2f"),
@@ -40,21 +40,21 @@ COLUMNS = {  # of the table: what is measured and its format
 
 @dataclass(frozen=True)
 class Measuring:
-    """How to measure."""
+    """Options of a measurement."""
 
     seeds: tuple[int, ...] = (8,)
-    """Numbers of seeds that train at once, over all devices."""
+    """Numbers of seeds to train at once, over all devices; one measurement for each."""
     seconds: float = 2.0
-    """Time of each measurement once it is compiled (three stretches at least)."""
+    """Time of each measurement after compilation [s]; at least three stretches are measured."""
     devices: int = 0
-    """Devices that share the seeds (0: all)."""
+    """Number of devices that share the seeds (0: all)."""
     out: Path | None = None
-    """Also write the figures to this JSON file."""
+    """JSON file for the results (default: none)."""
 
 
 @dataclass(frozen=True)
 class Bench(Measuring):
-    """Measure this machine: steps a second, memory a seed, time to the first step.
+    """Measure this machine: steps per second, memory per seed, time to the first step.
 
     Trains the small presets (quickstart) of the package's tasks, which takes about a minute. Name a task first to
     measure one configuration: cuelearner bench billiards --preset paper --seeds 8 75
@@ -73,7 +73,7 @@ OPTIONS = {"bench": Bench}
 
 
 def run(arguments: list[str]) -> None:
-    """Run the command. Raises UserError for what cannot be measured."""
+    """Run the command. Raises UserError for an invalid request."""
     works: list[tuple[Task, str, RunConfig]]
     named = any(argument == "--task" or argument.startswith("--task=") for argument in arguments)
     if named or (arguments and not arguments[0].startswith("-")):
@@ -90,7 +90,8 @@ def run(arguments: list[str]) -> None:
         works = [(task, "quickstart", task.presets["quickstart"].config) for task in tasks]
     mesh = _check(asked, works)
     rows: list[dict[str, Any]] = []
-    plan = [(*work, seeds) for work in works for seeds in sorted(asked.seeds)]  # a device's peak never falls again
+    # ascending, since a device's peak memory never falls again
+    plan = [(*work, seeds) for work in works for seeds in sorted(asked.seeds)]
     with interruptible() as stopping, progress_bars() as bars:
         bar = bars.add_task("bench", total=len(plan), note="")
 
@@ -114,7 +115,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _check(asked: Measuring, works: list[tuple[Task, str, RunConfig]]) -> Mesh:
-    """The devices to measure on. Raises UserError for what cannot be measured, or not in the memory that is free."""
+    """Return the devices to measure on. Raises UserError for invalid options, or too little free memory."""
     if (
         not asked.seeds
         or len(set(asked.seeds)) < len(asked.seeds)
@@ -124,7 +125,7 @@ def _check(asked: Measuring, works: list[tuple[Task, str, RunConfig]]) -> Mesh:
     if not 0 < asked.seconds < math.inf:
         raise UserError(f"--seconds is {asked.seconds}: give a positive number")
     if not 0 <= asked.devices <= jax.local_device_count():
-        raise UserError(f"--devices is {asked.devices}: there are {jax.local_device_count()} (0: all)")
+        raise UserError(f"--devices is {asked.devices}: give at most {jax.local_device_count()} (0: all)")
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")
     mesh = lane_mesh(jax.local_devices()[: asked.devices or None])
@@ -137,7 +138,7 @@ def _check(asked: Measuring, works: list[tuple[Task, str, RunConfig]]) -> Mesh:
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    """Measured rows as a table of text."""
+    """Return measured rows as a text table."""
     lines = [["task", "preset", "seeds", *COLUMNS]]
     for row in rows:
         cells = ["-" if row[name] is None else format(row[name], form) for name, form in COLUMNS.values()]

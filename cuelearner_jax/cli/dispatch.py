@@ -1,8 +1,8 @@
-"""The command `cuelearner`: calls the file of a command, turns errors into one line and an exit status.
+"""Dispatch of `cuelearner`: call a command's file, and turn errors into one line and an exit status.
 
 Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, everything
-saved; 1 the disk is full, everything up to the last checkpoint saved, or what was trained is not
-finite, all else saved; 141 nobody reads the output any more (of progress and messages on standard error nobody has to).
+saved; 1 the disk is full, everything up to the last checkpoint saved, or a training is not finite, everything else
+saved; 141 the reader of standard output has gone (standard error needs no reader).
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
-# Before JAX starts: warnings of its start-up are not the user's.
+# Set before JAX starts: its start-up warnings are of no use to the user.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-# What loads JAX, and takes seconds, is imported where a command needs it: `--version` and `--help` wait for nothing.
+# JAX takes seconds to load, so a command imports it only when needed, never for `--version` and `--help`.
 from cuelearner_jax import __version__
 from cuelearner_jax.errors import NotFinite, UserError, file_system_message, suggestion
 from cuelearner_jax.signals import Interrupted
 
 HELP, HELP_ALL = ("-h", "--help", "--help-all"), "--help-all"
-# Each is a file beside this one with `run(arguments)` and `OPTIONS`, the options of what it does by its full name.
+# Each is a file beside this one with `run(arguments)` and `OPTIONS`, its option classes by command name.
 COMMANDS = (
     *("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export"),
     "bench",
@@ -32,20 +32,20 @@ COMMANDS = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Returns the exit status."""
+    """Run a command line. Returns the exit status."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         try:
             return _dispatch(arguments)
         finally:
-            sys.stdout.flush()  # here, where it is heard if nobody reads
+            sys.stdout.flush()  # flush here, where a missing reader is handled
     except UserError as error:
         _tell(f"error: {error}")
         return 2
     except (Interrupted, NotFinite) as error:
         _tell(str(error))
         return error.status
-    except BrokenPipeError:  # whoever read our output has gone, as `head` does
+    except BrokenPipeError:  # the reader of the output has gone, as `head` does
         from cuelearner_jax.terminal import abandon
 
         abandon(sys.stdout)
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _tell(f"error: {told}")
         return 1
-    except KeyboardInterrupt:  # of a process that does more than this command: see `signals`
+    except KeyboardInterrupt:  # in a process that does more than this command: see `signals`
         _tell("stopped at once; what was saved before is safe")
         return 130
 
@@ -87,21 +87,21 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _resumes(arguments: list[str]) -> bool:
-    """Has the command that was given an option --resume?"""
+    """Whether the given command has an option --resume."""
     options = _file(arguments[0]).OPTIONS if arguments and arguments[0] in COMMANDS else {}
     asked = [kind for name, kind in options.items() if name.split() == arguments[: len(name.split())]]
     return any(hasattr(kind, "resume") for kind in asked)
 
 
 def _file(command: str) -> ModuleType:
-    """The file of a command, loaded when it is called: what one needs, the others need not wait for."""
+    """Import the file of a command; other commands' dependencies are not loaded."""
     return importlib.import_module(f"cuelearner_jax.cli.{command}")
 
 
 def summaries(command: str) -> dict[str, str]:
-    """One line about each command of a file, by its full name: the start of its options' docstring.
+    """Return one line about each command of a file, by its full name: the start of its options' docstring.
 
-    The file is read, not imported, because importing it loads JAX.
+    The file is read, not imported, since importing it loads JAX.
     """
     module = ast.parse(Path(__file__).with_name(f"{command}.py").read_text(encoding="utf-8"))
     abouts = {node.name: ast.get_docstring(node) or "" for node in module.body if isinstance(node, ast.ClassDef)}

@@ -52,7 +52,7 @@ COMPARE = "--compare"
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises UserError for what cannot be evaluated."""
+    """Run the command. Raises UserError for what cannot be evaluated."""
     if arguments and is_code(arguments[0]) and (file := taken(arguments, "--labels-from", "a labels.parquet"))[0]:
         if len(file[1]) > 1:
             raise UserError(f"the answers of a label file need the policy alone: leave out {file[1][1]}")
@@ -113,7 +113,7 @@ def _named_first(arguments: list[str]) -> list[str]:
 
 
 def _print_agreement(named: str, policy: Any, path: Any) -> None:
-    """Prints how many answers of a label file a policy agrees with."""
+    """Print the share of a label file's answers that a policy agrees with."""
     found = correction.agreement(policy, path)
     table = Table(
         "", "share of answers", "95% interval", title=f"{named}: agreement with {found.labels} labels of {path}"
@@ -131,7 +131,7 @@ def _print_agreement(named: str, policy: Any, path: Any) -> None:
 
 
 def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, str]:
-    """The source and the name of the policy to compare with. Raises UserError if it cannot be had in that world."""
+    """Return the source and name of the policy to compare with. Raises UserError if it does not act in that world."""
     given = str(asked.compare)
     folder = shipped.folder_of(given)
     if given in POLICIES and not folder.exists():
@@ -154,7 +154,7 @@ def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, st
 
 
 def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
-    """Means with their intervals, those of one policy over `episodes`; a section for each guidance and budget."""
+    """Return a table of means with intervals (single policies: over `episodes`), by guidance and budget."""
     columns = {
         "guidance": lambda row: row.guidance,
         "labels": lambda row: str(row.labels),
@@ -187,7 +187,7 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
 
 
 def _over(found: list[Measured], episodes: str) -> str:
-    """What means and intervals are over."""
+    """Return what the means and intervals are computed over, in words."""
     kinds = {measurements.over(row) for row in found}
     told = {
         measurements.EPISODES: f"one policy: mean and bootstrap over {episodes}",
@@ -197,7 +197,7 @@ def _over(found: list[Measured], episodes: str) -> str:
 
 
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
-    """Two policies side by side, with their difference."""
+    """Return a table of two policies side by side, with their difference."""
     mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
     over = f"{episodes}, paired" if difference.over == measurements.EPISODES else "seeds (interquartile means)"
     named = " against ".join(name + (f" ({told})" if told else "") for name, told in ((title, mine), (other, its)))
@@ -216,7 +216,7 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
 
 
 def _verdict(difference: Difference) -> str:
-    """Whether the interval of the difference excludes 0, metric by metric."""
+    """Return a sentence on which metrics' differences exclude 0."""
     apart = [name for name, less in difference.metrics.items() if less.excludes_zero]
     alike = [name for name in difference.metrics if name not in apart]
     told = [f"excludes 0 for {', '.join(apart)}"] * bool(apart) + [f"includes 0 for {', '.join(alike)}"] * bool(alike)

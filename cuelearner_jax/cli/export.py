@@ -26,10 +26,10 @@ class Export(Lane, Generic[TaskT]):
     format: str = "stablehlo"
     """stablehlo, onnx or numpy."""
     out: Path = Path("exported")
-    """Folder for the decision; it must not be there yet, or be empty."""
+    """Folder for the exported decision; a new or an empty one."""
     only_correction: Flag[bool] = False
-    """The correction alone, of a policy folder: observation and base action in, action out. The base stays where it
-    is, and is not needed here."""
+    """Export only the correction of a policy folder: a function of observation and base action. The base policy stays
+    on the robot and is not needed here."""
     scenario: str | None = None
     """A changed world, by its name, whose observations the golden cases are. Options of the task
     (--task.…) come on top of it."""
@@ -39,7 +39,7 @@ OPTIONS = {"export": Export}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises UserError for what cannot be exported, or does not hold its contract."""
+    """Run the command. Raises UserError for what cannot be exported, or does not fulfil its contract."""
     folder, rest = taken(arguments, "--check", "the folders that were exported")
     if folder is not None:
         if rest:
@@ -50,7 +50,7 @@ def run(arguments: list[str]) -> None:
     source, asked = asked_of_source(arguments, "export", Export, f"\n\nformats (--format):\n{formats}")
     name = asked.name_in(source, asked.task)
     if trained.POLICIES[name].taught:
-        raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
+        raise UserError(f"policy {name!r} asks the teacher, who needs the true state: choose another policy")
     contract.check_request(asked.format, asked.out)
     env = source.task.environment(asked.task)
     if asked.only_correction and source.adapted is not None:
@@ -71,12 +71,12 @@ def run(arguments: list[str]) -> None:
     golden = written["golden"]
     out.print(
         f"{golden['cases']} golden cases replayed, largest difference {written['difference']:.1e} "
-        f"({golden['steady']} of {golden['drawn']} decisions do not hang on the last digits); wrote {asked.out}"
+        f"({golden['steady']} of {golden['drawn']} decisions are insensitive to rounding); wrote {asked.out}"
     )
 
 
 def _check(folder: Path) -> None:
-    difference = contract.checked(folder)
-    if others := contract.unlisted(folder):
-        out.print(f"{folder} also holds what its contract does not list: {', '.join(others)}")
-    out.print(f"{folder} is as it was exported; golden cases replayed, largest difference {difference:.1e}")
+    difference = contract.replay_golden_cases(folder)
+    if others := contract.unlisted_files(folder):
+        out.print(f"{folder} also holds files that its contract does not list: {', '.join(others)}")
+    out.print(f"{folder} is unchanged since its export; golden cases replayed, largest difference {difference:.1e}")

@@ -42,56 +42,58 @@ from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
 UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
-REACH = 1.5  # of questions near an aim: from the aim, in turns by eps
-PRESET = "quickstart"  # where none is given and chance is asked about: what is labelled trains in minutes
-PRACTICE = len(controls.PRACTICE)  # questions
+REACH = 1.5  # distance of questions from an aim, in turns by eps
+PRESET = "quickstart"  # default for questions about uniform actions: its training takes minutes
+PRACTICE = len(controls.PRACTICE)  # number of practice questions
 MOST_LABELS = 100_000
-UNDRAWN = "a person cannot label what nobody draws; give its Body `pictures` with a `sketch`, or another --robot"
+UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch`, or choose another --robot"
 
 
 @dataclass(frozen=True)
 class Label(Generic[TaskT]):
-    """Label actions of chance, of a policy, or recorded ones, in a browser.
+    """Label actions in a browser: uniform ones, a policy's, or recorded ones.
 
-    A policy is named after the task: a run folder, a policy folder, or package.module:NAME of a function of
-    observations. In place of a task a folder of situations may be named: its recorded actions are asked about."""
+    Name a policy after the task: a run folder, a policy folder, or package.module:NAME of a function of observations.
+    In place of a task, a folder of recorded situations may be named: its recorded actions are asked about."""
 
     task: TaskT
     sizes: GuideSizes
     scalars: GuideScalars
     out: Path
-    """Folder of the labels; one that holds some already goes on where it stopped."""
+    """Folder for the labels. A folder with labels of this session is continued."""
     labels: int = 500
-    """Answers that are wanted; to go on later, give more (default without a policy: the most that the preset uses)."""
+    """Number of answers to collect; to continue later, give more (default without a policy: the preset's largest
+    budget)."""
     guidance: str = ""
-    """Kind of guidance that is fitted while you label; it decides what you are asked for."""
+    """Kind of guidance that is fitted while you label; it determines the form of the answers."""
     who: str = "anonymous"
-    """A name for you, written beside each label."""
+    """Your name, recorded with each label."""
     seed: int = 0
-    """Seed of the situations; the labels are this seed's."""
+    """Seed of the situations and of the labels."""
     cues: str = ""
-    """Words for more and less of each entry of an action, as "left,right;up,down" (default: the task's)."""
+    """Words for more and less of each entry of an action, such as "left,right;up,down" (default: the task's)."""
     one_cue: Flag[bool] = False
-    """Of several cues: one press, about whichever comes to mind, is the answer; of the others nothing is said."""
+    """With several cues: one press about one cue is the whole answer; nothing is said of the others."""
     bound_deg: Annotated[float | None, tyro.conf.arg(aliases=("--bound",))] = None
-    """Ask about actions within this of the policy's own alone [deg] (default: the scenario's, or wherever the guidance
-    leads)."""
+    """Largest distance of the questions from the policy's own actions [deg] (default: the scenario's bound, or no
+    bound)."""
     again: Path | None = None
-    """Instead: the questions of this page's file once more, for a second opinion; leave out the policy and --seed."""
+    """Ask the questions of this page's file again, for a second opinion. Leave out the policy and --seed then."""
     scenario: str | None = None
     """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     robot: str | None = None
     """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
     questions: Literal["uniform", "near_aims", "proposed"] = UNIFORM
-    """Without a policy: any actions, those near what a player may aim at (where the task has aims), or those that a
-    recording proposes."""
+    """Actions to ask about without a policy: uniform ones, ones near the task's aims (where it has aims), or those
+    that a recording proposes."""
     changes: str | None = None
-    """Of guidance calibration: package.module:NAME of distortions of your own (default: what the world declares)."""
+    """For guidance calibration: package.module:NAME of your own distortions (default: those that the world
+    declares)."""
     practice: Flag[bool] = True
-    """Begin a new file with three questions for practice, which are not saved."""
+    """Begin a new file with three practice questions, whose answers are not saved."""
     port: int = 0
-    """Port on 127.0.0.1 (0: any that is free)."""
+    """Port on 127.0.0.1 (0: any free port)."""
     open: Flag[bool] = False
     """Open the page in a browser of this machine."""
     base: Lane = field(default_factory=Lane)
@@ -101,16 +103,16 @@ OPTIONS = {"label": Label}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command.
+    """Run the command.
 
     Raises:
-        UserError: bad input, a port or a folder in use, or a folder with labels of something else.
+        UserError: bad input, a port or folder in use, or a folder with labels of another session.
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
     server, typed = _server(), list(arguments)
     task, rest = task_named(arguments, "label", Label)
     named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
-    finished_policy = named is not None or task.proposed is not None  # is it one that labels are to correct?
+    finished_policy = named is not None or task.proposed is not None  # whether the labels are to correct a policy
     usual = PAPER if finished_policy else PRESET
     chosen, preset, rest = preset_of(task, rest, usual)
     kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
@@ -141,33 +143,33 @@ def run(arguments: list[str]) -> None:
     )
     subject = pages.subject_of(arguments[0] if task.proposed is not None else typed_name(task), task.name, task)
     asked = parse(kind, rest, f"label {subject.typed}", default, about(Label, task, preset=usual), subject)
-    plan = planned(task, preset.config, asked, named, source)
+    plan = make_plan(task, preset.config, asked, named, source)
     config = preset.config if source is None else dataclasses.replace(preset.config, task=world)
     again = shlex.join(["cuelearner", "label", *typed])
     commands = server.Commands(again, partial(_following, task, chosen, config, asked, named))
-    # The port first: where it is refused, nothing has been made.
-    with server.bound(asked.port) as port, claimed(asked.out), interruptible("the answer of the moment") as stopping:
+    # The port comes first, so that nothing has been written where it is refused.
+    with server.bind(asked.port) as port, claimed(asked.out), interruptible("the answer of the moment") as stopping:
         finished = _served(server, plan, asked, port, stopping, commands)
     if finished is None:
-        raise Interrupted(f"stopped; every answer is in {asked.out}: the same command goes on")
+        raise Interrupted(f"stopped; every answer is in {asked.out}: repeat the same command to continue")
     out.print(f"done: {finished.line}\nnext: {finished.following}")
 
 
 def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
-    """What people are asked about where neither a policy is named nor anything else is said."""
+    """Return the default questions where no policy is named."""
     return PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
 
 
 def _reads_evidence(arguments: list[str]) -> bool:
-    """Is calibration asked for? Raises UserError for a kind that is not known."""
+    """Whether calibration is asked for. Raises UserError for an unknown kind."""
     name, _ = taken(arguments, "--guidance", ", ".join(kind.name for kind in guidances.kinds()))
     return name is not None and guidances.resolve(name).by_evidence
 
 
-def planned(
+def make_plan(
     task: Task, config: RunConfig, asked: Label[Any], named: str | None, source: PolicySource | None = None
 ) -> Plan:
-    """What is asked for. Raises UserError for what makes no sense."""
+    """Return the plan of the session. Raises UserError for an invalid request."""
     merged = dataclasses.replace(
         config,
         task=asked.task,
@@ -179,10 +181,10 @@ def planned(
     if not asked.who.strip():
         raise UserError("--who is empty: give a name, or leave it out")
     if merged.sizes.candidates > 1:
-        raise UserError("--sizes.candidates is above 1, but a page asks in situations as they come: leave it out")
+        raise UserError("--sizes.candidates is above 1, but the page takes situations as they come: leave it out")
     robot, task = _robot(task, asked.robot), task.on(asked.robot)
     if task.pictures(UNDRAWN).sketch is None:
-        raise UserError(f"{task.name} has no sketch of a situation to label by: {UNDRAWN}")
+        raise UserError(f"{task.name} has no sketch of a situation: {UNDRAWN}")
     env = shape_of(task, asked.task)
     space = actions_of(env)
     if asked.bound_deg is not None and not 0 < asked.bound_deg <= space.reach:
@@ -210,7 +212,7 @@ def planned(
 
 
 def _check_evidence(asked: Label[Any], named: str | None) -> None:
-    """Raises UserError for what calibration cannot ask about, or has no use for."""
+    """Raise UserError for options that calibration does not use."""
     if named is None or asked.again is not None:
         raise UserError("calibration asks about a policy: name one after the task, and leave out --again")
     scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(asked.scalars))
@@ -218,31 +220,31 @@ def _check_evidence(asked: Label[Any], named: str | None) -> None:
 
 
 def _family(asked: Label[Any], env: Any) -> Family:
-    """What may have changed. Raises UserError for changes that make no sense."""
+    """Return what may have changed. Raises UserError for invalid changes."""
     return declared_distortions(env) if asked.changes is None else changes.family_of(changes.load(asked.changes), env)
 
 
 def _robot(task: Task, name: str | None) -> str:
-    """How a file names the robot; empty: it is the task's own. Raises UserError if there is no such robot."""
+    """Return the robot's name in label files; empty for the default robot. Raises UserError for an unknown robot."""
     body = task.on(name).bodies[0]
     return "" if body.name == task.bodies[0].name else f"{body.name} {body.digest}".strip()
 
 
 def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
-    """The questions of another page's file. Raises UserError if there are none, or they are of another world."""
+    """Return a plan with the questions of another page's file. Raises UserError if they are not of this world."""
     assert asked.again is not None
     file = label_files.read(asked.again)
     if file.session is None or file.people is None:
-        raise UserError(f"{asked.again} is no page's own file: its questions cannot be asked again")
+        raise UserError(f"{asked.again} was not written by the labelling page: its questions cannot be asked again")
     if named is not None or asked.seed or asked.bound_deg is not None:
-        raise UserError("--again asks what another page asked: leave out the policy, --seed and --bound-deg")
+        raise UserError("--again repeats another page's questions: leave out the policy, --seed and --bound-deg")
     for name, value in plan.world.items():
         if file.task.get(name) != value:
             raise UserError(f"{asked.again} asked in a world with another {name} ({file.task.get(name)}, not {value})")
     if (other := file.session.get("robot", "")) != plan.robot:
         raise UserError(f"{asked.again} asked about {other or 'its own robot'}: give the same --robot")
     found = label_files.found_in(asked.again)
-    assert found is not None  # it was read
+    assert found is not None  # the file was read above
     actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(found)}
     again = tuple(actions[number] for number in sorted(actions))
     base = dataclasses.replace(plan.base, name=f"{file.session['base']} {file.session['base_digest']}".strip())
@@ -252,9 +254,9 @@ def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
 
 
 def _source(task: Task, named: str | None, changed: str | None) -> PolicySource | None:
-    """The folder that holds the policy; None: it is chance, or code. Raises UserError if it is of another task.
+    """Return the folder that holds the policy; None for uniform actions or code. Raises UserError for another task.
 
-    `changed`: code of the distortions that it corrects, if any.
+    `changed`: code of the distortions that the policy corrects, if any.
     """
     if named is None or is_code(named):
         return None
@@ -269,20 +271,20 @@ def _source(task: Task, named: str | None, changed: str | None) -> PolicySource 
 
 
 def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource | None, env: Any) -> Base:
-    """The policy that is asked about. Raises UserError if it cannot be had, or sees something else."""
+    """Return the policy to ask about. Raises UserError if it is not available, or needs other observations."""
     lane = asked.base
     if named is not None and asked.questions != UNIFORM:
-        raise UserError(f"--questions is {asked.questions}, but {named} is what is asked about: leave out one of them")
+        raise UserError(f"--questions is {asked.questions}, but the questions are about {named}: leave out one of them")
     if source is None:
         if lane != Lane():
-            raise UserError("--base.… chooses in a folder, and none is given: leave it out")
+            raise UserError("--base.… chooses a folder's lane, but no folder is given: leave it out")
         if named is not None:
             return Base(in_space(code_of(named), actions_of(env)), named)
         if asked.questions == UNIFORM:
             return Base(uniform_in(env), UNIFORM)
         if asked.questions == PROPOSED:
             if task.proposed is None:
-                raise UserError(f"--questions is {PROPOSED}, but {task.name} is no recording: give {UNIFORM}")
+                raise UserError(f"--questions is {PROPOSED}, but {task.name} is not a recording: give {UNIFORM}")
             return Base(task.proposed(task.environment(asked.task)), PROPOSED)
         if not offers(env, "aims"):
             raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
@@ -295,12 +297,12 @@ def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource
 
 
 def _part(kind: type, values: Any) -> Any:
-    """The fields of a part of a configuration."""
+    """Return one part of a configuration with the fields of `values`."""
     return kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
 
 
 def _server() -> Any:
-    """The module that serves a page. Raises UserError if the packages that it needs are not installed."""
+    """Import the module that serves a page. Raises UserError if its packages are not installed."""
     try:
         from cuelearner_jax.labelling import server
     except ImportError as error:
@@ -308,7 +310,7 @@ def _server() -> Any:
             f"the page needs packages that are not installed ({error.name}): run `make setup`, or "
             "pip install -c constraints.txt -e '.[label]' in the project's folder"
         ) from error
-    # Before JAX starts: what a thread asks for is computed by that thread, at its own priority (`learner`).
+    # Set before JAX starts: each thread's computations run in that thread, at its priority (`learner`).
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     return server
 
@@ -334,9 +336,9 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
 
 
 def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: str | None, labels: int) -> str:
-    """The command that uses so many labels: `train` for labels of chance, `adapt` for those about a policy.
+    """Return the command that uses the labels: `train` for labels of uniform actions, `adapt` for a policy's.
 
-    `asked` are the options of `cuelearner label` as they were used, `config` the preset's configuration.
+    `asked`: the options of `cuelearner label` as used. `config`: the preset's configuration.
     """
     name, out = typed_name(task), str(asked.out)
     if asked.again is not None:
@@ -359,7 +361,7 @@ def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: s
 
 
 def _differing(part: str, kind: type, before: Any, now: Any) -> list[str]:
-    """The options that make one part of a configuration another."""
+    """Return the options that turn one part of a configuration into another."""
     words = []
     for entry in dataclasses.fields(kind):
         value, option = getattr(now, entry.name), entry.name.replace("_", "-")

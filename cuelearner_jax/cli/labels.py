@@ -34,22 +34,22 @@ Files = Annotated[tuple[Path, ...], tyro.conf.Positional]
 
 @dataclass(frozen=True)
 class Inspect:
-    """What label files hold: counts, pace, who agrees with whom."""
+    """Summarise label files: counts, pace, agreement."""
 
     files: Files
-    """Label files, or folders of a page's; of two, how well they agree on the questions that both answered."""
+    """Label files, or folders of label files. Two files are also compared on the questions that both answered."""
     teacher: Flag[bool] = False
-    """Also ask the task's teacher about a page's questions (takes a while: situations are lived through anew)."""
+    """Also ask the task's teacher a page's questions (takes a while, since all situations are replayed)."""
 
 
 @dataclass(frozen=True)
 class Merge:
-    """One file of several people's labels, or of several sittings'."""
+    """Merge the labels of several people or sittings into one file."""
 
     files: Files
-    """Label files of one world, or folders of a page's."""
+    """Label files of one world, or folders of label files."""
     out: Path | None = None
-    """The new file, .parquet; one that is there is not replaced."""
+    """New file, .parquet; an existing file is not replaced."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class LabelsExport:
     """Labels as a table: a row a label; in CSV a column a number, in Parquet lists."""
 
     files: Files
-    """One label file, or a folder of a page's."""
+    """One label file, or the folder of one."""
     out: Path | None = None
-    """The new file, .csv or .parquet; one that is there is not replaced."""
+    """New file, .csv or .parquet; an existing file is not replaced."""
 
 
 OPTIONS = {"labels inspect": Inspect, "labels merge": Merge, "labels export": LabelsExport}
@@ -67,7 +67,7 @@ KINDS = {name.split()[1]: kind for name, kind in OPTIONS.items()}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs one of the commands. Raises UserError for files that are none or do not fit together."""
+    """Run one of the commands. Raises UserError for invalid files, or files that do not fit together."""
     if not arguments or arguments[0] in HELP:
         print("usage: cuelearner labels inspect|merge|export FILE ... [OPTIONS]\n")
         for name, kind in KINDS.items():
@@ -90,7 +90,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _inspect(asked: Inspect) -> None:
-    files = [comparing.checked(path) for path in asked.files]
+    files = [comparing.read_checked(path) for path in asked.files]
     table = Table("", *(one_line(str(path)) for path in asked.files))
     told = [_told(path, file, asked.teacher) for path, file in zip(asked.files, files, strict=True)]
     for name in dict.fromkeys(name for one in told for name in one):
@@ -101,7 +101,7 @@ def _inspect(asked: Inspect) -> None:
 
 
 def _told(path: Path, file: LabelFile, teacher: bool) -> dict[str, str]:
-    """What is known of a file, by name."""
+    """Return the facts about a label file, by name."""
     world = ", ".join(f"{name} {value}" for name, value in file.task.items() if name not in ("name", "from"))
     strength = "" if file.eps is None else f", by {file.eps:g} {file.space.unit}"
     facts = {"task": f"{file.task.get('name')} ({world})", "answers": f"{file.answers}{strength}"}
@@ -154,7 +154,7 @@ def _shape(file: LabelFile) -> Any:
 def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
     task = _task(file)
     found = label_files.found_in(path)
-    assert found is not None  # it was read
+    assert found is not None  # the file was read above
     presets = [preset.config.scalars for preset in task.presets.values()]
     scalars, rows = presets[0] if presets else Scalars(), label_files.history(found)
     return comparing.with_teacher(task, file, rows, scalars, lambda words: console.print(f"{words} ..."))
@@ -165,21 +165,21 @@ def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
 
 def _merge(asked: Merge) -> None:
     if asked.out is None or asked.out.suffix != ".parquet":
-        raise UserError("give --out a name that ends in .parquet")
-    file, left_out = comparing.merged([comparing.checked(path) for path in asked.files])
+        raise UserError("merge needs --out: give it a name that ends in .parquet")
+    file, left_out = comparing.merge([comparing.read_checked(path) for path in asked.files])
     sources = [f"{path.name} {label_files.digest(path)}" for path in asked.files]
     label_files.write_file(asked.out, file, merged_from=sources)
-    twice = f"; {left_out} that an earlier file holds already were left out" if left_out else ""
+    twice = f"; {left_out} duplicates of an earlier file's labels were left out" if left_out else ""
     out.print(f"wrote {len(file.seeds)} labels of {len(asked.files)} files to {asked.out}{twice}")
 
 
 def _export(asked: LabelsExport) -> None:
     if len(asked.files) != 1:
-        raise UserError("export takes one label file: merge several first")
+        raise UserError("export takes one label file: first join several by `cuelearner labels merge`")
     place = asked.out
     if place is None or place.suffix not in (".csv", ".parquet"):
-        raise UserError("give --out a name that ends in .csv or .parquet")
-    file = comparing.checked(asked.files[0])
+        raise UserError("export needs --out: give it a name that ends in .csv or .parquet")
+    file = comparing.read_checked(asked.files[0])
     if place.suffix == ".parquet":
         label_files.write_file(place, file)
     else:
@@ -192,7 +192,7 @@ def _export(asked: LabelsExport) -> None:
 
 
 def _flat(file: LabelFile) -> dict[str, list[Any]]:
-    """Columns of plain numbers and words."""
+    """Return the labels as columns of plain numbers and words."""
     columns: dict[str, list[Any]] = {"seed": file.seeds.tolist()}
     if file.people is not None:
         columns |= {name: getattr(file.people, name).tolist() for name in file.people._fields}

@@ -1,4 +1,4 @@
-"""Reading the command line: the task, preset or run named first, then options as a dataclass; refusals in one line."""
+"""Parse the command line: first a task, preset or run, then options as a dataclass; errors in one line."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class _Output(Console):
     """Standard output."""
 
     def on_broken_pipe(self) -> None:
-        """Raises BrokenPipeError: nobody reads what the command was to tell."""
+        """Raise BrokenPipeError: the reader of the output has gone."""
         raise BrokenPipeError
 
 
@@ -51,7 +51,7 @@ out = _Output(**PLAIN)
 
 
 def summary(kind: type) -> str:
-    """What a command does, in one line: the beginning of its options' docstring."""
+    """Return one line about a command: the beginning of its options' docstring."""
     return " ".join(inspect.cleandoc(kind.__doc__ or "").split("\n\n")[0].split())
 
 
@@ -101,14 +101,14 @@ def parse(
 
 
 def _moved(told: str, options: Any) -> str:
-    """Where an option of an unknown group is that another group has, as the end of a message."""
+    """Return a hint at groups that have an option of an unknown group, as the end of a message."""
     unknown = re.search(r"Unrecognized options: --[a-z_-]+\.([a-z0-9-]+)", told)
     there = [name for name in _options(options) if unknown and name.endswith(f".{unknown[1]}")]
     return f"; give --{' or --'.join(there)}" if there else ""
 
 
 def _options(group: Any, prefix: str = "") -> list[str]:
-    """The full names of options in groups."""
+    """Return the full names of the options in groups."""
     found = []
     for entry in dataclasses.fields(group):
         value, name = getattr(group, entry.name, None), entry.name.replace("_", "-")
@@ -164,14 +164,14 @@ def _names(kind: Any) -> set[str]:
 
 
 def check_numbers(asked: Any, **bounds: tuple[int, int]) -> None:
-    """Raises UserError for the first option, by its field, that is not within its bounds (least, most)."""
+    """Raise UserError for the first option, by its field, that is outside its bounds (least, most)."""
     for name, (least, most) in bounds.items():
         if not least <= (value := getattr(asked, name)) <= most:
             raise UserError(f"--{name} is {value}: give a number from {least} to {most:,}")
 
 
 def _check_given(arguments: list[str]) -> None:
-    """Raises UserError for an option that is given an empty value, as an unset variable of the shell makes it."""
+    """Raise UserError for an option with an empty value, as an unset shell variable gives it."""
     for before, argument in zip(["", *arguments], arguments, strict=False):
         option, equals, value = argument.partition("=")
         if argument == "" or (equals and option.startswith("--") and not value):
@@ -180,7 +180,7 @@ def _check_given(arguments: list[str]) -> None:
 
 
 def check_out(place: Path, folder: bool = True) -> None:
-    """Raises UserError unless a folder (or else a file) is at a place or can be made there; nothing is left there."""
+    """Raise UserError unless a folder (or a file) exists or can be made at a path; leave nothing there."""
     place = Path(os.path.normpath(place.absolute()))
     for there in (place, *place.parents):
         try:
@@ -201,7 +201,7 @@ def check_out(place: Path, folder: bool = True) -> None:
 
 
 def _try_folder(there: Path) -> None:
-    """Raises UserError unless something can be made in a folder, which permissions alone do not tell."""
+    """Raise UserError unless something can be made in a folder, which permissions alone do not tell."""
     try:
         os.rmdir(tempfile.mkdtemp(prefix=".cuelearner-", dir=there))
     except OSError as error:
@@ -210,7 +210,7 @@ def _try_folder(there: Path) -> None:
 
 
 def taken(arguments: list[str], option: str, choices: str) -> tuple[str | None, list[str]]:
-    """The value of an option (None: not given) and the other arguments. Raises UserError unless it is given once."""
+    """Return an option's value (None: not given) and the other arguments. Raises UserError if it is given twice."""
     places = [i for i, argument in enumerate(arguments) if argument == option or argument.startswith(f"{option}=")]
     if not places:
         return None, list(arguments)
@@ -225,7 +225,7 @@ def taken(arguments: list[str], option: str, choices: str) -> tuple[str | None, 
 
 
 def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[str]]:
-    """The task named first, or by --task or --env, and the other arguments. Raises UserError if it cannot be had.
+    """Return the task named first, or by --task or --env, and the other arguments. Raises UserError if unavailable.
 
     --teacher makes code its teacher.
     """
@@ -242,7 +242,7 @@ def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[
 
 
 def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[str, Preset, list[str]]:
-    """The preset (if none is given, `default` or the first) and other arguments. Raises UserError for a wrong one."""
+    """Return the preset (default: `default` or the first) and the other arguments. Raises UserError if unknown."""
     if not task.presets and task.name in registry.FAMILIES:
         raise UserError(f"{task.name} is a family of tasks: name one of its environments, as {task.name}:NAME")
     if not task.presets:
@@ -255,14 +255,13 @@ def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[s
 
 
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
-    """The run folder, policy folder or task named first, and the other arguments.
+    """Return the run folder, policy folder or task named first, and the other arguments.
 
-    --task, or --env, makes a task from outside known, and an environment of a library the world of a folder;
-    --teacher makes code its teacher; --agent and --arbiter make those of a run known, --base and --changes the code in
-    a policy.
+    --task, or --env, makes an outside task known, and a library's environment the world of a folder. --teacher makes
+    code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code.
 
     Raises:
-        UserError: there is no such folder or task, or it cannot be had.
+        UserError: the folder or task does not exist or is not available.
     """
     given, rest = _task_option(arguments)
     teacher, rest = taken(rest, "--teacher", "package.module:NAME")
@@ -304,7 +303,7 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
 
 
 def world_of(source: PolicySource, arguments: list[str]) -> Any:
-    """The source's world, changed as --scenario says; options on top of it are read from the same arguments later.
+    """Return the source's world, changed by --scenario; options on top are parsed from the same arguments later.
 
     Raises:
         UserError: there is no such scenario.
@@ -314,7 +313,7 @@ def world_of(source: PolicySource, arguments: list[str]) -> Any:
 
 
 def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:
-    """The text above a command's options: what it does, and what there is to choose from."""
+    """Return the text above a command's options: its purpose, and the available choices."""
     groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.kinds()}}
     if policies:
         trained = {name: named.about for name, named in POLICIES.items() if named.trained}
@@ -338,7 +337,7 @@ def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
 
 
 def _taught(task: Task, reference: str | None) -> Task:
-    """The task with the teacher that `package.module:NAME` leads to: a teacher, or what acts as a policy.
+    """Return the task with the teacher that `package.module:NAME` leads to: a teacher, or a policy used as one.
 
     Raises UserError if there is none.
     """
@@ -356,14 +355,14 @@ def is_code(named: str) -> bool:
 
 
 def code_of(reference: str) -> Any:
-    """The policy that `package.module:NAME` or a file in ONNX is. Raises UserError if there is none (`policy_of`)."""
+    """Return the policy of `package.module:NAME` or of a file in ONNX. Raises UserError if there is none."""
     return policy_of(reference if reference.endswith(ONNX) else plugins.load(reference, object, "a policy"))
 
 
 def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> PolicySource:
-    """A run or policy folder; of a family of tasks in the environment that is named beside it.
+    """Open a run or policy folder, for a family of tasks in the environment named beside it.
 
-    Raises UserError if it is none, of another task than the one named beside it, or of other observations or actions.
+    Raises UserError for another kind of folder, another task than named, or other observations or actions.
     """
     source = PolicySource.of_folder(folder, registry.find, code, changed)
     if known is not None and known.name != source.task.name:
@@ -396,7 +395,7 @@ def _tasks() -> str:
 
 
 def _choices(task: Task, preset: str = PAPER) -> str:
-    """A task's presets, changed worlds and other bodies, a line each; `preset`: which holds where none is given."""
+    """Return a task's presets, changed worlds and robots, one line each; `preset`: the default preset."""
     scenarios = {name: f"{one.about} ({_as_options(one.changes)})" for name, one in task.scenarios.items()}
     bodies = {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {}
     presets = {name: f"{one.about}{f' ({one.takes})' if one.takes else ''}" for name, one in task.presets.items()}
@@ -411,7 +410,7 @@ def _choices(task: Task, preset: str = PAPER) -> str:
 
 
 def _as_options(changes: dict[str, Any]) -> str:
-    """Fields of a configuration as they are typed."""
+    """Return fields of a configuration as command-line options."""
     typed = {name: value if isinstance(value, tuple) else (value,) for name, value in changes.items()}
     return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in typed.items())
 

@@ -14,36 +14,36 @@ from cuelearner_jax.runs import filming
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Lane, Generic[TaskT]):
-    """A still and a film of a policy at work, or the picture of a question."""
+    """Draw a still and a film of a policy at work, or the picture of a question."""
 
     task: TaskT
     out: Path = Path("pictures")
-    """Folder for the pictures; films and stills of the same name are not overwritten."""
+    """Folder for the pictures. Existing files are not replaced without --overwrite."""
     steps: int = 4
-    """Steps to film; a new episode follows the end of one."""
+    """Number of steps to film, over several episodes if needed."""
     episode: int = 0
-    """Which random start."""
+    """Number of the episode to begin with, which sets its random start."""
     robot: str | None = None
     """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
     scenario: str | None = None
     """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     question: Flag[bool] = False
-    """Instead: the situation that the episode begins with and the policy's action, as a person is asked about it."""
+    """Draw only the episode's first situation with the policy's action, as the labelling page shows it."""
     film: str = "gif"
-    """gif or mp4."""
+    """Format of the film: gif or mp4."""
     overwrite: Flag[bool] = False
-    """Replace pictures of the same name."""
+    """Replace existing pictures of the same name."""
 
 
-MOST_STEPS = 100_000  # a frame each
-MOST_EPISODE = 2**32 - 1  # is folded into a key
+MOST_STEPS = 100_000  # one frame each
+MOST_EPISODE = 2**32 - 1  # the episode's number is folded into a 32-bit key
 
 OPTIONS = {"render": Render}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises UserError for what cannot be drawn."""
+    """Run the command. Raises UserError for what cannot be drawn."""
     source, asked = asked_of_source(arguments, "render", Render)
     pictures, policy_name = source.task.pictures(), asked.name_in(source, asked.task)
     check_numbers(asked, steps=(1, MOST_STEPS), episode=(0, MOST_EPISODE))

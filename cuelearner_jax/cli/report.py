@@ -15,31 +15,31 @@ from cuelearner_jax.errors import UserError
 
 @dataclass(frozen=True)
 class Report:
-    """Curves and tables with intervals from recorded results."""
+    """Write curves and tables with intervals from recorded results."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders, or folders above them."""
+    """Run folders, or folders that contain run folders."""
     out: Path
     """Folder for the report."""
     metric: str = "reward"
-    """Column of the results."""
+    """Column of the results to report."""
     split: str = "validation"
-    """Episodes of the results: validation, or tuning."""
+    """Evaluation episodes to report: validation or tuning."""
     lower_is_better: Flag[bool] = False
-    """Small values of the metric are good ones, as of collisions."""
+    """Smaller values of the metric are better, as for collisions."""
     by_run: Flag[bool] = False
-    """Tell the folders apart by their names, as runs of different configurations: each is compared with its own
-    unguided agents, or, where it has none, with those of the first folder that has."""
+    """Report each folder separately, under its name, for runs of different configurations. Each is compared with its
+    own unguided agents or, without any, with those of the first folder that has some."""
     overwrite: Flag[bool] = False
-    """Replace an earlier report."""
+    """Replace an existing report."""
 
 
 OPTIONS = {"report": Report}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises UserError for what cannot be reported."""
-    # It loads what draws, which other commands need not wait for.
+    """Run the command. Raises UserError for what cannot be reported."""
+    # The import loads Matplotlib, which no other command needs.
     from cuelearner_jax.report.document import report
 
     asked = parse(Report, arguments, "report")

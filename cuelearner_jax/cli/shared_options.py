@@ -1,4 +1,4 @@
-"""What several commands share of their options: a field is an option, the text below it its help."""
+"""Options that several commands share; a field is an option, and its docstring the option's help."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ Flag = tyro.conf.FlagCreatePairsOff
 
 @dataclass(frozen=True, kw_only=True)
 class Lane:
-    """Which policy of a folder, and which of its lanes."""
+    """Choice of a folder's policy, and of its lane."""
 
     policy: str | None = None
-    """Who acts, as for evaluate (default: the agent, or the adapted policy)."""
+    """Name of the acting policy, as for evaluate (default: the agent, or the adapted policy)."""
     guidance: str | None = None
     """Kind of guidance of the lane (default: the run's last)."""
     labels: int | None = None
@@ -47,12 +47,12 @@ class Lane:
 
     @property
     def chosen(self) -> dict[str, Any]:
-        """What was given of the lane, by the names of the options."""
+        """Return the options that were given to choose a lane, by name."""
         lane = {"guidance": self.guidance, "labels": self.labels, "seed": self.seed, "bound-deg": self.bound_deg}
         return {name: value for name, value in lane.items() if value is not None}
 
     def name_in(self, source: PolicySource, world: Any) -> str:
-        """Return the policy's name. Raises UserError if the source has none of that name, or none for that world."""
+        """Return the policy's name. Raises UserError if the source has no such policy, or none for that world."""
         name = self.policy or source.default_policy
         source.check(name, world, **self.chosen)
         return name
@@ -64,10 +64,10 @@ class Lane:
 
 
 def asked_of_source(arguments: list[str], command: str, kind: Any, more: str = "") -> tuple[PolicySource, Any]:
-    """Return where policies come from, with the robot that is asked for, and the options of a command.
+    """Return the policies' source, with the chosen robot, and the options of a command.
 
-    `kind` is generic in the task's configuration; `more` is text below the help's. Raises UserError for what there is
-    not.
+    `kind` is generic in the task's configuration. `more` is added to the help's text. Raises UserError for choices that
+    do not exist.
     """
     source, rest = source_of(arguments, command, kind)
     default = kind[source.task.config](task=world_of(source, rest), policy=source.default_policy)
@@ -79,24 +79,25 @@ def asked_of_source(arguments: list[str], command: str, kind: Any, more: str = "
 
 @dataclass(frozen=True)
 class Training(Generic[RunT]):
-    """What train and sweep share."""
+    """Options that train and sweep share."""
 
     run: Annotated[RunT, tyro.conf.arg(name="")]  # a RunConfig
     out: Path
     """Folder for results and checkpoints."""
     resume: Flag[bool] = False
-    """Go on with an interrupted run."""
+    """Continue an interrupted run."""
     overwrite: Flag[bool] = False
-    """Delete what an earlier run left in the folder."""
+    """Delete an earlier run in the folder."""
     labels_from: Path | None = None
-    """Use the labels of this file instead of asking the teacher."""
+    """Label file to use instead of asking the teacher."""
     tuning: Flag[bool] = False
-    """Evaluate on episodes set aside for choosing settings, not on those of reported figures."""
+    """Evaluate on the tuning episodes, which are for choosing settings, not on the validation episodes."""
     track: str | None = None
-    """Also write curves, means over seeds, for tensorboard or wandb (offline), below the run's folder."""
+    """Tracker that also gets the curves, as means over seeds: tensorboard or wandb (offline), below the run's
+    folder."""
 
     def order(self, task: Task, grid: Grid, shard: Shard | None = None) -> Order:
-        """What is asked for, of a task and a grid."""
+        """Return the order to train a grid of a task."""
         return Order(
             task,
             as_kept(self.run),
@@ -112,16 +113,16 @@ class Training(Generic[RunT]):
 
     @property
     def done(self) -> str:
-        """What is told at the end."""
-        return f"done: {self.out} (see it with: cuelearner report {self.out} --out {self.out}/report)"
+        """The line printed at the end."""
+        return f"done: {self.out} (show it by: cuelearner report {self.out} --out {self.out}/report)"
 
 
 def asked_of_preset(
     arguments: list[str], command: str, kind: Any, options: Callable[[Grid], dict[str, Any]]
 ) -> tuple[Task, Any]:
-    """Return the task and the options of a command that trains. Raises UserError for what there is not.
+    """Return the task and the options of a training command. Raises UserError for choices that do not exist.
 
-    `kind` is generic in the run's configuration; `options` are of what the preset compares, where none are typed.
+    `kind` is generic in the run's configuration. `options` returns defaults from what the preset compares.
     """
     task, rest = task_of(arguments, command, kind)
     name, preset, rest = preset_of(task, rest)
@@ -147,15 +148,15 @@ def subject_of(source: PolicySource) -> Subject:
 
 
 def as_kept(run: RunConfig) -> RunConfig:
-    """A configuration of the command line with its options of kinds by name."""
+    """Return the command line's configuration with its options of kinds as a dictionary by name."""
     return replace(run, kinds=vars(run.kinds))
 
 
 def parts_of(config: RunConfig, arguments: list[str], kinds: tuple[str, ...]) -> tuple[RunConfig, Any, list[str]]:
-    """A preset's configuration with the agent, the arbiter and the options of kinds that are asked for.
+    """Return a preset's configuration with the chosen agent, arbiter and options of kinds.
 
-    Returns the configuration, its `kinds` a dataclass; its type, of which tyro makes options; the other arguments.
-    Raises UserError for a part that cannot be had.
+    Also returns its type, from which tyro makes options, and the other arguments. The configuration's `kinds` is a
+    dataclass. Raises UserError for a part that is not available.
     """
     for name, known in PARTS.items():
         asked, arguments = taken(arguments, f"--{name}", ", ".join(kind.NAME for kind in known.known))
@@ -169,17 +170,17 @@ def parts_of(config: RunConfig, arguments: list[str], kinds: tuple[str, ...]) ->
     return config, RunConfig[types], arguments  # pyright: ignore[reportInvalidTypeArguments]
 
 
-unprefixed = tyro.conf.arg(name="")  # options of kinds are `--KIND.…`
+unprefixed = tyro.conf.arg(name="")  # options of kinds are named `--KIND.…`
 
 
 def kinds_type(options: Mapping[str, Any]) -> type:
-    """The type whose fields are options of kinds, by their names; these are its defaults."""
+    """Make the dataclass with one field per kind of guidance, with the given options as defaults."""
     fields = [(name, type(own), field(default=own)) for name, own in options.items()]
     return make_dataclass("Kinds", fields, frozen=True)
 
 
 def named_kinds(arguments: list[str]) -> tuple[str, ...]:
-    """The values of --guidance, as they are typed."""
+    """Return the values of --guidance as typed."""
     for place, argument in enumerate(arguments):
         if argument.startswith("--guidance="):
             return (argument.partition("=")[2],)
@@ -189,6 +190,6 @@ def named_kinds(arguments: list[str]) -> tuple[str, ...]:
 
 
 def asking_kind(kinds: tuple[str, ...]) -> str:
-    """The first of the kinds that asks a teacher, or else the first."""
+    """Return the first of the kinds that asks a teacher, or else the first."""
     asking = [kind for kind in kinds if guidances.resolve(kind).asks]
     return (asking or list(kinds))[0]

@@ -1,4 +1,4 @@
-"""A folder of recorded situations in the place of a task, and cues in words, on the command line."""
+"""On the command line: a folder of recorded situations in place of a task, and cues in words."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ WORDS = 'words such as "left,right;up,down"'
 
 
 def task_named(arguments: list[str], command: str, kind: type) -> tuple[Task, list[str]]:
-    """The task named first, or that of a folder of situations, and the other arguments.
+    """Return the task named first, or the task of a folder of situations, and the other arguments.
 
-    Raises UserError if it cannot be had.
+    Raises UserError if it is not available.
     """
     folder = arguments[0].removeprefix("logs:") if arguments else ""
     recorded = folder and folder not in registry.names() and (Path(folder).exists() or folder != arguments[0])
@@ -38,7 +38,7 @@ def task_named(arguments: list[str], command: str, kind: type) -> tuple[Task, li
 
 
 def _numbers(arguments: list[str], option: str) -> list[float] | None:
-    """The numbers behind an option; None: it is not given. Raises UserError for what is no number."""
+    """Return the numbers after an option; None if it is not given. Raises UserError for other values."""
     if option not in arguments:
         return None
     behind = arguments[arguments.index(option) + 1 :]
@@ -50,11 +50,11 @@ def _numbers(arguments: list[str], option: str) -> list[float] | None:
 
 
 def with_cues(task: Task, config: Any, cues: str) -> Any:
-    """The configuration of a task with other words for its cues. Raises UserError for a task whose cues are its own."""
+    """Return a task's configuration with other words for its cues. Raises UserError if the cues are the task's own."""
     fields = {entry.name for entry in dataclasses.fields(config)}
     if not {"cues", "cue_names"} <= fields:
         raise UserError(f"--cues names cues, and {task.name} has its own: leave it out")
-    own = {"keys": ()} if "keys" in fields else {}  # of the words that go
+    own = {"keys": ()} if "keys" in fields else {}  # the recorded keys belong to the replaced words
     found = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in cues_from(cues)), **own)
-    shape_of(task, found)  # tells of cues that do not fit
+    shape_of(task, found)  # reports cues that do not fit
     return found

@@ -10,7 +10,7 @@ from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset
 from cuelearner_jax.runs import cluster
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
-from cuelearner_jax.runs.order import Plan, planned
+from cuelearner_jax.runs.order import Plan, make_plan
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.studies import train
 
@@ -22,19 +22,19 @@ class Sweep(Training[RunT], Generic[RunT]):
     guidance: tuple[str, ...] = ()
     """Kinds of guidance."""
     labels: tuple[int, ...] = (500,)
-    """Label budgets; guidance without labels runs once a seed."""
+    """Label budgets; guidance without labels runs once per seed."""
     seeds: int = 5
     """Number of seeds."""
     first_seed: int = 0
-    """The first seed; the others follow."""
+    """First seed; the others count up from it."""
     shard: str | None = None
-    """Only piece i of n, as i/n: its share of the seeds, in a folder of its own below --out. Goes on by itself where it
-    was interrupted."""
+    """Run only shard i of n, given as i/n: its share of the seeds, in a folder of its own below --out. An interrupted
+    shard is continued."""
     cluster: Literal["slurm"] | None = None
-    """Submit the sweep to Slurm as a job array, one job a piece, and return. The same command again goes on with the
-    pieces that are not finished. Needs submitit."""
+    """Submit the sweep to Slurm as a job array with one job per shard, and return. Repeat the command to continue
+    shards that are not finished. Needs submitit."""
     shards: int | None = None
-    """With --cluster: number of pieces, and so of jobs."""
+    """With --cluster: number of shards, each of which is one job."""
     job: Job = field(default_factory=Job)
 
 
@@ -42,14 +42,14 @@ OPTIONS = {"sweep": Sweep}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises what `studies.train.run` and `cluster.submit` raise."""
+    """Run the command. Raises what `studies.train.run` and `cluster.submit` raise."""
     task, asked = asked_of_preset(arguments, "sweep", Sweep, _options)
     grid = Grid(asked.guidance, seeds_of(asked.first_seed, asked.seeds), asked.labels)
     cluster.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
     if asked.cluster:
 
         def plan(shard: Shard) -> Plan:
-            return planned(asked.order(task, grid, shard))
+            return make_plan(asked.order(task, grid, shard))
 
         assert asked.shards  # `cluster.check`
         cluster.submit(asked.shards, asked.job, asked.out, arguments, plan, out.print)
@@ -60,6 +60,6 @@ def run(arguments: list[str]) -> None:
 
 
 def _options(grid: Grid) -> dict[str, Any]:
-    """The options of what a preset compares."""
+    """Return the options of what a preset compares."""
     seeds = {"seeds": len(grid.seeds), "first_seed": grid.seeds[0]}
     return {"guidance": grid.guidance, "labels": grid.labels, **seeds}

@@ -18,16 +18,16 @@ class Train(Training[RunT], Generic[RunT]):
     guidance: str = ""
     """Kind of guidance."""
     labels: int = 500
-    """Labels that the teacher is asked for."""
+    """Number of labels to ask the teacher for."""
     seed: int = 0
-    """Seed."""
+    """Seed of the run."""
 
 
 OPTIONS = {"train": Train}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises what `studies.train.run` raises."""
+    """Run the command. Raises what `studies.train.run` raises."""
     task, asked = asked_of_preset(
         arguments,
         "train",

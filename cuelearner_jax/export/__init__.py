@@ -1,4 +1,4 @@
-"""A policy as a file that a robot can use: the whole decision, and a contract that says what goes in and comes out.
+"""Export a policy's decision as files for a robot, with a contract that specifies inputs and outputs.
 
-`runner` needs nothing but NumPy and lies beside every exported decision; the other modules write what it reads.
+`runner` needs only NumPy and is copied beside every exported decision; the other modules write what it reads.
 """

@@ -1,8 +1,8 @@
-"""Writes a decision's folder: the decision, its contract, golden cases, and the file that runs it.
+"""Write an exported decision's folder.
 
-contract.json    what goes in and what comes out, with units; versions; digests of the other files and of itself
+contract.json    inputs and outputs with units; versions; digests of the other files and of the contract itself
 decision.*       the decision
-golden.npz       observations (cases, obs) and the actions (cases, action) that JAX decided on
+golden.npz       observations (cases, obs) and the actions (cases, action) that JAX computed for them
 decide.py        runs the decision: `runner`, with `operations` in place of their import
 """
 
@@ -26,7 +26,7 @@ from cuelearner_jax.environment import Quantity, action_of, actions_of
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.export import operations, runner
 from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
-from cuelearner_jax.export.formats import FORMATS, traced
+from cuelearner_jax.export.formats import FORMATS, trace_policy
 from cuelearner_jax.policies import Policy, describe
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
@@ -40,7 +40,7 @@ ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise
 
 
 def check_request(format: str, out: Path) -> None:
-    """Raises UserError unless a decision of that format can be written to a folder."""
+    """Raise UserError unless a decision in that format can be written to a folder."""
     if format not in FORMATS:
         raise UserError(f"unknown format {format!r}{suggestion(format, FORMATS)}")
     _check_free(out)
@@ -59,19 +59,20 @@ def write(
     out: Path,
     source: dict[str, Any],
 ) -> dict[str, Any]:
-    """Writes a policy's decision and replays its golden cases; the folder is there as a whole or not at all.
+    """Write a policy's decision and replay its golden cases; the folder appears completely or not at all.
 
-    `drawn` gives observations of the environment, among which golden cases are chosen; `source` is for the contract.
+    `drawn` returns observations of the environment, from which golden cases are chosen. `source` is copied to the
+    contract.
 
-    Returns the contract, with "difference": the largest one of a golden case, just now. Raises UserError if there is no
-    such format, the folder is in use, or the policy cannot be exported.
+    Returns the contract, with "difference": the largest difference among the golden cases in this replay. Raises
+    UserError for an unknown format, a folder in use, or a policy that cannot be exported.
     """
     check_request(format, out)
     with place_of(out, _check_free) as place:
-        policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # what was trained may lie on several devices
-        base = getattr(env, "base_size", 0)  # of a correction alone
+        policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
+        base = getattr(env, "base_size", 0)  # only for a correction alone
         sizes = env.obs_size, actions_of(env).size, base
-        artefact = FORMATS[format].make(policy, traced(policy, env.obs_size), *sizes)
+        artefact = FORMATS[format].make(policy, trace_policy(policy, env.obs_size), *sizes)
         golden, cases = golden_cases(policy, drawn()), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {artefact.file: artefact.contents, runner.GOLDEN: cases.getvalue(), "decide.py": decide_source()}
@@ -95,11 +96,11 @@ def write(
             for name, contents in {**files, runner.CONTRACT: sealed.encode()}.items():
                 with replacing(folder / name, "wb") as file:
                     file.write(contents)
-            return {**contract, "difference": checked(folder)}
+            return {**contract, "difference": replay_golden_cases(folder)}
 
 
 def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
-    """What an action is: its space with cues and units, and how far a guide leads from the policy's own."""
+    """Describe an action: its space with cues and units, and the guide's largest change."""
     action, space, radius = action_of(env), actions_of(env), policy.get("clip_radius_deg")
     told = {"name": action.name, "size": space.size, "unit": action.unit, "about": action.about, "dtype": "float32"}
     told["space"] = space.to_json()
@@ -109,9 +110,9 @@ def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
 
 
 def decide_source() -> bytes:
-    """`runner` with the contents of `operations` in place of their import: one file that needs NumPy alone."""
+    """Return `runner` with the contents of `operations` in place of their import: one file that needs only NumPy."""
     own, other = (inspect.getsource(module) for module in (runner, operations))
-    imported = "from cuelearner_jax.export.operations import ContractError, compiled\n"
+    imported = "from cuelearner_jax.export.operations import ContractError, compile_ops\n"
     return own.replace(imported, other.partition("from __future__ import annotations\n\n")[2]).encode()
 
 
@@ -123,10 +124,10 @@ def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:
     ]
 
 
-def checked(folder: Path) -> float:
-    """Replays a folder's golden cases; returns the largest difference.
+def replay_golden_cases(folder: Path) -> float:
+    """Replay a folder's golden cases; return the largest difference.
 
-    Raises UserError for a folder that is damaged, cannot be run here, or decides otherwise.
+    Raises UserError for a folder that is damaged, cannot be run here, or gives other actions.
     """
     try:
         return runner.Decision(folder).check()
@@ -134,8 +135,8 @@ def checked(folder: Path) -> float:
         raise UserError(str(error)) from error
 
 
-def unlisted(folder: Path) -> list[str]:
-    """Names of what lies in a folder and is not in its contract. Raises UserError for a folder that is damaged."""
+def unlisted_files(folder: Path) -> list[str]:
+    """Return the names of files in a folder that its contract does not list. Raises UserError if it is damaged."""
     try:
         return runner.Decision(folder).unlisted
     except runner.ContractError as error:

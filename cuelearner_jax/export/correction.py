@@ -1,6 +1,6 @@
-"""The correction alone: a corrected policy without its base, which stays where it is and gives its action beside.
+"""Export a correction alone: a corrected policy without its base, which runs elsewhere and supplies its action.
 
-A decision about observation and base action: what the contract calls the observation ends in the slice "base action".
+Such a decision takes observation and base action. In the contract, the observation ends with a slice "base action".
 """
 
 from __future__ import annotations
@@ -21,74 +21,74 @@ from cuelearner_jax.policies import PolicyNode, describe, uniform_in
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import EnvState
 
-BASE = "base action"  # the last slice of what such a decision is about
+BASE = "base action"  # the last slice of such a decision's observation
 
 
 class Given(PolicyNode):
-    """Actions that come from elsewhere."""
+    """Policy with fixed actions, supplied from elsewhere."""
 
     actions: Float[Array, "n action"]
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """These."""
+        """Return the supplied actions."""
         return self.actions
 
     def describe(self) -> dict[str, Any]:
-        """A policy elsewhere."""
+        """Describe a policy that runs elsewhere."""
         return {"policy": "given"}
 
 
 class CorrectionAlone(PolicyNode):
-    """What a corrected policy makes of an action that its base, which is elsewhere, has chosen."""
+    """The correction of an action that a base policy elsewhere has chosen."""
 
     corrected: Any  # the policy, with any base
     space: Space = struct.field(pytree_node=False)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n seen"]) -> Float[Array, "n action"]:
-        """The corrected actions of observations and base actions, one beside the other."""
+        """Return the corrected actions for rows of observation and base action, concatenated."""
         own, base = jnp.split(obs, [obs.shape[-1] - self.space.size], -1)
         base = self.space.retract(self.space.only_actions(base))
         return _over(self.corrected, Given(base)).act(key, states, own)
 
     def describe(self) -> dict[str, Any]:
-        """The corrections, one over the other, of an action that is given."""
+        """Describe the nested corrections of a supplied action."""
         return describe(_over(self.corrected, Given(jnp.zeros((1, self.space.size)))))
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Observation and action of a correction alone, as exporting asks an environment for it."""
+    """Observation and action of a correction alone, with the attributes that export needs of an environment."""
 
     observation: tuple[Quantity, ...]
     actions: Space
     action: Quantity
-    base_size: int  # entries at the end of what is seen that are the base's action
+    base_size: int  # number of entries at the end of the input that are the base's action
 
     @property
     def obs_size(self) -> int:
-        """Number of entries that are seen."""
+        """Number of entries of the input."""
         return sum(quantity.size for quantity in self.observation)
 
 
 def _over(policy: Any, base: Any) -> Any:
-    """A corrected policy over another base."""
+    """Return a corrected policy with its innermost base replaced."""
     below = policy.base
     return policy.replace(base=_over(below, base) if getattr(below, "base", None) is not None else base)
 
 
 def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Beside]:
-    """Return a policy's correction alone, and what that sees and does.
+    """Return a policy's correction alone, and a description of its input and output.
 
-    Raises UserError for a policy that corrects nothing, or that shows its base other observations than there are.
+    Raises UserError for a policy without a correction, or one that changes its base's observations.
     """
     if getattr(policy, "base", None) is None:
-        raise UserError("this policy corrects no other one: give one that was corrected, or export the whole policy")
+        raise UserError("this policy has no correction: give a corrected policy, or export the whole policy")
     layer = policy
     while (below := getattr(layer, "base", None)) is not None:
         asks = [one.name for one in getattr(layer, "family", ()) if one.asks]
         if asks:
             raise UserError(
-                f"this policy asks its base about other observations ({asks[0]}), so its correction cannot stand "
+                f"this policy asks its base about other observations ({asks[0]}), so its correction cannot be exported "
                 "alone: export the whole policy"
             )
         layer = below
@@ -99,7 +99,7 @@ def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Beside]:
 
 
 def cases(env: Any) -> Float[np.ndarray, "n seen"]:
-    """Return observations of a world with random actions beside, among which golden cases are chosen."""
+    """Return a world's observations with random base actions appended, from which golden cases are chosen."""
     obs = decisions.observations(env, uniform_in(env))
     base = actions_of(env).sample(jax.random.key(1), (len(obs),))
     return np.concatenate([obs, np.asarray(base)], -1)

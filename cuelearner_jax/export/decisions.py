@@ -1,4 +1,4 @@
-"""What is exported of a policy: its decision about one observation, what stands in it, and cases to hold it to."""
+"""A policy's decision about one observation, and golden cases to verify it."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, describe, layers, policy_name
 
-TOLERANCE = 1e-5  # by which an entry of an action may differ elsewhere
-NUDGE = 1e-6  # of an entry of an observation, as much as rounding may do
+TOLERANCE = 1e-5  # largest allowed difference of an action's entry on another machine
+NUDGE = 1e-6  # relative change of an observation's entry, as large as rounding may cause
 NUDGES, CASES = 4, 64
-WALKERS, STEPS = 32, 4  # from which observations for golden cases are taken
+WALKERS, STEPS = 32, 4  # environments and steps that observations for golden cases come from
 CALLBACKS = {"pure_callback", "io_callback", "python_callback"}
 
 
 def decision_of(policy: Policy) -> Callable[[PRNGKeyArray, Array], Array]:
-    """A policy's decision: (key, observation (obs,)) -> action (action,).
+    """Return a policy's decision as a function (key, observation (obs,)) -> action (action,).
 
-    Raises UserError for a policy that looks at more than observations.
+    Raises UserError for a policy that needs more than observations.
     """
     if any(layer.get("asks") for layer in layers(describe(policy))):
-        raise UserError("this policy asks a teacher, who looks at the true state: export one that does not")
+        raise UserError("this policy asks a teacher, who needs the true state: export a policy without a teacher")
     return lambda key, obs: policy.act(key, None, obs[None])[0]
 
 
 def row_by_row(policy: Policy) -> Callable[[Float[Array, "n obs"]], Float[Array, "n action"]]:
-    """The decision about each of a batch: none hangs on the others, whatever their number."""
+    """Return a function that decides about each row of a batch independently of the other rows."""
     decide = decision_of(policy)
     return lambda batch: jax.lax.map(lambda obs: decide(jax.random.key(0), obs), batch)
 
 
 def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS) -> Float[np.ndarray, "n obs"]:
-    """What a policy meets in a world: starts of episodes, and what follows from its own actions."""
+    """Return observations that a policy meets in a world: episode starts, and what follows from its own actions."""
 
     def step(walk: tuple[Any, Array], key: PRNGKeyArray) -> tuple[tuple[Any, Array], Array]:
         state, obs = walk
@@ -58,20 +58,20 @@ def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS)
 
 
 class Golden(NamedTuple):
-    """Cases that a decision is held to."""
+    """Golden cases: observations with the expected actions."""
 
     obs: Float[np.ndarray, "cases obs"]
-    actions: Float[np.ndarray, "cases action"]  # what JAX decided
-    drawn: int  # observations that they were chosen among
-    steady: int  # of these: decisions that do not hang on the last digits
+    actions: Float[np.ndarray, "cases action"]  # computed by JAX
+    drawn: int  # number of observations that they were chosen from
+    steady: int  # number of these observations whose decision is insensitive to rounding
 
 
 def golden_cases(policy: Policy, drawn: Float[np.ndarray, "n obs"], most: int = CASES) -> Golden:
-    """The first observations about which the decision stays the same when they are changed as little as by rounding.
+    """Return the first observations whose decision does not change under perturbations as small as rounding.
 
-    An argmax jumps where two values tie, and there another machine may well decide otherwise: such cases say nothing.
+    An argmax jumps where two values tie, and another machine may choose the other one, so such cases verify nothing.
 
-    Raises UserError if there is none.
+    Raises UserError if there is no insensitive case.
     """
     drawn = np.asarray(drawn, np.float32)
     decide = jax.jit(row_by_row(policy))
@@ -85,5 +85,8 @@ def golden_cases(policy: Policy, drawn: Float[np.ndarray, "n obs"], most: int = 
         apart = np.maximum(apart, np.abs(nudged - actions).max(-1))
     steady = apart <= TOLERANCE
     if not steady.any():
-        raise UserError(f"all of {len(drawn)} decisions hang on the last digits: nothing to check by")
+        raise UserError(
+            f"all {len(drawn)} decisions change with the last digits of their "
+            f"observation, so none can serve as a golden case"
+        )
     return Golden(drawn[steady][:most], actions[steady][:most], len(drawn), int(steady.sum()))

@@ -1,4 +1,4 @@
-"""The formats that a decision is written in, by name."""
+"""File formats of an exported decision, by name."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from cuelearner_jax.export.decisions import CALLBACKS, decision_of, row_by_row
 from cuelearner_jax.export.graph import Traced, trace
 from cuelearner_jax.policies import Policy
 
-PLATFORMS = ("cpu", "cuda")  # that a decision in StableHLO runs on
+PLATFORMS = ("cpu", "cuda")  # platforms of a decision in StableHLO
 
 
 class Artefact(NamedTuple):
-    """A decision as a file."""
+    """An exported decision as a file."""
 
     file: str
     contents: bytes
-    about: dict[str, Any]  # what the contract says of it
+    about: dict[str, Any]  # the contract's entry
 
 
 class Format(NamedTuple):
-    """A format."""
+    """A file format, with the function that writes it."""
 
     about: str
-    # (policy, its graph, entries of what is seen, of the action, and of a base's action at the end of what is seen)
+    # (policy, its graph, sizes of input, action, and the base's action at the end of the input)
     make: Callable[[Policy, Traced, int, int, int], Artefact]
 
 
 def _of_graph(traced: Traced, name: str) -> None:
-    """Raises UserError if the graph is not all of the decision."""
+    """Raise UserError if the graph lacks operations of the decision."""
     if traced.missing:
         raise UserError(
-            f"--format {name} has no words for {', '.join(traced.missing)}, which this policy needs: "
+            f"--format {name} does not support {', '.join(traced.missing)}, which this policy needs: "
             "give --format stablehlo"
         )
 
@@ -56,7 +56,7 @@ def _numpy(policy: Policy, traced: Traced, obs_size: int, action_size: int, base
 
 def _onnx(policy: Policy, traced: Traced, obs_size: int, action_size: int, base_size: int) -> Artefact:
     _of_graph(traced, "onnx")
-    contents = onnx_graph.serialized(traced, obs_size, action_size, base_size)
+    contents = onnx_graph.serialize(traced, obs_size, action_size, base_size)
     about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET, "input": "obs", "output": "action"}
     about |= {"base_input": onnx_graph.BASE} if base_size else {}
     return Artefact("decision.onnx", contents, about)
@@ -81,18 +81,18 @@ FORMATS = {
 }
 
 
-def traced(policy: Policy, obs_size: int) -> Traced:
-    """A policy's decision as a graph.
+def trace_policy(policy: Policy, obs_size: int) -> Traced:
+    """Trace a policy's decision as a graph.
 
-    Raises UserError for a policy that acts at random, or holds code that is not JAX's.
+    Raises UserError for a policy with random actions, or with code other than JAX's.
     """
-    assert rules.RULES  # they are registered by importing them
+    assert rules.RULES  # importing `rules` registers them
     found = trace(decision_of(policy), obs_size)
     if CALLBACKS & set(found.missing):
         raise UserError(
-            "this policy calls a Python function, which no file can hold: export one of JAX "
+            "this policy calls a Python function, which cannot be exported: export a policy of JAX "
             "functions, or the correction alone (--only-correction, cl.export_correction)"
         )
     if found.random:
-        raise UserError("this policy acts at random, and an exported one cannot: export one that does not")
+        raise UserError("this policy acts at random, which cannot be exported: export a deterministic policy")
     return found

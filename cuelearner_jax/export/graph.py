@@ -1,8 +1,8 @@
-"""A function of one observation as a graph of few plain operations, which NumPy and ONNX can run.
+"""Trace a function of one observation into a graph of few basic operations, which NumPy and ONNX can run.
 
-JAX traces the function; its calls are inlined, whatever does not depend on the observation is computed once, and what
-is left becomes the operations that `operations.OPERATIONS` lists. All shapes are fixed, for it is one observation: a
-batch is decided row by row.
+JAX traces the function. Calls are inlined, whatever does not depend on the observation is computed once, and the rest
+becomes the operations of `operations.OPERATIONS`. All shapes are fixed, since the input is one observation; a batch is
+processed row by row.
 """
 
 from __future__ import annotations
@@ -24,36 +24,36 @@ KINDS = {"float32": "float32", "int32": "int32", "uint32": "int32", "bool": "boo
 
 
 class Value(NamedTuple):
-    """What an operation gives; its numbers are known when the graph runs."""
+    """The output of an operation, known only when the graph runs."""
 
     name: str
     shape: tuple[int, ...]
     kind: str  # float32, int32 or bool
 
 
-Known = Value | np.ndarray | jax.Array  # or what is known already
+Known = Value | np.ndarray | jax.Array  # a run-time value, or one that is known already
 
 
 @dataclasses.dataclass
 class Graph:
-    """Operations in an order in which they can be run: [name, inputs, outputs, attributes]."""
+    """Operations in executable order: [name, inputs, outputs, attributes]."""
 
     inputs: list[str]
     outputs: list[str]
     ops: list[list[Any]]
 
     def as_json(self) -> dict[str, Any]:
-        """For a file, or as an attribute of a loop."""
+        """Return the graph for a file, or as an attribute of a loop."""
         return dataclasses.asdict(self)
 
 
 class Traced(NamedTuple):
-    """A function as a graph."""
+    """A traced function."""
 
     graph: Graph
     constants: dict[str, np.ndarray]
-    missing: tuple[str, ...]  # operations of JAX that it needs and this module does not know
-    random: bool  # does it hang on the key?
+    missing: tuple[str, ...]  # required JAX operations without a rule
+    random: bool  # whether the function depends on the key
 
 
 Rule = Callable[["Builder", Any, list[Any]], list[Known]]  # (builder, equation, its inputs) -> its outputs
@@ -61,7 +61,7 @@ RULES: dict[str, Rule] = {}
 
 
 def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
-    """A function (key, observation (obs_size,)) -> action (action,) as a graph of the observation."""
+    """Trace a function (key, observation (obs_size,)) -> action (action,) as a graph of the observation."""
     key, obs = jax.random.key(0), jax.ShapeDtypeStruct((obs_size,), jnp.float32)
     with written_out():
         closed = jax.make_jaxpr(function)(key, obs)
@@ -75,7 +75,7 @@ def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
 
 
 def _needed(ops: list[list[Any]], wanted: set[str]) -> tuple[list[list[Any]], set[str]]:
-    """The operations that lead to what is wanted, and every name that they look at."""
+    """Return the operations needed for `wanted`, and all names that they read."""
     kept, wanted = [], set(wanted)
     for op in reversed(ops):
         name, inputs, outputs, attributes = op
@@ -99,19 +99,19 @@ def _names(ops: list[list[Any]]) -> Iterator[str]:
 
 
 class Builder:
-    """Collects operations."""
+    """Collects the operations of a graph."""
 
     def __init__(self) -> None:
-        """Nothing yet."""
+        """Start with an empty graph."""
         self.ops: list[list[Any]] = []
         self.constants: dict[str, np.ndarray] = {}
-        self._done_before: dict[str, Value] = {}  # by what was done to which values
-        self._narrow: dict[str, Value] = {}  # by the name of a broadcast value: what it was made of
-        self._named: dict[int, tuple[Any, str]] = {}  # by identity; the array is kept, so that no other gets its place
+        self._done_before: dict[str, Value] = {}  # results by operation and inputs
+        self._narrow: dict[str, Value] = {}  # by the name of a broadcast value: the value before broadcasting
+        self._named: dict[int, tuple[Any, str]] = {}  # by identity; keeping the array reserves its identity
         self._numbers = itertools.count()
 
     def inlined(self, jaxpr: Any, consts: Any, inputs: list[Known]) -> list[Known]:
-        """Adds what a jaxpr does to its inputs; returns its outputs."""
+        """Add the operations of a jaxpr on its inputs; return its outputs."""
         values: dict[Any, Known] = dict(zip(jaxpr.constvars, consts, strict=True))
         values.update(zip(jaxpr.invars, inputs, strict=True))
 
@@ -144,18 +144,18 @@ class Builder:
         ]
 
     def _missing(self, equation: Any, given: list[Known]) -> list[Known]:
-        """An operation that there is no rule for: it may turn out that nothing hangs on it."""
+        """Add a placeholder for an operation without a rule, which may turn out not to be needed."""
         outputs = [self.new(var.aval.shape, KINDS.get(str(var.aval.dtype), "key")) for var in equation.outvars]
         known = [value.name for value in given if isinstance(value, Value)]
         self.ops.append([f"missing:{equation.primitive.name}", known, [value.name for value in outputs], {}])
         return list(outputs)
 
     def new(self, shape: tuple[int, ...], kind: str) -> Value:
-        """A value with a name of its own."""
+        """Return a value with a new name."""
         return Value(f"v{next(self._numbers)}", tuple(shape), kind)
 
     def add(self, op: str, inputs: list[Known], shape: tuple[int, ...], kind: str, /, **attributes: Any) -> Value:
-        """Adds an operation with one output, unless the same has been done before."""
+        """Add an operation with one output, or reuse an equal earlier one."""
         if op in WIDENING:
             inputs = self._narrowed(inputs, tuple(shape))
         names = [self.name(value) for value in inputs]
@@ -168,13 +168,13 @@ class Builder:
         return self._done_before[done]
 
     def _narrowed(self, inputs: list[Known], shape: tuple[int, ...]) -> list[Known]:
-        """Inputs as they were before they were broadcast, where another one has the shape of the result anyway."""
+        """Return inputs before broadcasting, where another input has the result's shape anyway."""
         narrow = [self._narrow.get(value.name) if isinstance(value, Value) else None for value in inputs]
         wide = any(found is None and tuple(value.shape) == shape for value, found in zip(inputs, narrow, strict=True))
         return [found if wide and found else value for value, found in zip(inputs, narrow, strict=True)]
 
     def name(self, value: Known) -> str:
-        """The name of a value; what is known becomes a constant."""
+        """Return the name of a value; a known value becomes a constant."""
         if isinstance(value, Value):
             return value.name
         if id(value) not in self._named:
@@ -185,7 +185,7 @@ class Builder:
         return self._named[id(value)][1]
 
     def reshaped(self, value: Known, shape: tuple[int, ...]) -> Known:
-        """The same numbers in another shape."""
+        """Reshape a value."""
         if tuple(value.shape) == tuple(shape):
             return value
         if not isinstance(value, Value):
@@ -193,7 +193,7 @@ class Builder:
         return self.add("reshape", [value], shape, value.kind, shape=list(map(int, shape)))
 
     def transposed(self, value: Known, axes: tuple[int, ...]) -> Known:
-        """Axes in another order."""
+        """Permute a value's axes."""
         if tuple(axes) == tuple(range(len(axes))):
             return value
         if not isinstance(value, Value):
@@ -202,17 +202,17 @@ class Builder:
         return self.add("transpose", [value], turned, value.kind, axes=list(axes))
 
     def branch(self, jaxpr: Any, consts: list[Known], carried: list[Value]) -> Graph:
-        """A jaxpr of carried values as a graph of its own, which may look at everything outside."""
+        """Return a jaxpr of carried values as a graph of its own, which may read all outer values."""
         outer, self.ops = self.ops, []
         before = dict(self._done_before)
         results = self.inlined(jaxpr.jaxpr, jaxpr.consts, [*consts, *carried])
         made, self.ops = self.ops, outer
-        self._done_before = before  # what is done inside is not there outside
+        self._done_before = before  # operations inside are not available outside
         names = [value.name for value in carried]
         return Graph(names, [self.name(result) for result in results], self._kept_inside(made, set(names)))
 
     def _kept_inside(self, ops: list[list[Any]], changing: set[str]) -> list[list[Any]]:
-        """The operations that every pass must do again; those that hang on nothing that changes go before the loop."""
+        """Return the operations that every pass must repeat; loop-invariant ones are moved before the loop."""
         inside = []
         for op in ops:
             name, inputs, outputs, _ = op
@@ -225,7 +225,7 @@ class Builder:
 
 
 def _computed(equation: Any, given: list[Any], origin: Any) -> list[Any]:
-    """What one equation gives of inputs that are known; `origin` is what JAX tells of where it stood."""
+    """Evaluate one equation with known inputs; `origin` is JAX's debug information."""
     own = [atom for atom in equation.invars if not _is_literal(atom)]
     first = [number for number, atom in enumerate(own) if atom not in own[:number]]
     known = [value for atom, value in zip(equation.invars, given, strict=True) if not _is_literal(atom)]
@@ -238,7 +238,7 @@ def _is_literal(atom: Any) -> bool:
 
 
 def _called(equation: Any) -> Any:
-    """The jaxpr that an equation merely calls, or None."""
+    """Return the jaxpr that an equation merely calls, or None."""
     if equation.primitive.name in ("while", "cond", "scan"):
         return None
     for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
@@ -247,12 +247,12 @@ def _called(equation: Any) -> Any:
     return None
 
 
-# What broadcasts its inputs itself.
+# Operations that broadcast their inputs themselves.
 WIDENING = {
     *("add", "sub", "mul", "div", "rem", "pow", "atan2", "max", "min", "and", "or", "xor", "select"),
     *("eq", "ne", "lt", "le", "gt", "ge"),
 }
-# What computes in bfloat16 where its result is of that type; the others only move numbers, or choose among them.
+# Operations that compute in bfloat16 if their result has that type; the others only move or select numbers.
 ROUNDED = {
     *("add", "sub", "mul", "div", "dot_general", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan"),
     *("atan2", "sqrt", "rsqrt", "square", "logistic", "pow", "integer_pow", "reduce_sum", "convert_element_type"),

@@ -1,4 +1,4 @@
-"""A decision's graph in ONNX: a scan over the rows of a batch, whose body is the graph of one observation.
+"""Write a decision's graph in ONNX: a scan over the rows of a batch, whose body is the graph of one observation.
 
 Written operation by operation from the graph that NumPy runs. A converter of JAX programs, jax2onnx 0.17, was tried. It
 has no rule for a dense layer under vmap, which ensembles and aims need. Its values of navigation's features are off by
@@ -17,14 +17,14 @@ import numpy as np
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export.graph import Traced
 
-OPSET, IR_VERSION = 18, 8  # of 2022: runtimes of several years take them
+OPSET, IR_VERSION = 18, 8  # of 2022, supported by runtimes of several years
 BASE = "base_action"  # the second input of a correction alone
 
 
-def serialized(traced: Traced, obs_size: int, action_size: int, base_size: int = 0) -> bytes:
-    """A model with the input `obs` (n, obs_size) and the output `action` (n, action_size).
+def serialize(traced: Traced, obs_size: int, action_size: int, base_size: int = 0) -> bytes:
+    """Return the bytes of a model with input `obs` (n, obs_size) and output `action` (n, action_size).
 
-    Of a correction alone the last `base_size` entries of what is seen are a second input, `base_action`. Raises
+    For a correction alone, the last `base_size` entries of the input are a second input, `base_action`. Raises
     UserError if the package onnx is missing.
     """
     try:
@@ -59,19 +59,19 @@ def serialized(traced: Traced, obs_size: int, action_size: int, base_size: int =
 
 
 class _Writer:
-    """Operations as nodes. Names are unique in the whole model: inner graphs see those outside."""
+    """Converts operations to nodes. Names are unique in the whole model, since inner graphs see outer names."""
 
     def __init__(self, helper: Any, types: Any) -> None:
         self.helper = helper
         self.kinds = {"float32": types.FLOAT, "int32": types.INT32, "bool": types.BOOL}
         self.bfloat16, self.counter = types.BFLOAT16, types.INT64
         self.constants: dict[str, np.ndarray] = {}
-        self.names: dict[str, str] = {}  # of the graph's values in this model, where they differ
+        self.names: dict[str, str] = {}  # the graph's names of values -> this model's, where they differ
         self._made: list[Any] = []
         self._numbers = itertools.count()
 
     def nodes(self, ops: list[list[Any]], names: dict[str, str], suffix: str) -> list[Any]:
-        """Nodes of operations; `names` are called otherwise here, what they give has a suffix."""
+        """Return the nodes of operations; `names` renames inputs, and `suffix` is appended to outputs."""
         outer, self._made = self._made, []
         self.names.update(names)
         for op, inputs, outputs, attributes in ops:
@@ -93,7 +93,7 @@ class _Writer:
         return made
 
     def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """Adds a node; returns the name of its output."""
+        """Add a node; return the name of its output."""
         name = f"n{next(self._numbers)}"
         self._named(kind, list(inputs), name, **attributes)
         return name
@@ -102,7 +102,7 @@ class _Writer:
         self._made.append(self.helper.make_node(kind, inputs, [output], **attributes))
 
     def constant(self, array: np.ndarray) -> str:
-        """The name of a constant."""
+        """Return the name of a constant array."""
         for name, known in self.constants.items():
             if known.dtype == array.dtype and np.array_equal(known, array):
                 return name
@@ -111,19 +111,19 @@ class _Writer:
         return name
 
     def whole(self, numbers: Any) -> str:
-        """The name of a row of whole numbers."""
+        """Return the name of a constant row of integers."""
         return self.constant(np.array(numbers, np.int64).reshape(-1))
 
     def number(self, value: float) -> str:
-        """The name of a number."""
+        """Return the name of a constant number."""
         return self.constant(np.array(value, np.float32))
 
     def cast(self, value: str, kind: str) -> str:
-        """A value in another kind."""
+        """Cast a value to another type."""
         return self.node("Cast", value, to=self.kinds[kind])
 
     def _loop(self, given: list[str], results: list[str], carried: list[str], kinds: Any, test: Any, body: Any) -> None:
-        """Loop takes its condition from before and from the end of each pass; ours stands at a pass's beginning."""
+        """Convert a loop: ONNX reads the condition at the end of a pass, this graph at its beginning."""
         first = self.nodes(test["ops"], dict(zip(carried, given, strict=True)), f"_t{next(self._numbers)}")
         self._made += first
         condition = self.names[test["outputs"][0]]
@@ -131,7 +131,7 @@ class _Writer:
         inside = [name + mark for name in carried]
         nodes = self.nodes(body["ops"], dict(zip(carried, inside, strict=True)), mark)
         after = []
-        for number, name in enumerate(body["outputs"]):  # outputs of a graph must be nodes of its own
+        for number, name in enumerate(body["outputs"]):  # ONNX requires a graph's outputs to be nodes of its own
             after.append(f"{self.names.get(name, name)}_{number}{mark}")
             nodes.append(self.helper.make_node("Identity", [self.names.get(name, name)], [after[-1]]))
         mark = f"_e{next(self._numbers)}"
@@ -164,7 +164,7 @@ def _argument(kind: str) -> Callable[..., str]:
 
 
 def _atan2(w: _Writer, y: str, x: str) -> str:
-    """From the arc tangent, which alone is there; exact to a few units of the last place."""
+    """Compute atan2 from atan, which ONNX has; exact to a few units in the last place."""
     zero = w.number(0.0)
     steep = w.node("Equal", x, zero)
     slope = w.node("Atan", w.node("Div", y, w.node("Where", steep, w.number(1.0), x)))
@@ -186,7 +186,7 @@ def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[in
     return w.node("Slice", x, w.whole(start), w.whole(stop), w.whole(range(len(start))), w.whole(step))
 
 
-# By the names of `operations.OPERATIONS`: (writer, names of inputs, attributes) -> name of the output.
+# By the names of `operations.OPERATIONS`: (writer, input names, attributes) -> output name.
 NODES: dict[str, Callable[..., str]] = {
     **{name.lower(): _plain(name) for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin")},
     **{name.lower(): _plain(name) for name in ("Cos", "Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul")},

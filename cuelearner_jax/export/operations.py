@@ -1,4 +1,4 @@
-"""The operations of a decision in NumPy, and a graph of them as one function. `decide.py` holds all of this file."""
+"""A decision's operations in NumPy, and their compilation into one function. `decide.py` contains this file."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any
 
 import numpy as np
 
-LARGEST_ARRAY = 1 << 28  # entries that an operation makes of fewer
+LARGEST_ARRAY = 1 << 28  # limit on the entries of an operation's output
 
 Values = dict[str, np.ndarray]
 Run = Callable[[Values], None]
 
 
 class ContractError(ValueError):
-    """A folder that holds no sound decision, or an observation that is not what its contract says. One line."""
+    """Raised for an invalid decision folder, or an observation that violates the contract. One line."""
 
 
-def compiled(ops: list[list[Any]], kept: set[str] | None = None) -> Run:
-    """A graph's operations as one function, which adds their results to the values it is given.
+def compile_ops(ops: list[list[Any]], kept: set[str] | None = None) -> Run:
+    """Return a graph's operations as one function, which adds their results to the values it is given.
 
     Args:
         ops: each [name, inputs, outputs, attributes]; see `OPERATIONS`, `SETTLED`, `_loop` and `_highest`.
-        kept: what is looked at afterwards; given, large results are written where they were in the call before.
+        kept: names read afterwards; if given, large results reuse the memory of the call before.
     """
     steps: list[Run] = []
     for name, inputs, outputs, attributes in ops if kept is None else _joined(ops, kept):
@@ -69,12 +69,12 @@ def _step(function: Callable[..., Any], inputs: list[str], output: str) -> Run:
 
 
 def _joined(ops: list[list[Any]], kept: set[str]) -> list[list[Any]]:
-    """Bias, rectifier and the product that follows, where nothing else looks at what is between, as one operation."""
+    """Fuse bias, rectifier and the following product, where nothing else reads the values between."""
     looks = Counter([*_looked_at(ops), *kept])
     made = {output: op for op in ops for output in op[2]}
 
     def before(name: str, wanted: str) -> list[list[Any]] | None:
-        """The operation that gives a value, last, and the reshapes that follow it."""
+        """Return the operation that computes a value, last, after the reshapes that follow it."""
         passed = []
         while name in made and looks[name] == 1:
             passed.append(made[name])
@@ -106,7 +106,7 @@ def _looked_at(ops: list[list[Any]]) -> Iterator[str]:
 
 
 def _into(function: Callable[..., Any], inputs: list[str], output: str) -> Run:
-    """Writes into one array, call after call: new memory for large ones takes longer than the arithmetic."""
+    """Reuse one output array for all calls: allocating large arrays takes longer than the arithmetic."""
     own: list[np.ndarray] = []
 
     def step(values: Values) -> None:
@@ -126,8 +126,8 @@ def _loop(
     test: dict[str, Any],
     body: dict[str, Any],
 ) -> Run:
-    """Repeats `body` on the carried values (of these kinds and shapes) as long as `test` of them holds."""
-    look, work = compiled(test["ops"]), compiled(body["ops"])
+    """Repeat `body` on the carried values (of these types and shapes) while `test` of them is true."""
+    look, work = compile_ops(test["ops"]), compile_ops(body["ops"])
 
     def run(values: Values) -> None:
         values.update(zip(carried, [values[name] for name in inputs], strict=True))
@@ -143,7 +143,7 @@ def _loop(
 
 
 def _highest(given: str, largest: str, places: str, k: int) -> Run:
-    """The k largest along the last axis, of equal ones the first, and where they are."""
+    """Compute the k largest entries along the last axis, ties by position, and their positions."""
 
     def run(values: Values) -> None:
         x = values[given]
@@ -154,7 +154,7 @@ def _highest(given: str, largest: str, places: str, k: int) -> Run:
 
 
 def _rounded(x: np.ndarray) -> np.ndarray:
-    """To the nearest number that bfloat16 has, ties to even; kept in single precision."""
+    """Round to the nearest bfloat16, ties to even; the result stays in single precision."""
     bits = np.atleast_1d(x).view(np.uint32)
     up = ((bits >> np.uint32(16)) & np.uint32(1)) + np.uint32(0x7FFF)
     return ((bits + up) & np.uint32(0xFFFF0000)).view(np.float32).reshape(x.shape)
@@ -163,7 +163,7 @@ def _rounded(x: np.ndarray) -> np.ndarray:
 def _layer(
     one: np.ndarray, other: np.ndarray, floor: np.ndarray, weights: np.ndarray, out: np.ndarray | None = None
 ) -> np.ndarray:
-    """max(one + other, floor) @ weights. Units of a large layer that no row turns on are left out: a third of them."""
+    """Return max(one + other, floor) @ weights, skipping units of a large layer that no row activates (a third)."""
     row, rows = (one, other) if one.size < other.size else (other, one)
     width = weights.shape[0]
     fits = row.shape[-1:] == rows.shape[-1:] == (width,) and row.size == width and weights.ndim == 2
@@ -205,21 +205,21 @@ def _filling(low: list[int], high: list[int]) -> Callable[..., Any]:
 
 
 def _quotient(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Rounded toward zero where both are whole."""
+    """Divide; integers round toward zero."""
     return np.asarray(np.trunc(np.true_divide(x, y)), x.dtype) if x.dtype.kind in "iu" else np.divide(x, y)
 
 
 ONE = np.float32(1)
 LARGE = 32  # rows
 
-# Of arrays in single precision, int32 or bool; all shapes are fixed. Elementwise ones take equal or broadcast shapes.
+# For float32, int32 or bool arrays of fixed shapes. Elementwise ones take equal or broadcastable shapes.
 OPERATIONS: dict[str, Callable[..., Any]] = {
     "neg": np.negative,
     "abs": np.abs,
     "sign": np.sign,
     "floor": np.floor,
     "ceil": np.ceil,
-    "round": np.rint,  # halves to the even one
+    "round": np.rint,  # halves to even
     "exp": np.exp,
     "log": np.log,
     "log1p": np.log1p,
@@ -255,15 +255,15 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "gt": np.greater,
     "ge": np.greater_equal,
     "select": np.where,  # (which, where true, where false)
-    "take": np.take,  # of x as one row
+    "take": np.take,  # from x flattened to one row
     "matmul": np.matmul,
 }
 
-# Those that can write where they are told. A "layer" stands in no file: `_joined` makes it.
+# Operations that can write into a given array. "layer" is in no file: `_joined` makes it.
 INTO = {name: OPERATIONS[name] for name in ("add", "sub", "mul", "max", "min", "matmul")} | {"layer": _layer}
 
-# Those that have attributes, as what gives their function of the arrays: of small arrays, to settle what is to be done
-# is most of the work.
+# Operations with attributes, as functions that return the function of the arrays. For small arrays, preparing an
+# operation is most of the work.
 SETTLED: dict[str, Callable[..., Callable[..., Any]]] = {
     "cast": lambda dtype: operator.methodcaller("astype", dtype),
     "reshape": lambda shape: operator.methodcaller("reshape", tuple(shape)),

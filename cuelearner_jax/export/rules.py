@@ -1,7 +1,7 @@
-"""How each operation of JAX is said by those of `operations.OPERATIONS`: one rule a primitive, by its name.
+"""Rules that express each JAX operation by those of `operations.OPERATIONS`: one rule per primitive, by name.
 
-A rule gives one value of (builder, parameters of the primitive, its inputs, shape and kind of the output); rules of
-primitives with several outputs, or with functions inside, take the equation.
+A rule returns one value from (builder, the primitive's parameters, its inputs, shape and type of the output). A rule
+of a primitive with several outputs, or with inner functions, takes the equation.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _out(equation: Any, place: int = 0) -> tuple[Shape, str]:
 
 
 def _one(*names: str) -> Callable[[Single], Single]:
-    """Register a function that gives the one output of primitives."""
+    """Register a function for primitives with one output."""
 
     def register(single: Single) -> Single:
         def rule(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
@@ -51,7 +51,7 @@ def _several(name: str) -> Callable[[Rule], Rule]:
 
 
 def _said_by(op: str, of_bools: str = "", **attributes: Callable[[Any], Any]) -> Single:
-    """Say a primitive by one operation, another one `of_bools`; attributes are functions of its parameters."""
+    """Return a rule for one operation (another one for booleans); attributes are functions of the parameters."""
 
     def single(builder: Builder, params: dict[str, Any], given: list[Known], shape: Shape, kind: str) -> Known:
         own = {name: told(params) for name, told in attributes.items()}
@@ -88,7 +88,7 @@ def _integer_pow(builder: Builder, params: Any, given: list[Known], shape: Shape
 
 
 def _chosen(builder: Builder, which: Known, cases: list[Known], shape: Shape, kind: str) -> Known:
-    """The case of a number, or of False and True."""
+    """Select the case of a number, or of False and True."""
     is_bool = which.kind == "bool" if isinstance(which, Value) else which.dtype == bool
     if is_bool:
         return builder.add("select", [which, cases[1], cases[0]], shape, kind)
@@ -131,7 +131,7 @@ def _cut(builder: Builder, value: Known, start: Any, stop: Any, step: Any = None
 
 
 def _part(builder: Builder, value: Known, axis: int, first: int, last: int) -> Known:
-    """From `first` to before `last` along one axis."""
+    """Slice from `first` to before `last` along one axis."""
     start, stop = [0] * len(value.shape), list(value.shape)
     start[axis], stop[axis] = first, last
     return _cut(builder, value, start, stop)
@@ -162,7 +162,7 @@ def _pad(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: 
 
 
 def _taken(builder: Builder, value: Known, places: Known, shape: Shape, kind: str) -> Value:
-    """Entries of a value by their numbers in one row of all of them."""
+    """Take entries of the flattened value by their positions."""
     return builder.add("take", [builder.reshaped(value, (math.prod(value.shape),)), places], shape, kind)
 
 
@@ -177,7 +177,7 @@ def _strides(shape: Shape) -> list[int]:
 
 
 def _offsets(sizes: Shape, strides: list[int]) -> np.ndarray:
-    """Of every entry of a block of these sizes from its first."""
+    """Return the offset of every entry of a block of these sizes from the first entry."""
     numbers = np.zeros(sizes, np.int32)
     for axis, (size, stride) in enumerate(zip(sizes, strides, strict=True)):
         numbers += _along(axis, len(sizes), np.arange(size, dtype=np.int32) * stride)
@@ -185,12 +185,12 @@ def _offsets(sizes: Shape, strides: list[int]) -> np.ndarray:
 
 
 def _along(axis: int, axes: int, row: np.ndarray) -> np.ndarray:
-    """A row laid along one of several axes."""
+    """Return a row laid along one of several axes."""
     return row.reshape([-1 if a == axis else 1 for a in range(axes)])
 
 
 def _clipped(builder: Builder, start: Known, most: int, stride: int) -> Known:
-    """stride * start, where a block that begins there still fits."""
+    """Return stride * start, with `start` limited so that a block still fits."""
     if not isinstance(start, Value):
         return np.asarray(np.clip(np.asarray(start, np.int32), 0, most) * np.int32(stride))
     for op, number in (("max", 0), ("min", most), ("mul", stride)):
@@ -220,7 +220,7 @@ def _dynamic_slice(builder: Builder, params: Any, given: list[Known], shape: Sha
 
 @_one("gather")
 def _gather(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    """Blocks of the operand, one for each row of indices (XLA's Gather)."""
+    """Gather blocks of the operand, one for each row of indices (XLA's Gather)."""
     value, indices = given
     named, sizes = params["dimension_numbers"], params["slice_sizes"]
     fills = params["mode"] == GatherScatterMode.FILL_OR_DROP
@@ -256,7 +256,7 @@ def _gather(builder: Builder, params: Any, given: list[Known], shape: Shape, kin
 
 @_one("dot_general")
 def _dot_general(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    """As a product of matrices: (batch, left, summed) by (batch, summed, right)."""
+    """Express the product as (batch, left, summed) by (batch, summed, right)."""
     left, right = given
     (left_summed, right_summed), (left_batch, right_batch) = params["dimension_numbers"]
     left_free = [a for a in range(len(left.shape)) if a not in (*left_summed, *left_batch)]
@@ -313,7 +313,7 @@ def _while(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
 
 @_several("scan")
 def _scan(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
-    """Pass by pass: of one observation they are few."""
+    """Unroll a scan; for one observation it has few passes."""
     named = equation.params
     if named["length"] > MOST_UNROLLED:
         raise NotImplementedError(f"a scan of {named['length']} passes")
@@ -336,7 +336,7 @@ def _scan(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
 
 
 def _parts(named: Any) -> tuple[int, int]:
-    """How many operands of a scan are constants, and how many are carried."""
+    """Return the numbers of constant and carried operands of a scan."""
     if "ft_in" in named:  # since JAX 0.11
         consts, carry, _ = named["ft_in"].unpack()
         return len(consts), len(carry)
@@ -345,7 +345,7 @@ def _parts(named: Any) -> tuple[int, int]:
 
 @_several("cond")
 def _cond(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
-    """Every branch, and the results of the one that is asked for: nothing in a decision has an effect."""
+    """Evaluate every branch and select one result; nothing in a decision has side effects."""
     which, *operands = given
     branches = equation.params["branches"]
     if not isinstance(which, Value):

@@ -1,12 +1,12 @@
-"""Runs a decision that `cuelearner export` wrote; lies beside every decision as `decide.py`, with `operations` in it.
+"""Run a decision written by `cuelearner export`; this file lies beside every decision as `decide.py`.
 
     from decide import Decision
     decide = Decision("folder")        # verifies every file against the contract
     action = decide(observation)       # (obs,) -> (action,); or (n, obs) -> (n, action)
-    action = decide(observation, base_action)       # of a correction alone, which runs beside its base
+    action = decide(observation, base_action)       # for a correction alone, which runs beside its base
 
-It needs Python and NumPy, nothing of cuelearner or JAX; decisions in ONNX also need onnxruntime, those in StableHLO
-need JAX. Every row of a batch is decided by itself.
+It needs Python and NumPy, neither cuelearner nor JAX. Decisions in ONNX also need onnxruntime, and those in StableHLO
+need JAX. Every row of a batch is processed by itself.
 """
 
 from __future__ import annotations
@@ -21,40 +21,41 @@ from typing import Any
 
 import numpy as np
 
-from cuelearner_jax.export.operations import ContractError, compiled
+from cuelearner_jax.export.operations import ContractError, compile_ops
 
 CONTRACT, GOLDEN = "contract.json", "golden.npz"
 VERSION = 1  # of contracts and graphs
-DIGEST = "digest"  # the name under which a contract holds the digest of its other values
+DIGEST = "digest"  # the key of a contract's digest of its other values
 VECTORS = ("observation", "action")
-MOST = 1 << 20  # entries of an observation or an action, and golden cases
-LARGEST_CONTRACT, LARGEST_FILE = 1 << 26, 1 << 30  # bytes, unpacked
-LOOSEST = 1e-2  # tolerance that still says that two actions are one
+MOST = 1 << 20  # most entries of an observation or an action, and most golden cases
+LARGEST_CONTRACT, LARGEST_FILE = 1 << 26, 1 << 30  # bytes, uncompressed
+LOOSEST = 1e-2  # largest tolerance at which two actions still count as equal
 
 
 class Decision:
     """An exported decision.
 
-    `contract` is what contract.json says: slices of the observation with sizes and units, the action's frame and sign.
+    `contract` is the content of contract.json: slices of the observation with sizes and units, the action's frame and
+    sign.
     """
 
     def __init__(self, folder: str | Path) -> None:
-        """Reads a folder. Raises ContractError if a file is missing, damaged or changed, or cannot be run here."""
+        """Read a folder. Raises ContractError if a file is missing, damaged or changed, or cannot be run here."""
         self.folder = Path(folder)
         self.contract = read_contract(self.folder)
         self._decide = self._sound(lambda: RUNNERS[self.contract["artefact"]["format"]](self.folder, self.contract))
 
     @property
     def unlisted(self) -> list[str]:
-        """Names of what lies in the folder and is not in the contract: nobody vouches for that."""
+        """Names of files in the folder that the contract does not list, and so does not verify."""
         known = (CONTRACT, "__pycache__", *self.contract["files"])
         return sorted(path.name for path in self.folder.iterdir() if path.name not in known)
 
     def __call__(self, obs: Any, base_action: Any = None) -> np.ndarray:
-        """The action for an observation (obs,), or for each of a batch (n, obs): (action,) or (n, action).
+        """Return the action for an observation (obs,), or for each of a batch (n, obs): (action,) or (n, action).
 
-        `base_action`, as many rows: of a correction alone, what the base would do there. Raises ContractError for an
-        observation of another size, or one that is not finite in single precision; for a decision that is no action.
+        `base_action`, for a correction alone: the base's action for each observation. Raises ContractError for an
+        observation of another size or not finite in single precision, and for a decision that gives no valid action.
         """
         rows, size = _numbers(obs), self.contract["observation"]["size"]
         if self._base:
@@ -71,18 +72,18 @@ class Decision:
         actions = self._sound(lambda: self._decide(np.ascontiguousarray(batch)))
         wanted = (len(batch), self.contract["action"]["size"])
         if actions.shape != wanted or actions.dtype.kind != "f" or not np.isfinite(actions).all():
-            raise ContractError(f"{self.folder} decides on no finite numbers of shape {wanted}: export the policy anew")
+            raise ContractError(f"{self.folder} does not give finite numbers of shape {wanted}: export the policy anew")
         if "angle" in self.contract["action"] and not actions.any(axis=-1).all():
-            raise ContractError(f"{self.folder} decides on zero, which is no direction: export the policy anew")
+            raise ContractError(f"{self.folder} gives zero, which is not a direction: export the policy anew")
         return actions[0] if rows.ndim == 1 else actions
 
     @property
     def _base(self) -> int:
-        """Entries of a base's action, of a correction alone; else 0."""
+        """Number of entries of the base's action for a correction alone; otherwise 0."""
         return self.contract.get("base", {}).get("size", 0)
 
     def _beside(self, rows: np.ndarray, base_action: Any) -> np.ndarray:
-        """Observations and base actions side by side. Raises ContractError unless there are as many of both."""
+        """Concatenate observations and base actions. Raises ContractError unless their rows match."""
         own = self.contract["observation"]["size"] - self._base
         if base_action is None:
             raise ContractError(
@@ -92,12 +93,12 @@ class Decision:
         if rows.ndim not in (1, 2) or rows.shape[-1:] != (own,) or base.shape != (*rows.shape[:-1], self._base):
             raise ContractError(
                 f"observations have shape {rows.shape} and base actions {base.shape}: the contract says ({own},) and "
-                f"({self._base},), or as many rows of both"
+                f"({self._base},), or equally many rows of both"
             )
         return np.concatenate([rows, base], -1)
 
     def _sound(self, work: Callable[[], Any]) -> Any:
-        """What some work on the artefact gives; of one that makes no sense whatever is raised is told in one line."""
+        """Return the result of some work on the artefact; any error becomes a one-line ContractError."""
         try:
             return work()
         except ContractError:
@@ -105,23 +106,25 @@ class Decision:
         except Exception as error:
             told = f"{type(error).__name__}: {' '.join(str(error).split())}"[:160]
             raise ContractError(
-                f"{self.folder} holds a decision that makes no sense here ({told}): export the policy anew"
+                f"{self.folder} holds a decision that cannot be run here ({told}): export the policy anew"
             ) from None
 
     def angle(self, obs: Any) -> np.ndarray:
-        """Directions as angles [rad], counterclockwise positive, 0 along x: () or (n,).
+        """Return directions as angles [rad], counterclockwise positive, 0 along x: () or (n,).
 
-        Raises ContractError for a decision whose actions are no directions.
+        Raises ContractError for a decision whose actions are not directions.
         """
         if "angle" not in self.contract["action"]:
-            raise ContractError(f"{self.folder} decides on actions without an angle: call it, and read its contract")
+            raise ContractError(
+                f"{self.folder} gives actions that are not directions: call it instead, and read its contract"
+            )
         actions = self(obs)
         return np.asarray(np.arctan2(actions[..., 1], actions[..., 0]))
 
     def check(self) -> float:
-        """Decides the golden cases anew. Returns the largest difference of an entry from what is recorded.
+        """Recompute the golden cases; return the largest difference of an entry from the recorded actions.
 
-        Raises ContractError if that is more than the contract allows.
+        Raises ContractError if the difference is larger than the contract allows.
         """
         obs, actions = self._sound(self._golden)
         seen = (obs[:, : -self._base], obs[:, -self._base :]) if self._base else (obs,)
@@ -129,13 +132,13 @@ class Decision:
         allowed = self.contract["golden"]["tolerance"]
         if not difference <= allowed:
             raise ContractError(
-                f"{self.folder} decides otherwise here than where it was exported: golden cases differ by "
+                f"{self.folder} gives other actions here than where it was exported: golden cases differ by "
                 f"{difference:.2g}, more than {allowed:g}; export it anew"
             )
         return difference
 
     def _golden(self) -> tuple[np.ndarray, np.ndarray]:
-        """Observations (cases, obs) and actions (cases, action). Raises ValueError unless they are as many as told."""
+        """Return observations (cases, obs) and actions (cases, action). Raises ValueError unless their shapes fit."""
         _check_unpacked(self.folder / GOLDEN)
         with np.load(self.folder / GOLDEN, allow_pickle=False) as golden:
             obs, actions = golden["obs"], golden["actions"]
@@ -148,14 +151,14 @@ class Decision:
 
 
 def _check_unpacked(path: Path) -> None:
-    """Raises ValueError for arrays that are packed more densely than any decision's."""
+    """Raise ValueError for arrays compressed more densely than any decision's."""
     with zipfile.ZipFile(path) as packed:
         if sum(part.file_size for part in packed.infolist()) > LARGEST_FILE:
             raise ValueError(f"{path.name} declares more than {LARGEST_FILE:,} bytes")
 
 
 def _numbers(obs: Any) -> np.ndarray:
-    """Observations in single precision, infinite where that does not hold them."""
+    """Return observations in single precision, infinite where out of its range."""
     try:
         rows = np.asarray(obs)
     except (TypeError, ValueError):  # rows of different lengths
@@ -167,14 +170,14 @@ def _numbers(obs: Any) -> np.ndarray:
 
 
 def digest(values: dict[str, Any]) -> str:
-    """Of JSON values, whatever their order."""
+    """Return the SHA-256 of JSON values, independent of their order."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def read_contract(folder: Path) -> dict[str, Any]:
-    """The contract of a folder whose files are all as they were written.
+    """Return the contract of a folder after verifying all files against their digests.
 
-    Raises ContractError for the first that is not.
+    Raises ContractError for the first file that was changed.
     """
     path = folder / CONTRACT
     try:
@@ -195,7 +198,7 @@ def read_contract(folder: Path) -> dict[str, Any]:
         _check(contract)
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         told = f"no {error}" if isinstance(error, KeyError) else f"{error}"
-        raise ContractError(f"{path} makes no sense ({told[:160]}): export the policy anew") from None
+        raise ContractError(f"{path} is invalid ({told[:160]}): export the policy anew") from None
     for name, recorded in contract["files"].items():
         try:
             if (folder / name).stat().st_size > LARGEST_FILE:
@@ -209,7 +212,7 @@ def read_contract(folder: Path) -> dict[str, Any]:
 
 
 def _check(contract: dict[str, Any]) -> None:
-    """Raises ValueError, KeyError, TypeError or AttributeError for a contract that no export writes."""
+    """Raise ValueError, KeyError, TypeError or AttributeError for an invalid contract."""
     files, artefact, golden = contract["files"], contract["artefact"], contract["golden"]
     _hold("version", type(contract["version"]) is int and contract["version"] > 0)
     for name in (*files, artefact["file"]):
@@ -239,7 +242,7 @@ Batch = Callable[[np.ndarray], np.ndarray]  # observations (n, obs) -> actions (
 
 
 def _cut(batch: np.ndarray, base: int) -> list[np.ndarray]:
-    """What is seen as the inputs of a decision: of a correction alone the base's action is one of its own."""
+    """Split the input into a decision's inputs; for a correction alone the base's action is a separate one."""
     parts = [batch[:, :-base], batch[:, -base:]] if base else [batch]
     return [np.ascontiguousarray(part) for part in parts]
 
@@ -250,11 +253,12 @@ def _of_numpy(folder: Path, contract: dict[str, Any]) -> Batch:
         graph = json.loads(stored["graph"].tobytes())
         constants = {name: stored[name] for name in stored.files if name != "graph"}
     (given,), (result,) = graph["inputs"], graph["outputs"]
-    run, alone = compiled(graph["ops"], {result}), threading.Lock()
+    run, alone = compile_ops(graph["ops"], {result}), threading.Lock()
 
     def decide(batch: np.ndarray) -> np.ndarray:
         actions = np.empty((len(batch), contract["action"]["size"]), np.float32)
-        with alone, np.errstate(all="ignore"):  # operations write where they wrote before; JAX warns of nothing either
+        # operations reuse their memory; JAX does not warn of floating-point errors either
+        with alone, np.errstate(all="ignore"):
             for number, row in enumerate(batch):
                 values = {**constants, given: row}
                 run(values)
@@ -270,7 +274,7 @@ def _of_onnx(folder: Path, contract: dict[str, Any]) -> Batch:
     except ImportError:
         raise ContractError("a decision in ONNX needs onnxruntime: pip install onnxruntime") from None
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1  # a robot has other work for its cores
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # a robot's cores have other work
     options.log_severity_level = 3
     try:
         path = str(folder / contract["artefact"]["file"])
@@ -282,7 +286,7 @@ def _of_onnx(folder: Path, contract: dict[str, Any]) -> Batch:
     names, base = [one.name for one in session.get_inputs()], contract.get("base", {}).get("size", 0)
     if names != ["obs", *(["base_action"] if base else [])]:
         raise ContractError(
-            f"{path} has the inputs {', '.join(names)}, which its contract does not say: export it anew"
+            f"{path} has the inputs {', '.join(names)}, which its contract does not list: export it anew"
         )
     return lambda batch: np.asarray(session.run(None, dict(zip(names, _cut(batch, base), strict=True)))[0])
 
@@ -296,7 +300,8 @@ def _of_stablehlo(folder: Path, contract: dict[str, Any]) -> Batch:
     stored = (folder / contract["artefact"]["file"]).read_bytes()
     try:
         exported = export.deserialize(bytearray(stored))
-        if b"callback" in exported.mlir_module_serialized:  # no export has one: it leads out of the program
+        # no export contains callbacks, which lead out of the program
+        if b"callback" in exported.mlir_module_serialized:
             raise ContractError(f"{folder} holds a decision that calls Python functions: export the policy anew")
         call = jax.jit(exported.call)
         base = contract.get("base", {}).get("size", 0)

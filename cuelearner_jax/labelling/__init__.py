@@ -1,1 +1,1 @@
-"""People give labels: the session that asks and keeps them, and the page in a browser that shows it."""
+"""Collect labels from people: the labelling session, and the browser page that shows its questions."""

@@ -1,4 +1,4 @@
-"""Arrows in the frame of a sketch, as SVG."""
+"""Draw arrows as SVG in the coordinate frame of a task's sketch."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 
 from cuelearner_jax.types import Sketch
 
-HAIR = 1 / 400  # of the sketch's width: a thin line
+HAIR = 1 / 400  # width of a thin line, as a share of the sketch's width; "hair" below is this length
 HEAD = 7.0  # length of an arrow's head [hairs]
-HALO = ' class="halo"', 3.8  # so that arrows stand out on any ground
-BADGE = 7.0  # radius of the key at an arrow's tip [hairs]
+HALO = ' class="halo"', 3.8  # CSS class and width [hairs] of the outline that sets an arrow off from its background
+BADGE = 7.0  # radius of the key's disc at an arrow's tip [hairs]
 
 
 def point(sketch: Sketch, angle: float, along: float, across: float = 0.0) -> tuple[float, float]:
-    """A place on the screen, by its distances along and to the left of an action's direction."""
+    """Return the screen point at a distance along, and one to the left of, an action's direction [m]."""
     screen = math.radians(angle + sketch.turn)
     cos, sin = math.cos(screen), math.sin(screen)
     x, y = along * cos - across * sin, along * sin + across * cos
@@ -21,7 +21,7 @@ def point(sketch: Sketch, angle: float, along: float, across: float = 0.0) -> tu
 
 
 def room(sketch: Sketch, angle: float) -> float:
-    """From the foot along a direction to the edge of what is shown."""
+    """Return the distance from the sketch's foot, along a direction [deg], to the edge of the picture [m]."""
     (x, y), (left, top, width, height) = sketch.foot, sketch.box
     away_x, away_y = (one - other for one, other in zip(point(sketch, angle, 1.0), sketch.foot, strict=True))
     across = (left + width - x if away_x > 0 else x - left) / max(abs(away_x), 1e-9)
@@ -30,9 +30,10 @@ def room(sketch: Sketch, angle: float) -> float:
 
 
 def ends(sketch: Sketch, angle: float, longer: float = 1.0, beyond: float = 0.0) -> tuple[float, float]:
-    """Where an arrow begins and ends, from the foot: within what is shown, but never too short for its head [m].
+    """Return where an arrow begins and ends, as distances from the sketch's foot [m].
 
-    `beyond`: what else is to be shown beyond its tip [m].
+    The arrow stays within the picture, but is never too short for its head. `beyond` is the space to leave beyond its
+    tip [m].
     """
     hair, (first, last) = sketch.box[2] * HAIR, sketch.reach
     last = first + (last - first) * longer
@@ -40,15 +41,15 @@ def ends(sketch: Sketch, angle: float, longer: float = 1.0, beyond: float = 0.0)
 
 
 def arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0, key: str = "", larger: float = 1.0) -> str:
-    """Draw an arrow of an action's direction [deg].
+    """Return the SVG of an arrow along an action's direction.
 
     Args:
-        sketch: says where the arrow begins, and how long it is.
-        angle: of the direction, counterclockwise [deg].
-        name: its class, which gives its colour.
-        longer: factor of its length.
-        key: shown at its tip; empty: none.
-        larger: factor of its strokes, its head and its key.
+        sketch: gives the arrow's start and length.
+        angle: the direction, counterclockwise [deg].
+        name: the arrow's CSS class, which sets its colour.
+        longer: factor on the arrow's length.
+        key: the key shown at the arrow's tip; empty for no key.
+        larger: factor on the widths of strokes, head and key.
     """
     hair = sketch.box[2] * HAIR * larger
     head, half, badge = HEAD * hair, 2.8 * hair, BADGE * hair
@@ -61,7 +62,7 @@ def arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0, key: str
     halo, line = (f'<line{kind} {place} stroke-width="{width * hair:.5f}"/>' for kind, width in (HALO, ("", 2.2)))
     head_drawn = f'<polygon points="{corners}" stroke-width="{1.6 * hair:.5f}"/>'
     shown = ""
-    if key:  # which says this, at its tip: left and right on the screen are others where the arrow points down
+    if key:  # the key at the tip names the answer: screen left and right are swapped where an arrow points down
         x, y = point(sketch, angle, last + badge)
         disc = f'<circle cx="{x:.4f}" cy="{y:.4f}" r="{badge:.5f}" stroke-width="{0.8 * hair:.5f}"/>'
         shown = f'<g class="at-key">{disc}<text x="{x:.4f}" y="{y:.4f}" font-size="{1.6 * badge:.5f}">{key}</text></g>'
@@ -69,7 +70,7 @@ def arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0, key: str
 
 
 def line(sketch: Sketch, angle: float) -> str:
-    """Draw the thin line that goes on from an arrow, of a sketch that has one."""
+    """Return the SVG of the thin line that continues an arrow; empty where the sketch has no aim line."""
     if not sketch.aim:
         return ""
     (x1, y1), (x2, y2) = (point(sketch, angle, along) for along in (sketch.reach[1], sketch.reach[1] + sketch.aim))

@@ -1,4 +1,4 @@
-"""Label files compared: with what a task's teacher would have answered, and two people's on the same questions."""
+"""Compare and merge label files: with a task's teacher, with each other, and several into one."""
 
 from __future__ import annotations
 
@@ -25,26 +25,27 @@ from cuelearner_jax.task import Task
 
 
 def form_of(file: LabelFile) -> AnswerForm | None:
-    """The form of a file's answers; None: of a kind of guidance that is not known here."""
+    """Return the form of a label file's answers; None where no known kind of guidance has this form."""
     forms = {kind.form.name: kind.form for kind in guidances.kinds() if kind.form is not None}
     return forms.get(file.answers)
 
 
-def checked(path: Path) -> LabelFile:
-    """The labels of a file, as training would take them. Raises UserError if there are none, or one makes no sense."""
+def read_checked(path: Path) -> LabelFile:
+    """Read a label file and check it as training does. Raises UserError for an empty or invalid file."""
     file = label_files.read(path)
     external_labels.check_file(file, None, form_of(file), str(path))
     return file
 
 
 def world_of(task: Task, file: LabelFile) -> Any:
-    """The configuration in which a file's labels were given. Raises UserError if it is not this task's."""
+    """Return the task configuration in which a file's labels were given. Raises UserError for another task's."""
     values = {name: value for name, value in file.task.items() if name not in ("name", "from")}
     try:
         return configuration.from_json(task.config, values)
     except TypeError as error:
         raise UserError(
-            f"the file's world is none of {task.name} ({error}): it was written by another version"
+            f"the file's world has other fields than a world of {task.name} ({error}): use the "
+            f"version that wrote the file"
         ) from error
 
 
@@ -55,14 +56,19 @@ def with_teacher(
     scalars: Scalars,
     tell: Callable[[str], None] = lambda words: None,
 ) -> Agreement:
-    """How well a page's labels agree with the answers of the task's teacher, who makes no faults.
+    """Return how well a page's labels agree with the answers of the task's teacher, simulated without mistakes.
 
-    The situations of all `rows` (`label_files.history`) are lived through anew. Raises UserError if the task has no
-    teacher, or the situations cannot be had again.
+    The situations of all `rows` (`label_files.history`) are replayed.
+
+    Raises:
+        UserError: the task has no teacher, or the situations cannot be replayed.
     """
     form = form_of(file)
     if form is None or file.people is None or file.session is None:
-        raise UserError("a teacher looks at situations, and this file's cannot be had again: it is no page's own file")
+        raise UserError(
+            "this file does not hold what is needed to replay its situations for the teacher: "
+            "give a file that `cuelearner label` wrote"
+        )
     config, task = world_of(task, file), task.on(str(file.session.get("robot", "")).partition(" ")[0] or None)
     tell(f"asking the teacher of {task.name} about {len(rows)} questions")
     env = task.environment(config)
@@ -70,7 +76,10 @@ def with_teacher(
     items = {row["item"]: (np.asarray(row["obs"], np.float32), np.asarray(row["action"], np.float32)) for row in rows}
     situations = list(lived(env, keys_of(file.session["seed"]), [items[number] for number in range(len(items))]))
     if len(situations) <= len(items):
-        raise UserError("the file's situations come out otherwise with this program: use the one that wrote it")
+        raise UserError(
+            "replaying the file's situations gives other observations: use the version of "
+            "cuelearner that wrote the file"
+        )
     told = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
 
     @jax.jit
@@ -83,9 +92,9 @@ def with_teacher(
 
 
 def between(one: LabelFile, other: LabelFile, env: Any) -> Agreement:
-    """How well two files agree on the questions that both answered: the same observation and action.
+    """Return how well two files agree on the questions both answered (equal observation and action).
 
-    Raises UserError if their answers are of two forms, spaces or strengths.
+    Raises UserError if the two files differ in the form, space or strength of their answers.
     """
     form = form_of(one)
     if form is None or (one.answers, one.space, one.eps) != (other.answers, other.space, other.eps):
@@ -107,29 +116,32 @@ def _by_question(file: LabelFile) -> dict[bytes, np.ndarray]:
 
 
 def _questions(file: LabelFile) -> Iterator[tuple[bytes, np.ndarray]]:
-    """What was asked, observation and action, and what was said, label after label."""
+    """Yield each label's question, as the bytes of its observation and action, and its answer."""
     columns = (file.labels.obs, file.labels.action, file.labels.answer)
     for *asked, answer in zip(*(np.asarray(column) for column in columns), strict=True):
         yield b"".join(part.tobytes() for part in asked), answer
 
 
-def merged(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
-    """One set of labels of several files' sets, one after the other, and how many were left out as they were there.
+def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
+    """Concatenate the labels of several files; return the merged file and the number of duplicates left out.
 
-    A label is there already if one of an earlier file has its observation, action and answer, and the person and the
-    time where both tell them.
+    A label is a duplicate if an earlier file has a label of equal observation, action and answer, and of equal person
+    and time where both files record them.
 
-    Raises UserError if they differ in task, world, form or strength, or a file holds several sets.
+    Raises UserError if the files differ in task, world, form or strength, or if one file holds several seeds' labels.
     """
     files = list(files)
     first = files[0]
     for file in files:
         if len(np.unique(file.seeds)) > 1:
-            raise UserError("a file holds the labels of several seeds, which belong apart: merge files of one set each")
+            raise UserError(
+                "a file holds the labels of several seeds, which must stay separate: merge files of one seed each"
+            )
         for name in ("task", "answers", "space", "eps"):
             if getattr(file, name) != getattr(first, name):
                 raise UserError(
-                    f"the files differ in {name} ({getattr(first, name)}, {getattr(file, name)}): merge alike ones"
+                    f"the files differ in {name} ({getattr(first, name)}, {getattr(file, name)}): "
+                    f"merge only files that agree in it"
                 )
     if len({(file.labels.obs.shape[1], file.labels.action.shape[1]) for file in files}) > 1:
         raise UserError("the files' observations differ in size: merge files of one world")
@@ -147,7 +159,7 @@ def merged(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
 
 
 def _new(files: list[LabelFile]) -> list[np.ndarray]:
-    """Of each file, which of its labels no file before it has, (labels,)."""
+    """Return for each file a mask (labels,) of the labels that no earlier file has."""
     there: dict[bytes, set[Any]] = {}
     found = []
     for file in files:
@@ -165,7 +177,7 @@ def _new(files: list[LabelFile]) -> list[np.ndarray]:
 
 
 def _rows(file: LabelFile, kept: np.ndarray) -> LabelFile:
-    """Some of a file's labels."""
+    """Select a file's labels by a mask (labels,)."""
     people = None if file.people is None else label_files.People(*(column[kept] for column in file.people))
     labels = jax.tree.map(lambda leaf: np.asarray(leaf)[kept], file.labels)
     return file._replace(seeds=file.seeds[kept], labels=labels, people=people)

@@ -1,4 +1,4 @@
-"""What a person may press, and what the answers mean: from the form of answers and the space of actions."""
+"""Buttons and keys of the labelling page, and the answers they give, for a form of answers and an action space."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.spaces import DIRECTIONS, UNSAID, Cue, Space
 
-# What is said on the page of a turn, by somebody who walks along the arrow: its cue says counterclockwise, clockwise.
+# What the page calls the two turns, from the point of view of somebody walking along the arrow.
 WALKED = ("more to the left", "more to the right")
-BESIDE = {"ArrowLeft": "aA", "ArrowRight": "dD"}  # keys for the other hand
-SHOWN = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # keys, for people
+BESIDE = {"ArrowLeft": "aA", "ArrowRight": "dD"}  # the same answers' keys for the other hand
+SHOWN = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # how the page writes these keys
 SHOWN |= {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
-PRACTICE = (  # what a person is to try, one a question of practice
+PRACTICE = (  # the hint of each practice question, in order
     "Compare the action with what is wanted, then answer by key, button or click.",
     "Where you cannot tell, press {unsure}: it costs nothing.{film}",
     "An answer can be taken back with {undo}. After this one it counts.",
@@ -27,21 +27,21 @@ PRACTICE = (  # what a person is to try, one a question of practice
 class Control(NamedTuple):
     """A button and its keys."""
 
-    name: str  # of its event
+    name: str  # of the control's event
     words: str
     keys: tuple[str, ...] = ()  # as browsers call them (`KeyboardEvent.key`)
-    answer: tuple[float, ...] | None = None  # in the words of the form; None: no answer
-    colour: str = ""  # of the button, and of the arrow that shows what it would do: a name of `outcomes`
-    cue: int | None = None  # of several: the one that it answers about
+    answer: tuple[float, ...] | None = None  # the answer in the form's encoding; None: this control gives no answer
+    colour: str = ""  # of the button, and of the arrow that shows the answer's outcome: a key of `outcomes`
+    cue: int | None = None  # index of the cue that this control answers about, where the space has several
 
     @property
     def picks(self) -> bool:
-        """Is it kept until the answer is sent?"""
+        """Whether a press is only stored until the whole answer is sent."""
         return self.cue is not None and self.answer is not None and len(self.answer) == 1
 
     @property
     def shown(self) -> str:
-        """The first of its keys, for people."""
+        """The first key, as the page writes it."""
         return _shown(self.keys[0]) if self.keys else ""
 
 
@@ -51,7 +51,7 @@ FILM = Control("film", "film", ("f", "F", "v", "V"))
 CORRECTED = Control("film-refined", "film of the correction", ("x", "X"))
 HELP = Control("help", "help", ("h", "H", "?"))
 AS_IT_IS = Control("0", "already right", ("ArrowUp", "w", "W", " "), (0.0,), "asked")
-REST_UNSAID = Control("send", "send, of the others nothing is said", ("Enter",), (UNSAID,))
+REST_UNSAID = Control("send", "send, nothing is said of the others", ("Enter",), (UNSAID,))
 REST_RIGHT = Control("rest", "send, the others are already right", (" ", "ArrowUp"), (0.0,))
 ALL_RIGHT = REST_RIGHT._replace(words="all already right", colour="asked")
 
@@ -61,23 +61,23 @@ def _shown(key: str) -> str:
 
 
 def _cases(key: str) -> tuple[str, ...]:
-    """A key, of a letter both of its cases."""
+    """Return a key; for a letter, both of its cases."""
     return tuple(dict.fromkeys((key.lower(), key.upper()))) if len(key) == 1 else (key,)
 
 
 def _spare(space: Space, keys: tuple[str, ...] | str) -> tuple[str, ...]:
-    """Those of some keys that no cue names."""
+    """Return those of `keys` that no cue of the space uses."""
     named = {one for cue in space.cues for key in cue.keys for one in _cases(key)}
     return tuple(key for key in keys if key not in named)
 
 
 def _keys_of(space: Space, cue: Cue) -> tuple[tuple[str, ...], ...]:
-    """All keys for more and for less of a cue."""
+    """Return all keys for "more" and all keys for "less" of a cue."""
     return tuple((*_cases(key), *_spare(space, BESIDE.get(key, ""))) for key in cue.keys)
 
 
 def _of_cue(number: int, space: Space, one_cue: bool) -> tuple[Control, ...]:
-    """What can be said about one cue of several: each as a part of the answer, or more and less as the whole of it."""
+    """Return the controls about one of several cues: parts of an answer or, with `one_cue`, whole answers."""
     cue, count = space.cues[number], len(space.cues)
     more, less = _keys_of(space, cue)
     if one_cue:
@@ -96,9 +96,9 @@ def _of_cue(number: int, space: Space, one_cue: bool) -> tuple[Control, ...]:
 
 
 def answers(form: AnswerForm, space: Space, one_cue: bool = False) -> tuple[Control, ...]:
-    """The answers that a form has, in the order of their buttons; none where an answer is pointed at.
+    """Return the controls that give an answer, in the order of their buttons; empty for an answer by pointing.
 
-    `one_cue`: of several cues, one press about one of them is the whole answer.
+    `one_cue`: where the space has several cues, one press about one cue is the whole answer.
     """
     if form.by_eps and len(space.cues) == 1:
         words = WALKED if space == DIRECTIONS else space.cues[0].words
@@ -123,9 +123,9 @@ def answers(form: AnswerForm, space: Space, one_cue: bool = False) -> tuple[Cont
 def controls(
     form: AnswerForm, space: Space, one_cue: bool = False, films: bool = True, simulated: bool = True
 ) -> dict[str, Control]:
-    """Everything that can be pressed, by name; a key that an answer has is no other control's.
+    """Return all controls by name; an answer's key is removed from every other control.
 
-    `films`: is there a film of a situation? `simulated`: of where any action leads from there?
+    `films`: whether the task films a situation. `simulated`: whether it can film the outcome of any action.
     """
     own, filmed = answers(form, space, one_cue), ()
     if films:
@@ -144,20 +144,21 @@ def controls(
 
 
 def check(form: AnswerForm, space: Space) -> None:
-    """Raises UserError for a form of answers that a page cannot take in a space, or two cues with one key."""
+    """Raise UserError for answers that the page does not support in a space, or two cues with one key."""
     if form.is_action and space != DIRECTIONS:
         raise UserError(
-            f"{form.name} answers are pointed at, which a page can for directions alone: give --guidance relative"
+            f"{form.name} answers are given by pointing, which the page supports only for "
+            f"directions: give --guidance relative"
         )
     if form.by_eps and not space.cues:
         raise UserError(f"the space {space.name} has no cues to ask about: give --guidance scalar")
     keys = [key for control in answers(form, space) for key in control.keys]
     if twice := [key for key in keys if keys.count(key) > 1]:
-        raise UserError(f"the key {_shown(twice[0])!r} stands for two answers: give the cues of the space other keys")
+        raise UserError(f"the key {_shown(twice[0])!r} stands for two answers: give the space's cues different keys")
 
 
 def question(form: AnswerForm, space: Space) -> str:
-    """What a person is asked."""
+    """Return the question that the page asks."""
     planar = space == DIRECTIONS
     if form.by_eps:
         return "Which way should the middle arrow turn?" if planar else "Which way should the action change?"
@@ -169,60 +170,63 @@ def question(form: AnswerForm, space: Space) -> str:
 
 
 def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list[str]:
-    """What the page's help says of the controls that it knows, line by line."""
+    """Return the lines of the page's help about these controls."""
     told = list(known)
     names = [f"{space.cues[one.cue].name}: " if one.cue is not None else "" for one in told]
     lines = [f"{name}{one.words}: {keys_of(one)}" for name, one in zip(names, told, strict=True) if one.keys]
     if form.by_eps and space == DIRECTIONS:
         lines.append(
-            "Left and right are those of somebody who walks along the arrow: left turns it counterclockwise. "
-            "Two arrows in the picture show both turns, in the colour of their button and with its key."
+            "Left and right are meant for somebody who walks along the arrow: left turns it counterclockwise. "
+            "Two arrows in the picture show both turns, each in the colour of its button and with its key."
         )
     if form.by_eps and len(space.cues) > 1 and any(one.picks for one in told):
         lines.append(
-            "Say which way each cue should change, then send. Where nothing is said of any, it is: don't know."
+            "Say which way each cue should change, then send. An answer that says nothing of any "
+            "cue counts as: don't know."
         )
     elif form.by_eps and len(space.cues) > 1:
-        lines.append("Say what comes to mind first: one press is the answer. Of the other cues nothing is said.")
+        lines.append("Say what comes to mind first: one press is the answer. Nothing is said of the other cues.")
     return [
         *lines,
-        "Each answer is saved before the next question shows. Where you cannot tell, say so: it costs nothing.",
-        "A key that comes while no question can take it is not taken, and the page says so.",
+        "Each answer is saved before the next question shows. Where you cannot tell, say so: not "
+        "knowing costs nothing.",
+        "A key pressed while no question is ready is ignored, and the page says so.",
     ]
 
 
 def hint(number: int, known: Mapping[str, Control]) -> str:
-    """What a person is to try at a question of practice, counted from 0."""
+    """Return the hint of a practice question, counted from 0."""
     film = f" {known['film'].shown} shows a film." if "film" in known else ""
     told = {name: known[name].shown or known[name].words for name in ("unsure", "undo")}
     return PRACTICE[min(number, len(PRACTICE) - 1)].format(film=film, **told)
 
 
 def keys_of(control: Control) -> str:
-    """All keys of a control, for people."""
+    """Return all keys of a control, as the page writes them."""
     return ", ".join(dict.fromkeys(map(_shown, control.keys)))
 
 
-def given(
+def answer_of(
     space: Space, pressed: Control | None, angle_deg: float | None, said: Mapping[int, float]
 ) -> np.ndarray | None:
-    """An answer in the words of the form; None: no answer.
+    """Return the answer in the form's encoding, (width,); None for "don't know".
 
-    Where nothing was pressed, a direction was pointed at [deg]. `said`: what was picked of cues, by their numbers.
+    Without a `pressed` control the answer is the direction pointed at [deg]. `said` maps a cue's index to the part of
+    the answer chosen for it.
     """
     if pressed is None:
         assert angle_deg is not None
         return np.array([np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))], np.float32)
     if pressed.answer is None:
         return None
-    if pressed.name not in (REST_RIGHT.name, REST_UNSAID.name):  # which fill up what was picked
+    if pressed.name not in (REST_RIGHT.name, REST_UNSAID.name):  # these two complete the parts chosen so far
         return np.asarray(pressed.answer, np.float32)
     found = np.array([said.get(number, *pressed.answer) for number in range(len(space.cues))], np.float32)
     return None if (found == UNSAID).all() else found
 
 
 def outcomes(form: AnswerForm, space: Space, action: np.ndarray, eps: float) -> dict[str, np.ndarray]:
-    """The action in question ("asked"), and what the answers about its only cue would make of it ("left", "right")."""
+    """Return the asked action ("asked") and, for a single cue, each answer's outcome ("left", "right")."""
     found = {"asked": action}
     if form.by_eps and len(space.cues) == 1:
         for name, h in (("left", 1.0), ("right", -1.0)):

@@ -1,6 +1,6 @@
-"""What a session of calibration asks and learns: its answers as evidence of what changed, read by the learner's thread.
+"""Calibration on the labelling page: answers as evidence of what changed, processed by the learner's thread.
 
-The learner's own calibration goes on learning. What questions are chosen by is a copy of it, which stays as it is.
+The learner updates its own calibration. Questions are chosen by a frozen copy of that calibration.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from cuelearner_jax.labelling.learner import Fitted, Learner
 from cuelearner_jax.labelling.programs import Programs
 from cuelearner_jax.types import Label
 
-SOUND = 40  # labels before which it is not told that no change explains them: a few say so too soon
-BESIDE = 7  # other situations, by which a question's tiny changes and the sizes of unknowns are measured
+SOUND = 40  # labels before the page reports that no change explains the answers; with fewer, this verdict is unreliable
+BESIDE = 7  # other situations, which set the scale of each unknown and of the small changes in a question
 
 
 @jax.jit
@@ -32,7 +32,7 @@ def _act(policy: Any, obs: Array) -> Array:
 
 
 class Theory:
-    """What is known after some answers, in place of a model: it chooses questions, and says what is right."""
+    """What calibration has inferred from the answers so far; chooses questions and predicts right actions."""
 
     def __init__(self, known: Calibration, family: Family, beside: Float[np.ndarray, "n obs"]) -> None:
         self.known, self.beside = known, beside
@@ -41,17 +41,17 @@ class Theory:
         if isinstance(policy, Calibrated) and policy is not known.base:
             own = [one.name for one in unknowns_of(policy.family)]
             theta |= dict(zip(own, np.asarray(policy.theta).tolist(), strict=True))
-        # Of the whole family, whatever has changed by now: it is compiled once.
+        # The policy covers the whole family, whatever has changed so far, so that it compiles once.
         self.policy = Calibrated(known.base, jnp.array([theta[name] for name in names]), family)
 
     def question(self, obs: Float[Array, " obs"], key: PRNGKeyArray) -> Float[np.ndarray, " action"]:
-        """The action of this situation of which an answer is expected to tell most."""
+        """Return the action in this situation whose answer is expected to be most informative."""
         known = self.known.copy(np.random.default_rng(np.asarray(jax.random.key_data(key))))
         rows = np.concatenate([np.asarray(obs)[None], self.beside])
         return known.questions(rows, len(rows)).action[0]
 
     def right(self, obs: Float[Array, " obs"]) -> Float[np.ndarray, " action"]:
-        """What the corrected policy does."""
+        """Return the corrected policy's action."""
         rows = jnp.asarray(obs)[None]
         found = self.policy.act(jax.random.key(0), None, rows) if is_python(self.policy) else _act(self.policy, rows)
         return np.asarray(found)[0]
@@ -73,16 +73,16 @@ PROGRAMS = Programs(question=_question, fit=_no_model, refined=_right, answers=_
 
 
 class EvidenceLearner(Learner):
-    """Reads answers whenever as many as a round has are new."""
+    """Update the calibration whenever a full round of labels is new."""
 
     def prepare(self) -> None:
-        """Meets some situations, and compiles what chooses questions."""
+        """Meet some situations and compile the choice of questions."""
         plan, env = self._plan, self._env
-        walk = Walk(env, None, plan.config.scalars)  # pyright: ignore[reportArgumentType]  # nobody is asked
+        walk = Walk(env, None, plan.config.scalars)  # pyright: ignore[reportArgumentType]  # no teacher is needed
         self._beside = np.asarray(walk.situations(self._key, plan.base.policy, BESIDE)[1], np.float32)
         self._rows: list[tuple[np.ndarray, ...]] = []
         self._known = self._fresh()
-        self._known.questions(self._beside, 1)  # settles how large unknowns may be
+        self._known.questions(self._beside, 1)  # fixes the range of the unknowns
         self.newest = Fitted(self._theory())
         self.newest.model.right(jnp.asarray(self._beside[0]))
 
@@ -95,7 +95,7 @@ class EvidenceLearner(Learner):
         return Theory(self._known.copy(self._known.random), family, self._beside)
 
     def fit(self, labels: Label) -> None:
-        """Reads what is new of the labels; all of them, where earlier ones were taken back."""
+        """Process the new labels; all labels again if earlier ones were taken back."""
         valid = np.flatnonzero(labels.valid)
         obs, action, answer = (np.asarray(part)[valid] for part in (labels.obs, labels.action, labels.answer))
         rows = list(zip(obs, action, answer, strict=True))
@@ -112,12 +112,12 @@ class EvidenceLearner(Learner):
             doubt = ties(self._known.meaning, (), np.zeros(0), beside, self._known.eps)[: len(obs)]
             self._known.learn(obs, action, answer, doubt)
             self._rows = rows
-        told = told_of(self._known.result(), len(rows)) if len(rows) >= LEAST else ()
+        told = describe_result(self._known.result(), len(rows)) if len(rows) >= LEAST else ()
         self.newest = Fitted(self._theory(), len(rows), self.newest.number + 1, told=told)
 
 
-def told_of(result: Result, labels: int) -> tuple[str, ...]:
-    """What is told of the answers so far, line by line."""
+def describe_result(result: Result, labels: int) -> tuple[str, ...]:
+    """Return lines that report what the answers so far show."""
     if result.verdict == CHANGED:
         return tuple(result.words())
     if result.verdict == UNEXPLAINED and labels >= SOUND:

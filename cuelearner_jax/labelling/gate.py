@@ -1,8 +1,8 @@
-"""Who may talk to the page: browsers of this machine that were given its address.
+"""Access control of the labelling page: browsers of this machine that know the page's address.
 
-A page of another site can make a browser send requests to 127.0.0.1, and a name that it owns can lead there (DNS
-rebinding): so the host and the origin that a browser tells are checked, and a secret of the page's own address is
-needed, which a cookie then carries.
+A page of another site can make a browser send requests to 127.0.0.1, and a domain name of that site can resolve to
+127.0.0.1 (DNS rebinding). So the host and origin headers are checked, and a secret token is required: first in the
+page's address, afterwards in a cookie.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from typing import Any
 from fastapi.requests import HTTPConnection
 
 HEADERS = (
-    (b"referrer-policy", b"no-referrer"),  # the address has the token in it
+    (b"referrer-policy", b"no-referrer"),  # the address contains the token
     (b"x-frame-options", b"DENY"),
     (b"x-content-type-options", b"nosniff"),
 )
 
 
 class Gate:
-    """An ASGI application in front of another."""
+    """An ASGI application that checks each connection before passing it to another application."""
 
     def __init__(self, app: Any, port: int, token: str) -> None:
-        """Lets in who comes by `127.0.0.1:port` or `localhost:port` and knows the token."""
-        self.app, self.token, self.cookie = app, token, f"cuelearner-{port}"  # a cookie holds for all ports
+        """Admit connections to `127.0.0.1:port` or `localhost:port` that present the token."""
+        self.app, self.token, self.cookie = app, token, f"cuelearner-{port}"  # browsers share cookies among ports
         self.hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """One connection."""
+        """Handle one connection."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
@@ -44,7 +44,7 @@ class Gate:
             await send({"type": "http.response.body", "body": f"{refusal}\n".encode()})
 
     def refusal(self, scope: Any) -> tuple[str | None, bool]:
-        """Why a connection is refused (None: it is not), and whether it brought the token in its address."""
+        """Return why a connection is refused (None: admitted), and whether its address carried the token."""
         told = HTTPConnection(scope)
         hosts = [host.lower() for host in told.headers.getlist("host")]
         if len(hosts) != 1 or hosts[0] not in self.hosts:
@@ -62,7 +62,7 @@ class Gate:
         return secrets.compare_digest(token.encode(), self.token.encode())
 
     def _marked(self, send: Any, entering: bool) -> Any:
-        """`send` with headers that keep the page to itself."""
+        """Return `send` with headers that keep the page's address and content private."""
         cookie = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
         extra = [*HEADERS, *([(b"set-cookie", cookie.encode())] if entering else [])]
 

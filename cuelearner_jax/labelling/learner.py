@@ -1,4 +1,4 @@
-"""The model of a session: fitted by a thread of its own, from scratch, to all labels so far."""
+"""Background fitting of a session's model: from scratch, to all labels so far, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import Agreement, Programs, agreement
 from cuelearner_jax.types import Label
 
-# A fit computes in its own thread alone, which makes way for whoever answers.
+# A fit uses one thread, at low priority, so that the page stays responsive.
 ALONE = {"xla_cpu_multi_thread_eigen": False}
-NICE = 5  # of 19: what it gives way by
+NICE = 5  # niceness of the fitting thread, of at most 19
 
 
 def _step_back() -> None:
-    """Makes this thread give way to all others, where the system lets threads have priorities of their own."""
+    """Lower this thread's priority, where the system has priorities per thread."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
 
 
 class Fitted(NamedTuple):
-    """A model, and what is known of it."""
+    """A fitted model and its quality."""
 
     model: Any  # a `GuidanceModel`, or an `evidence.Theory`
-    labels: int = 0  # that it was fitted to
-    number: int = 0  # of the fit, from 1; 0: there was none
-    quality: Agreement | None = None  # with the labels that it was not trained on
-    problem: str = ""  # why there is none of the last fit: the one before it stays
-    told: tuple[str, ...] = ()  # of calibration, line by line: what changed
+    labels: int = 0  # number of labels in the fit
+    number: int = 0  # of the fit, from 1; 0: no fit yet
+    quality: Agreement | None = None  # with the labels held out of the fit
+    problem: str = ""  # why the last fit gave no model (the previous model stays)
+    told: tuple[str, ...] = ()  # calibration only: lines that report what changed
 
 
 class Learner:
-    """Fits whenever as many labels as a round has are new; one fit at a time."""
+    """Fit whenever a full round of labels is new, one fit at a time."""
 
     def __init__(self, plan: Plan, env: Any, programs: Programs, blank: GuideState, key: PRNGKeyArray) -> None:
         """Begins to compile the fit; `blank` is a guide that knows nothing, `key` the session's."""
@@ -71,14 +71,14 @@ class Learner:
         return guide, self._key, jnp.asarray(count // self._plan.config.sizes.labels_per_round, jnp.int32)
 
     def padded(self, rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Label:
-        """Observations, actions and answers as labels of a session's slots."""
+        """Put observations, actions and answers into a padded `Label` of the session's size."""
         blank = jax.tree.map(np.array, self._blank.labels)
         for slot, (obs, action, answer) in enumerate(rows[: len(blank.valid)]):
             blank.obs[slot], blank.action[slot], blank.answer[slot], blank.valid[slot] = obs, action, answer, True
         return blank
 
     def fit(self, labels: Label) -> None:
-        """Fits to labels now, and waits for it."""
+        """Fit to these labels now; return when the fit is done."""
         count = int(labels.valid.sum())
         if not count:
             return
@@ -93,14 +93,14 @@ class Learner:
         self.newest = Fitted(model, count, self.newest.number + 1, found if found.count else None)
 
     def due(self, count: int) -> bool:
-        """Are enough of so many labels new?"""
+        """Whether a full round of `count` labels is new since the last fit."""
         every = self._plan.config.sizes.labels_per_round
         return count // every > self.newest.labels // every
 
     def fit_later(self, labels: Callable[[], Label], count: int, done: Callable[[], None]) -> bool:
-        """Has the thread fit to what `labels` then gives, if enough is new and it has nothing to do; is it at it now?
+        """Start a background fit if due; return whether one started.
 
-        `done` is called by that thread afterwards.
+        The thread fits to what `labels` then returns, and calls `done` afterwards.
         """
         with self._lock:
             if self.running or not self.due(count):
@@ -110,7 +110,7 @@ class Learner:
         def work() -> None:
             try:
                 self.fit(labels())
-            except Exception as error:  # labels are still kept, whatever becomes of the model
+            except Exception as error:  # labels are still saved, whatever happens to the model
                 told = (str(error).splitlines() or [""])[0][:80]
                 problem = f"the last fit failed ({type(error).__name__}: {told})"
                 self.newest = self.newest._replace(labels=count, problem=problem)
@@ -123,5 +123,5 @@ class Learner:
         return True
 
     def close(self) -> None:
-        """Waits for a fit that runs."""
+        """Wait for a running fit, then stop the thread."""
         self._pool.shutdown(wait=True, cancel_futures=True)

@@ -1,17 +1,17 @@
-// Keys, buttons and pointing; each answer names the item that is on the screen. Films move what can move.
+// Keys, buttons and pointing. Each answer names the item on the screen. Films move the sketch's movers.
 //
-// What is pressed before a question can be answered is dropped, counted and told, never kept for later: a key that
-// waited would answer a question that nobody has seen. So what was pressed is what was saved plus what was told.
+// A press before a question can be answered is ignored, counted and reported. It is never queued, since it would then
+// answer a question that nobody has seen. So the presses made are the answers saved plus the presses reported.
 "use strict";
-const SOON = 100;  // after a question came nobody can have seen it and answered [ms]
-const TWICE = 400;  // within this the second click of a double click may follow the first [ms]
+const SOON = 100;  // within this time of a question's appearance nobody can have read it and answered [ms]
+const TWICE = 400;  // longest time between the clicks of a double click [ms]
 const cue = {
   keys: {}, again: "", item: undefined, shown: Infinity, sent: false, dropped: 0, playing: 0,
   scene() { return document.querySelector("svg.scene"); },
   at() { const scene = cue.scene(); return scene ? +scene.dataset.item : null; },
   window() { return document.querySelector(".q-dialog"); },
   seconds() { return Math.max(performance.now() - cue.shown, 0) / 1000; },
-  why(clicks) {  // nothing can be answered now; empty: something can
+  why(clicks) {  // the reason why no answer is possible now; empty if one is
     const since = performance.now() - cue.shown;
     if (cue.window()) return "a window lies over the question: close it first";
     if (cue.sent || cue.item !== cue.at()) return "the next question was not there yet";
@@ -26,7 +26,7 @@ const cue = {
     const why = cue.why(told.clicks || 1);
     if (why) { cue.drop(why); return; }
     if (!cue.scene() && name !== "undo") return;
-    if (name.startsWith("pick")) { emitEvent("cue", {name, item: cue.at()}); return; }  // one cue of several
+    if (name.startsWith("pick")) { emitEvent("cue", {name, item: cue.at()}); return; }  // a part of the answer, about one of several cues
     cue.sent = true;
     cue.tell("");
     emitEvent("cue", {name, item: cue.at(), angle: told.angle === undefined ? null : told.angle, seconds: cue.seconds()});
@@ -39,7 +39,7 @@ const cue = {
     line.classList.toggle("now", !!why);
   },
   drop(why) { cue.dropped += 1; cue.tell(why); },
-  mark(names) {  // what is picked of several cues, in the picture
+  mark(names) {  // highlight in the picture the parts chosen so far
     document.querySelectorAll("svg.scene .said").forEach(
       said => said.classList.toggle("picked", names.includes(said.dataset.name)));
   },
@@ -60,7 +60,7 @@ const cue = {
     mover.style.visibility = at ? "visible" : "hidden";
     if (at) mover.setAttribute("transform", `translate(${at[0]} ${at[1]}) rotate(${at[2]})`);
   },
-  photos(scene, film) {  // the pictures of a film, over that of the scene: decoded first, so that none flickers
+  photos(scene, film) {  // show a film's pictures over the scene's; decoded beforehand, to avoid flicker
     const photo = scene.querySelector("image.photo");
     scene.querySelectorAll("image.frame").forEach(one => one.remove());
     if (!photo) return [];
@@ -96,7 +96,7 @@ const cue = {
     };
     requestAnimationFrame(tick);
   },
-  gone() {  // what NiceGUI shows when nothing answers any more
+  gone() {  // contents of NiceGUI's notice of a lost connection
     const popup = document.getElementById("popup");
     if (!popup) return;
     const line = (kind, text) => popup.append(Object.assign(document.createElement(kind), {textContent: text}));
@@ -109,7 +109,7 @@ const cue = {
 };
 window.cue = cue;
 new MutationObserver(() => {
-  if (cue.at() === cue.item) return;  // the same question, with what a newer model makes of it
+  if (cue.at() === cue.item) return;  // the same question, with a newer model's correction
   cue.item = cue.at();
   cue.sent = false;
   cue.shown = Infinity;
@@ -122,7 +122,7 @@ document.addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey) return;
   const name = cue.keys[event.key];
   if (!name) return;
-  if (cue.window() && (["Enter", " "].includes(event.key) || name === "undo")) return;  // the window's own
+  if (cue.window() && (["Enter", " "].includes(event.key) || name === "undo")) return;  // keys for the open window
   event.preventDefault();
   if (!event.repeat) cue.send(name);
 });

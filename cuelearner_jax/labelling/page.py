@@ -1,4 +1,4 @@
-"""The page: one question, its answers, and how far it is. Everything that counts is the session's."""
+"""The labelling page in a browser: one question, its answers and the progress. All state is the session's."""
 
 from __future__ import annotations
 
@@ -18,19 +18,22 @@ from cuelearner_jax.labelling.session import Item, Session, Status
 from cuelearner_jax.spaces import UNSAID
 
 HERE = Path(__file__).parent
-LATE = "another question had come by then"  # to the server
+LATE = "the next question was already shown"  # why an answer was ignored
 
-Finish = Callable[[], Awaitable[None]]  # ends the work; raises UserError if that cannot be
+Finish = Callable[[], Awaitable[None]]  # ends the session; raises UserError if the labels cannot be saved
 
 
 class Page:
-    """What one browser shows of a session; several may show the same one."""
+    """One browser's view of a session; several browsers may show the same session."""
 
     def __init__(self, session: Session, pages: set[Page], finish: Finish | None = None, again: str = "") -> None:
-        """Builds the page in NiceGUI's current client.
+        """Build the page in NiceGUI's current client.
 
-        It joins the `pages` of the session while it is open. `finish` is called by the button that ends the work (None:
-        there is no such button); `again` is the command that opens the session once more.
+        Args:
+            session: the session to show.
+            pages: the open pages of the session; this page adds itself while it is open.
+            finish: called by the button that ends the session; None: no such button.
+            again: the command that opens the session once more.
         """
         self.session, self._pages, self._finish = session, pages, finish
         self.form, self.space = session.plan.form, session.space
@@ -38,17 +41,17 @@ class Page:
         self._one_cue = session.plan.one_cue
         films = session.films, session.simulates
         self.controls = controls.controls(self.form, self.space, self._one_cue, *films)
-        self._said: dict[int, float] = {}  # of the question on the screen, by the number of the cue
+        self._said: dict[int, float] = {}  # parts of the answer chosen so far, by the cue's index
         self._said_of = session.number
-        self._drawn: Item | None = None  # what the page shows
+        self._drawn: Item | None = None  # the item on the screen
         self._loop = asyncio.get_running_loop()
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
         keys = {key: name for name, control in self.controls.items() for key in control.keys}
         script = (HERE / "page.js").read_text() + f"cue.keys = {json.dumps(keys)}; cue.again = {json.dumps(again)};"
-        script = script.replace("</", "<\\/")  # which would end it
+        script = script.replace("</", "<\\/")  # an unescaped "</" would end the script
         ui.add_head_html(f"<script>{script}</script>")
-        rows = len(self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0  # of cues to be picked
+        rows = len(self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0  # of cues to choose from
         with ui.element("main").classes("label-page").style(f"--rows: {rows}"):
             with ui.column().classes("w-full gap-2"):
                 self._practice()
@@ -66,10 +69,10 @@ class Page:
         self._client.on_delete(lambda: (pages.discard(self), stop()))
         self.refresh()
 
-    # --- what it is made of ------------------------------------------------------------------------------------------
+    # --- building ------------------------------------------------------------------------------------------
 
     def _button(self, control: Control, **look: str) -> ui.button:
-        """A button that says the item on the screen with what it does."""
+        """Make a button whose event names the control and the item on the screen."""
         with ui.button(color=None).props(look.get("props", "")) as button:
             ui.html(f"{control.words}<span class=key>{control.shown}</span>", sanitize=False)
         button.classes(control.colour).mark(control.name)
@@ -90,7 +93,8 @@ class Page:
         self._pressable, self._picks = [], {}
         for number, cue in enumerate(self.space.cues):
             if about := [control for control in own if control.cue == number]:
-                with ui.element("div").classes("cue"):  # a row each, so that all lie above the fold
+                # one row per cue, so that all rows are visible without scrolling
+                with ui.element("div").classes("cue"):
                     ui.label(cue.name)
                     with ui.element("div").classes("answers"):
                         buttons = {control: self._button(control) for control in about}
@@ -115,7 +119,7 @@ class Page:
         with ui.element("div").classes("hide-small"):
             turned = [one for one in self.controls.values() if one.colour in ("left", "right") and one.cue is None]
             swatches = {"asked": "the action in question", **{one.colour: one.words for one in turned}}
-            refined = "the policy as corrected so far" if self._by_evidence else "what the model makes of it"
+            refined = "the corrected policy" if self._by_evidence else "the model's correction"
             for name, about in {**swatches, "refined": refined}.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
             ui.label(self.session.legend).classes("text-caption")
@@ -148,10 +152,10 @@ class Page:
                 ui.button("finish now", on_click=self._end, color="grey-7").mark("finish-now")
         return dialog
 
-    # --- what happens ------------------------------------------------------------------------------------------------
+    # --- events ------------------------------------------------------------------------------------------------
 
     async def _heard(self, event: GenericEventArguments, name: str | None = None) -> None:
-        """Something was pressed; without a browser's word for it, it is about the question of the moment."""
+        """Handle a control's event; without an item from the browser, it is about the current question."""
         told = event.args if isinstance(event.args, dict) and "name" in event.args else {"name": name}
         if told["name"] == "help":
             self._help.open() if not self._help.value else self._help.close()
@@ -167,11 +171,11 @@ class Page:
         if pressed is None and not (name == "point" and self.form.is_action and angle is not None):
             return
         taken, why = False, LATE
-        if self._help.value or self._early.value:  # a browser may not know yet that it opened
+        if self._help.value or self._early.value:  # the browser may not know yet that the window opened
             why = "a window lies over the question: close it first"
         elif pressed is not None and pressed.cue is not None and pressed.answer is not None and pressed.picks:
             if taken := number == self.session.number:
-                self._said_about(number)[pressed.cue] = pressed.answer[0]  # until the answer is sent
+                self._said_about(number)[pressed.cue] = pressed.answer[0]  # stored until the answer is sent
                 self._mark()
                 return
         else:
@@ -180,7 +184,7 @@ class Page:
                     taken = await run.io_bound(self.session.undo, number)
                 else:
                     said = self._said if self._said_of == number else {}
-                    answer = controls.given(self.space, pressed, angle, said)
+                    answer = controls.answer_of(self.space, pressed, angle, said)
                     taken = await run.io_bound(self.session.answer, number, answer, told.get("seconds"))
             except UserError as error:
                 why = str(error)
@@ -197,14 +201,14 @@ class Page:
             page.refresh()
 
     async def _ask_finish(self) -> None:
-        """Finishes what is complete; asks before the rest."""
+        """Finish if all labels are given; otherwise ask first."""
         status = self.session.status()
         if self.session.done:
             await self._end()
             return
         self._early_words.text = (
-            f"{status.answered} of {status.labels} labels are given, and saved. Those can be used as they are, and the "
-            "same command goes on later."
+            f"{status.answered} of {status.labels} labels are given and saved. They can be used now, and the "
+            "same command continues later."
         )
         self._early.open()
 
@@ -223,7 +227,7 @@ class Page:
             return
         of = name.removeprefix("film-")
         shown = item.refined if of == "refined" else self.session.outcomes(item).get(of, item.action)
-        if shown is None:  # nothing corrects it yet
+        if shown is None:  # there is no correction yet
             return
         reel = await run.io_bound(self.session.film, number, shown)
         if reel is not None:
@@ -231,20 +235,20 @@ class Page:
                 ui.run_javascript(f"cue.play({view.film(item, reel)})")
 
     def goto(self, address: str) -> None:
-        """Has the browser open another page of this server."""
+        """Make the browser open another page of this server."""
         with self._client:
             ui.run_javascript(f"location.replace({json.dumps(address)})")
 
     def _model_changed(self) -> None:
-        """From any thread."""
+        """Refresh the page; may be called from any thread."""
         self._loop.call_soon_threadsafe(self.refresh)
 
     def refresh(self) -> None:
-        """Shows the session as it is."""
+        """Show the session's current state."""
         status, item = self.session.status(), self.session.item
         plan = self.session.plan
         how = self.form, plan.config.scalars.eps_deg, self.space
-        if item is not self._drawn:  # what was picked of cues changes nothing in it
+        if item is not self._drawn:  # chosen parts of an answer do not change the picture
             self._drawn = item
             self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
             self._note.text = "" if item is None else view.note(item, *how)
@@ -267,13 +271,13 @@ class Page:
         self._tell(status)
 
     def _said_about(self, number: int) -> dict[int, float]:
-        """What was picked of a question's cues; of another than the one before nothing."""
+        """Return the parts chosen for a question; empty for a new question."""
         if self._said_of != number:
             self._said, self._said_of = {}, number
         return self._said
 
     def _mark(self) -> None:
-        """Shows what was picked of several cues."""
+        """Highlight the parts chosen so far, where there are several cues."""
         picked = {one.name for one in self._picks if one.answer == (self._said.get(one.cue, UNSAID),)}
         for control, button in self._picks.items():
             button.classes(**{"add" if control.name in picked else "remove": "picked"})
@@ -293,7 +297,7 @@ class Page:
         self._model.text = f"{fitted}; {doing} the next" if status.fitting else fitted
         if newest.problem:
             self._model.text = f"{fitted}; {newest.problem}"
-        apart = f"agrees with labels kept apart: {newest.quality}" if newest.quality else ""
+        apart = f"agreement with held-out labels: {newest.quality}" if newest.quality else ""
         self._quality.text = "\n".join(newest.told) or apart
         place = "/".join(self.session.place.parts[-2:])
         self._saved.text = f"{place}: {status.answered + status.unsure} answers saved"

@@ -1,4 +1,4 @@
-"""What a session of labelling is about."""
+"""What a labelling session is configured to ask."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from cuelearner_jax.policies import Policy
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Task
 
-APART = ("env", "teacher")  # fields of policies that are the world's, which the file tells by itself
+APART = ("env", "teacher")  # fields of policies that describe the world; the label file records them separately
 
 
 @dataclass(frozen=True)
 class Base:
-    """The policy whose actions are asked about."""
+    """The policy whose actions the questions are about."""
 
     policy: Policy
     name: str
 
     @property
     def digest(self) -> str:
-        """Short hash of its parameters; empty where it has none that JAX knows of."""
+        """Short hash of the policy's parameters; empty for a policy without JAX arrays."""
         found = hashlib.sha256()
         count = 0
         for path, leaf in jax.tree_util.tree_leaves_with_path(self.policy):
@@ -43,40 +43,41 @@ class Base:
 
 @dataclass(frozen=True)
 class Plan:
-    """Who is asked about what, and how much."""
+    """Settings of a labelling session: who is asked, about what, and how many questions."""
 
     task: Task
-    config: RunConfig  # of which the world, the sizes and the scalars count
+    config: RunConfig  # whose world, sizes and scalars the session uses
     guidance: Guide
     base: Base
-    labels: int  # answers that are wanted
+    labels: int  # number of answers wanted
     seed: int = 0
     who: str = "anonymous"
-    bound_deg: float | None = None  # of questions' way from the base's actions, in the space's unit; None: anywhere
-    robot: str = ""  # its body and what that walks by, where it is not the task's own
-    again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about: they are asked again
-    again_of: str = ""  # digest of its file
-    family: Family = ()  # of calibration: what may have changed
-    one_cue: bool = False  # of several cues, is one press, about one of them, the whole answer?
+    # largest distance of a question from the base policy's action, in the space's unit; None: no bound
+    bound_deg: float | None = None
+    robot: str = ""  # the robot's body and its locomotion policy, where not the task's default
+    again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about, to be asked again
+    again_of: str = ""  # digest of that session's file
+    family: Family = ()  # calibration only: what may have changed
+    one_cue: bool = False  # whether one press about one of several cues is the whole answer
 
     @property
     def form(self) -> AnswerForm:
-        """Of the answers."""
+        """The answer form being collected."""
         assert self.guidance.form is not None
         return self.guidance.form
 
     @property
     def world(self) -> dict[str, Any]:
-        """The task and its configuration, as label files name them."""
+        """The task's name and configuration, as label files record them."""
         return {"name": self.task.name, **to_json(self.config.task)}
 
     @property
     def eps(self) -> float | None:
-        """Strength of an answer in the space's unit, where the form has one."""
+        """Strength of an answer in the space's unit; None where the form has no strength."""
         return self.config.scalars.eps_deg if self.form.by_eps else None
 
     def session(self, env: Any) -> dict[str, Any]:
-        """What else must be the same for answers to share a file."""
+        """Return the settings that must be equal for answers to share a file, beyond task and form."""
         layout = [{"name": part.name, "size": part.size, "unit": part.unit} for part in env.observation]
         return {
             "seed": self.seed,

@@ -1,4 +1,4 @@
-"""Where cues point in a picture: as the task says, or by their words; and how they are drawn there."""
+"""Screen directions of cues, given by the task or inferred from the cues' words, and their drawing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cuelearner_jax.spaces.box import SHARE
 from cuelearner_jax.types import Sketch
 
 Direction = tuple[float, float]  # on the screen: x to the right, y down
-AWAY = (0.7, -0.7)  # what lies farther off is drawn to the upper right: up and right are other cues'
+AWAY = (0.7, -0.7)  # "away" is drawn to the upper right, since up and right belong to other cues
 WORDS: dict[str, Direction] = {
     **dict.fromkeys(("left", "leftward", "leftwards"), (-1.0, 0.0)),
     **dict.fromkeys(("right", "rightward", "rightwards"), (1.0, 0.0)),
@@ -24,13 +24,13 @@ WORDS: dict[str, Direction] = {
     **dict.fromkeys(("forward", "forwards", "farther", "further", "away", "ahead"), AWAY),
     **dict.fromkeys(("back", "backward", "backwards", "nearer", "closer"), (-AWAY[0], -AWAY[1])),
 }
-LENGTH = 0.1  # of the arrow of a cue, of the shorter side of the picture
-LEAST = 0.05  # of a sketch's reach: an arrow of an action that is shorter is not drawn
-LARGER = 1.5  # strokes and keys of cues' arrows: than those of directions
+LENGTH = 0.1  # length of a cue's arrow, as a share of the picture's shorter side
+LEAST = 0.05  # arrows of actions shorter than this share of the sketch's reach are not drawn
+LARGER = 1.5  # factor on strokes and keys of cues' arrows, compared with those of directions
 
 
 def by_words(cue: Cue) -> Direction | None:
-    """Return which way more of a cue points by its words; None: they do not say, or contradict each other."""
+    """Return the screen direction for "more" of a cue by its words; None: the words give none, or contradict."""
     found = [_direction(words) for words in cue.words]
     more, less = found[0], None if found[1] is None else (-found[1][0], -found[1][1])
     if more is not None and less is not None and more != less:
@@ -44,9 +44,9 @@ def _direction(words: str) -> Direction | None:
 
 
 def ways_of(space: Space, sketch: Sketch) -> tuple[Direction | None, ...]:
-    """Return which way more of each cue points in a sketch; nothing for directions, which are drawn as they are.
+    """Return the screen direction for "more" of each cue in a sketch; empty for directions, which are arrows already.
 
-    A direction that is given has its own length; one by words has length 1 or less.
+    A direction that the task gives has its own length; a direction inferred from words has length 1 or less.
     """
     if space == DIRECTIONS:
         return ()
@@ -56,9 +56,9 @@ def ways_of(space: Space, sketch: Sketch) -> tuple[Direction | None, ...]:
 
 
 def answers_drawn(sketch: Sketch, ways: Sequence[Direction | None], controls: Sequence[Control]) -> list[str]:
-    """Draw each control that asks for more or less of a cue that points somewhere: an arrow with its key and words.
+    """Draw an arrow with key and words for each control about a cue that has a direction on the screen.
 
-    The arrows stand near the edge, so that the middle of the picture stays free.
+    The arrows are placed near the edge, to leave the middle of the picture free.
     """
     drawn, lanes = [], {}
     for control in controls:
@@ -69,7 +69,7 @@ def answers_drawn(sketch: Sketch, ways: Sequence[Direction | None], controls: Se
         if abs(sign) != 1.0:
             continue
         angle = math.degrees(math.atan2(-sign * way[1], sign * way[0]))
-        lane = lanes[round(angle)] = lanes.get(round(angle), -1) + 1  # several cues may point the same way
+        lane = lanes[round(angle)] = lanes.get(round(angle), -1) + 1  # several cues may point in one direction
         drawn.append(_at_edge(sketch, angle, lane, control))
     return drawn
 
@@ -102,7 +102,7 @@ def _at_edge(sketch: Sketch, angle: float, lane: int, control: Control) -> str:
 def from_foot(sketch: Sketch, ways: Sequence[Direction | None], shares: np.ndarray, name: str) -> str:
     """Draw an action as an arrow from the foot of a sketch, if it is long enough to be seen.
 
-    `shares` (cues,) tell how far the action is from the middle of each cue's range, 1 at its end.
+    `shares` (cues,) is the action's distance from the middle of each cue's range; 1 is the end of the range.
     """
     moves = [(float(share) * way[0], float(share) * way[1]) for share, way in zip(shares, ways, strict=True) if way]
     x, y = sum(move[0] for move in moves), sum(move[1] for move in moves)

@@ -1,4 +1,4 @@
-"""The compiled steps of a session: asking, following, fitting, and what a model would answer itself."""
+"""The compiled steps of a labelling session: choose a question, step the world, fit, and predict answers."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.types import EnvState, Label, Teacher
 
-SAME = 1e-5  # by which an observation may differ that is lived through anew
+SAME = 1e-5  # largest difference of a replayed observation from the recorded one
 
 Advance = Callable[[Any, PRNGKeyArray, EnvState, Any], tuple[EnvState, Any]]  # (env, key, state, action)
 
 
 class Keys(NamedTuple):
-    """Random numbers of a session."""
+    """Random keys of a session."""
 
-    session: PRNGKeyArray  # of its questions and fits
+    session: PRNGKeyArray  # for questions and fits
     model: PRNGKeyArray
-    start: PRNGKeyArray  # of the first situation
+    start: PRNGKeyArray  # for the first situation
 
 
 def keys_of(seed: int) -> Keys:
-    """Those of a seed."""
+    """Derive a session's random keys from its seed."""
     return Keys(*jax.random.split(jax.random.key(seed), 3))
 
 
 @jax.jit
 def begin(env: Environment, key: PRNGKeyArray) -> tuple[EnvState, jax.Array]:
-    """The first situation of an episode: (state, observation)."""
+    """Return the first situation of an episode: (state, observation)."""
     return env.reset(key)
 
 
 @jax.jit
 def advance(env: Environment, key: PRNGKeyArray, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
-    """The situation that an action leads to: (state, observation)."""
+    """Return the situation after an action: (state, observation)."""
     after, step = env.step(key, state, action)
     return after, step.obs
 
@@ -55,9 +55,10 @@ def advance(env: Environment, key: PRNGKeyArray, state: EnvState, action: jax.Ar
 def lived(
     env: Environment, keys: Keys, rows: Iterable[tuple[np.ndarray, np.ndarray]]
 ) -> Iterator[tuple[EnvState, jax.Array]]:
-    """Situation after situation: before each of the items, whose observations and actions `rows` hold, and after all.
+    """Replay recorded items; yield the situation (state, observation) before each item, and after the last.
 
-    Ends early, before the first item that was seen otherwise: by a program of another version.
+    `rows` holds the items' observations and actions. The replay ends early, before the first item whose observation
+    differs from the recorded one (a program of another version).
     """
     state, obs = begin(env, keys.start)
     for number, (seen, action) in enumerate(rows):
@@ -70,17 +71,18 @@ def lived(
 
 
 class Programs(NamedTuple):
-    """Compiled functions of one form of guidance; each is called with arrays of the same shapes throughout."""
+    """The compiled functions for one kind of guidance; each is always called with the same array shapes."""
 
     question: Callable[..., Array]  # (env, scalars, base, guide, keys, bound) -> the action to ask about (action,)
-    fit: Callable[..., GuideState]  # (env, scalars, guide, lane_key, times) -> with a model of its labels
-    refined: Callable[..., Array]  # (env, scalars, model, obs, action) -> what the model makes of an action (action,)
-    answers: Callable[..., Array]  # (env, scalars, model, labels) -> what it would have answered (labels, width)
+    fit: Callable[..., GuideState]  # (env, scalars, guide, lane_key, times) -> guide with a model of its labels
+    refined: Callable[..., Array]  # (env, scalars, model, obs, action) -> the action refined by the model (action,)
+    # (env, scalars, model, labels) -> the answers that the model predicts (labels, width)
+    answers: Callable[..., Array]
 
 
 @cache
 def programs(guidance: Guide) -> Programs:
-    """Those of a guidance, not compiled yet; the same ones for the same guidance."""
+    """Return the jitted functions of a kind of guidance; cached, so that each compiles once per kind."""
 
     def refined(env: Any, scalars: Any, model: Any, obs: Array, action: Array) -> Array:
         return guidance.act(model, env, obs[None], action[None], jnp.ones(1, bool), scalars).actions[0]
@@ -106,18 +108,18 @@ def programs(guidance: Guide) -> Programs:
 
 
 class _Holds:
-    """A teacher that holds one action for best."""
+    """A teacher with one fixed best action."""
 
     def __init__(self, action: Array) -> None:
         self.action = action
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """That action."""
+        """Return the fixed action (action,)."""
         return self.action
 
 
 def faultless(scalars: Scalars) -> Scalars:
-    """The same without the faults of a simulated teacher, who looks at one action alone."""
+    """Return `scalars` without a simulated teacher's mistakes, silence, indifference and bias."""
     none = {"mistake_probability": 0.0, "silence_probability": 0.0, "indifference_deg": 0.0, "teacher_bias_deg": 0.0}
     return dataclasses.replace(scalars, answer="best", says="all", **none)
 
@@ -131,14 +133,14 @@ def as_teacher(
     obs: Float[Array, " obs"],
     action: Float[Array, " action"],
 ) -> Float[Array, " answer"]:
-    """What a teacher without faults answers."""
+    """Return the answer of a teacher without mistakes."""
     return form.answer(jax.random.key(0), env, teacher, state, obs, action, faultless(scalars))[0]
 
 
 class Agreement(NamedTuple):
-    """How well two sets of answers agree."""
+    """Agreement of two sets of answers."""
 
-    value: float  # share of answers that are equal; of actions the mean distance between them
+    value: float  # share of equal answers; for actions, the mean distance between them
     count: int
     unit: str  # "%", or the unit of the space
 
@@ -151,7 +153,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.ndarray) -> Agreement:
-    """That of answers (n, width) with others of the same questions; of cues, where both say something."""
+    """Compare answers (n, width) to the same questions; a cue counts where both sets say something."""
     space = actions_of(env)
     if form.is_action:
         apart = np.asarray(space.to_unit(space.distance(jnp.asarray(one), jnp.asarray(other))))

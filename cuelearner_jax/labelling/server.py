@@ -1,4 +1,4 @@
-"""Serving a session's page on this machine, until it is finished or stopped."""
+"""Serve a session's page on this machine until the session is finished or stopped."""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ from cuelearner_jax.labelling.page import Page
 from cuelearner_jax.labelling.session import Session
 
 HOST = "127.0.0.1"
-SHOWN_WITHIN = 10.0  # of the end every browser should have shown the last page; nobody waits longer [s]
-RECONNECT = 60.0  # for which a page whose connection broke is kept [s]
+SHOWN_WITHIN = 10.0  # time for all browsers to load the last page before the server stops [s]
+RECONNECT = 60.0  # time for which the page of a broken connection is kept [s]
 
 
-ADDRESS, SEEN = "/finished", "/finished/seen"  # the last page, and what its script asks for once it is shown
+ADDRESS, SEEN = "/finished", "/finished/seen"  # the last page, and the address its script requests once it is shown
 
 
 class Commands(NamedTuple):
-    """What a person may type."""
+    """Commands that the page shows for copying."""
 
-    again: str  # opens the session once more
-    following: Callable[[int], str]  # number of labels -> what uses them
+    again: str  # opens this session again
+    following: Callable[[int], str]  # number of labels -> the command that uses them
 
 
 class Ending(NamedTuple):
-    """How the work ended."""
+    """Result of a finished session."""
 
     file: Path
     labels: int
     unsure: int
     wanted: int
     following: str  # the command that uses the labels
-    again: str  # the one that goes on
+    again: str  # the command that continues the session
 
     @property
     def line(self) -> str:
-        """What was saved, and where."""
+        """Return one line that says what was saved, and where."""
         also = f", and {self.unsure} questions without an answer" if self.unsure else ""
         return f"{self.labels} of {self.wanted} labels are saved{also}, in {self.file}"
 
 
 def last_page(told: Ending) -> str:
-    """The end as a whole page of HTML, which needs no server once it is shown, and tells the server that it is."""
+    """Return the last page as HTML. It needs no server once shown, and its script reports that it is shown."""
     line, following, again = (html.escape(text) for text in (told.line, told.following, told.again))
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
@@ -79,36 +79,36 @@ this.textContent = 'copied'">copy</button></p>
 </body></html>"""
 
 
-def bound(port: int) -> socket.socket:
-    """A socket of this machine alone (port 0: any that is free). Raises UserError if the port is taken."""
+def bind(port: int) -> socket.socket:
+    """Return a socket bound to this machine only (port 0: any free port). Raises UserError if the port is taken."""
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((HOST, port))
-        found.listen()  # from now on a browser waits for the page instead of being refused
+        found.listen()  # from now on a browser waits for the page, where it would have been refused
     except OSError as error:
         found.close()
-        raise UserError(f"port {port} of {HOST} cannot be had ({error.strerror}): give another --port") from error
+        raise UserError(f"port {port} of {HOST} is not available ({error.strerror}): give another --port") from error
     return found
 
 
 class _Server(uvicorn.Server):
-    """Ends when an event is set; signals are the command's."""
+    """A server that stops when an event is set and leaves signals to the command."""
 
     ends: threading.Event
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Leaves them alone."""
+        """Install no signal handlers."""
         yield
 
     async def on_tick(self, counter: int) -> bool:
-        """Is it over?"""
+        """Return whether the server should stop."""
         return await super().on_tick(counter) or self.ends.is_set()
 
 
 class _Last:
-    """The end of the work: finishes the session, sends every browser to the last page, and stops once it is shown."""
+    """Ends the session: saves its labels, sends every browser to the last page, stops the server once shown."""
 
     def __init__(
         self, session: Session | None, pages: set[Page], stopping: threading.Event, commands: Commands
@@ -134,7 +134,7 @@ class _Last:
             page.goto(ADDRESS)
 
     def routes(self, app: FastAPI) -> None:
-        """The last page, and where it says that it is shown."""
+        """Add the last page, and the address by which its script reports that it is shown."""
 
         @app.get(ADDRESS)
         def show() -> HTMLResponse:
@@ -184,7 +184,7 @@ def serve(
         reconnect_timeout=RECONNECT,
         show_welcome_message=False,
     )
-    # uvloop would take the signals' wake-up from the thread of `signals` that hears them.
+    # uvloop would take over the signal wake-up that the thread of `signals` waits for.
     how = {"log_level": "warning", "ws": "wsproto", "loop": "asyncio", "timeout_graceful_shutdown": 1}
     settings = uvicorn.Config(Gate(app, port, token), **how)
     server = _Server(settings)

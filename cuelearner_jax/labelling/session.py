@@ -1,8 +1,7 @@
-"""A session of labelling: what is asked next, what was said, and the model that is fitted meanwhile. Knows no page.
+"""A labelling session without its page: choose questions, save answers, fit a model in the background.
 
-Every answer is on the disk before the next question can be seen. Questions are prepared ahead and models are fitted by
-threads of their own: nobody who answers waits for either. A session that is opened again goes on where the file ends:
-its situations are lived through anew with the recorded actions.
+An answer is on disk before the next question is shown. Threads prepare questions and fit models, so that nobody who
+answers has to wait. A session that is reopened replays the recorded actions and continues where its file ends.
 """
 
 from __future__ import annotations
@@ -35,24 +34,25 @@ from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import Label, Reel, Sketch
 
-RECENT = 50  # answers by which the pace is told
-KEPT = 20  # questions back whose pictures are still there; those of earlier ones are made anew where undo leads there
-NUMBERS = 2**31  # of questions: those of practice count down to 0, and their random numbers are the last ones
+RECENT = 50  # number of answers from which the pace is computed
+KEPT = 20  # number of past questions whose pictures are kept; undo redraws earlier ones
+NUMBERS = 2**31  # practice questions have numbers below 0, whose random numbers are counted down from this
 
 
 class Item(NamedTuple):
     """A question: a situation and an action in it."""
 
-    number: int  # from 0; below 0: it is for practice
-    guide: GuideState  # in that situation
+    number: int  # from 0; below 0: a practice question
+    guide: GuideState  # the guide's state in that situation
     action: np.ndarray  # (action,)
-    sketch: Sketch | None = None  # None: nobody is about to see it
-    refined: np.ndarray | None = None  # what the newest model makes of the action; None: there is none yet
-    trails: dict[str, str] | None = None  # where `controls.outcomes` lead, as `Pictures.trails`; None: not made
+    sketch: Sketch | None = None  # None: not needed yet
+    refined: np.ndarray | None = None  # the action refined by the newest model; None: no model yet
+    # drawings of the `controls.outcomes`, as `Pictures.trails`; None: not drawn yet
+    trails: dict[str, str] | None = None
 
 
 class Said(NamedTuple):
-    """What was said of an item."""
+    """The recorded response to an item."""
 
     said: str  # one of `label_checks.SAID`
     obs: np.ndarray
@@ -62,20 +62,20 @@ class Said(NamedTuple):
 
 
 class Status(NamedTuple):
-    """How far a session is."""
+    """Progress of a session."""
 
     answered: int
     unsure: int
-    labels: int  # wanted
-    per_minute: float | None  # answers, lately
+    labels: int  # number wanted
+    per_minute: float | None  # answers a minute, over the last `RECENT` questions
     minutes_left: float | None
     fitting: bool
     newest: Fitted
-    trouble: str  # why the last answer is not saved; empty: all is well
+    trouble: str  # why the last answer is not saved; empty: no problem
 
 
 class Session:
-    """Asks, keeps, fits. Its methods may be called from any thread."""
+    """Asks questions, saves answers and fits models. Its methods may be called from any thread."""
 
     def __init__(
         self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None, practice: int = 0
@@ -83,17 +83,20 @@ class Session:
         """Opens the file and prepares the first questions: afterwards nothing is compiled, but by the thread that fits.
 
         Args:
-            plan: what it is about.
-            folder: where `labels.jsonl` lies, or is to lie. Keep it claimed (`records.folders.claimed`).
-            tell: is told what is being prepared.
-            practice: questions that come before the first one and are not saved, unless the file holds some already.
+            plan: the session's settings.
+            folder: the folder of `labels.jsonl`. Keep the folder claimed (`storage.folders.claimed`).
+            tell: called with progress lines.
+            practice: number of practice questions before the first one; their answers are not saved. None are asked
+                where the file holds answers already.
 
         Raises:
-            UserError: the folder holds labels of something else, or nothing draws the task.
+            UserError: the folder holds labels of another session, or the task has no sketch.
         """
         self._pictures = plan.task.pictures()
         if self._pictures.sketch is None:
-            raise UserError(f"{plan.task.name} has no sketches to label by: give its body's Pictures `sketch`")
+            raise UserError(
+                f"{plan.task.name} has no sketches to show on the page: set `sketch` in the Pictures of its body"
+            )
         if self._pictures.check is not None:
             self._pictures.check(plan.task.environment(plan.config.task))
         self.plan = plan
@@ -101,20 +104,21 @@ class Session:
         self.space = space = actions_of(shape)
         named = plan.world, plan.form.name, space, plan.eps, plan.form.meaning(space), plan.session(shape)
         self._writer = label_files.LabelWriter(folder, *named, written_by=provenance())
-        tell("making the world")
+        tell("building the environment")
         self.env = plan.task.environment(plan.config.task)
         by_evidence = plan.guidance.kind.by_evidence
         self._programs = PROGRAMS if by_evidence else programs(plan.guidance)
         self._keys = keys_of(plan.seed)
         slots = asking.label_slots(plan.labels, plan.config.sizes)
         start = asking.start(plan.guidance, self.env, slots, plan.labels, self._keys.model, self._keys.start)
-        tell("preparing the model")
+        tell("compiling the model's fit")
         learner = EvidenceLearner if by_evidence else Learner
         self._learner = learner(plan, self.env, self._programs, start, self._keys.session)
         self._bound = None if plan.bound_deg is None else space.from_unit(plan.bound_deg)
-        self._acting = threading.Lock()  # one answer at a time; whoever waits for an item holds no other lock
+        # answers are handled one at a time; whoever waits for an item holds no other lock
+        self._acting = threading.Lock()
         self._lock = threading.RLock()
-        self._ahead = ThreadPoolExecutor(1, thread_name_prefix="ahead")  # the one thread that makes items
+        self._ahead = ThreadPoolExecutor(1, thread_name_prefix="ahead")  # the only thread that makes items
         self._listeners: list[Callable[[], None]] = []
         self._rows: dict[int, Said] = {}
         self._items: dict[int, Item] = {}
@@ -126,27 +130,30 @@ class Session:
         tell("preparing questions")
         self._ensure(self.number)
         self._ensure(self.number + 1)
-        self.films = self.film(self.number, self._items[self.number].action) is not None  # are there any?
+        # whether the task films situations
+        self.films = self.film(self.number, self._items[self.number].action) is not None
         self._next: Future[None] = self._ahead.submit(self._ensure, self.number + 1)
         self._since = time.monotonic()
 
     def _lived(self, start: GuideState, tell: Callable[[str], None]) -> None:
-        """Lives through what the file holds, fits a model to it, and asks where it ends."""
+        """Replay the file's items, fit a model to its answers, and make the question that comes next."""
         for row in label_files.history(self._writer.path):
             if row.get("item") is None:
-                raise UserError(f"{self._writer.path} is no page's file: give another --out")
+                raise UserError(f"{self._writer.path} was not written by the labelling page: give another --out")
             obs, action = (np.asarray(row[name], np.float32) for name in ("obs", "action"))
             answer = None if row.get("answer") is None else np.asarray(row["answer"], np.float32)
             self._rows[row["item"]] = Said(row["said"], obs, action, answer, row["seconds"])
         count = len(self._rows)
         if set(self._rows) != set(range(count)):
-            raise UserError(f"{self._writer.path} lacks items, so it is no page's file: give another --out")
+            raise UserError(
+                f"{self._writer.path} lacks items, so the labelling page did not write it: give another --out"
+            )
         if count:
-            tell(f"going through {count} earlier questions")
+            tell(f"replaying {count} earlier questions")
         told = [self._rows[number] for number in range(count)]
         found = list(lived(self.env, self._keys, [(row.obs, row.action) for row in told]))
         if len(found) <= count:
-            tell("the earlier situations come out otherwise with this program: a new episode begins")
+            tell("replaying the earlier situations gives other observations with this version: a new episode begins")
             found = [(None, None)] * count + [begin(self.env, jax.random.fold_in(self._keys.start, count))]
         for number, (state, obs) in enumerate(found[:count]):
             if obs is not None:
@@ -158,7 +165,7 @@ class Session:
         self._items[count] = self._asked(count, start.replace(env=state, obs=obs))
 
     def _prepare_practice(self, start: GuideState) -> None:
-        """Makes the questions of practice, each in an episode of its own, and goes to the first of them."""
+        """Make the practice questions, each in an episode of its own, and go to the first of them."""
         for number in range(-self.practice, 0):
             state, obs = begin(self.env, jax.random.fold_in(self._keys.start, number % NUMBERS))
             self._items[number] = self._asked(number, start.replace(env=state, obs=obs))
@@ -188,7 +195,7 @@ class Session:
         return item._replace(refined=np.asarray(refined) if newest.number else None)
 
     def _ensure(self, number: int) -> None:
-        """Makes the item of a number ready to be seen; the one before it is there."""
+        """Make an item ready to be shown; the item before it exists already."""
         assert self._pictures.sketch is not None
         item = self._items.get(number) or self._asked(number, self._followed(self._items[number - 1]))
         if item.sketch is None:
@@ -205,11 +212,11 @@ class Session:
         return dict(zip(outcomes, drawn, strict=True))
 
     def outcomes(self, item: Item) -> dict[str, np.ndarray]:
-        """What the answers would make of an item's action, see `controls.outcomes`."""
+        """Return each answer's outcome for an item's action, see `controls.outcomes`."""
         return controls.outcomes(self.plan.form, self.space, item.action, self.plan.config.scalars.eps_deg)
 
     def _renew(self) -> None:
-        """By the newest model: what is prepared but was never seen is asked anew, what is seen is refined anew."""
+        """Update items for the newest model: remake prepared questions, refine the shown ones again."""
         coming, seen = self._items.get(self._furthest + 1), self._items.get(self.number)
         anew = coming and self._refined(self._asked(coming.number, coming.guide)._replace(sketch=coming.sketch))
         again = seen and self._refined(seen)
@@ -222,45 +229,45 @@ class Session:
 
     @property
     def place(self) -> Path:
-        """The file."""
+        """The path of the label file."""
         return self._writer.path
 
     @property
     def legend(self) -> str:
-        """What the picture's trails mean; empty: there are none."""
+        """The meaning of the picture's trails; empty where there are none."""
         return self._pictures.legend
 
     @property
     def simulates(self) -> bool:
-        """Is a film what any action would lead to?"""
+        """Whether the task can film the outcome of any action."""
         return self._pictures.simulates
 
     @property
     def item(self) -> Item | None:
-        """The question of the moment; None: all are answered, or the work is finished."""
+        """The current question; None once all are answered or the session is finished."""
         with self._lock:
             return None if self.done else self._items[self.number]
 
     @property
     def done(self) -> bool:
-        """Are as many answered as were wanted, or is the work finished before?"""
+        """Whether all wanted labels are given, or the session was finished early."""
         enough = self._counted(ANSWERED) >= self.plan.labels or 0 < len(self.plan.again) <= self.number
         return enough or self._finished is not None
 
     # --- answers -----------------------------------------------------------------------------------------------------
 
     def answer(self, number: int, answer: np.ndarray | None, seconds: float | None = None) -> bool:
-        """Keeps an answer and moves on; False if the question is another by now: it was answered, or taken back.
+        """Save an answer and move on. Return False if another question is current: the answer came too late.
 
-        What is said of a question of practice is not kept.
+        Answers to practice questions are not saved.
 
         Args:
-            number: of the item that was on the screen.
-            answer: in the words of the form, (width,); None: don't know.
-            seconds: from the question on the screen to the answer (default: since it became the question).
+            number: number of the item that was on the screen.
+            answer: in the form's encoding, (width,); None for "don't know".
+            seconds: time from showing the question to the answer (default: since it became the current question) [s].
 
         Raises:
-            UserError: the answer cannot be saved. It may be given again.
+            UserError: the answer could not be saved. It may be given again.
         """
         with self._acting:
             with self._lock:
@@ -275,7 +282,7 @@ class Session:
         return True
 
     def _show(self, number: int) -> None:
-        """Moves to an item that is ready, and has the one after it made."""
+        """Move to an item that is ready, and start preparing the next one."""
         with self._lock:
             self.number, self._since = number, time.monotonic()
             self._furthest = max(self._furthest, number)
@@ -284,9 +291,10 @@ class Session:
             self._next = self._ahead.submit(self._ensure, number + 1)
 
     def undo(self, number: int) -> bool:
-        """Takes the answer before this question back and asks it again; False if there is none, or not this question.
+        """Take back the answer before this question and ask it again.
 
-        Nothing leads from the first question back to those of practice. Raises UserError if it cannot be saved.
+        Return False if there is no such answer, or another question is current. The first question has no way back to
+        the practice questions. Raises UserError if the change cannot be saved.
         """
         with self._acting:
             with self._lock:
@@ -299,7 +307,7 @@ class Session:
             return True
 
     def skip_practice(self) -> None:
-        """Goes to the first question that counts; nothing happens where practice is over."""
+        """Go to the first question that counts; do nothing after practice."""
         with self._acting:
             self._next.result()
             if self.number < 0:
@@ -307,9 +315,9 @@ class Session:
                 self._show(0)
 
     def finish(self) -> Path:
-        """Ends the work: turns the answers into Parquet and returns that file; whatever is said later is not taken.
+        """End the session: write the answers as Parquet and return that file. Later answers are refused.
 
-        Raises UserError if there is no answer yet, or the disk takes no more; the work then goes on.
+        Raises UserError if there is no answer yet or the disk is full; the session then continues.
         """
         with self._acting:
             if self._finished is None:
@@ -339,7 +347,7 @@ class Session:
     # --- the model ---------------------------------------------------------------------------------------------------
 
     def _labels(self) -> Label:
-        """What was answered, in the order of the items, padded."""
+        """Return the answers in the order of their items, as a padded `Label`."""
         with self._lock:
             rows = [self._rows[number] for number in sorted(self._rows)]
         return self._learner.padded([(row.obs, row.action, row.answer) for row in rows if row.answer is not None])
@@ -352,10 +360,10 @@ class Session:
         self._ahead.submit(self._renew)
         self._fit_if_due()
 
-    # --- what a page shows -------------------------------------------------------------------------------------------
+    # --- for the page -------------------------------------------------------------------------------------------
 
     def film(self, number: int, action: np.ndarray) -> Reel | None:
-        """What an action leads to in an item's situation; None where nothing films the task."""
+        """Film the outcome of an action in an item's situation; None where the task has no films."""
         if self._pictures.reel is None:
             return None
         return self._pictures.reel(self.env, self._items[number].guide.env, jnp.asarray(action, jnp.float32))
@@ -365,7 +373,7 @@ class Session:
             return sum(one.said == said for one in self._rows.values())
 
     def status(self) -> Status:
-        """How far it is."""
+        """Return the session's progress."""
         with self._lock:
             answered = self._counted(ANSWERED)
             given = [self._rows[number] for number in sorted(self._rows) if self._rows[number].said != UNDONE][-RECENT:]
@@ -383,7 +391,10 @@ class Session:
             )
 
     def listen(self, heard: Callable[[], None]) -> Callable[[], None]:
-        """Has a function called, from any thread, when a fit begins or its model comes into use. Returns the end."""
+        """Register a function that is called, from any thread, when a fit begins or a new model is in use.
+
+        Returns a function that ends the registration.
+        """
         self._listeners.append(heard)
         return lambda: self._listeners.remove(heard)
 
@@ -392,7 +403,7 @@ class Session:
             heard()
 
     def close(self) -> None:
-        """Closes the file; a fit that runs is waited for."""
+        """Close the file and stop the threads, after any running fit."""
         self._learner.close()
         self._ahead.shutdown(wait=True, cancel_futures=True)
         self._writer.close()

@@ -1,4 +1,4 @@
-"""A question as SVG: the sketch of its situation, the action as an arrow, and what answers would make of it."""
+"""Draw a question as SVG: the situation's sketch, the action as an arrow, and the answers' outcomes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from cuelearner_jax.labelling.session import Item
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Reel, Sketch
 
-TURNED_REACH = 1.25, 3.5  # how much farther arrows reach that are turned: the more the less they are,
-APART = 10.0  # by this over eps [deg], so that they can be told apart
-BESIDE_TRAILS = 1.8  # no turned arrow reaches farther where trails tell them apart: what it points at stays in view
-TIPS = 8.0  # turns are drawn larger than they are where tips would be nearer than this [hairs],
-STEEPEST = 30.0  # but eps no larger than this [deg],
-WIDEST = 60.0  # and a refined action no farther away, unless it is [deg]
-LEAST_TURN = 1.0  # of the refined action from the one in question as they are drawn, to be shown [deg]
+# factors on the reach of turned arrows, least and most: the smaller the turn, the longer the arrow,
+TURNED_REACH = 1.25, 3.5
+APART = 10.0  # by this over eps [deg], so that the arrows can be told apart
+BESIDE_TRAILS = 1.8  # the most where trails show the outcomes, so that what an arrow points at stays visible
+TIPS = 8.0  # turns are magnified where arrow tips would otherwise be nearer than this [hairs],
+STEEPEST = 30.0  # with eps drawn no larger than this [deg],
+WIDEST = 60.0  # and a refined action no farther away than this, unless its true turn is larger [deg]
+LEAST_TURN = 1.0  # smallest drawn turn for which the refined action is shown [deg]
 
 
 def magnified(item: Item, eps_deg: float) -> int:
-    """How many times larger than they are turns of an item's action are drawn: so that one by eps can be seen."""
+    """Return the factor by which turns of an item's action are magnified, so that a turn by eps is visible."""
     assert item.sketch is not None
     sketch, hair = item.sketch, item.sketch.box[2] * HAIR
     far = ends(sketch, angle_of(item.action), _farthest(item))[1]
@@ -36,12 +37,12 @@ def magnified(item: Item, eps_deg: float) -> int:
 
 
 def _farthest(item: Item) -> float:
-    """How much farther turned arrows may reach."""
+    """Return the largest factor on the reach of turned arrows."""
     return BESIDE_TRAILS if item.trails else TURNED_REACH[1]
 
 
 def note(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS) -> str:
-    """What a person has to know about the picture, of an action that is no arrow in it what it is; empty: nothing."""
+    """Return the note below the picture: the magnification or, where the action is no arrow, its words."""
     if space != DIRECTIONS:
         told = f"the action: {space.words_of(item.action)}"
         if item.refined is None:
@@ -56,10 +57,10 @@ def note(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS
 
 
 def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS, one_cue: bool = False) -> str:
-    """An item with a sketch, as an SVG element; attributes `data-…` tell the page's script what it shows.
+    """Return an item with a sketch as an SVG element; attributes `data-…` describe it to the page's script.
 
-    Directions are drawn as arrows. Of other actions the picture shows what they lead to, where the task draws that, and
-    the cues that point somewhere in it. `one_cue`: see `controls.answers`.
+    Directions are drawn as arrows. For other actions the picture shows their outcomes, where the task draws them, and
+    the cues that have a direction on the screen. `one_cue`: see `controls.answers`.
     """
     assert item.sketch is not None
     sketch, planar = item.sketch, space == DIRECTIONS
@@ -86,12 +87,12 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
 
 
 def angle_of(action: np.ndarray) -> float:
-    """Of a direction, counterclockwise [deg]."""
+    """Return the angle of a direction, counterclockwise [deg]."""
     return math.degrees(math.atan2(float(action[1]), float(action[0])))
 
 
 def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
-    """The direction in question, what the answers and the model would make of it, and where one points."""
+    """Return the arrows of the asked direction, of the answers' outcomes, of the model's action, and the pointer."""
     assert item.sketch is not None
     sketch, angle = item.sketch, angle_of(item.action)
     parts, times = [], magnified(item, eps_deg) if form.by_eps else 1
@@ -114,7 +115,7 @@ def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
 
 
 def _cues(item: Item, space: Space, answers: Sequence[Control]) -> list[str]:
-    """The answers about cues, the action in question, and what the model makes of it, where cues point somewhere."""
+    """Return the arrows of the cues' answers and of the actions, for cues with a screen direction."""
     assert item.sketch is not None
     ways, middle = pointing.ways_of(space, item.sketch), space.middle()
     parts = pointing.answers_drawn(item.sketch, ways, answers)
@@ -126,7 +127,7 @@ def _cues(item: Item, space: Space, answers: Sequence[Control]) -> list[str]:
 
 
 def film(item: Item, reel: Reel) -> str:
-    """A film for the page's script, as JSON."""
+    """Return a film as JSON for the page's script."""
     return json.dumps({"item": item.number, **reel._asdict()})
 
 

@@ -1,1 +1,1 @@
-"""From recorded results to statistics, figures and a document."""
+"""Turn recorded results into statistics, figures and a report."""

@@ -1,4 +1,4 @@
-"""Figures and tables from recorded results: what `cuelearner report` writes.
+"""Write the folder of `cuelearner report`: figures and tables from recorded results.
 
 A report is a folder: `report.html` (one file: figures that tell their values under the pointer, the table, what is
 missing, where the numbers come from), `report.md` (the same for other documents), `summary.csv` (the table),
@@ -31,7 +31,7 @@ TABLES = ("summary", "curves", "efficiency", "labels_to_level", "equal_area")
 
 
 class Study(NamedTuple):
-    """What a study adds to a report."""
+    """A study's additions to a report."""
 
     lines: Sequence[str]  # of Markdown, below the summary
     tables: dict[str, list[tables.Row]]  # by the name of the file
@@ -51,26 +51,26 @@ def report(
     overwrite: bool = False,
     command: str = "",
 ) -> Path:
-    """Writes the report of any number of runs, done or still going.
+    """Write the report of any number of runs, finished or not.
 
     Args:
-        folders: folders of runs, or folders above them.
+        folders: run folders, or folders above them.
         out: folder of the report.
         metric: metric column to report.
         split: "validation" or "training".
-        task: keeps the runs of this task only; needed where there are several.
-        lower_is_better: small values of the metric are good ones: what is best, and when a value is reached.
-        by_run: tells the folders apart by their names, as runs whose configurations differ need.
-        study: adds to the report; takes its variants and its title.
-        overwrite: write over a report that is there already.
-        command: command line that makes this report, noted in it.
+        task: keeps only this task's runs; needed where there are several tasks.
+        lower_is_better: smaller values of the metric are better, for the best value and for reaching a value.
+        by_run: reports each folder separately, under its name, as needed where the runs' configurations differ.
+        study: called with the variants and the title; returns additions to the report.
+        overwrite: replaces an existing report.
+        command: command line that makes this report, recorded in it.
 
     Returns:
         The path of `report.md`.
 
     Raises:
-        UserError: if `out` is there already, or the results are missing, corrupt, of several tasks, lack the metric or
-            the split, hold a seed twice, or are of failed lanes alone.
+        UserError: `out` exists, or the results are missing, damaged, of several tasks, without the metric or the split,
+            contain a seed twice, or have failed lanes only.
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
@@ -99,7 +99,7 @@ def report(
 
 
 def _write(out: Path, written: dict[str, list[tables.Row]], figures: dict[str, Figure]) -> None:
-    """The tables and figures of a report; those of an earlier one that this one lacks must not stay."""
+    """Write a report's tables and figures; remove those of an earlier report."""
     out.mkdir(parents=True, exist_ok=True)
     figure_files = [f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")]
     for stale in (*figure_files, *(f"{name}.csv" for name in TABLES)):
@@ -120,7 +120,7 @@ def _seed_count(variants: Sequence[Variant]) -> str:
 def _missing(
     folders: Sequence[PathLike], groups: Sequence[Group], variants: Sequence[Variant], metric: str, split: str
 ) -> list[str]:
-    """One line for everything that a reader of the report would otherwise take to be there."""
+    """Return one line for everything that is missing from the report."""
     failed, gaps, invalid = [], [], 0
     for group in groups:
         own = [variant for variant in variants if variant.run == group.name]

@@ -1,4 +1,4 @@
-"""Figures of recorded results: learning curves, and what a label budget buys. The same variants give the same bytes."""
+"""Draw figures of recorded results: learning curves and label efficiency. Equal variants give equal bytes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval
 from cuelearner_jax.report.variants import Variant, guidance_name
 
-# Okabe and Ito's palette, told apart with any colour vision: what its own kinds of guidance leave of it.
+# Palette of Okabe and Ito, distinguishable with any colour vision, without the colours of the package's kinds.
 OTHER_COLOURS = ("#E69F00", "#56B4E9", "#B8A600", "#000000")
 AXIS_NAMES = {"reward": "reward a step", "success": "success rate", "collision": "collision rate"}
 STYLE: dict[Any, Any] = {
-    "svg.hashsalt": "cuelearner",  # together with no date: the same figure gives the same bytes
+    "svg.hashsalt": "cuelearner",  # with no date, so that equal figures give equal bytes
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -33,14 +33,14 @@ STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "grid.color": "#e6e6e6",
     "legend.frameon": False,
-    "text.parse_math": False,  # a name with dollar signs is a name
+    "text.parse_math": False,  # dollar signs in a name are not mathematics
 }
-DWARFED = 5.0  # times the span of all other evaluations that the first may have for it to set the scale
-APART = 0.09  # of an axis over label budgets: nearer ticks than that cannot both have their names
+DWARFED = 5.0  # the first evaluation is off the scale if it would make the span this many times larger
+APART = 0.09  # least distance of two labelled ticks, as a share of the axis over label budgets
 
 
 def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
-    """Learning curves: interquartile means with their intervals as bands, each named at its right end."""
+    """Draw learning curves: interquartile means with interval bands, each curve named at its right end."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5), layout="constrained")
         axes = figure.add_subplot()
@@ -65,7 +65,7 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
 
 
 def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) -> Figure:
-    """Interquartile means against the label budget; what takes no labels is a level with a band."""
+    """Draw interquartile means against the label budget; a kind without labels is a horizontal band."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.2), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
@@ -81,13 +81,13 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
 
 
 def _at(known: Curve, step: int) -> Interval:
-    """The last evaluation up to a step: later ones of some would be compared with earlier ones of others."""
+    """Return the last evaluation up to a step, so that no curve is compared beyond its end."""
     place = max(0, int(np.searchsorted(known.steps, step, side="right")) - 1)
     return Interval(*(values[place] for values in known[1:]))
 
 
 def draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[Interval], panel: str) -> None:
-    """Intervals against the label budget, a line for each kind of guidance; what takes no labels is a level."""
+    """Draw intervals against the label budget, one line per kind of guidance; a kind without labels is a level."""
     kinds = list(dict.fromkeys(variant.guidance for variant in variants))
     for place, kind in enumerate(kinds):
         colour, name = colour_of(kind), guidance_name(kind)
@@ -99,7 +99,7 @@ def draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[In
         if any(point[0] for point in points):
             labels, estimate, lower, upper = np.array([point for point in points if point[0]], float).T
             bars = np.nan_to_num([estimate - lower, upper - estimate])
-            # All stand on their budget's tick: the caps, of a width each, tell intervals at one budget apart.
+            # All points stand on their budget's tick; caps of different widths tell intervals at one budget apart.
             axes.errorbar(labels, estimate, bars, color=colour, label=name, marker="o", capsize=3 + 2 * place)
     budgets = sorted({variant.labels for variant in variants if variant.labels})
     axes.set_xscale("log")
@@ -110,7 +110,7 @@ def draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[In
 
 
 def names_of(budgets: Sequence[int]) -> list[str]:
-    """Budgets as ticks of a logarithmic axis show them; of those too near a larger one for both to be read, nothing."""
+    """Return budgets as labels of a logarithmic axis; empty for a budget too near a larger one."""
     names: list[str] = []
     last, least = np.inf, APART * np.log(max(budgets) / min(budgets)) if budgets else 0.0
     for budget in reversed(budgets):
@@ -120,33 +120,34 @@ def names_of(budgets: Sequence[int]) -> list[str]:
 
 
 def save_figure(figure: Figure, stem: Path) -> None:
-    """Writes `stem.png` and `stem.svg`, without a date or a version in either."""
+    """Write `stem.png` and `stem.svg` without dates or versions."""
     with matplotlib.rc_context(STYLE):
         figure.savefig(stem.with_name(stem.name + ".png"), dpi=200, metadata={"Software": None})
         figure.savefig(stem.with_name(stem.name + ".svg"), metadata={"Date": None, "Creator": None})
 
 
 def colour_of(guidance: str) -> str:
-    """The hue of a kind of guidance, of one that is not known here too."""
+    """Return the colour of a kind of guidance; an unknown kind gets a fixed one of the other colours."""
     kind = registry.find_or_none(guidance)
     return kind.colour if kind and kind.colour else OTHER_COLOURS[sum(guidance.encode()) % len(OTHER_COLOURS)]
 
 
-def colours_of(variants: Sequence[Variant]) -> list[tuple[float, ...]]:
-    """The hue of the guidance, the paler the smaller the label budget is among those of its guidance."""
+def colours_of(variants: Sequence[Variant]) -> list[tuple[float, float, float]]:
+    """Return each variant's colour: that of its guidance, paler for smaller label budgets."""
     colours = []
     for variant in variants:
         budgets = [other.labels for other in variants if other.guidance == variant.guidance]
         pale = 0.6 * (1 - (budgets.index(variant.labels) + 1) / len(budgets))
-        colours.append(tuple((1 - pale) * channel + pale for channel in to_rgb(colour_of(variant.guidance))))
+        red, green, blue = ((1 - pale) * channel + pale for channel in to_rgb(colour_of(variant.guidance)))
+        colours.append((red, green, blue))
     return colours
 
 
 def _scale(axes: Axes, variants: Sequence[Variant]) -> str:
-    """Sets the heights shown; returns words on what lies beyond them.
+    """Set the vertical scale; return words about points beyond it.
 
-    The first evaluation, before anything was learned, is left out where it would make the span of all others less than
-    a fifth of the picture: agents that still run into everything say nothing of those that seldom do.
+    The first evaluation, before learning, is left out where it would compress all others to less than a fifth of the
+    height: agents that still collide all the time would hide the differences between those that seldom do.
     """
     first = [_extremes([row[:1] for row in variant.curve[1:]]) for variant in variants]
     later = [_extremes([row[1:] for row in variant.curve[1:]]) for variant in variants if len(variant.curve.steps) > 2]
@@ -164,7 +165,7 @@ def _scale(axes: Axes, variants: Sequence[Variant]) -> str:
 
 
 def _mark_failed(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
-    """A cross for each lane that failed, on its variant's curve or at the edge of the scale."""
+    """Draw a cross for each failed lane, on its variant's curve or at the edge of the scale."""
     low, high = axes.get_ylim()
     axes.set_ylim(low, high)
     for variant, colour in zip(variants, colours, strict=True):
@@ -174,33 +175,33 @@ def _mark_failed(axes: Axes, variants: Sequence[Variant], colours: Sequence[tupl
         heights = np.clip(np.interp(at, variant.curve.steps, variant.curve.estimate), low, high)
         axes.plot(at, heights, "x", color=colour, markersize=8, clip_on=False)
     if any(len(variant.failed) for variant in variants):
-        cross = Line2D([], [], linestyle="", marker="x", color="#595959", label="a seed failed, and is left out")
+        cross = Line2D([], [], linestyle="", marker="x", color="#595959", label="a failed seed, left out")
         axes.legend(handles=[cross], loc="best", fontsize=9)
 
 
 def _extremes(rows: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Least and largest of what is known: a single seed has no interval."""
+    """Return the least and largest finite values; a single seed has no interval."""
     values = np.concatenate(rows)
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
 def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
-    """Writes each curve's name right of the axes, in the order of their ends, moved apart where names would overlap."""
+    """Write each curve's name to the right of the axes, ordered by the curves' ends and without overlap."""
     low, high = axes.get_ylim()
     axes.set_ylim(low, high)
     right = axes.get_xlim()[1]
     ends = np.array([variant.curve.estimate[-1] for variant in variants])
-    height = 0.055 * (high - low)  # of a line of text, with room
+    height = 0.055 * (high - low)  # height of a line of text with its spacing
     gap = min((high - low) / len(variants), height)
-    # Heights that keep the order, lie a gap apart and move least are an isotonic regression of the ends less the gaps.
+    # The heights that keep the order and a gap and move least are an isotonic regression of the ends less the gaps.
     order, rank = np.argsort(ends, kind="stable"), gap * np.arange(len(variants))
     heights = scipy.optimize.isotonic_regression(ends[order] - rank).x
     heights = np.clip(heights, low, high - rank[-1]) + rank
     for place, height_of_name in zip(order, heights, strict=True):
         variant, colour = variants[place], colours[place]
         last = float(variant.curve.steps[-1])
-        # Dotted: what leads from the end of a curve is no data. It is level as far as the axes reach, so that leaders
-        # have the order of the names and no two cross.
+        # The leader is dotted, since it shows no data. It is level within the axes, so that the leaders keep the
+        # order of the names and never cross.
         leader = {"color": colour, "linewidth": 1, "linestyle": ":", "clip_on": False}
         if last < right:
             axes.plot([last, right], [ends[place]] * 2, **leader)
@@ -218,5 +219,5 @@ def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[
 
 
 def axis_name(metric: str) -> str:
-    """What an axis says of a metric."""
+    """Return an axis label for a metric."""
     return AXIS_NAMES.get(metric, one_line(metric.replace("_", " ")))

@@ -1,4 +1,4 @@
-"""Intervals of measured policies, differences between two of them, and the JSON file of a measurement."""
+"""Intervals of measured policies, differences of two policies, and the JSON file of a measurement."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.studies.evaluate import Measured
 
-EPISODES = "episodes"  # what the interval of a single policy is over
+EPISODES = "episodes"  # what a single policy's interval is computed over
 SEEDS = "seeds"
 
 
 def is_single(row: Measured) -> bool:
-    """Whether a row measures one policy, whose interval is over episodes, not over seeds."""
+    """Whether a row measures one policy, whose interval is over episodes instead of seeds."""
     return len(row.seeds) == 1 or row.is_shared
 
 
 def over(row: Measured) -> str:
-    """What the intervals of a row are over."""
+    """Return what a row's intervals are computed over: "episodes" or "seeds"."""
     return EPISODES if is_single(row) else SEEDS
 
 
 def spread(row: Measured, metric: str) -> Interval | None:
-    """One policy's mean over its episodes, or the interquartile mean over seeds; None where a value is not finite."""
+    """Return one policy's mean over episodes, or the interquartile mean over seeds; None if a value is not finite."""
     if not np.isfinite(row.metrics[metric]).all():
         return None
     return Interval(*mean_interval(row.each[metric][0])) if is_single(row) else interval(row.metrics[metric])
 
 
 class Difference(NamedTuple):
-    """A measured policy less another on the same episodes."""
+    """The difference of two policies measured on the same episodes."""
 
     row: Measured
     other: Measured
@@ -50,17 +50,17 @@ class Difference(NamedTuple):
 
 
 def variant(row: Measured) -> str:
-    """The guidance, labels and bound of a row, as a phrase; empty for a policy without them."""
+    """Return a row's guidance, labels and bound as a phrase; empty for a policy without them."""
     if row.guidance == "-":
         return ""
     return f"{row.guidance}, {row.labels} labels{f' within {row.within}' if row.within else ''}"
 
 
 def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Difference]:
-    """Each row less the other of its variant, or less the only other.
+    """Return the difference of each row from the other row of its variant, or from the only other row.
 
-    Two single policies are paired by episode; rows of the same seeds are paired by seed; one policy is taken off each
-    seed of several; rows of different seeds are drawn independently.
+    Two single policies are paired by episode, and rows of equal seeds by seed. A single policy is subtracted from each
+    seed of several. Rows of different seeds are resampled independently.
 
     Raises:
         UserError: a row has no counterpart.
@@ -76,9 +76,7 @@ def _counterpart(row: Measured, others: Sequence[Measured]) -> Measured:
         return alike[0]
     known = "; ".join(variant(other) for other in others)
     wanted = variant(row) or "without labels"
-    raise UserError(
-        f"--compare leads to {len(others)} variants ({known}), none of them {wanted}: give a policy of one variant"
-    )
+    raise UserError(f"--compare has {len(others)} variants ({known}), but not {wanted}: give a policy of one variant")
 
 
 def _difference(row: Measured, other: Measured) -> Difference:
@@ -106,7 +104,7 @@ def _finite(value: Any) -> float | None:
 
 
 def _plain(found: Interval | None) -> list[float | None] | None:
-    """(estimate, lower, upper)"""
+    """Return (estimate, lower, upper) for JSON."""
     return None if found is None else [_finite(value) for value in found]
 
 
@@ -133,9 +131,9 @@ def write(
     body: dict[str, str],
     compared: tuple[str, Sequence[Difference]] | None = None,
 ) -> None:
-    """Write measurements as JSON: the world, the rows with intervals, and where the numbers come from.
+    """Write measurements as JSON: the world, the rows with intervals, and the provenance.
 
-    `body` names robot, engine and scenario where they are not the task's own, `compared` the other policy.
+    `body`: robot, engine and scenario, where they are not the defaults. `compared`: the other policy.
     """
     contents = {
         "subject": source.folder.name,

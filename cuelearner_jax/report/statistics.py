@@ -1,6 +1,6 @@
-"""Statistics over seeds: interquartile means with bootstrap intervals, and what can be read off their curves.
+"""Statistics over seeds: interquartile means with bootstrap intervals, and quantities derived from curves.
 
-Everything here is NumPy on results that are already recorded; the first axis is always the seeds.
+Everything here is NumPy on recorded results; the first axis is always the seeds.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 RESAMPLES = 2000
-_BATCH_ELEMENTS = 4_000_000  # numbers held at a time while resampling: 32 MB
+_BATCH_ELEMENTS = 4_000_000  # most numbers in memory at a time while resampling: 32 MB
 
 
 class Interval(NamedTuple):
@@ -25,17 +25,17 @@ class Interval(NamedTuple):
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether zero lies outside an interval of one number."""
+        """Whether zero lies outside the interval of a single number."""
         return bool(self.lower > 0 or self.upper < 0)
 
     def __str__(self) -> str:
-        """An interval of one number, as tables show it."""
+        """Format the interval of a single number for tables."""
         bounds = "" if np.isnan(self.lower) else f" [{self.lower:.3f}, {self.upper:.3f}]"
         return f"{self.estimate:.3f}{bounds}"
 
 
 class Curve(NamedTuple):
-    """An interval at each evaluation."""
+    """An interval at each evaluation step."""
 
     steps: Int[np.ndarray, "steps"]  # environment steps of a seed, ascending
     estimate: Float[np.ndarray, "steps"]
@@ -44,11 +44,10 @@ class Curve(NamedTuple):
 
 
 def interquartile_mean(values: ArrayLike, axis: int = 0) -> Float[np.ndarray, "*rest"]:
-    """The mean of what is left when the lowest and the highest quarter are cut off: the 25% trimmed mean.
+    """Return the 25% trimmed mean: the mean without the lowest and the highest quarter of the values.
 
-    The definition is that of `scipy.stats.trim_mean(values, 0.25)`: of n values, floor(n / 4) are dropped at each end,
-    never a fraction of one. So up to 3 values give the plain mean, 4 to 7 drop one at each end (5 average the middle
-    three), 8 to 11 drop two.
+    The definition is that of `scipy.stats.trim_mean(values, 0.25)`: of n values, floor(n / 4) are dropped at each end.
+    So up to 3 values give the plain mean, 4 to 7 values drop one at each end, and 8 to 11 drop two.
 
     Args:
         values: array of any shape; `axis` is the seeds.
@@ -62,24 +61,25 @@ def interquartile_mean(values: ArrayLike, axis: int = 0) -> Float[np.ndarray, "*
 def interval(
     *strata: Float[np.ndarray, "seeds *steps"], confidence: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
 ) -> Interval:
-    """The interquartile mean over all seeds with its stratified percentile bootstrap interval.
+    """Return the interquartile mean over all seeds with its stratified percentile bootstrap interval.
 
-    Seeds are drawn with replacement, whole curves at a time, inside each stratum (for instance each task) separately;
-    the interquartile mean is taken over the seeds of all strata together. One stratum gives the ordinary bootstrap.
-    With few seeds the interval is too narrow: on normal data a nominal 95% covered the truth in 75% of 4,000 trials
-    with 3 seeds, in 90% with 5 and in 94% with 10 or more.
+    Seeds are drawn with replacement, whole curves at a time, within each stratum (for instance each task) separately.
+    The interquartile mean is taken over the seeds of all strata together. One stratum gives the ordinary bootstrap.
+
+    With few seeds the interval is too narrow. On normal data a nominal 95% interval covered the truth in 75% of 4,000
+    trials with 3 seeds, in 90% with 5, and in 94% with 10 or more.
 
     Args:
-        strata: arrays of shape (seeds, *steps); the number of seeds may differ, the rest not.
+        strata: arrays of shape (seeds, *steps); only the number of seeds may differ.
         confidence: nominal coverage of the interval.
         resamples: number of bootstrap samples.
-        seed: seed of the resampling, so that the same data always gives the same interval.
+        seed: seed of the resampling; equal data gives equal intervals.
 
     Returns:
         Arrays of shape (*steps); the bounds are NaN if a stratum has a single seed.
 
     Raises:
-        ValueError: if there are no seeds or a value is NaN.
+        ValueError: there are no seeds, or a value is NaN.
     """
     data = tuple(np.moveaxis(np.asarray(stratum, dtype=float), 0, -1) for stratum in strata)
     if not data or min(stratum.shape[-1] for stratum in data) == 0:
@@ -108,9 +108,9 @@ def interval(
 def drawn(
     groups: int, members: int, resamples: int = RESAMPLES, seed: int = 0
 ) -> tuple[Int[np.ndarray, "draws groups 1"], Int[np.ndarray, "draws groups members"]]:
-    """Indices of a bootstrap over groups and over the members of each, such as agents with several seeds of labels.
+    """Return indices of a bootstrap over groups and over each group's members, such as agents with several label seeds.
 
-    The first draw is the data as they are. Index an array (groups, members, ...) with both.
+    The first draw is the original data. Index an array (groups, members, ...) with both results.
     """
     random = np.random.default_rng(seed)
     outer = random.integers(0, groups, (resamples, groups))
@@ -121,7 +121,7 @@ def drawn(
 
 
 def interval_of_groups(values: Float[np.ndarray, "groups members"], seed: int = 0) -> Interval:
-    """The interquartile mean over the groups' means, with a 95% interval that draws groups and members of each."""
+    """Return the interquartile mean over the groups' means, with a 95% bootstrap interval over groups and members."""
     if values.shape[1] == 1:
         return interval(values[:, 0], seed=seed)
     means = interquartile_mean(values[drawn(*values.shape, seed=seed)].mean(-1), axis=1)
@@ -132,15 +132,15 @@ def interval_of_groups(values: Float[np.ndarray, "groups members"], seed: int = 
 def curve(
     steps: Int[np.ndarray, "steps"], *strata: Float[np.ndarray, "seeds steps"], confidence: float = 0.95, seed: int = 0
 ) -> Curve:
-    """The interval (see there) at each evaluation."""
+    """Return the interval at each evaluation, see `interval`."""
     return Curve(np.asarray(steps), *interval(*strata, confidence=confidence, seed=seed))
 
 
 def stretches_apart(curve_a: Curve, curve_b: Curve) -> list[tuple[int, int]]:
-    """Where the interval of `curve_a` lies wholly above that of `curve_b`.
+    """Return the stretches of steps where the interval of `curve_a` lies wholly above that of `curve_b`.
 
-    The intervals hold at each evaluation by itself: of many evaluations, a few may come apart by chance, so trust a
-    long stretch more than a short one.
+    Each evaluation is compared by itself. Among many evaluations a few may differ by chance, so a long stretch is
+    stronger evidence than a short one.
 
     Returns:
         (first step, last step) of each unbroken stretch of the steps that both curves have; empty if there is none.
@@ -154,16 +154,16 @@ def stretches_apart(curve_a: Curve, curve_b: Curve) -> list[tuple[int, int]]:
 def area_under_curve(
     steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]
 ) -> Float[np.ndarray, "seeds"]:
-    """The area under each seed's curve by the trapezoidal rule, in units of the metric times environment steps."""
+    """Return the area under each seed's curve by the trapezoidal rule [metric times environment steps]."""
     return np.trapezoid(values, np.asarray(steps, dtype=float), axis=-1)
 
 
 def mean_over_curve(
     steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]
 ) -> Float[np.ndarray, "seeds"]:
-    """The mean of each seed's curve over its steps: the area over the span, so uneven steps weigh what they should.
+    """Return the mean of each seed's curve over its steps: the area over the span, correct for uneven steps too.
 
-    A curve of one evaluation has that value as its mean.
+    The mean of a curve with one evaluation is its value.
     """
     span = float(steps[-1] - steps[0])
     return area_under_curve(steps, values) / span if span > 0 else np.asarray(values, dtype=float)[..., 0]
@@ -172,7 +172,7 @@ def mean_over_curve(
 def steps_to_reach(
     steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"], threshold: float
 ) -> Float[np.ndarray, "seeds"]:
-    """The step of the first evaluation at which each seed is at or above `threshold`; infinity if it never is."""
+    """Return the step of each seed's first evaluation at or above `threshold`; infinity if there is none."""
     reached = np.asarray(values) >= threshold
     return np.where(reached.any(axis=-1), np.asarray(steps, dtype=float)[reached.argmax(axis=-1)], np.inf)
 
@@ -180,10 +180,10 @@ def steps_to_reach(
 def resampled(
     values: Float[np.ndarray, "seeds *steps"], resamples: int = RESAMPLES, seed: int = 0
 ) -> Float[np.ndarray, "resamples *steps"]:
-    """Interquartile means over seeds drawn with replacement, whole curves at a time: the bootstrap of `interval`.
+    """Return interquartile means over seeds drawn with replacement, whole curves at a time, as in `interval`.
 
-    For statistics that need more than one variant: those of different variants are drawn independently, each with its
-    own `seed`. A single seed is drawn again and again, so it gives no spread.
+    This serves statistics of several variants, which are drawn independently, each with its own `seed`. A single seed
+    is drawn repeatedly, so it gives no spread.
     """
     values = np.asarray(values, dtype=float)
     drawn = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))

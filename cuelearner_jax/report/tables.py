@@ -1,4 +1,4 @@
-"""The tables of a report: what they hold, as CSV and as Markdown."""
+"""Build a report's tables and write them as CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Row = dict[str, str | int | float]  # of a table
 
 
 def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
-    """One row for each variant, numbers unrounded; the columns are those of `summary.csv`.
+    """Return one row for each variant, with unrounded numbers; the columns are those of `summary.csv`.
 
-    `reaches_unguided_final` is the first step at which the variant's interquartile mean is as good as the unguided
-    one's at its last step. The stretches `above_unguided` and `below_unguided` are those of `stretches_apart`. Where
-    runs are told apart, a variant is compared with the unguided one of `unguided_of`.
+    `reaches_unguided_final` is the first step at which the variant's interquartile mean is as good as the final one
+    without guidance. `above_unguided` and `below_unguided` are stretches of `stretches_apart`. With several runs, a
+    variant is compared with the unguided variant of `unguided_of`.
     """
     sign = -1.0 if lower_is_better else 1.0
     rows = []
@@ -50,19 +50,19 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
 
 
 def unguided_of(variant: Variant, variants: Sequence[Variant]) -> Variant | None:
-    """The unguided agents that a variant is compared with: those of its own run, or else the first there are."""
+    """Return the unguided variant to compare with: that of the variant's own run, or else the first one."""
     unguided = [other for other in variants if other.guidance == "none"]
     return next((other for other in unguided if other.run == variant.run), unguided[0] if unguided else None)
 
 
 def named(variant: Variant) -> Row:
-    """The columns that tell a variant from others; `run` is one of them where runs are told apart."""
+    """Return the columns that identify a variant; `run` is among them where runs are reported separately."""
     row: Row = {"run": variant.run} if variant.run else {}
     return row | {"guidance": variant.guidance, "labels": variant.labels}
 
 
 def of_failed_alone(rows: Sequence[Row], groups: Sequence[Group]) -> list[Row]:
-    """Rows of the summary, beside those that there are, for variants of which every lane has failed."""
+    """Return summary rows for variants whose lanes have all failed, which have no other rows."""
     blank = dict.fromkeys(rows[0], "")
     more: list[Row] = []
     for group in groups:
@@ -76,7 +76,7 @@ def of_failed_alone(rows: Sequence[Row], groups: Sequence[Group]) -> list[Row]:
 
 
 def curve_rows(variants: Sequence[Variant]) -> list[Row]:
-    """One row for each variant and evaluation: what the curves show."""
+    """Return one row for each variant and evaluation: the values of the curves."""
     return [
         {**named(variant), "seeds": len(variant.seeds), "step": int(step)}
         | {"iqm": float(estimate), "lower": float(lower), "upper": float(upper)}
@@ -86,7 +86,7 @@ def curve_rows(variants: Sequence[Variant]) -> list[Row]:
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Writes a table whose rows have the columns of the first."""
+    """Write a CSV table with the columns of the first row."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -94,7 +94,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
-    """Lines of a table in Markdown; cells are Markdown already, and a short row is filled with blank ones."""
+    """Return the lines of a Markdown table; cells are Markdown already, and short rows are padded."""
     lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
     for cells in rows:
         lines.append(f"| {' | '.join(map(str, cells))} |" + " |" * (len(header) - len(cells)))

@@ -1,4 +1,4 @@
-"""From rows of results to variants: all seeds under one kind of guidance with one label budget, of a group of runs."""
+"""Group rows of results into variants: all seeds with one kind of guidance and one label budget."""
 
 from __future__ import annotations
 
@@ -20,64 +20,65 @@ from cuelearner_jax.runs import failures
 from cuelearner_jax.storage import results
 
 PathLike = str | os.PathLike[str]
-LONGEST_NAME = 40  # characters of a kind of guidance, or of a run, in a figure
+LONGEST_NAME = 40  # characters
 
 
 class Variant(NamedTuple):
-    """All seeds under one kind of guidance with one label budget, at the steps that all of them have reached."""
+    """All seeds with one kind of guidance and one label budget, at the steps that all of them have reached."""
 
     guidance: str
     labels: int
     seeds: Int[np.ndarray, "seeds"]
     values: Float[np.ndarray, "seeds steps"]
     curve: Curve
-    mean: Interval  # of the mean over the curve, up to the last step that all variants share
-    failed: Int[np.ndarray, "lanes"]  # steps by which other lanes had failed, of which nothing else is here
-    run: str = ""  # of the group of runs, where groups are told apart
+    mean: Interval  # mean over the curve, up to the last step that all variants share
+    # steps by which the failed lanes had failed; nothing else here is about these lanes
+    failed: Int[np.ndarray, "lanes"]
+    run: str = ""  # name of the group of runs, where groups are reported separately
     guide: Float[np.ndarray, "guides"] | None = None  # metric of each seed's guide alone, where it was measured
 
     @property
     def name(self) -> str:
-        """What the legend says."""
+        """The variant's name in a legend."""
         name = guidance_name(self.guidance)
         name = f"{name}, {self.labels:,} labels" if self.labels else name
         return f"{shortened(self.run)}: {name}" if self.run else name
 
 
 def guidance_name(guidance: str) -> str:
-    """What figures call a kind of guidance, one that is not known here too."""
+    """Return the name of a kind of guidance in figures, known here or not."""
     kind = registry.find_or_none(guidance)
     return shortened(kind.title if kind and kind.title else guidance)
 
 
 def shortened(name: str) -> str:
-    """A name in a figure: one line of bounded length."""
+    """Return a name for a figure: one line of bounded length."""
     name = one_line(name)
     name = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
-    return f" {name}" if name.startswith("_") else name  # Matplotlib leaves names with an underscore out of legends
+    return f" {name}" if name.startswith("_") else name  # Matplotlib omits names with a leading underscore from legends
 
 
 class Group(NamedTuple):
-    """Results that are taken together."""
+    """Results that are reported together."""
 
-    name: str  # empty where there is one group alone
+    name: str  # empty for a single group
     table: pa.Table  # the rows to report
-    failed: pa.Table  # all rows of lanes that failed
-    invalid: int  # rows left out for a metric that is not finite
-    guides: pa.Table | None  # rows of the guides' own quality, see `storage.results`; None: there are none
+    failed: pa.Table  # all rows of failed lanes
+    invalid: int  # number of rows left out since the metric is not finite
+    guides: pa.Table | None  # evaluations of the guides alone, see `storage.results`; None: there are none
 
     @property
     def all_rows(self) -> pa.Table:
-        """Those of failed lanes too."""
+        """The rows to report and those of failed lanes."""
         return pa.concat_tables([self.table, self.failed])
 
 
 def read_groups(folders: Sequence[PathLike], task: str | None, metric: str, split: str, by_run: bool) -> list[Group]:
-    """The results of folders, together or (`by_run`) each folder by itself under its name.
+    """Read the results of folders, together or (`by_run`) each folder by itself under its name.
 
     Raises:
-        UserError: results are missing, corrupt, of several tasks, lack the metric or the split, or are of failed lanes
-            alone; or two folders that are to be told apart have one name.
+        UserError: results are missing, damaged, of several tasks, without the metric or the split, or have failed lanes
+            only; or two folders that are to be reported separately have one name.
     """
     if not by_run:
         return [_group("", folders, task, metric, split)]
@@ -101,7 +102,7 @@ def _group(name: str, folders: Sequence[PathLike], task: str | None, metric: str
 
 
 def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int]:
-    """The rows to report, all rows of lanes that failed, and how many rows were left out for a metric not finite."""
+    """Return the rows to report, all rows of failed lanes, and the number of rows whose metric is not finite."""
     if metric not in results.metrics(table):
         raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(table))}")
     splits = sorted(set(table["split"].to_pylist()))
@@ -121,10 +122,10 @@ def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Tabl
 
 
 def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
-    """The variants in the order of the legend: group by group unguided, then by guidance and label budget.
+    """Return the variants in the legend's order: for each group unguided first, then by guidance and label budget.
 
     Raises:
-        UserError: a seed is there twice, or the seeds of a variant have no step in common.
+        UserError: a seed occurs twice, or the seeds of a variant have no step in common.
     """
     raw = {(group.name, *key): matrix for group in groups for key, matrix in _matrices(group, metric).items()}
     failed: Mapping[str, Mapping[results.LaneKey, int]]
@@ -144,7 +145,7 @@ Matrix = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def _matrices(group: Group, metric: str) -> dict[tuple[str, int], Matrix]:
-    """By kind of guidance and label budget: seeds, steps, values (see `_matrix`) and the guides' metric."""
+    """Return by kind of guidance and label budget: seeds, steps, values (see `_matrix`) and the guides' metric."""
     table = group.table
     guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
     keys = set(zip(guidance.tolist(), labels.tolist(), strict=True))
@@ -156,7 +157,7 @@ def _matrices(group: Group, metric: str) -> dict[tuple[str, int], Matrix]:
 
 
 def _guides(rows: pa.Table, metric: str, guides: pa.Table | None, key: tuple[str, int]) -> np.ndarray:
-    """The metric of each seed's guide after its last label, (seeds,), or as the results have it."""
+    """Return the metric of each seed's guide after its last label, (seeds,)."""
     column = f"guide_{metric}"
     latest: dict[int, float] = {}
     if column in rows.column_names:
@@ -164,14 +165,15 @@ def _guides(rows: pa.Table, metric: str, guides: pa.Table | None, key: tuple[str
         latest = dict(zip(measured["seed"].to_pylist(), measured[column].to_pylist(), strict=True))
     if guides is not None:
         own = guides.filter((pc.field("guidance") == key[0]) & (pc.field("labels") == key[1])).sort_by("asked")
-        seeds = set(rows["seed"].to_pylist())  # those of failed lanes are not among them
+        seeds = set(rows["seed"].to_pylist())  # without failed lanes
         pairs = zip(own["seed"].to_pylist(), own[column].to_pylist(), strict=True)
         latest |= {seed: value for seed, value in pairs if seed in seeds}
     return np.array([latest[seed] for seed in sorted(latest)])
 
 
 def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Seeds (seeds,), steps (steps,) and values (seeds, steps) of one variant, at the steps that all seeds have."""
+    """Return seeds (seeds,), steps (steps,) and values (seeds, steps) of a variant, at the steps that all seeds
+    have."""
     seeds, row = np.unique(table["seed"].to_numpy(), return_inverse=True)
     steps, column = np.unique(table["step"].to_numpy(), return_inverse=True)
     count = np.zeros((len(seeds), len(steps)), int)
@@ -181,14 +183,14 @@ def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndar
         where = sorted(set(table.filter(pc.field("seed") == int(twice))["folder"].to_pylist()))
         raise UserError(
             f"seed {twice} of {key[0]} guidance with {key[1]} labels occurs twice, in {' and '.join(where)}: "
-            "leave one of them out, or give --by-run and each folder by itself"
+            "leave one of them out, or name each folder and add --by-run"
         )
     values = np.full(count.shape, np.nan)
     values[row, column] = table[metric].to_numpy()
     whole = (count == 1).all(axis=0)
     if not whole.any():
         raise UserError(
-            f"the seeds of {key[0]} guidance with {key[1]} labels have no step in common: wait for all of them, or "
+            f"the seeds of {key[0]} guidance with {key[1]} labels have no step in common: wait until all have one, or "
             "leave out the run that was evaluated at other steps"
         )
     return seeds, steps[whole], values[:, whole]

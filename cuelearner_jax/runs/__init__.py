@@ -1,1 +1,1 @@
-"""Runs of many lanes: grid, blocks of lanes, sweep, pieces, clusters, what a finished run acts with."""
+"""Runs of many lanes: grids, lane groups, sweeps, shards, clusters, and the trained policies."""

@@ -1,4 +1,4 @@
-"""Policy folders: what `cuelearner adapt` leaves, written and opened again."""
+"""Write and open policy folders, the output of `cuelearner adapt`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.types import Label
 
-COLUMNS = {"base": int, "seeds": int, "labels": int, "bounds_deg": float, "used": bool}  # of the lanes
+# columns that describe the lanes
+COLUMNS = {"base": int, "seeds": int, "labels": int, "bounds_deg": float, "used": bool}
 CONVENTIONS = {
     "action": "the base policy's, refined by the model until a pass moves it by less than tau, within the bound; or, "
     "calibrated, of the observation as it was before the changes, led back to what it meant",
@@ -40,12 +41,12 @@ class AdaptedLanes:
     """The lanes of a policy folder."""
 
     folder: Path
-    values: dict[str, Any]  # what policy.json says
+    values: dict[str, Any]  # the contents of policy.json
     lanes: Lanes
     used: np.ndarray  # (lanes,) bool
-    rows: int | None  # base policies, of which lanes have one each; None: they share one
-    code: Any  # the policy that stands for code, or None
-    changes: Any = None  # the user's own distortions, as `changes.family_of` takes them, or None
+    rows: int | None  # number of base policies, one per lane; None: the lanes share one
+    code: Any  # the policy that the folder names as code; None: not given
+    changes: Any = None  # the user's own distortions, as `changes.family_of` takes them; None: not given
 
     @property
     def guidance(self) -> str:
@@ -54,16 +55,16 @@ class AdaptedLanes:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of guidance that the policy is under, the last first."""
+        """The kinds of guidance that refine the policy, the last one first."""
         return tuple(layer["guidance"] for layer in layers(self.values["policy"]) if "guidance" in layer)
 
     @property
     def bounds_deg(self) -> np.ndarray:
-        """How far lanes may lead from what was adapted, in the space's unit; 0: there is no bound."""
+        """Largest distance from the adapted policy's actions per lane, in the space's unit; 0: no bound."""
         return self.lanes.bound_deg * bool(self.values["policy"].get("bounded"))
 
     def policy(self, env: Any) -> Any:
-        """A block of the lanes' policies. Raises UserError if it cannot be had."""
+        """Return a block of the lanes' policies. Raises UserError if they cannot be read."""
         values, arrays = self.values["policy"], self._arrays(env)
         base = serialization.from_json(values["base"], arrays["base"], env, self.code, self.changes)
         base = Common(base) if self.rows is None else base.lane(self.lanes.base)
@@ -71,7 +72,7 @@ class AdaptedLanes:
         return replace(made, base=base)
 
     def base(self, env: Any) -> Any:
-        """A block of the policies that were adapted, a row a lane, or `Common`. Raises UserError as `policy`."""
+        """Return the base policies, one per lane, or as `Common`. Raises UserError as `policy`."""
         return self.policy(env).base
 
     def _arrays(self, env: Any) -> Any:
@@ -87,16 +88,16 @@ class AdaptedLanes:
 def open_folder(
     folder: Path, find: Callable[[str], Task], code: Any = None, changes: Any = None
 ) -> tuple[Task, Any, AdaptedLanes]:
-    """The task, the world (a configuration) and the lanes of a policy folder.
+    """Open a policy folder; return its task, world (a configuration) and lanes.
 
     Args:
         folder: the folder.
-        find: as `grid.load` has it.
-        code: the policy that stands for code in it; None: none was given.
-        changes: the user's own distortions in it, as `changes.family_of` takes them; None: none were given.
+        find: see `grid.load`.
+        code: the policy that the folder names as code; None: not given.
+        changes: the user's own distortions in it, as `changes.family_of` takes them; None: not given.
 
     Raises:
-        UserError: it cannot be read, is damaged, or of a task that is not known.
+        UserError: the folder cannot be read, is damaged, or belongs to an unknown task.
     """
     path = folder / policy_folders.POLICY
     values = formats.read("policy", path)
@@ -112,9 +113,9 @@ def open_folder(
 
 
 def _lanes(told: dict[str, Any], rows: int | None) -> tuple[Lanes, np.ndarray]:
-    """The lanes that a file tells of, and which models are used (lanes,). Raises ValueError or KeyError for nonsense.
+    """Parse the lanes in a policy file; return them and whether each model is used (lanes,).
 
-    `rows`: base policies; None: the lanes share one.
+    `rows`: number of base policies; None: the lanes share one. Raises ValueError or KeyError for invalid contents.
     """
     columns = [told[column] for column in COLUMNS]
     for column, kind in zip(columns, COLUMNS.values(), strict=True):
@@ -126,9 +127,9 @@ def _lanes(told: dict[str, Any], rows: int | None) -> tuple[Lanes, np.ndarray]:
         raise ValueError(f"{len(seeds)} lanes have {rows!r} base policies")
     ends = ((base, rows or 1), (seeds, LARGEST_SEED), (labels, LARGEST_BUDGET))
     if not all(0 <= value < end for column, end in ends for value in column) or not all(0 < b <= 180 for b in bounds):
-        raise ValueError("some lane's base, seed, labels or bound is none")
+        raise ValueError("a lane has an invalid base, seed, label budget or bound")
     if len(set(zip(base, seeds, labels, bounds, strict=True))) < len(seeds):
-        raise ValueError("a lane is there twice")
+        raise ValueError("two lanes are equal")
     return Lanes(*(np.array(column) for column in columns[:-1])), np.array(used)
 
 
@@ -140,17 +141,17 @@ def write(
     origin: dict[str, Any],
     used: dict[str, str | None] | None = None,
 ) -> None:
-    """Writes a policy folder.
+    """Write a policy folder.
 
     Args:
-        place: where to; the folder appears once it is whole.
+        place: the target; the folder appears once it is complete.
         adapted: the lanes.
-        task, world: in which they were adapted.
-        origin: what was adapted, in plain values: "folder" and which lanes of it, or "code".
-        used: what else led to it, by name: the label file, another robot.
+        task, world: in which the lanes were adapted.
+        origin: the base policies in plain values: "folder" and which lanes of it, or "code".
+        used: further inputs by name: the label file, another robot.
 
     Raises:
-        UserError: something came to the place meanwhile, or the policy cannot be kept.
+        UserError: something appeared at the place meanwhile, or the policy cannot be written.
     """
     lanes, judged, env = adapted.lanes, adapted.judged, shape_of(task, world)
     block = replace(adapted.policy(env), base=adapted.of.bases)
@@ -194,13 +195,13 @@ def _plain(values: np.ndarray) -> list[float | None]:
 
 
 def labels_name(lanes: Lanes, bound_deg: float) -> str:
-    """The label file of the lanes of a bound."""
+    """Return the name of the label file of the lanes with a bound."""
     several = len(np.unique(lanes.bound_deg)) > 1
     return f"labels-{bound_deg:g}deg.parquet" if several else label_files.PARQUET
 
 
 def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: Any) -> None:
-    """One file a bound, with a set a seed: that of the largest budget, of which smaller ones have the first labels."""
+    """Write one label file per bound: for each seed the largest budget's set, which starts with the smaller sets."""
     of, lanes = adapted.of, adapted.lanes
     form: AnswerForm | None = of.guidance.form
     assert form is not None
@@ -216,7 +217,7 @@ def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: An
 
 
 def _write_curve(folder: Path, name: str, adapted: AdaptationResult, task: Task) -> None:
-    """What the policies were worth after so many labels, as runs keep it of their guides."""
+    """Write the policies' performance by number of labels, as runs do for their guides."""
     of = adapted.of
     if not adapted.curve:
         return
@@ -232,7 +233,7 @@ def _write_curve(folder: Path, name: str, adapted: AdaptationResult, task: Task)
     with tables.TableWriter(folder, results.GUIDES, constants) as writer:
         done = np.full(adapted.lanes.number, -1)
         for row in adapted.curve:
-            new = row["asked"] > done  # a lane that has its budget does not change any more
+            new = row["asked"] > done  # a lane that has used up its budget does not change any more
             done = row["asked"]
             metrics = {f"guide_{metric}": row[metric] for metric in row if metric not in ("asked", "failed")}
             columns = {**lanes, "asked": row["asked"], "failed": row["failed"].astype(float), **metrics}

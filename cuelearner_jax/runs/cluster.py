@@ -1,9 +1,9 @@
-"""A sweep's pieces as jobs of a Slurm cluster: the only file that knows submitit.
+"""Run a sweep's shards as jobs of a Slurm cluster; the only module that uses submitit.
 
-A job is submitit's process with `cuelearner sweep ... --shard i/n` below it, the command that anyone may give by hand.
-The outer process never waits inside compiled code, so it always hears the scheduler: told that its time is up, it has
-the command save and stop as Ctrl-C does, then asks to be started again. What submitit writes lies in `jobs` below the
-sweep's folder, one folder a submission.
+A job is submitit's process with `cuelearner sweep ... --shard i/n` as its child, a command that can also be given by
+hand. The outer process never waits inside compiled code, so it always receives the scheduler's signals: near its time
+limit it makes the command save and stop, as Ctrl-C does, and then asks to be requeued. submitit's files lie in `jobs`
+below the sweep's folder, one folder per submission.
 """
 
 from __future__ import annotations
@@ -30,48 +30,49 @@ from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.order import Plan
 from cuelearner_jax.runs.shards import Shard
 
-# The command, named in the results as if it had been typed.
+# The command, whose name in the results is as if it had been typed.
 ENTRY = "import sys; sys.argv[0] = 'cuelearner'; from cuelearner_jax.cli import main; sys.exit(main())"
-OURS = ("array", "error", "nodes", "open_mode", "output", "requeue", "signal")  # of sbatch's options
-REQUEUE_S = 30  # of the notice, for submitit to put the job back
+# options of sbatch that this program sets
+OURS = ("array", "error", "nodes", "open_mode", "output", "requeue", "signal")
+REQUEUE_S = 30  # part of the notice that submitit needs to requeue the job [s]
 
 
 @dataclass(frozen=True)
 class Job:
-    """What each job gets."""
+    """Resources of each job."""
 
     gpus: int = 0
-    """GPUs of each job (0: it runs on the CPU)."""
+    """GPUs of each job (0: run on the CPU)."""
     cpus: int = 4
     """CPU cores of each job."""
     memory_gb: float = 0.0
     """Main memory of each job (0: the partition's default) [GB]."""
     minutes: int = 240
-    """Time limit of each job (slurm); one that runs into it saves, and starts again where it stood [min]."""
+    """Time limit of each job [min]. A job that reaches the limit saves its state and is requeued to continue."""
     partition: str | None = None
     """Partition to submit to (default: the cluster's)."""
     account: str | None = None
     """Account to charge (default: yours)."""
     at_once: int = 0
-    """Jobs that run at once (0: all of them)."""
+    """Largest number of jobs that run at once (0: all)."""
     restarts: int = 100
-    """How often a job that ran into its time limit starts again."""
+    """How often a job is requeued after reaching its time limit."""
     notice_s: int = 180
-    """Time before its limit at which a job is told to save: more than it trains between two evaluations [s]."""
+    """Time before the limit at which a job is told to save [s]. Give more than the time between two evaluations."""
     setup: tuple[str, ...] = ()
-    """Shell lines before the job, for instance "module load cuda"."""
+    """Shell lines to run before the job, for instance "module load cuda"."""
     slurm: tuple[str, ...] = ()
-    """Any other options of sbatch as KEY=VALUE, for instance qos=high gres=gpu:h200:1 constraint=ib."""
+    """Further options of sbatch as KEY=VALUE, for instance qos=high gres=gpu:h200:1 constraint=ib."""
 
 
 def check(place: str | None, shards: int | None, job: Job, shard: str | None, overwrite: bool, out: Path) -> None:
-    """Raises UserError for options that do not go together. `place`: "slurm", or None for no jobs."""
+    """Raise UserError for options that do not fit together. `place`: "slurm", or None for no jobs."""
     if place is None:
         if shards is not None or job != Job():
             raise UserError("--shards and --job belong to --cluster: give --cluster slurm, or --shard i/n alone")
         return
     if shard:
-        raise UserError("--shard runs one piece here, --cluster all of them as jobs: give one of the two")
+        raise UserError("--shard runs one shard here and --cluster runs all shards as jobs: give one of the two")
     if shards is None or shards < 1:
         raise UserError(f"--cluster needs --shards of at least 1, the number of jobs; it is {shards}")
     if overwrite:
@@ -98,41 +99,41 @@ def submit(
     plan: Callable[[Shard], Plan],
     tell: Callable[[str], None] = print,
 ) -> None:
-    """Every piece of a sweep that is not finished, as a job of Slurm.
+    """Submit every unfinished shard of a sweep as a job of Slurm.
 
     Args:
-        shards: number of pieces.
-        job: what each job gets.
+        shards: number of shards.
+        job: resources of each job.
         out: the sweep's folder.
-        arguments: of the command `cuelearner sweep` that submits them.
-        plan: what the sweep does for a piece.
-        tell: told how it went, and how to go on.
+        arguments: arguments of the command `cuelearner sweep` that submits the jobs.
+        plan: returns a shard's plan.
+        tell: called with the outcome and how to continue.
 
     Raises:
-        UserError: what the sweep or the cluster refuses, before anything is written.
-        NotFinite: all is done, but some lanes stopped being finite.
+        UserError: the sweep or the cluster refuses the request, before anything is written.
+        NotFinite: everything is finished, but some lanes stopped being finite.
     """
     jax.config.update("jax_platforms", "cpu")  # the accelerator's memory is for the jobs
     plans = {shard: plan(shard) for shard in (Shard(index, shards) for index in range(1, shards + 1))}
     pieces = [piece_arguments(arguments, shard) for shard, planned in plans.items() if not planned.finished]
     if len(pieces) < len(plans):
-        tell(f"{len(plans) - len(pieces)} of {len(plans)} pieces were finished before")
+        tell(f"{len(plans) - len(pieces)} of {len(plans)} shards were finished before")
     told = f"cuelearner report {out} --out {out}/report"
     if pieces:
         number, logs = _submit_to_slurm(pieces, out, job)
         tell(
             f"submitted {len(pieces)} jobs as {number}; logs in {logs}\n"
-            f"how they stand: squeue --job {number}\nwhat there is and what is missing: {told}\n"
-            f"stop them: scancel {number}; the same command again goes on with what is not finished"
+            f"their state: squeue --job {number}\nresults so far: {told}\n"
+            f"to stop them: scancel {number}; repeat the same command to continue unfinished shards"
         )
         return
     orders = [planned.order for planned in plans.values()]
     failures.check(out, [order.out / kind for order in orders for kind in order.grid.guidance])
-    tell(f"done: {out} (see it with: {told})")
+    tell(f"done: {out} (show it by: {told})")
 
 
 def _submitit() -> ModuleType:
-    """submitit, which otherwise would close every log of the program that imports it. Raises UserError without it."""
+    """Import submitit without its side effect of closing all logs. Raises UserError if it is not installed."""
     level = os.environ.get("SUBMITIT_LOG_LEVEL")
     os.environ["SUBMITIT_LOG_LEVEL"] = "NOCONFIG"
     try:
@@ -141,7 +142,7 @@ def _submitit() -> ModuleType:
         raise UserError(
             "--cluster needs submitit: install the extra `cluster`, for instance pip install -e '.[cluster]'"
         ) from None
-    finally:  # jobs log as submitit does
+    finally:  # jobs need submitit's own logging
         del os.environ["SUBMITIT_LOG_LEVEL"]
         if level is not None:
             os.environ["SUBMITIT_LOG_LEVEL"] = level
@@ -149,7 +150,7 @@ def _submitit() -> ModuleType:
 
 
 def _sbatch_options(job: Job) -> dict[str, Any]:
-    """`--job.slurm` as sbatch's long options. Raises UserError for what is none, or is set here."""
+    """Parse `--job.slurm` into sbatch's long options. Raises UserError for invalid or reserved options."""
     found: dict[str, Any] = {}
     for text in job.slurm:
         key, equals, value = text.partition("=")
@@ -163,12 +164,12 @@ def _sbatch_options(job: Job) -> dict[str, Any]:
 
 
 def piece_arguments(arguments: list[str], shard: Shard) -> tuple[str, ...]:
-    """The arguments of `cuelearner sweep` that run one piece, from those that submit all of them."""
+    """Return the arguments of `cuelearner sweep` that run one shard, from those that submit all shards."""
     kept, dropping = [], False
     for argument in arguments:
         if argument.startswith("--"):
             name = argument.partition("=")[0]
-            # A piece goes on by itself; were --resume asked of one that has not begun, it would be refused.
+            # A shard resumes by itself; --resume would be refused for a shard that has not begun.
             dropping = name in ("--cluster", "--shards", "--resume") or name.startswith("--job.")
         if not dropping:
             kept.append(argument)
@@ -177,21 +178,21 @@ def piece_arguments(arguments: list[str], shard: Shard) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class PieceJob:
-    """One job: a callable that submitit pickles, loads where the job runs, and calls."""
+    """One job: a callable that submitit pickles, and loads and calls where the job runs."""
 
     arguments: tuple[str, ...]
     folder: str
-    """Where the command was given; relative paths begin there."""
+    """Working directory of the command, to which relative paths refer."""
     grace_s: int
-    """How long the command may take to save and stop before it is killed [s]."""
+    """Time for the command to save and stop before it is killed [s]."""
 
     def __call__(self) -> None:
-        """Runs the command to its end; leaves the process with its status where it is not 0."""
-        again = signal.getsignal(signal.SIGUSR2)  # submitit's: calls `checkpoint`, asks to be started again, exits
+        """Run the command to its end; exit with its status unless that is 0."""
+        again = signal.getsignal(signal.SIGUSR2)  # submitit's handler: calls `checkpoint`, requeues the job, exits
         signals = (signal.SIGUSR2, signal.SIGTERM)
-        for number in signals:  # a scheduler sends them to every process; the command is to hear of them from here
+        for number in signals:  # a scheduler signals every process; the command gets its signal from here only
             signal.signal(number, signal.SIG_IGN)
-        # Ignored by a function, not by SIG_IGN, which the command would inherit: it is to hear of this from here too.
+        # Ignored by a function: the command would inherit SIG_IGN, but has to receive the signal from here.
         signal.signal(signal.SIGINT, lambda number, frame: None)
         command = [sys.executable, "-u", "-c", ENTRY, *self.arguments]
         process = subprocess.Popen(command, cwd=self.folder, start_new_session=True)
@@ -199,7 +200,7 @@ class PieceJob:
         asked: list[int] = []
 
         def stop(number: int, frame: Any) -> None:
-            if not asked:  # twice would be: at once
+            if not asked:  # a second signal would stop the command at once
                 process.send_signal(signal.SIGINT)
             asked.append(number)
             signal.alarm(self.grace_s)
@@ -212,7 +213,7 @@ class PieceJob:
         if status == 0:
             return
         while asked and signal.SIGUSR2 not in asked:
-            time.sleep(1)  # SIGTERM alone: to be started again or not is the scheduler's, which ends this process
+            time.sleep(1)  # after SIGTERM the scheduler decides about requeuing, and ends this process
         if signal.SIGUSR2 in asked and callable(again):
             again(signal.SIGUSR2, None)
         if status < 0 and not asked:
@@ -220,30 +221,30 @@ class PieceJob:
         sys.exit(status if status > 0 else 1)
 
     def checkpoint(self) -> Any:
-        """What submitit starts in place of a job that was stopped: the same, for a piece goes on where it stands."""
+        """Return the job for submitit to start after this one was stopped: the same, since a shard resumes."""
         return _submitit().helpers.DelayedSubmission(self)
 
 
 def _new_folder(out: Path) -> Path:
-    """A folder below the sweep's for what submitit writes of one submission, named by the time."""
+    """Make a folder for submitit's files of one submission, named after the time."""
     stamp, number = time.strftime("%Y-%m-%dT%H-%M-%S"), 1
     while True:
         folder = out / "jobs" / (stamp if number == 1 else f"{stamp}-{number}")
         try:
             folder.mkdir(parents=True)
             return folder.absolute()
-        except FileExistsError:  # submitted twice within a second
+        except FileExistsError:  # two submissions within a second
             number += 1
 
 
 def _submit_to_slurm(pieces: list[tuple[str, ...]], out: Path, job: Job) -> tuple[str, Path]:
-    """Submits one job array with a command for each piece; returns its number, and the folder of its logs.
+    """Submit one job array with a command per shard; return its number and the folder of its logs.
 
-    Raises UserError without Slurm, or with the last line of sbatch if that refused; nothing is left on disk then.
+    Raises UserError without Slurm, or with sbatch's last line if sbatch refused; nothing is left on disk then.
     """
     submitit = _submitit()
     if submitit.SlurmExecutor.affinity() < 0:
-        raise UserError("--cluster slurm: no srun here; submit where Slurm's commands are")
+        raise UserError("--cluster slurm: Slurm's command srun is not installed here: submit from a login node")
     given = {
         "partition": job.partition,
         "account": job.account,
@@ -265,11 +266,11 @@ def _submit_to_slurm(pieces: list[tuple[str, ...]], out: Path, job: Job) -> tupl
         )
         grace = job.notice_s - REQUEUE_S
         calls = [PieceJob(arguments, os.getcwd(), grace) for arguments in pieces]
-        with contextlib.redirect_stderr(io.StringIO()):  # submitit prints what it then raises
+        with contextlib.redirect_stderr(io.StringIO()):  # submitit prints the error that it raises afterwards
             jobs = executor.submit_array(calls)
     except (submitit.core.utils.FailedJobError, submitit.core.utils.FailedSubmissionError, FileNotFoundError) as error:
         shutil.rmtree(folder)
-        with contextlib.suppress(OSError):  # not empty
+        with contextlib.suppress(OSError):  # the folder is not empty
             folder.parent.rmdir()
             folder.parent.parent.rmdir()
         told = [line.strip() for line in str(error).splitlines() if line.strip()]

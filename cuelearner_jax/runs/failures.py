@@ -1,4 +1,4 @@
-"""Which lanes of a run have failed: those that stopped being finite. They are named, and counted in no mean."""
+"""Failed lanes of a run: lanes that stopped being finite. They are named, and excluded from every mean."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.storage import results
 from cuelearner_jax.terminal import console
 
-LISTED = 8  # lanes of one kind of guidance and budget that a message names
+LISTED = 8  # most lanes that a message names per kind of guidance and budget
 
 
 def variant_name(guidance: str, labels: int) -> str:
-    """How messages name the lanes of one kind of guidance and budget."""
+    """Return the name of a kind of guidance and budget in messages."""
     return f"{guidance}, {labels:,} labels" if labels else guidance
 
 
-def told(table: pa.Table) -> dict[tuple[str, int], str]:
-    """The failed lanes of a table of results by kind of guidance and budget, in words: seeds, and since when."""
+def describe_failed(table: pa.Table) -> dict[tuple[str, int], str]:
+    """Describe failed lanes by kind of guidance and budget: seeds, and the step by which each failed."""
     steps: dict[tuple[str, int], list[str]] = {}
     for (guidance, labels, seed), step in results.failures(table).items():
         steps.setdefault((guidance, labels), []).append(f"{seed} (by step {step:,})")
@@ -32,16 +32,16 @@ def told(table: pa.Table) -> dict[tuple[str, int], str]:
 
 
 def summary(table: pa.Table) -> str:
-    """How many lanes of a table of results have failed, and which; nothing where none has."""
+    """Return a sentence on the failed lanes of a results table; empty if no lane failed."""
     failed = results.failures(table)
-    which = "; ".join(f"{variant_name(*variant)}: {seeds}" for variant, seeds in told(table).items())
+    which = "; ".join(f"{variant_name(*variant)}: {seeds}" for variant, seeds in describe_failed(table).items())
     return f"{len(failed)} of {results.lanes(table)} lanes failed, no longer finite ({which})" if failed else ""
 
 
 def without_failed(loaded: Sequence[Any]) -> list[Any]:
-    """Trained lanes (`trained.Lanes`) less those that have failed, which are named on the console.
+    """Drop the failed lanes of trained lanes (`trained.Block`) and name them on the console.
 
-    Raises UserError if none is left.
+    Raises UserError if no lane is left.
     """
     left = []
     for lanes in loaded:
@@ -50,7 +50,7 @@ def without_failed(loaded: Sequence[Any]) -> list[Any]:
         for budget in sorted({budget for budget, _ in pairs}):
             seeds = [str(seed) for own, seed in pairs if own == budget]
             name = variant_name(lanes.guidance.name, budget)
-            console.print(f"{name}: {_listed(seeds)} failed, no longer finite, and left out")
+            console.print(f"{name}: {_listed(seeds)} failed (no longer finite) and are left out")
         if not failed.all():
             kept = jax.tree.map(lambda leaf, failed=failed: leaf[~failed], lanes.policies)
             left.append(replace(lanes, seeds=lanes.seeds[~failed], budgets=lanes.budgets[~failed], policies=kept))
@@ -65,7 +65,9 @@ def _listed(seeds: Sequence[str]) -> str:
 
 
 def check(out: Path, folders: Iterable[Path]) -> None:
-    """Raises NotFinite if lanes of a run at `out` have failed, as the results in these folders of it say."""
+    """Raise NotFinite if the results in these folders of a run at `out` contain failed lanes."""
     found = summary(results.read(list(folders)))
     if found:
-        raise NotFinite(f"{found}: their rows in {out} are marked, and reports leave them out; all else is done")
+        raise NotFinite(
+            f"{found}: their rows in {out} are marked and excluded from reports; everything else is finished"
+        )

@@ -1,4 +1,4 @@
-"""Pictures of a policy at work: a still and a film, or the first situation as a person is asked about it."""
+"""Pictures of a policy at work: a film with a still, or a situation as the labelling page shows it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FILMS = ("gif", "mp4")
 
 
 class Files(NamedTuple):
-    """Where the pictures of a policy go."""
+    """Paths of a policy's pictures."""
 
     film: Path
     still: Path
@@ -31,35 +31,35 @@ class Files(NamedTuple):
 
 
 def files(folder: Path, name: str, film: str) -> Files:
-    """The files of a name in a folder. Raises UserError for a kind of film that there is not."""
+    """Return the paths of the pictures of a name in a folder. Raises UserError for an unknown film format."""
     if film not in FILMS:
         raise UserError(f"--film is {film!r}: choose gif or mp4")
     return Files(folder / f"{name}.{film}", folder / f"{name}.png", folder / f"{name}-question.png")
 
 
 def check_free(*wanted: Path, overwrite: bool) -> None:
-    """Raises UserError if one of the files is there already and may not be replaced."""
+    """Raise UserError if one of the files exists and may not be replaced."""
     for file in wanted:
         if file.exists() and not overwrite:
             raise UserError(f"{file} exists: give --overwrite to replace it, or another --out")
 
 
 def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, steps: int, to: Files) -> list[float]:
-    """Writes a film and a still of some steps of a policy; a new episode follows the end of one.
+    """Write a film and a still of some steps of a policy, over as many episodes as needed.
 
     Args:
-        pictures: how the environment is drawn.
+        pictures: drawing functions of the environment.
         env: the world.
-        policy: who acts.
-        episode: which of the validation episodes is the first.
-        steps: how many.
-        to: where they go; folders are made.
+        policy: the acting policy.
+        episode: number of the first validation episode.
+        steps: number of steps.
+        to: the target paths; folders are made.
 
     Returns:
         The reward of each step.
 
     Raises:
-        UserError: the policy gave something else than actions; nothing has been written.
+        UserError: the policy returned something other than actions; nothing has been written.
     """
     acting = _Watched(policy, actions_of(env))
     frames, rewards = pictures.record(env, acting, _start(episode), steps)
@@ -72,15 +72,15 @@ def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, ste
 
 
 def question(pictures: Pictures, env: Environment, policy: Policy, episode: int, to: Path) -> None:
-    """Writes a picture of the situation that a validation episode begins with, with the policy's action in question.
+    """Write a picture of a validation episode's first situation, with the policy's action as the asked action.
 
-    Raises UserError, and writes nothing, if the policy gives something else than an action.
+    Raises UserError, and writes nothing, if the policy returns something other than an action.
     """
 
     @jax.jit
     def first(env: Environment, key: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
         k_reset, k_play = jax.random.split(key)
-        k_act, _ = jax.random.split(jax.random.fold_in(k_play, 0))  # as a film draws its first step
+        k_act, _ = jax.random.split(jax.random.fold_in(k_play, 0))  # the same key as the first step of a film
         state, obs = env.reset(k_reset)
         states = jax.tree.map(lambda leaf: leaf[None], state)
         return state, obs, call_policy(policy, k_act, states, obs[None], actions_of(env))[0]
@@ -92,14 +92,14 @@ def question(pictures: Pictures, env: Environment, policy: Policy, episode: int,
 
 
 class _Watched:
-    """A policy that takes note of whether it gave actions; films are drawn inside compiled programs."""
+    """Records whether a policy returned actions; needed since films are drawn inside compiled programs."""
 
     def __init__(self, policy: Policy, actions: Space) -> None:
         self.policy, self.sound = policy, []
         self._actions = actions
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """What the policy does, NaN in place of what is no action."""
+        """Return the policy's actions, with NaN in place of anything that is not an action."""
         chosen = call_policy(self.policy, key, states, obs, self._actions)
         jax.debug.callback(lambda sound: self.sound.append(bool(sound)), jnp.isfinite(chosen).all())
         return chosen

@@ -1,4 +1,4 @@
-"""What a run is: the grid of its lanes, and its description in config.json."""
+"""A run's grid of lanes, and the run's description in config.json."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.task import Task
 
-LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key
+LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key, so they must differ
 LARGEST_BUDGET = configuration.LARGEST_ROUND
 
 
 @dataclass(frozen=True)
 class Grid:
-    """What is varied. Guidance without labels is run once a seed, whatever the budgets."""
+    """Values that vary among lanes. Guidance without labels runs once per seed, whatever the budgets."""
 
     guidance: tuple[str, ...]
     seeds: tuple[int, ...]
     labels: tuple[int, ...]
 
     def lanes(self, guidance: Guide | Kind) -> tuple[np.ndarray, np.ndarray]:
-        """(seeds, budgets) of one kind's lanes, each (lanes,)."""
+        """Return (seeds, budgets) of the lanes of one kind, each (lanes,)."""
         budgets = self.labels if guidance.asks else (0,)
         pairs = [(seed, budget) for budget in budgets for seed in self.seeds]
         return np.array([p[0] for p in pairs], np.int32), np.array([p[1] for p in pairs], np.int32)
 
 
 def seeds_of(first: int, count: int) -> tuple[int, ...]:
-    """So many seeds. Raises UserError, before any is made, where there are none or more than there can be."""
+    """Return `count` seeds from `first` on. Raises UserError for an impossible number before making any."""
     if count < 1:
         raise UserError(f"--seeds is {count}: give --seeds of at least 1")
     if first < 0 or first + count > LARGEST_SEED:
@@ -59,11 +59,11 @@ def seeds_of(first: int, count: int) -> tuple[int, ...]:
 
 
 def check_grid(grid: Grid, adapts: bool = False) -> None:
-    """Raises UserError for a grid that makes no sense; `adapts`: a finished policy is adapted, no agent trained."""
+    """Raise UserError for an invalid grid. `adapts`: a finished policy is adapted and no agent is trained."""
     kinds = [guidances.find(kind) for kind in grid.guidance]
     for kind in kinds:
         if kind.adapts_only and not adapts:
-            raise UserError(f"guidance {kind.name!r} corrects a finished policy: give it to `adapt` alone")
+            raise UserError(f"guidance {kind.name!r} corrects a finished policy: use it with `cuelearner adapt` only")
     if not grid.guidance or len(set(grid.guidance)) < len(grid.guidance):
         raise UserError("--guidance: give each kind once, and at least one")
     if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < LARGEST_SEED for s in grid.seeds):
@@ -88,8 +88,8 @@ def describe(
     labels_from: Path | None = None,
     shard: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The contents of config.json; `shard` is what a piece of a sweep says of itself."""
-    origin = {"from": task.origin} if task.origin else {}  # no field of a configuration can be called so
+    """Return the contents of config.json; `shard` describes a shard of a sweep."""
+    origin = {"from": task.origin} if task.origin else {}  # "from" is a Python keyword, so no field has this name
     return {
         "format": formats.FORMATS["config"],
         "task": {"name": task.name, **origin, **configuration.to_json(config.task)},
@@ -104,13 +104,13 @@ def describe(
 
 
 def defaults(task: Task) -> dict[str, Any]:
-    """What a config.json means where it lacks a field that a task or the method got later: the field's default."""
+    """Return the default of every field, for config.json files written before the field existed."""
     groups = {"task": task.config, **run_config.GROUPS, "agent": ddqn.Config, "arbiter": episodes.Config}
     return {name: configuration.defaults(kind) for name, kind in groups.items()}
 
 
 def config_hash(described: dict[str, Any]) -> str:
-    """Short hash of what a lane learns from: of a description less the file's format and the other lanes."""
+    """Return a short hash of what a lane's result depends on: a description without format and other lanes."""
     apart = ("format", "grid", "shard")
     learned_from = {name: value for name, value in described.items() if name not in apart}
     task = {name: value for name, value in described["task"].items() if name != "from"}
@@ -118,13 +118,13 @@ def config_hash(described: dict[str, Any]) -> str:
 
 
 def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid]:
-    """What a run folder's config.json says; code that it names is never loaded.
+    """Read a run folder's config.json; return its task, configuration and grid. Code that it names is not loaded.
 
-    `find` gives the task of a name. Raises UserError for no run folder, or a task that is not known.
+    `find` returns the task of a name. Raises UserError if the folder is not a run's, or the task is unknown.
     """
     path = folder / CONFIG
     if not path.is_file():
-        raise UserError(f"{folder} is no run folder (it has no config.json): give the --out of a train or sweep")
+        raise UserError(f"{folder} is not a run folder (it has no config.json): give the --out of a train or sweep")
     values = formats.read("config", path)
     try:
         task, world = world_of(values["task"], find, path)
@@ -133,7 +133,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
         if "shard" in values:
             Shard.of(values["shard"])
         if values["split"] not in SPLITS or values["total_steps"] != config.schedule.total_steps:
-            raise ValueError("what it says of its evaluations makes no sense")
+            raise ValueError("its evaluation settings are invalid")
         run_config.check(config)
         _check_room(path, config, grid)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -142,7 +142,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
 
 
 def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:
-    """Raises UserError if a run's lanes are more than memory holds: their networks at work, or an evaluation."""
+    """Raise UserError if a run's lanes or evaluations need more memory than is free."""
     lanes, spaces = len(grid.seeds) * max(1, len(grid.labels)), Spaces(1, stand_in(config.agent), (1, 1))
     agent = config.agent.make(config.sizes.frame, spaces, config.bootstraps)
     weights = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(agent.init, jax.random.key(0))))
@@ -154,28 +154,28 @@ def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:
 
 
 def _grid(values: dict[str, Any]) -> Grid:
-    """Raises ValueError, TypeError or KeyError if it is none; that its guidance is known is not asked."""
+    """Parse a grid; its kinds of guidance may be unknown. Raises ValueError, TypeError or KeyError if invalid."""
     kinds, seeds, labels = parts = [values[name] for name in ("guidance", "seeds", "labels")]
     if not all(isinstance(part, list) and len(set(part)) == len(part) for part in parts) or not (kinds and seeds):
-        raise ValueError("it has no lists of different kinds of guidance, seeds and label budgets")
+        raise ValueError("its lists of kinds of guidance, seeds and label budgets are missing or have duplicates")
     if not all(isinstance(kind, str) and NAME.fullmatch(kind) for kind in kinds):
-        raise ValueError(f"{kinds} are no names of kinds of guidance")
+        raise ValueError(f"{kinds} are not names of kinds of guidance")
     numbers = [(number, end) for part, end in ((seeds, LARGEST_SEED), (labels, LARGEST_BUDGET)) for number in part]
     if not all(type(number) is int and 0 <= number < end for number, end in numbers):
-        raise ValueError("some seed or label budget is none")
+        raise ValueError("a seed or label budget is invalid")
     return Grid(*map(tuple, parts))
 
 
 def world_of(told: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:
-    """The task of a folder and the world in it (a configuration), of what its file says of them.
+    """Return the task and the world (a configuration) that a folder's file describes.
 
     Raises:
-        UserError: the task is not known; the message says how one from outside becomes so.
-        ValueError, KeyError, TypeError, AttributeError: it makes no sense.
+        UserError: the task is unknown; the message says how to name a task from outside the package.
+        ValueError, KeyError, TypeError, AttributeError: the description is invalid.
     """
     name, origin = told["name"], told.get("from")
     if origin is not None and not REFERENCE.fullmatch(origin):
-        raise ValueError(f"{origin!r} names no code")
+        raise ValueError(f"{origin!r} is not the name of code")
     task = _known_task(find, name, origin, path)
     fields = {field: value for field, value in told.items() if field not in ("name", "from")}
     return task, configuration.from_json(task.config, fields)
@@ -186,8 +186,8 @@ def _known_task(find: Callable[[str], Task], name: str, origin: str | None, path
         return find(name)
     except UserError as error:
         if origin is None:
-            raise UserError(f"{path} is of a task that is not here ({error})") from error
+            raise UserError(f"{path} belongs to an unknown task ({error})") from error
         raise UserError(
-            f"{path} is of a task from outside, whose code is not loaded because a file names it: "
+            f"{path} belongs to a task outside the package; its code is not loaded just because a file names it: "
             f"add --task {origin} if you trust that code"
         ) from error

@@ -1,4 +1,4 @@
-"""Which arm of an arbiter acts in the finished policy: each is validated in episodes that no figure is of."""
+"""Validate an arbiter's arms and choose the one that acts in the finished policy."""
 
 from __future__ import annotations
 
@@ -19,41 +19,41 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.types import Step
 
 SPLIT = "tuning"
-APART = 1  # folded into the key of the split: runs that are evaluated on that split do not meet their judge's episodes
+APART = 1  # folded into the split's key, so that no reported episode is used for validation
 
 
 def judges_world(config: RunConfig, environment: Callable[[str], Environment]) -> Environment | None:
-    """The world in which arms are validated, of `environment` by split; None where there are no arms."""
+    """Return the world in which arms are validated (`environment` maps a split to it); None without arms."""
     return environment(SPLIT) if isinstance(arbiter_of(config), Finishes) else None
 
 
 def judges_episodes() -> PRNGKeyArray:
-    """Key of the episodes in which arms are validated."""
+    """Return the key of the episodes in which arms are validated."""
     return jax.random.fold_in(episodes(SPLIT), APART)
 
 
 def judges_envs(bootstraps: bool) -> int:
-    """Environments that share the steps of a validation: few where only whole episodes count."""
+    """Return how many environments share a validation's steps: few where only whole episodes count."""
     return 20 if bootstraps else 100
 
 
 class Playing(NamedTuple):
-    """An environment's state, and the discounted return of the running episode."""
+    """An environment's state, with the discounted return of the running episode."""
 
     inner: Any
     earned: Float[Array, ""]
-    factor: Float[Array, ""]  # discount to the power of the steps so far
+    factor: Float[Array, ""]  # discount to the power of the number of steps so far
 
 
 class Returns(WholeObservations, struct.PyTreeNode):
-    """An environment whose metrics are `ended`, 1 where an episode ends, and `returned`, its discounted return."""
+    """An environment with metrics `ended` (1 at an episode's end) and `returned` (the discounted return there)."""
 
     env: Any
     discount: Float[Array, ""] | float
 
     @property
     def observation(self) -> Any:
-        """The environment's."""
+        """The environment's observation slices."""
         return self.env.observation
 
     @property
@@ -76,9 +76,9 @@ class Returns(WholeObservations, struct.PyTreeNode):
 
 
 def score(means: dict[str, Any], bootstraps: bool) -> np.ndarray:
-    """What agents maximise, of a roll-out in `Returns`: reward a step, or, where targets bootstrap, return an episode.
+    """Return the agents' objective in a roll-out of `Returns`: reward per step; return per episode if bootstrapping.
 
-    NaN where nothing can be said: an action was not finite. An arm that ends no episode has returned nothing.
+    NaN where an action was not finite. An arm that ends no episode gets a return of 0.
     """
     if not bootstraps:
         return np.asarray(means["reward"])
@@ -86,9 +86,9 @@ def score(means: dict[str, Any], bootstraps: bool) -> np.ndarray:
 
 
 def scores(arms: list[dict[str, Any]], bootstraps: bool) -> np.ndarray:
-    """Scores (arms, lanes) of the roll-outs of all arms, see `score`.
+    """Return the scores (arms, lanes) of the roll-outs of all arms, see `score`.
 
-    In a lane where no arm has ended an episode, which may be longer than the validation, the reward a step tells.
+    In a lane where no arm ends an episode within the validation, the reward per step is used instead.
     """
     found = np.stack([score(means, bootstraps) for means in arms])
     if not bootstraps:

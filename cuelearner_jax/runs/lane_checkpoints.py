@@ -1,4 +1,4 @@
-"""Save and restore a lane group's checkpoint, and check what its folder holds before it goes on."""
+"""Save and restore a lane group's checkpoint, and check its folder before resuming."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
 
-DUE = "due.json"  # beside a checkpoint whose evaluation was ended: the columns that its row will have beside that
+DUE = "due.json"  # columns of a stretch whose evaluation was interrupted, beside the checkpoint at its end
 
 
 def items(blocks: list[TrainState], clock: Clock, wall: float, arbiter: Arbiter) -> dict[str, Any]:
-    """A run's state as the items of a checkpoint: acting needs the first alone; the last says how lanes are cut."""
+    """Return a run's state as checkpoint items; acting needs only the first, the last gives the cut of lanes."""
     return {
         "policy": [acting_state(arbiter, block.agent.params, block.guide.model, block.arbiter) for block in blocks],
         "rest": [
@@ -40,17 +40,19 @@ def items(blocks: list[TrainState], clock: Clock, wall: float, arbiter: Arbiter)
 
 
 def _clock(saved: Checkpoints, lanes: int) -> tuple[dict[str, Any], int, int]:
-    """The item "clock", the number of blocks and the lanes of each. Raises UserError if there are fewer lanes."""
+    """Return the item "clock", the number of blocks and lanes per block. Raises UserError for too few lanes."""
     like = {"clock": jax.eval_shape(start_clock), "wall_s": np.float32(0), "cut": np.zeros(2, np.int32)}
     clock = saved.restore({"clock": like})["clock"]
     count, size = (int(number) for number in clock["cut"])
     if size < 1 or count * size < lanes:
-        raise UserError(f"the checkpoint holds {count * size} lanes, the run has {lanes}: start it anew")
+        raise UserError(
+            f"the checkpoint holds {count * size} lanes, the run has {lanes}: start the run again with --overwrite"
+        )
     return clock, count, size
 
 
 def _shapes(group: LaneGroup, saved: Checkpoints) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The newest checkpoint's item "clock", and shapes of all items, in blocks cut as they were when it was written.
+    """Return the newest checkpoint's item "clock", and the shapes of all items in the blocks of its writing.
 
     Raises UserError if there is no readable checkpoint, or it holds fewer lanes.
     """
@@ -60,7 +62,7 @@ def _shapes(group: LaneGroup, saved: Checkpoints) -> tuple[dict[str, Any], dict[
 
 
 def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainState], Clock, float]:
-    """Blocks in this group's cut, counters and seconds of training, of the newest checkpoint.
+    """Restore the newest checkpoint: blocks in this group's cut, the clock, and the seconds of training.
 
     Raises UserError if there is no readable checkpoint or it holds other lanes.
     """
@@ -78,12 +80,12 @@ def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainStat
 
 
 def write_due(folder: Path, step: int, columns: dict[str, np.ndarray]) -> None:
-    """Keeps the columns (lanes,) of a stretch up to `step` whose evaluation was ended, beside a checkpoint there."""
+    """Save the columns (lanes,) of a stretch up to `step` whose evaluation was interrupted."""
     formats.write("due", folder / DUE, {"step": step, "columns": {name: c.tolist() for name, c in columns.items()}})
 
 
 def read_due(folder: Path, step: int, lanes: int) -> dict[str, np.ndarray] | None:
-    """The columns (lanes,) of a stretch up to `step` that waits for its evaluation; None: no stretch does.
+    """Return the columns (lanes,) of a stretch up to `step` that waits for its evaluation; None: no such stretch.
 
     Raises UserError if the file cannot be read or is damaged.
     """
@@ -99,17 +101,17 @@ def read_due(folder: Path, step: int, lanes: int) -> dict[str, np.ndarray] | Non
 
 
 def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
-    """Whether a group can go on from what its folder holds: nothing lost, nothing changed.
+    """Check that a group can resume from its folder: no rows are missing and nothing was changed.
 
-    Its rows must be there up to the newest checkpoint, or to the end if it is finished; what comes after the checkpoint
-    is made again. `given`: are its labels from a file?
+    Rows must reach up to the newest checkpoint, or to the end of a finished run. Rows after the checkpoint are
+    computed again. `given`: whether the labels come from a file.
 
     Raises UserError if rows are missing, a file cannot be read, or the checkpoint is of another version of the program;
     nothing has been changed.
     """
     schedule, finished = group.config.schedule, (folder / results.PARQUET).exists()
     step, rounds = (schedule.total_steps, group.rounds) if finished else (0, 0)
-    waits = False  # for the evaluation of its newest stretch
+    waits = False  # whether the newest stretch still needs its evaluation
     if not finished and (folder / "checkpoints").is_dir():
         with checkpoints(folder / "checkpoints", read_only=True) as saved:
             if saved.latest() is not None:
@@ -126,7 +128,8 @@ def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
         results.check_complete(folder, results.SCHEMA, columns, rows, among)
     elif (folder / results.JSONL).exists():
         tables.read(folder / results.JSONL, results.SCHEMA)
-    if results.GUIDES.found_in(folder) or (rounds and not finished):  # finished runs of before have no such table
+    # runs finished by earlier versions have no such table
+    if results.GUIDES.found_in(folder) or (rounds and not finished):
         columns, among = ("seed", "labels", "asked"), pc.field("round") <= rounds
         results.check_complete(folder, results.GUIDES, columns, group.looks(rounds, given), among)
     if finished and group.guidance.asks:
@@ -134,17 +137,20 @@ def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
 
 
 def restore_policies(folder: Path, like: Any, lanes: int) -> tuple[dict[str, Any], int]:
-    """What the lanes of a run's folder act with, and which have failed and stand at their last finite state.
+    """Restore what the lanes of a run's folder act with, and whether each has failed.
+
+    A failed lane is restored at its last finite state.
 
     Args:
-        folder: of one kind of guidance.
+        folder: the folder of one kind of guidance.
         like: shapes of what one lane acts with (`policies.acting_state`).
-        lanes: their number.
+        lanes: number of lanes.
 
     Returns:
-        What they act with, and "failed"; leading axis: lanes; their step.
+        What the lanes act with, and "failed", with lanes as leading axis; and their training step.
 
-    Raises UserError if there is no readable checkpoint.
+    Raises:
+        UserError: there is no readable checkpoint.
     """
     if not (folder / "checkpoints").is_dir():
         raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")

@@ -1,4 +1,4 @@
-"""The lanes of one kind of guidance: their blocks, and what is done with all of them."""
+"""A group of lanes of one kind of guidance, cut into blocks, and the operations on all blocks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 class LaneGroup:
-    """The lanes of one kind of guidance: one compiled program, its lanes cut into equal blocks."""
+    """The lanes of one kind of guidance: one compiled program, with the lanes cut into equal blocks."""
 
     def __init__(self, config: RunConfig, env: Any, guidance: Guide, grid: Grid, mesh: Mesh | None = None) -> None:
         self.config, self.env, self.guidance = config, env, guidance
@@ -54,22 +54,22 @@ class LaneGroup:
         return label_slots(self.largest_budget, self.config.sizes) // self.config.sizes.labels_per_round
 
     def asked(self, rounds: int) -> np.ndarray:
-        """Labels (lanes,) asked for after so many rounds."""
+        """Return the labels (lanes,) asked for after a number of rounds."""
         return np.minimum(self.budgets, rounds * self.config.sizes.labels_per_round)
 
     def examined(self, rounds: int, before: int) -> np.ndarray:
-        """Whose guide (lanes,) is looked at after so many rounds, those since `before` having changed it.
+        """Return a mask (lanes,) of the guides to evaluate after `rounds` rounds, the last time being `before`.
 
-        At every multiple of `guide_eval_every` labels of its own, and at its last.
+        A guide is due at every multiple of `guide_eval_every` labels of its own, and at its last label.
         """
         earlier, now, every = self.asked(before), self.asked(rounds), self.config.schedule.guide_eval_every
         due = now == self.budgets
         return (now > earlier) & (due | (now % every == 0) if every else due)
 
     def looks(self, rounds: int, given: bool) -> list[tuple[int, int, int]]:
-        """(seed, budget, labels asked for) of each evaluation of a guide alone up to so many rounds.
+        """Return (seed, budget, labels asked for) of each evaluation of a guide alone, up to a number of rounds.
 
-        `given`: were labels taken from a file at once, instead of asked for?
+        `given`: whether labels were taken from a file at once, instead of asked for.
         """
         made = [(0, rounds)] if given else [(number - 1, number) for number in range(1, rounds + 1)]
         found = []
@@ -80,53 +80,53 @@ class LaneGroup:
         return found
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(seeds, budgets) of each block; the last is filled up with repeats, whose results are dropped."""
+        """Return (seeds, budgets) of each block; the last block is padded with repeats, whose results are dropped."""
         return [(self.seeds[rows], self.budgets[rows]) for rows in self.cut]
 
     @property
     def cut(self) -> np.ndarray:
-        """Numbers of the lanes of each block (blocks, lanes of a block), which divide among the devices."""
+        """Lane numbers of each block (blocks, lanes of a block); the block size divides among the devices."""
         count = -(-len(self.seeds) // self.lanes_per_block)
         size = -(-len(self.seeds) // count)
         size = -(-size // self.mesh.size) * self.mesh.size
         return np.minimum(np.arange(count * size), len(self.seeds) - 1).reshape(count, size)
 
     def recut(self, blocks: list[TrainState]) -> list[TrainState]:
-        """Blocks of whatever cut in this group's."""
+        """Return blocks of any cut in this group's cut."""
         if [block.key.shape[0] for block in blocks] != [len(rows) for rows in self.cut]:
             joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *blocks)
             blocks = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], joined) for rows in self.cut]
         return [place(self.mesh, block, BY_LANE) for block in blocks]
 
     def _fitting_lanes(self) -> int:
-        """Lanes of a block: on accelerators all; on one CPU device an equal share for each core."""
+        """Return the lanes per block: all on accelerators, an equal share per core on one CPU device."""
         if jax.default_backend() != "cpu" or self.mesh.size > 1:
             return len(self.seeds)
         return -(-len(self.seeds) // CORES)
 
     @property
     def at_once(self) -> int:
-        """Lanes that each device works on at the same time: of a CPU's block one."""
+        """Lanes that a device works on at the same time; on a CPU one of each block."""
         if jax.default_backend() == "cpu":
             return min(CORES, len(self.cut)) if self.mesh.size == 1 else 1
         return self.cut.shape[1] // self.mesh.size
 
     def each(self, work: Callable[..., T], *blocks: list[Any]) -> list[T]:
-        """`work` of every block. A CPU takes as many at once as it has cores, which then seldom wait for each other."""
+        """Apply `work` to every block; a CPU works on as many blocks at once as it has cores."""
         if jax.default_backend() != "cpu" or len(blocks[0]) == 1:
             return [work(*entries) for entries in zip(*blocks, strict=True)]
         with ThreadPoolExecutor(CORES) as pool:
             return list(pool.map(lambda *entries: jax.block_until_ready(work(*entries)), *blocks))
 
     def start(self) -> list[TrainState]:
-        """Fresh blocks."""
+        """Return fresh blocks."""
         root = jax.random.key(0)
         return [self.program.init(self.env, jnp.asarray(s), jnp.asarray(b), root) for s, b in self.blocks()]
 
     def shapes_of(self, cut: np.ndarray) -> list[TrainState]:
-        """Shapes of the blocks of a cut (see `cut`), without making them."""
+        """Return the shapes of the blocks of a cut (see `cut`), without computing them."""
         root, program = jax.random.key(0), self.program
-        if len(cut[0]) % self.mesh.size:  # shapes alone: one device's program has the same
+        if len(cut[0]) % self.mesh.size:  # for shapes alone, one device's program gives the same
             program = make_program(self.config, self.guidance, self.env, self.largest_budget)
         return [
             jax.eval_shape(program.init, self.env, jnp.asarray(self.seeds[rows]), jnp.asarray(self.budgets[rows]), root)
@@ -136,20 +136,20 @@ class LaneGroup:
     def train(
         self, clock: Clock, blocks: list[TrainState], iterations: int
     ) -> tuple[Clock, list[TrainState], list[dict[str, jax.Array]]]:
-        """So many iterations of all lanes, done when this returns: (clock, blocks, each block's means (lanes,))."""
+        """Train all lanes for some iterations; return (clock, blocks, each block's means (lanes,)) when done."""
         settings = self.config.settings
         done = self.each(lambda block: self.program.train(self.env, settings, clock, block, iterations), blocks)
         after = jax.block_until_ready(done[0][0])
         return after, [block for _, block, _ in done], [measured for _, _, measured in done]
 
     def label_round(self, teacher: Teacher, clock: Clock, blocks: list[TrainState]) -> tuple[Clock, list[TrainState]]:
-        """One round of questions to a simulated teacher, and the fit that follows it."""
+        """Ask a simulated teacher one round of questions and fit the guides to all answers."""
         scalars = self.config.scalars
         done = self.each(lambda block: self.program.label_round(self.env, teacher, scalars, clock, block), blocks)
         return jax.block_until_ready(done[0][0]), [block for _, block in done]
 
     def take_labels(self, labels: list[Label], blocks: list[TrainState]) -> list[TrainState]:
-        """Labels (lanes, slots, ...) of each block that were given elsewhere, and the fit to them."""
+        """Take labels (lanes, slots, ...) of each block from elsewhere and fit the guides to them."""
         return self.each(
             lambda rows, block: self.program.take_labels(self.env, self.config.scalars, rows, block), labels, blocks
         )
@@ -164,9 +164,9 @@ class LaneGroup:
         blocks: list[TrainState],
         tell: Tell = ignore_progress,
     ) -> dict[str, np.ndarray]:
-        """Metrics (lanes,) of a policy of each block on the same episodes.
+        """Return metrics (lanes,) of a policy of each block on the same episodes.
 
-        One device tells between stretches how far each block is; several devices evaluate in one stretch.
+        One device reports progress by `tell` between stretches; several devices evaluate in one stretch.
         """
         mesh = self.mesh if self.mesh.size > 1 else None
 
@@ -176,7 +176,7 @@ class LaneGroup:
         return self.columns(self.each(measured, blocks))
 
     def columns(self, blocks: list[Any]) -> dict[str, np.ndarray]:
-        """Columns of one row a lane from per-block dictionaries of (lanes,) arrays."""
+        """Join per-block dictionaries of (lanes,) arrays into columns with one row per lane."""
         return {
             name: np.concatenate([np.asarray(block[name]) for block in blocks])[: len(self.seeds)] for name in blocks[0]
         }

@@ -1,4 +1,4 @@
-"""The memory that lanes need, told before anything is made."""
+"""Estimate the memory that lanes need, before anything is computed."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage.room import free_bytes
 
 FLOAT = 4  # bytes
-METRICS = 16  # of an evaluation's step, at most
-COPIES = 3  # of environments while they step, and of worlds: of training, of evaluation, and while they are made
+METRICS = 16  # most metrics of an evaluation's step
+COPIES = 3  # of environments while stepping, and of worlds: training, evaluation, and during generation
 
 
 def state_bytes(tree: Any) -> int:
-    """Memory of a tree of arrays or shapes [bytes]."""
+    """Return the memory of a tree of arrays or shapes [bytes]."""
     return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def memory_report(group: LaneGroup) -> str:
-    """One line on the memory that the lanes need on each device. Raises UserError if it is more than there is."""
-    block = group.shapes_of(group.cut[:1])[0]  # the blocks are alike
+    """Return one line on the memory that the lanes need per device. Raises UserError if more than is free."""
+    block = group.shapes_of(group.cut[:1])[0]  # the blocks have equal shapes
     count, width = group.cut.shape
     lanes, devices = len(group.seeds), group.mesh.size
     guide = group.guidance.footprint(group.env)
@@ -55,7 +55,7 @@ def memory_report(group: LaneGroup) -> str:
 
 
 def _at_rest(block: TrainState, layers: Footprint) -> dict[str, int]:
-    """What a block keeps [bytes], by the option that decides it."""
+    """Return the memory that a block keeps [bytes], by the option that determines it."""
     agent, guide = block.agent, block.guide
     parts = {
         "--agent.replay-capacity": (agent.replay, agent.guided),
@@ -69,7 +69,7 @@ def _at_rest(block: TrainState, layers: Footprint) -> dict[str, int]:
 
 
 def _training(group: LaneGroup, block: TrainState, guide: Footprint) -> dict[str, int]:
-    """What one lane takes beside that in each kind of work, of which one is done at a time [bytes], by option."""
+    """Return one lane's further memory in each kind of work [bytes], by option; the kinds alternate."""
     sizes, schedule = group.config.sizes, group.config.schedule
     agent = group.config.agent.make(sizes.frame, spaces_of(group.env), group.config.bootstraps)
     needed = {option: FLOAT * number for option, number in agent.working(sizes.num_envs, portions().actions).items()}
@@ -94,7 +94,7 @@ def _training(group: LaneGroup, block: TrainState, guide: Footprint) -> dict[str
 
 
 def _evaluating(group: LaneGroup, block: TrainState, guide: Footprint) -> dict[str, int]:
-    """The same of evaluations."""
+    """Return the memory of one lane's evaluations [bytes], by option."""
     schedule = group.config.schedule
     lanes = block.key.shape[0] * group.config.sizes.candidates
     situation = state_bytes((block.guide.env, block.guide.obs)) // lanes

@@ -1,4 +1,4 @@
-"""What is asked of a training, and whether it makes sense: nothing here writes anything."""
+"""Training requests and their validation; nothing here writes to disk."""
 
 from __future__ import annotations
 
@@ -28,44 +28,45 @@ RequestT = TypeVar("RequestT", bound="TrainRequest")
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """What training is asked for: a grid of runs of one task."""
+    """A request to train a grid of runs of one task."""
 
     task: Task
     config: RunConfig
     grid: Grid
     labels_from: Path | None = field(default=None, kw_only=True)  # a label file in place of the teacher
-    split: str = field(default="validation", kw_only=True)  # episodes of the evaluations
+    split: str = field(default="validation", kw_only=True)  # split of the evaluation episodes
 
 
 @dataclass(frozen=True)
 class Order(TrainRequest):
-    """The same in a folder."""
+    """A request to train into a folder."""
 
     out: Path
     resume: bool = False
     overwrite: bool = False
-    shard: Shard | None = None  # its share of the seeds alone, in its own folder below `out`
-    track: str | None = None  # where it can be followed, see `storage.tracking`
+    shard: Shard | None = None  # train only this share of the seeds, in a folder of its own below `out`
+    track: str | None = None  # tracker to write to, see `storage.tracking`
 
 
 @dataclass(frozen=True)
 class Plan:
-    """An order that was found to make sense; nothing has been written."""
+    """A validated order; nothing has been written."""
 
-    order: Order  # of this piece: its seeds, its folder
+    order: Order  # of this shard: its seeds and its folder
     described: dict[str, Any]  # the contents of config.json
     labels: label_files.LabelFile | None
 
     @property
     def finished(self) -> bool:
-        """Is there nothing left to do?"""
+        """Whether nothing is left to do."""
         return all((self.order.out / kind / results.PARQUET).exists() for kind in self.order.grid.guidance)
 
 
-def checked(request: RequestT) -> RequestT:
-    """The request with its kinds by their names, wherever it is carried out. Raises UserError for what cannot be."""
+def resolve_request(request: RequestT) -> RequestT:
+    """Check a request; return it with its kinds of guidance by name. Raises UserError for an invalid request."""
     run_config.check(request.config)
-    names = tuple(guidances.resolve(kind).name for kind in request.grid.guidance)  # code is loaded here
+    # loads the code of kinds from outside
+    names = tuple(guidances.resolve(kind).name for kind in request.grid.guidance)
     request = dataclasses.replace(request, grid=dataclasses.replace(request.grid, guidance=names))
     check_grid(request.grid)
     request.task.check_evaluations(request.config)
@@ -73,17 +74,17 @@ def checked(request: RequestT) -> RequestT:
 
 
 def labels_of(request: TrainRequest) -> label_files.LabelFile | None:
-    """The labels in place of the teacher's; None: it is asked. Raises UserError for labels that do not fit."""
+    """Return the labels used in place of the teacher; None: ask the teacher. Raises UserError if they do not fit."""
     if request.labels_from is None:
         return None
     config = request.config
     return read_labels(request.labels_from, request.task, config.task, config.sizes, config.scalars, request.grid)
 
 
-def planned(order: Order) -> Plan:
-    """What `run` does with an order. Raises UserError for what it would refuse, but for too little memory."""
+def make_plan(order: Order) -> Plan:
+    """Check what `run` would refuse, except for memory; return the plan. Raises UserError."""
     tracking.check(order.track)
-    order = checked(order)
+    order = resolve_request(order)
     piece, sweep = None, order.out
     if order.shard:
         piece = order.shard.described(order.grid.seeds)
@@ -103,10 +104,10 @@ def planned(order: Order) -> Plan:
 
 
 def check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> None:
-    """Raises UserError unless labels are of a run's task and world, as far as labels depend on it."""
+    """Raise UserError unless labels belong to a run's task and, in all that labels depend on, to its world."""
     if told.get("name") != task.name:
         name = told.get("name")
-        raise UserError(f"{path} holds labels of {name}, this run is {task.name}: give labels of the same task")
+        raise UserError(f"{path} holds labels of {name}, but this run trains {task.name}: give labels of the same task")
     values = {name: value for name, value in told.items() if name not in ("name", "from")}
     try:
         theirs = configuration.to_json(configuration.from_json(task.config, values))
@@ -116,7 +117,7 @@ def check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> Non
     apart = [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]
     if apart:
         raise UserError(
-            f"{path} holds labels of a world with another task.{apart[0]} ({theirs[apart[0]]}, this run's is "
+            f"{path} holds labels of a world with another task.{apart[0]} ({theirs[apart[0]]}; this run has "
             f"{ours[apart[0]]}): give labels of the same world"
         )
 
@@ -124,7 +125,7 @@ def check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> Non
 def read_labels(
     path: Path, task: Task, world: Any, sizes: GuideSizes, scalars: Scalars, grid: Grid
 ) -> label_files.LabelFile:
-    """A label file that fits a task's world (a configuration) and a grid. Raises UserError if it does not."""
+    """Read a label file for a task's world (a configuration) and a grid. Raises UserError if it does not fit."""
     file = label_files.read(path)
     env = shape_of(task, world)
     check_world(path, file.task, task, world)
@@ -137,13 +138,14 @@ def read_labels(
         assert guidance.form is not None
         if guidance.form.name != file.answers:
             raise UserError(
-                f"{path} holds {file.answers} answers, guidance {guidance.name} needs {guidance.form.name} ones: "
+                f"{path} holds {file.answers} answers, but guidance {guidance.name} needs "
+                f"{guidance.form.name} answers: "
                 "give fitting labels"
             )
         external_labels.check_file(file, spaces_of(env), guidance.form, str(path))
     if file.eps is not None and not math.isclose(file.eps, scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
-            f"{path} holds labels of {file.eps:g} {file.space.unit}, the run's are of {scalars.eps_deg:g}: "
+            f"{path} holds labels of {file.eps:g} {file.space.unit}, the run expects {scalars.eps_deg:g}: "
             f"give --scalars.eps-deg {file.eps:g}, or other labels"
         )
     for guidance in asking:

@@ -1,4 +1,4 @@
-"""A run as it lies on the disk, whole or in the pieces of a sweep, and the lanes of its newest checkpoints."""
+"""Open a run on disk, whole or in shards, with the lanes of its newest checkpoints."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from cuelearner_jax.terminal import console
 
 
 class Piece(NamedTuple):
-    """A folder with lanes of a run: all of them, or those of some seeds."""
+    """A folder with lanes of a run: all lanes, or those of some seeds."""
 
     folder: Path
     grid: Grid
@@ -34,7 +34,7 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True)
 class RunLanes:
-    """The lanes of one kind of guidance that have come to the same step, as their newest checkpoints have them."""
+    """Lanes of one kind of guidance at the same step, from their newest checkpoints."""
 
     guidance: Guide
     seeds: np.ndarray  # (lanes,)
@@ -44,9 +44,11 @@ class RunLanes:
 
 
 def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid, tuple[Piece, ...]]:
-    """The run in a folder, or the sweep whose pieces lie below it (`--shard`, `--cluster`); the grid is of all pieces.
+    """Open the run in a folder, or the sweep whose shards lie below it (`--shard`, `--cluster`).
 
-    `find`: as `grid.load` has it. Raises UserError for no run, a task that is not known, or pieces of different sweeps.
+    Returns the task, the configuration, the grid of all shards, and the folders. `find`: see `grid.load`.
+
+    Raises UserError for a folder without runs, an unknown task, or shards of different sweeps.
     """
     files = [] if (folder / CONFIG).exists() else sorted(folder.glob(f"shard-*-of-*/{CONFIG}"))
     if not files:
@@ -56,9 +58,10 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
     loaded = [load(file.parent, find) for file in files]
     task, config, first = loaded[0]
     for file, other in zip(files, described, strict=True):
-        if found := shards.apart(described[0], other, defaults(task)):
+        if found := shards.differing_options(described[0], other, defaults(task)):
             raise UserError(
-                f"{files[0].parent} and {file.parent} are pieces of different sweeps (another {found}): give the "
+                f"{files[0].parent} and {file.parent} are shards of different sweeps (they differ "
+                f"in {found}): give the "
                 "folder of one of them"
             )
     pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
@@ -67,10 +70,10 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
 
 
 def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:
-    """The lanes of one kind of guidance, those at the same step together, the farthest first.
+    """Return the lanes of one kind of guidance, grouped by step, the furthest step first.
 
-    What is missing or not finished is said on the console, a line for each piece. `sweep`: are these the pieces of a
-    sweep, some of which may not have begun? Raises UserError if no piece has a checkpoint, or one is damaged.
+    Missing or unfinished shards are named on the console, one line each. `sweep`: whether these are a sweep's shards,
+    some of which may not have begun. Raises UserError if there is no checkpoint, or one is damaged.
     """
     env = shape_of(task, config.task)
     guidance, arbiter = config.guide_in(env, kind), arbiter_of(config)
@@ -94,12 +97,12 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     for line in told:
         console.print(line)
     if not found:
-        raise UserError(f"no piece has a checkpoint of {kind} guidance: train first, or choose another --guidance")
+        raise UserError(f"there is no checkpoint of {kind} guidance: train first, or choose another --guidance")
     return [_joined(found[step]) for step in sorted(found, reverse=True)]
 
 
 def _joined(parts: list[RunLanes]) -> RunLanes:
-    """Lanes of several pieces at one step."""
+    """Join the lanes of several shards at one step."""
     if len(parts) == 1:
         return parts[0]
     seeds, budgets = (np.concatenate([getattr(part, name) for part in parts]) for name in ("seeds", "budgets"))

@@ -1,4 +1,4 @@
-"""One group of lanes trained into a run's folder: labels, rows and checkpoints, from wherever it stands."""
+"""Train one group of lanes into a run's folder, resuming where the folder stands."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROUNDS_A_CHUNK = 10  # label rounds between two checkpoints
 
 
 class Runner:
-    """Keeps on disk what a `Training` does."""
+    """Writes a `Training`'s labels, rows and checkpoints to disk."""
 
     def __init__(
         self,
@@ -41,21 +41,21 @@ class Runner:
         stopping: threading.Event,
         bars: Progress,
     ) -> None:
-        """Nothing is done yet; `described` is what config.json says, `stopping` is set by Ctrl-C.
+        """Prepare without starting.
 
-        For `examined` and `judged` see `Training`.
+        `described`: contents of config.json. `stopping`: set by Ctrl-C. For `examined` and `judged` see `Training`.
         """
         self.training = Training(group, examined, order.split, self._end_if_asked, judged)
         self.group, self.order, self.described = group, order, described
         self.stopping, self.bars = stopping, bars
         self.name = group.guidance.name
         self.folder = order.out / self.name
-        self.failed = np.zeros(len(group.seeds), bool)  # lanes that the user has been told of
+        self.failed = np.zeros(len(group.seeds), bool)  # lanes whose failure has been reported
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
-        """From wherever the group stands to its end. `labels`: of a file, in place of the teacher's.
+        """Train from where the group stands to its end. `labels`: a file's labels in place of the teacher's.
 
-        Raises Interrupted once it was asked to stop and everything is saved.
+        Raises Interrupted when asked to stop, once everything is saved.
         """
         if (self.folder / results.PARQUET).exists():
             console.print(f"{self.name}: finished before, left as it is")
@@ -68,14 +68,14 @@ class Runner:
             with (
                 TableWriter(self.folder, results.SCHEMA, constants) as writer,
                 TableWriter(self.folder, results.GUIDES, constants) if asks else nullcontext() as guides,
-                tracking.opened(self.order.track, self.folder, self.described, self.training.step) as tracker,
+                tracking.open_tracker(self.order.track, self.folder, self.described, self.training.step) as tracker,
             ):
                 if guides is not None:
                     self._label(saved, guides, teacher, labels)
                 self._train(saved, writer, tracker)
         if asks:
             tables.finish(self.folder, results.GUIDES)
-        tables.finish(self.folder, results.SCHEMA)  # last: a kind with finished results is finished
+        tables.finish(self.folder, results.SCHEMA)  # last, since a kind with finished results counts as finished
 
     def _constants(self) -> dict[str, Any]:
         return {
@@ -88,7 +88,7 @@ class Runner:
         }
 
     def _restore(self, saved: Checkpoints) -> None:
-        """The newest checkpoint, or a fresh start; rows past it are dropped."""
+        """Restore the newest checkpoint, or start afresh; drop the rows after it."""
         last_step = last_round = -1
         if saved.latest() is None:
             self.training.begin()
@@ -97,7 +97,7 @@ class Runner:
             due = read_due(self.folder, int(clock.step), len(self.group.seeds))
             self.training.go_on(blocks, clock, wall, due)
             self.failed = self.training.failed
-            # A checkpoint of labels alone comes before the rows of step 0, one without its evaluation before its rows.
+            # A checkpoint of labels alone precedes the rows of step 0; one without its evaluation precedes its rows.
             last_step = self.training.step - (self.training.step == 0 or due is not None)
             last_round = self.training.round
         tables.truncate(self.folder, results.SCHEMA, keep=lambda row: row["step"] <= last_step)
@@ -113,7 +113,7 @@ class Runner:
         )
 
     def _end_if_asked(self, done: int, count: int) -> None:
-        """Ends an evaluation if that was asked for: an `evaluate.Tell`, called by several threads."""
+        """End an evaluation if asked to stop: an `evaluate.Tell`, called by several threads."""
         if self.stopping.wait(0):
             raise self._interrupted(", before its evaluation")
 
@@ -123,12 +123,13 @@ class Runner:
             raise self._interrupted()
 
     def _tell_failed(self, when: str) -> None:
-        """One line for each lane that is no longer finite since the last look, or for the first of very many."""
+        """Print a line for each newly failed lane, or for the first ones if there are many."""
         found, group = np.flatnonzero(self.training.failed & ~self.failed), self.group
         for lane in found[:LISTED]:
             variant = variant_name(self.name, int(group.budgets[lane]))
             console.print(
-                f"{variant}: the lane of seed {group.seeds[lane]} is no longer finite {when}: kept at its last finite "
+                f"{variant}: the lane of seed {group.seeds[lane]} is no longer finite {when}: it is "
+                f"kept at its last finite "
                 "state and marked as failed"
             )
         if len(found) > LISTED:
@@ -142,7 +143,7 @@ class Runner:
         teacher: Teacher | None,
         labels: label_files.LabelFile | None,
     ) -> None:
-        """Takes the labels of a file, or asks the teacher for those that are missing; leaves the label file."""
+        """Take the labels of a file, or ask the teacher for missing ones; write the label file."""
         now = self.training
         if now.labelled and label_files.readable(self.folder / label_files.PARQUET):
             return
@@ -153,7 +154,7 @@ class Runner:
                 self._tell_failed("after its labels")
                 self._examine(guides, before=0)
             else:
-                assert teacher is not None  # asked for where no file was given
+                assert teacher is not None  # `teacher` may be None only where a file was given
                 for done in now.label_rounds(teacher):
                     self.bars.update(bar, completed=done)
                     self._tell_failed(f"after {done * self.group.config.sizes.labels_per_round} labels")
@@ -165,7 +166,7 @@ class Runner:
         self._save(saved)
 
     def _examine(self, guides: TableWriter, before: int) -> None:
-        """Writes how good the guides are by themselves that are due after the rounds since `before`."""
+        """Write the evaluations of guides that are due after the rounds since `before`."""
         row = self.training.guides(before)
         if row is not None:
             guides.append(**row)
@@ -196,12 +197,13 @@ class Runner:
             self._stop_if_asked(saved)
 
     def _evaluated(self, saved: Checkpoints) -> Iterator[dict[str, Any]]:
-        """The rows of the next stretches. A stretch whose evaluation is ended is kept, to be evaluated on resuming."""
+        """Yield the rows of the next stretches; save an interrupted stretch, for evaluation on resuming."""
         now = self.training
         try:
             yield from now.stretches()
         except Interrupted:
             if now.due is not None:
-                write_due(self.folder, now.step, now.due)  # first: beside an older checkpoint it says nothing
+                # written first: beside an older checkpoint the file has no effect
+                write_due(self.folder, now.step, now.due)
                 self._save(saved)
             raise

@@ -1,4 +1,4 @@
-"""A sweep in pieces that know nothing of each other: each with its own seeds and folder, free to be started anew."""
+"""Shards of a sweep: independent pieces with seeds and a folder of their own, which may be restarted."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import CONFIG, differences
 
-MOST_PIECES = min(SPLITS.values())  # one for each seed that there can be
-OWN = ("grid.seeds", "shard.index")  # of what config.json says, that which differs between pieces of one sweep
+MOST_PIECES = min(SPLITS.values())  # one for each possible seed
+OWN = ("grid.seeds", "shard.index")  # entries of config.json that differ between shards of one sweep
 
 
 class Shard(NamedTuple):
-    """Piece `index` (from 1) of `count`."""
+    """Shard `index` (from 1) of `count`."""
 
     index: int
     count: int
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """From "i/n". Raises UserError for anything else."""
+        """Parse "i/n". Raises UserError for anything else."""
         found = re.fullmatch(r"(\d+)/(\d+)", text)
         shard = cls(*(int(number) for number in found.groups())) if found else cls(0, 0)
         if not 1 <= shard.index <= shard.count:
@@ -34,66 +34,68 @@ class Shard(NamedTuple):
         return shard
 
     def folder(self, out: Path) -> Path:
-        """Where the piece writes below the sweep's folder."""
+        """Return the shard's folder below the sweep's folder."""
         return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
 
     def check_sweep(self, out: Path, described: dict[str, Any], defaults: dict[str, Any]) -> None:
-        """Whether its piece, whose config.json is to hold `described`, belongs to the sweep in the folder `out`.
+        """Check that the shard, with `described` as its config.json, belongs to the sweep in the folder `out`.
 
-        `defaults`: as `differences` has them. Raises UserError if the folder holds a whole run, pieces of another
-        count, or of a sweep with other settings.
+        `defaults`: see `differences`. Raises UserError if the folder holds a whole run, shards of another number, or
+        shards of a sweep with other settings.
         """
         if out.exists() and not out.is_dir():
-            raise UserError(f"{out} is no folder: give another --out")
+            raise UserError(f"{out} is not a folder: give another --out")
         if (out / CONFIG).exists():
-            raise UserError(f"{out} holds a run that is not cut into pieces: give another --out")
+            raise UserError(f"{out} holds a run that is not cut into shards: give another --out")
         for folder in sorted(out.glob("shard-*-of-*")):
             if not folder.name.endswith(f"-of-{self.count}"):
                 raise UserError(
-                    f"{folder} is a piece of another cut, whose seeds would count twice: "
-                    f"cut into as many pieces as before, or give another --out"
+                    f"{folder} is a shard of another division, whose seeds would count twice: "
+                    f"use as many shards as before, or give another --out"
                 )
             if folder == self.folder(out) or not (folder / CONFIG).is_file():
                 continue
-            if found := apart(formats.read("config", folder / CONFIG), described, defaults):
+            if found := differing_options(formats.read("config", folder / CONFIG), described, defaults):
                 raise UserError(
-                    f"{folder} is a piece of a sweep with another {found}: give the same options for all pieces, or "
+                    f"{folder} is a shard of a sweep with another {found}: give the same options for all shards, or "
                     "another --out"
                 )
 
     def described(self, seeds: tuple[int, ...]) -> dict[str, Any]:
-        """What its config.json says of it: its number, and the seeds of all pieces."""
+        """Return the shard's entry in config.json: its number, and the seeds of all shards."""
         return {**self._asdict(), "seeds": list(seeds)}
 
     @classmethod
     def of(cls, described: dict[str, Any]) -> Shard:
-        """From what config.json says. Raises ValueError, TypeError or KeyError if that makes no sense."""
+        """Parse the entry in config.json. Raises ValueError, TypeError or KeyError if it is invalid."""
         shard, seeds = cls(described["index"], described["count"]), described["seeds"]
         if not isinstance(seeds, list) or not all(type(number) is int for number in (*shard, *seeds)):
-            raise TypeError("a piece is made of whole numbers")
+            raise TypeError("a shard has whole numbers")
         if not 1 <= shard.index <= shard.count <= min(MOST_PIECES, len(seeds)):
-            raise ValueError(f"{shard} is no piece of {len(seeds)} seeds")
+            raise ValueError(f"{shard} is not a shard of {len(seeds)} seeds")
         return shard
 
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
-        """Its share of a sweep's seeds: as many as the other pieces have, or one less.
+        """Return the shard's share of a sweep's seeds; shares differ by at most one seed.
 
-        Raises UserError if some piece would have none.
+        Raises UserError if some shard would have none.
         """
         if self.count > len(seeds):
-            raise UserError(f"--shard: {len(seeds)} seeds do not make {self.count} pieces, at most {len(seeds)}")
+            raise UserError(
+                f"--shard: {len(seeds)} seeds cannot be divided into {self.count} shards: give at most {len(seeds)}"
+            )
         return tuple(int(seed) for seed in np.array_split(np.array(seeds), self.count)[self.index - 1])
 
 
-def apart(before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any]) -> str:
-    """The options in which two descriptions are of different sweeps, four at most; see `folders.differences`."""
+def differing_options(before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any]) -> str:
+    """Return at most four options in which the sweeps of two descriptions differ, see `folders.differences`."""
     return ", ".join(sorted({*differences(before, now, defaults)} - set(OWN))[:4])
 
 
 def missing(configurations: list[Path]) -> list[str]:
-    """One line for each sweep of whose pieces some have not begun, given the config.json files that there are.
+    """Return one line per sweep some of whose shards have not begun, given the existing config.json files.
 
-    A file that cannot be read is passed over: it says nothing of a piece. One whose piece makes no sense is named.
+    Unreadable files are ignored, since they say nothing of a shard. Invalid shards are named.
     """
     begun: dict[tuple[Path, int], set[int]] = {}
     lines = []
@@ -117,7 +119,7 @@ def missing(configurations: list[Path]) -> list[str]:
 
 
 def _between(there: list[int], count: int) -> list[str]:
-    """The stretches of 1 to `count` that are not there: as many as there are pieces, however many are absent."""
+    """Return the missing stretches of 1 to `count`: few, however many numbers are missing."""
     edges = [0, *there, count + 1]
     stretches = [(low + 1, high - 1) for low, high in itertools.pairwise(edges) if high - low > 1]
     return [str(first) if first == last else f"{first} to {last}" for first, last in stretches]

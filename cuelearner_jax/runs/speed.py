@@ -1,7 +1,7 @@
-"""What training costs on this machine: throughput, memory a seed, time to the first step.
+"""Measure what training costs on this machine: throughput, memory per seed, time to the first step.
 
-Every measurement trains unguided lanes by the program that `cuelearner sweep` runs, learning from the first step on.
-Compiling and the first stretch stay apart; figures are medians over stretches of some iterations.
+Every measurement trains unguided lanes with the program of `cuelearner sweep`, learning from the first step on.
+Compilation and the first stretch are reported separately; figures are medians over stretches of some iterations.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import state_bytes
 
 FEWEST_STRETCHES = 3
-STEPS_A_STRETCH = {"cpu": 128, "gpu": 1024, "tpu": 1024}  # of a seed
+STEPS_A_STRETCH = {"cpu": 128, "gpu": 1024, "tpu": 1024}  # per seed
 
 T = TypeVar("T")
 
@@ -40,20 +40,20 @@ class Timed:
         self.clock, self.blocks = place(mesh, start_clock(), SHARED), self.group.start()
 
     def train(self, iterations: int) -> float:
-        """Seconds of so many iterations of all lanes. The first call with a number compiles."""
+        """Return the seconds for some iterations of all lanes. The first call with a number compiles."""
         seconds, done = timed(lambda: self.group.train(self.clock, self.blocks, iterations))
         self.clock, self.blocks, _ = done
         return seconds
 
 
 def lanes(config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0, *, mesh: Mesh) -> LaneGroup:
-    """The lanes of a measurement; `env` may be its shapes."""
+    """Return the lane group of a measurement; `env` may be its shapes."""
     made = config.guide_in(env, kind)
     return LaneGroup(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)), mesh)
 
 
 def learning(config: RunConfig, *, guided: bool = False) -> RunConfig:
-    """The configuration with greedy actions and gradient steps from the first step on; guided throughout, or never."""
+    """Return the configuration with greedy actions and learning from the first step; always guided, or never."""
     until = 2**30 if guided else 0
     schedule = dataclasses.replace(config.schedule, random_steps=0, learn_after=0, guidance_until=until)
     return dataclasses.replace(config, schedule=schedule)
@@ -70,17 +70,17 @@ def measure(
     """Measure the training of `seeds` unguided lanes.
 
     Args:
-        config: what is trained; its schedule is that of `learning`.
-        env: makes the environment, which counts into the time to the first step.
-        seeds: how many train at once, over all devices.
-        seconds: time of the measurement once it is compiled (three stretches at least).
+        config: the configuration to train, with the schedule of `learning`.
+        env: makes the environment, which counts towards the time to the first step.
+        seeds: number of seeds that train at once, over all devices.
+        seconds: time of the measurement after compilation (at least three stretches) [s].
         mesh: devices that share the seeds (default: all).
-        watch: hears of each stretch before it begins.
+        watch: called with a note before each stretch.
 
     Returns:
-        `steps_a_second` (environment steps, of all seeds), `ms_a_step` (one step of every seed), `mb_a_seed` (at rest),
-        `peak_gb` (of the first device in the process so far; None where not known), `first_step_s` (environment,
-        compilation and first step, imports apart), `seeds`, `devices`, `stretches`, `spread` (slowest less fastest
+        `steps_a_second` (environment steps of all seeds), `ms_a_step` (one step of every seed), `mb_a_seed` (at rest),
+        `peak_gb` (of the first device in this process so far; None where unknown), `first_step_s` (environment,
+        compilation and first step, without imports), `seeds`, `devices`, `stretches`, `spread` (slowest less fastest
         stretch, over their median).
     """
     watch("compiling")
@@ -111,7 +111,7 @@ def measure(
 
 
 def timed(work: Callable[[], T]) -> tuple[float, T]:
-    """Seconds until everything that `work` returns is there, and that."""
+    """Return the seconds until everything that `work` returns is computed, and the returned value."""
     began = time.perf_counter()
     done = jax.block_until_ready(work())
     return time.perf_counter() - began, done

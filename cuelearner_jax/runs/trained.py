@@ -1,4 +1,4 @@
-"""Policies by name: of a trained run's lanes, of a policy folder's, or of a task alone; picked out."""
+"""Policies by name, from a trained run, a policy folder or a task alone, and the choice among lanes."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from cuelearner_jax.types import Teacher
 
 
 class Named(NamedTuple):
-    """A policy that can be asked for by name."""
+    """A policy that can be chosen by name."""
 
     about: str
-    trained: bool = False  # does it need a run?
-    adapted: bool = False  # does it need a policy folder?
-    taught: bool = False  # does it ask the teacher?
-    needs: tuple[str, ...] = ()  # optional members of an environment without which there is none
+    trained: bool = False  # whether the policy needs a run
+    adapted: bool = False  # whether the policy needs a policy folder
+    taught: bool = False  # whether the policy asks the teacher
+    needs: tuple[str, ...] = ()  # optional members of an environment that the policy needs
 
     @property
     def kept(self) -> bool:
-        """Does it lie in a folder?"""
+        """Whether the policy comes from a folder."""
         return self.trained or self.adapted
 
 
@@ -62,15 +62,15 @@ def make(
     lanes: RunLanes | None = None,
     adapted: AdaptedLanes | None = None,
 ) -> Policy:
-    """A policy by its name, or a block of lanes of it.
+    """Return a policy by its name, or a block of its lanes.
 
     Args:
         name: one of `POLICIES`.
-        config: what it was trained with.
-        view: of where it acts.
-        teacher: of that world, where the policy asks one.
-        lanes: of a run, where it is trained.
-        adapted: of a policy folder, where it is adapted.
+        config: the configuration that it was trained with.
+        view: view of the world it acts in.
+        teacher: that world's teacher, where the policy asks one.
+        lanes: a run's lanes, for a trained policy.
+        adapted: a policy folder's lanes, for an adapted policy.
     """
     if name in ("uniform", "heuristic"):
         return uniform_in(view) if name == "uniform" else Heuristic(view)
@@ -93,18 +93,18 @@ def make(
 
 @dataclass(frozen=True)
 class PolicySource:
-    """Where policies come from: a run folder, a policy folder, or a task alone."""
+    """The origin of policies: a run folder, a policy folder, or a task alone."""
 
     task: Task
     config: RunConfig
     grid: Grid | None
     folder: Path
-    pieces: tuple[Piece, ...] = ()  # of a run; none named: all of it lies in its folder
+    pieces: tuple[Piece, ...] = ()  # shards of a run; empty: the whole run lies in its folder
     adapted: AdaptedLanes | None = None  # of a policy folder
 
     @classmethod
     def of_run(cls, folder: Path, find: Callable[[str], Task]) -> PolicySource:
-        """A run's, or those of a sweep in pieces; see `run_folders.open_run`."""
+        """Return the policies of a run, or of a sweep in shards; see `run_folders.open_run`."""
         task, config, grid, pieces = open_run(folder, find)
         return cls(task, config, grid, folder, pieces)
 
@@ -112,9 +112,9 @@ class PolicySource:
     def of_folder(
         cls, folder: Path, find: Callable[[str], Task], code: Any = None, changes: Any = None
     ) -> PolicySource:
-        """A run's or a policy folder's. `code`, `changes`: the code in the latter, named by the user (`open_folder`).
+        """Return the policies of a run or of a policy folder. `code`, `changes`: the latter's code (`open_folder`).
 
-        Raises UserError if it is neither, cannot be read, or no code is asked for where some is given.
+        Raises UserError if the folder is neither, cannot be read, or needs no code where some is given.
         """
         if not policy_folders.is_one(folder):
             run = cls.of_run(folder, find)
@@ -127,21 +127,21 @@ class PolicySource:
 
     @property
     def default_policy(self) -> str:
-        """Who acts where nobody is named."""
+        """The policy that acts where none is named."""
         if self.adapted:
             return "adapted"
         return "agent" if self.grid else "heuristic"
 
     def on(self, robot: str | None) -> PolicySource:
-        """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
+        """Return the source with another robot of the task (None: the default). Raises UserError if unknown."""
         return replace(self, task=self.task.on(robot))
 
     def check(self, policy: str, changed: Any, **lanes: Any) -> None:
-        """Raises UserError unless the policy can be had and acts in the changed world.
+        """Raise UserError unless the policy is available and acts in the changed world.
 
-        What was trained sees the observations that it was trained on, and aims as they were told then; other policies
-        act in any world. `lanes`: options that choose among a run's lanes, by name; one that is given must choose
-        something.
+        A trained policy needs the observations and aims of its training world; other policies act in any world.
+
+        `lanes`: options that choose among a run's lanes, by name; a given option must have something to choose.
         """
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{suggestion(policy, POLICIES)}")
@@ -150,14 +150,14 @@ class PolicySource:
             others = [name for name, one in POLICIES.items() if not one.kept or (one.adapted and self.adapted)]
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
         if named.adapted and not self.adapted:
-            raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` left")
+            raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` wrote")
         given = [name for name, value in lanes.items() if value not in (None, ())]
         if given and not named.kept:
             raise UserError(
-                f"--{given[0]} chooses nothing here, policy {policy!r} belongs to no lane of a run: leave it out"
+                f"--{given[0]} has no effect, since policy {policy!r} belongs to no lane of a run: leave it out"
             )
         if self.grid and given and given[-1].endswith("bound-deg"):
-            raise UserError("--bound-deg chooses among the lanes of a policy folder, this is a run: leave it out")
+            raise UserError("--bound-deg chooses among the lanes of a policy folder, but this is a run: leave it out")
         after = shape_of(self.task, changed)
         for need in named.needs:
             if not offers(after, need):
@@ -168,7 +168,8 @@ class PolicySource:
         known = shape_of(self.task, self.config.task)
         if (size := known.obs_size) != after.obs_size:
             raise UserError(
-                f"the {what}'s observations have {size} entries, this world's {after.obs_size}: keep its structure"
+                f"the {what}'s observations have {size} entries, this world's have "
+                f"{after.obs_size}: keep the options that set the observation's size"
             )
         if policy in ("agent", "corrected") and not isinstance(arbiter_of(self.config), Finishes):
             return
@@ -176,27 +177,29 @@ class PolicySource:
         if not self._weighs_aims((chosen,) if isinstance(chosen, str) else chosen):
             return
         if (width := spaces_of(known).aims) != (now := spaces_of(after).aims):
-            raise UserError(f"the {what} weighs aims of {width} features, this world's have {now}: keep its structure")
+            raise UserError(
+                f"the {what} uses aims of {width} features, this world's have {now}: keep the options that set the aims"
+            )
 
     def _weighs_aims(self, chosen: tuple[str, ...] | None) -> bool:
-        """Is a policy under a guidance that looks at the task's aims? `chosen`: of these kinds of a run alone."""
+        """Whether a policy's guidance uses the task's aims. `chosen`: only these kinds of a run."""
         kinds = self.adapted.kinds if self.adapted else chosen or (self.grid.guidance if self.grid else ())
         found = (guidances.find_or_none(kind) for kind in kinds)
         return any(kind is not None and "aims" in kind.needs for kind in found)
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[RunLanes]:
-        """The lanes of a run's kinds of guidance (none named: all), those at different steps apart.
+        """Return the lanes of a run's kinds of guidance (none named: all), grouped by step.
 
-        Raises UserError for a kind that the run does not have, or without a checkpoint.
+        Raises UserError for a kind that the run lacks, or if there is no checkpoint.
         """
-        assert self.grid is not None  # `check` has seen to it
+        assert self.grid is not None  # ensured by `check`
         loaded = []
         for name in kinds or self.grid.guidance:
             if name not in self.grid.guidance:
                 raise UserError(f"{self.folder} has no guidance {name!r}: choose among {', '.join(self.grid.guidance)}")
             if guidances.find_or_none(name) is None:
                 raise UserError(
-                    f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
+                    f"{self.folder} has lanes of a guidance outside the package, {name!r}: name its code by "
                     "--guidance package.module:NAME, if you trust that code"
                 )
             pieces = self.pieces or (Piece(self.folder, self.grid),)
@@ -205,7 +208,7 @@ class PolicySource:
 
 
 def _with_labels(task: Task, folder: Path) -> Task:
-    """A policy folder's task, whose situations are those of the folder's labels where its configuration names none."""
+    """Return a policy folder's task; without recorded situations in its configuration, those of its labels are used."""
     body = task.bodies[0]
     if body.filled is None:
         return task
@@ -220,12 +223,12 @@ def _with_labels(task: Task, folder: Path) -> Task:
 
 
 class Block(NamedTuple):
-    """Lanes of one kind of guidance at one step, and what they act with."""
+    """Lanes of one kind of guidance at one step, and the policies that they act with."""
 
     guidance: str
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
-    bounds: np.ndarray  # (lanes,) [deg]; 0: there is none
+    bounds: np.ndarray  # (lanes,), in the space's unit; 0: no bound
     step: int
     policy: Any  # a block, or `Common`
     failed: np.ndarray  # (lanes,) bool
@@ -239,11 +242,11 @@ def blocks_of(
     kinds: tuple[str, ...],
     failed_too: bool = False,
 ) -> list[Block]:
-    """A policy of a folder's lanes under `kinds` of guidance, by name. Raises UserError if it cannot be had."""
+    """Return a folder's policy of a name, in blocks under `kinds` of guidance. Raises UserError if unavailable."""
     if source.adapted is not None:
         kept = source.adapted
         if kinds and kept.guidance not in kinds:
-            raise UserError(f"{source.folder} is under {kept.guidance} guidance: leave out --guidance")
+            raise UserError(f"{source.folder} was adapted by {kept.guidance} guidance: leave out --guidance")
         columns = (kept.lanes.seed, kept.lanes.budget, kept.bounds_deg)
         policy = make(name, source.config, view, teacher, adapted=kept)
         return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
@@ -266,7 +269,7 @@ def one_policy(
     bound_deg: float | None = None,
     env: Any = None,
 ) -> Any:
-    """A single policy: of one lane of a folder, or of the task. Raises UserError if there is no such lane."""
+    """Return a single policy: of one lane of a folder, or of the task. Raises UserError without such a lane."""
     seeds = () if seed is None else (seed,)
     return several(source, world, name, kind, labels, seeds, bound_deg, env)[0][0]
 
@@ -281,19 +284,19 @@ def several(
     bound_deg: float | None = None,
     env: Any = None,
 ) -> tuple[list[Any], tuple[int, ...]]:
-    """Single policies of lanes of a folder that differ by their seeds alone (none named: the first), and the seeds.
+    """Return single policies of a folder's lanes that differ only in their seeds, and the seeds.
 
-    Of the task, where the policy lies in no folder, and its seed is 0.
+    A policy of the task alone has seed 0.
 
     Args:
-        source: where they come from.
-        world: where they are to act.
-        name: of the policy.
-        kind: of guidance (None: the run's last).
+        source: the policies' origin.
+        world: the world they are to act in.
+        name: name of the policy.
+        kind: kind of guidance (None: the run's last).
         labels: budget (None: the largest).
-        seeds: of the lanes.
-        bound_deg: of a policy folder's lanes (None: the largest).
-        env: of that world, which a teacher looks at (default: with its training episodes).
+        seeds: the lanes' seeds (empty: the first).
+        bound_deg: bound of a policy folder's lanes (None: the largest).
+        env: that world's environment, for a teacher (default: with its training episodes).
 
     Raises:
         UserError: there is no such lane.

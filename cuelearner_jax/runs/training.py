@@ -1,4 +1,4 @@
-"""The lanes of one kind of guidance on their way from the first label to the last step; nothing here touches a disk."""
+"""Training of one kind of guidance, from the first label to the last step, without disk access."""
 
 from __future__ import annotations
 
@@ -24,10 +24,9 @@ from cuelearner_jax.types import Label, Teacher
 
 
 class Training:
-    """Where a group of lanes stands, and its next stretches.
+    """The state of a group of lanes in training, and its next stretches.
 
-    Between two of them its `clock`, `blocks` and `wall` are all there is to keep; after an evaluation that was ended,
-    `due` too.
+    Between two stretches `clock`, `blocks` and `wall` are the whole state; after an interrupted evaluation also `due`.
     """
 
     def __init__(
@@ -38,13 +37,13 @@ class Training:
         tell: Tell = ignore_progress,
         judged: Environment | None = None,
     ) -> None:
-        """At the beginning.
+        """Start at the beginning.
 
         Args:
             group: the lanes.
             examined, split: environment and episodes of evaluations, see `evaluate.SPLITS`.
-            tell: called while evaluations run; what it raises ends them.
-            judged: environment in which an arbiter's arms are validated, see `judging`; None: there are no arms.
+            tell: called while evaluations run; an exception from it ends them.
+            judged: environment in which an arbiter's arms are validated, see `judging`; None: no arms.
         """
         self.group, self.split, self.tell = group, split, tell
         self.judged = (
@@ -53,18 +52,19 @@ class Training:
         self.examined = place(group.mesh, examined, SHARED)
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
-        self.wall = 0.0  # seconds of labelling and training
-        self.due: dict[str, np.ndarray] | None = None  # the newest stretch's columns, until its evaluation is done
-        self._guides: tuple[int, dict[str, np.ndarray]] | None = None  # the round of the newest measurement, and that
+        self.wall = 0.0  # seconds of labelling and training so far
+        self.due: dict[str, np.ndarray] | None = None  # columns of the newest stretch, until its evaluation is done
+        # round of the newest evaluation of guides, and its result
+        self._guides: tuple[int, dict[str, np.ndarray]] | None = None
 
     def begin(self) -> None:
-        """Fresh lanes."""
+        """Start fresh lanes."""
         self.blocks = self.group.start()
 
     def go_on(
         self, blocks: list[TrainState], clock: Clock, wall: float, due: dict[str, np.ndarray] | None = None
     ) -> None:
-        """From where others stood."""
+        """Continue from a saved state."""
         self.blocks, self.wall, self.due = blocks, wall, due
         self.clock = place(self.group.mesh, clock, SHARED)
 
@@ -80,21 +80,21 @@ class Training:
 
     @property
     def labelled(self) -> bool:
-        """Have all questions been asked?"""
+        """Whether all questions have been asked."""
         return not self.group.guidance.asks or self.round >= self.group.rounds
 
     @property
     def done(self) -> bool:
-        """Is nothing left to do?"""
+        """Whether training is finished."""
         return self.step >= self.group.config.schedule.total_steps
 
     @property
     def failed(self) -> np.ndarray:
-        """Which lanes (lanes,) are no longer finite: they stand where they last were, and count in no mean."""
+        """Mask (lanes,) of lanes that are no longer finite; they keep their last finite state."""
         return self.group.columns([{"failed": block.failed} for block in self.blocks])["failed"]
 
     def label_rounds(self, teacher: Teacher) -> Iterator[int]:
-        """Asks a simulated teacher for all labels, a round at a time; gives the number of rounds so far."""
+        """Ask a simulated teacher for all labels, round by round; yield the number of rounds so far."""
         while not self.labelled:
             started = time.perf_counter()
             self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks)
@@ -104,7 +104,7 @@ class Training:
             yield self.round
 
     def take(self, file: label_files.LabelFile) -> None:
-        """Labels of a file in place of questions, fitted once."""
+        """Take a file's labels in place of questions, and fit once."""
         group = self.group
         slots = label_slots(group.largest_budget, group.config.sizes)
         rows = [
@@ -116,7 +116,7 @@ class Training:
         self.clock = place(group.mesh, taken, SHARED)
 
     def guides(self, before: int) -> dict[str, Any] | None:
-        """The columns of an evaluation of the guides alone after the rounds since `before`, or None: none is due.
+        """Return the columns of an evaluation of the guides alone after the rounds since `before`; None: none is due.
 
         Scalars, or one entry for each lane whose guide is due, see `LaneGroup.examined`.
         """
@@ -130,7 +130,10 @@ class Training:
         return {**own, **{name: values[due] for name, values in each.items()}}
 
     def labels(self) -> tuple[np.ndarray, Label]:
-        """Seeds (lanes,) and labels (lanes, slots, ...) of the largest budget: other lanes hold the first of these."""
+        """Return seeds (lanes,) and labels (lanes, slots, ...) of the largest budget's lanes.
+
+        Lanes of smaller budgets hold the first of these labels.
+        """
         group = self.group
         labels = [jax.device_get(block.guide.labels) for block in self.blocks]
         rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(group.seeds)], *labels)
@@ -138,7 +141,7 @@ class Training:
         return group.seeds[largest], jax.tree.map(lambda leaf: leaf[largest], rows)
 
     def stretches(self) -> Iterator[dict[str, Any]]:
-        """Trains to the end; gives the columns of each evaluation: before the first step, then after every stretch."""
+        """Train to the end; yield the columns of each evaluation: before the first step and after every stretch."""
         group, schedule = self.group, self.group.config.schedule
         if self.step == 0:
             yield {**self.evaluation(), **self.guide_alone()}
@@ -154,7 +157,7 @@ class Training:
             yield row
 
     def evaluation(self) -> dict[str, Any]:
-        """The columns of one evaluation of all agents: scalars, or (lanes,); NaN where a failed lane has no metric."""
+        """Return the columns of one evaluation of all agents: scalars, or (lanes,) with NaN for failed lanes."""
         group = self.group
         own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
         own["failed"] = self.failed.astype(float)
@@ -170,13 +173,13 @@ class Training:
         return final_policy(self.group.config, self.group.guidance, view, self.step, joined)
 
     def _policy(self, lane: TrainState, view: Any, **arm: Any) -> PolicyBlock:
-        """A block's finished policies; `arm`: the one by which all lanes act, in place of that which validated best."""
+        """Return a block's finished policies; `arm` overrides the arm that validated best."""
         group = self.group
         known = {**acting_state(group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter), **arm}
         return final_policy(group.config, group.guidance, view, self.step, known)
 
     def _judge(self) -> dict[str, np.ndarray]:
-        """Let the arm that validates best act in each lane; columns (lanes,): its number, and the scores of all."""
+        """Let each lane act by its best validated arm; return columns (lanes,): its number, and all scores."""
         group, arbiter, world = self.group, self.group.arbiter, self.judged
         if world is None or not isinstance(arbiter, Finishes):
             return {}
@@ -195,9 +198,9 @@ class Training:
         return self._of_finite({"arm": best.astype(float), **judged})
 
     def guide_alone(self) -> dict[str, np.ndarray]:
-        """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance.
+        """Return metrics (lanes,) of uniform actions under guidance; without guidance that is chance.
 
-        Guides change by rounds alone, so what was measured after the last one is measured once.
+        Guides change only in label rounds, so one evaluation per round is enough.
         """
         if self._guides is None or self._guides[0] != self.round:
             self._guides = self.round, self._of_guides()
@@ -219,11 +222,11 @@ class Training:
         return self._of_finite(found)
 
     def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Metrics (lanes,) with NaN in place of those of failed lanes, so that nobody averages them unmarked."""
+        """Replace failed lanes' metrics (lanes,) by NaN, so that they never enter a mean unnoticed."""
         return {name: np.where(self.failed, np.nan, values) for name, values in columns.items()}
 
 
 def mean_of_finite(values: np.ndarray) -> str:
-    """The mean of a metric (lanes,) over the lanes that have one, for a progress bar."""
+    """Format the mean of a metric (lanes,) over the finite lanes, for a progress bar."""
     there = values[np.isfinite(values)]
     return f"{there.mean():.3f}" if len(there) else "-"

@@ -1,1 +1,1 @@
-"""What is kept on disk: tables of results, labels, checkpoints, run folders, and where numbers come from."""
+"""Files on disk: tables of results, labels, checkpoints, run folders and provenance."""

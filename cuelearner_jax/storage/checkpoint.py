@@ -1,9 +1,9 @@
-"""Checkpoints: the only file that knows Orbax.
+"""Save and restore checkpoints; the only module that uses Orbax.
 
 A run's checkpoint holds four items: `policy` (what acting needs, so that evaluation never reads a replay buffer),
-`rest`, `failed` (which lanes have) and `clock`; and the `digests` of their arrays, without which nothing is read: Orbax
-would read many a changed bit without a word. Orbax writes to a temporary folder and renames it,
-so a kill leaves the last complete checkpoint in place.
+`rest`, `failed` (which lanes have failed) and `clock`. It also holds digests of all arrays, which are verified on
+reading, since Orbax reads many changed bits without an error. Orbax writes to a temporary folder and renames that
+folder, so that a kill leaves the last complete checkpoint in place.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ import orbax.checkpoint as ocp
 from cuelearner_jax.errors import UserError, mentions, no_space
 from cuelearner_jax.signals import saving
 
-KEPT = 2  # the newest checkpoints of a run
-SETTLING_S = 0.2  # within which reads and writes that are under way come to their end [s]
-ROOM_LEFT = 1 << 20  # beyond a checkpoint's arrays, for what describes them [bytes]
+KEPT = 2  # number of checkpoints of a run that stay on disk
+SETTLING_S = 0.2  # wait after a failed read or write, for Orbax's other reads and writes to end [s]
+ROOM_LEFT = 1 << 20  # space for a checkpoint's metadata, beyond its arrays [bytes]
 
 
 def _is_key(leaf: Any) -> bool:
@@ -42,7 +42,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _flat(tree: Any) -> dict[str, Any]:
-    """Leaves by their path, as Orbax takes them: keys as raw words, leaves without entries left out."""
+    """Return a tree's leaves by path, as Orbax takes them: keys as raw words, without empty leaves."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path): _words(leaf) for path, leaf in leaves if 0 not in leaf.shape}
 
@@ -56,7 +56,7 @@ def _words(leaf: Any) -> Any:
 
 
 def _unflat(flat: dict[str, Any], like: Any) -> Any:
-    """The inverse of `_flat`."""
+    """Rebuild a tree of the structure of `like` from `_flat`'s leaves."""
 
     def leaf(path: Any, kind: Any) -> Any:
         if 0 in kind.shape:
@@ -68,7 +68,7 @@ def _unflat(flat: dict[str, Any], like: Any) -> Any:
 
 
 def _digest(leaf: Any) -> str:
-    """SHA-256 of an array's shape, type and values, however it is cut among devices (along its first axis)."""
+    """Return the SHA-256 of an array's shape, type and values, however it is sharded along its first axis."""
     found = hashlib.sha256(f"{leaf.shape} {leaf.dtype}".encode())
     pieces = {}
     for shard in leaf.addressable_shards if isinstance(leaf, jax.Array) else ():
@@ -80,29 +80,29 @@ def _digest(leaf: Any) -> str:
 
 
 def _digests(flat: dict[str, Any]) -> dict[str, str]:
-    """Those of an item's leaves."""
-    with ThreadPoolExecutor() as pool:  # hashing lets other threads run
+    """Return the digest of each leaf."""
+    with ThreadPoolExecutor() as pool:  # hashing releases the interpreter lock
         return dict(zip(flat, pool.map(_digest, flat.values()), strict=True))
 
 
 def digest(tree: Any) -> str:
-    """Short SHA-256 of a tree's arrays: equal trees have equal ones."""
+    """Return a short SHA-256 of a tree's arrays; equal trees have equal digests."""
     return hashlib.sha256(json.dumps(_digests(_flat(tree)), sort_keys=True).encode()).hexdigest()[:12]
 
 
-# What is said of a checkpoint that cannot be read.
-OTHERS = "it is of another configuration, or of another version of the program: go on with that one, or start anew"
-DAMAGED = "it is damaged; delete its folder to go back to the checkpoint before, or start the run anew"
+# Remedies in the message about a checkpoint that cannot be read.
+OTHERS = "it is of another configuration, or of another version of the program: use that one, or start a new run"
+DAMAGED = "it is damaged; delete its folder to return to the checkpoint before it, or start a new run"
 FORBIDDEN = "check the permissions of its files, nothing was changed"
 DIGESTS = "digests"
 
 
 class _OfAnother(ValueError):
-    """A checkpoint holds other leaves, or of other shapes, than are wanted."""
+    """Raised for a checkpoint whose leaves, or their shapes, differ from those wanted."""
 
 
 def _compare(folder: Any, wanted: dict[str, dict[str, Any]]) -> None:
-    """Raises _OfAnother unless items in a checkpoint's folder have the leaves that are wanted, of their shapes."""
+    """Raise _OfAnother unless a checkpoint's items have the wanted leaves with the wanted shapes."""
     reader = ocp.StandardCheckpointHandler()
     for name, item in wanted.items():
         stored = reader.metadata(folder / name).tree
@@ -114,9 +114,9 @@ def _compare(folder: Any, wanted: dict[str, dict[str, Any]]) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps silent what Orbax leaves to threads and to the garbage collector once a read or a write has failed.
+    """Silence the complaints of Orbax's threads and of the garbage collector after a failed read or write.
 
-    Each complains by pages, at any later time and in anybody's code.
+    These complaints are pages long, and may come at any later time, from unrelated code.
     """
     log, unraisable, uncaught = logging.getLogger("asyncio"), sys.unraisablehook, sys.excepthook
     silenced = log.disabled
@@ -131,15 +131,15 @@ def _quiet() -> Iterator[None]:
 
 
 def _settle() -> None:
-    """Waits for the other reads or writes of one that failed, and collects them."""
+    """Wait for the other reads or writes after one failed, and collect their garbage."""
     time.sleep(SETTLING_S)
     gc.collect()
 
 
 class _LateComplaints:
-    """A hook of the interpreter that passes over what the other reads or writes of one that failed complain of later.
+    """An `unraisablehook` that ignores late complaints of reads or writes whose sibling failed.
 
-    On a slow disk they outlast `_settle`, and find the event loop closed in which Orbax ran them all.
+    On a slow disk they outlast `_settle`, and find that the event loop in which Orbax ran them is closed.
     """
 
     def __init__(self, before: Callable[[Any], Any]) -> None:
@@ -151,12 +151,12 @@ class _LateComplaints:
 
 
 class Checkpoints:
-    """The checkpoints of one program's run, in one folder; newest last."""
+    """The checkpoints of one program's run in one folder."""
 
     def __init__(self, folder: Path, read_only: bool = False, damaged: str = DAMAGED) -> None:
-        """Of a folder. `damaged`: what to do about a checkpoint that is, in a message's words."""
+        """Open a folder of checkpoints. `damaged` is the remedy in the message about a damaged checkpoint."""
         self._damaged = damaged
-        logging.getLogger("absl").setLevel(logging.CRITICAL)  # its threads log what `save` then raises
+        logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax's threads log what `save` raises anyway
         self._folder = folder.resolve()
         self._manager = ocp.CheckpointManager(
             self._folder,
@@ -166,11 +166,11 @@ class Checkpoints:
         )
 
     def latest(self) -> int | None:
-        """Number of the newest complete checkpoint."""
+        """Return the number of the newest complete checkpoint; None if there is none."""
         return self._manager.latest_step()
 
     def save(self, number: int, items: dict[str, Any]) -> None:
-        """Writes a checkpoint; returns once it is complete on disk. Raises OSError where there is no room for it."""
+        """Write a checkpoint; return once it is complete on disk. Raises OSError if the disk is full."""
         needed = sum(leaf.nbytes for leaf in jax.tree.leaves(items) if hasattr(leaf, "nbytes"))
         if shutil.disk_usage(self._folder).free < needed + ROOM_LEFT:
             raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
@@ -189,19 +189,19 @@ class Checkpoints:
         raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
 
     def compare(self, like: dict[str, Any]) -> None:
-        """Whether the newest checkpoint's items have the leaves of those in `like`; their arrays are not read.
+        """Check that the newest checkpoint's items have the leaves of those in `like`, without reading arrays.
 
         Raises:
-            UserError: no checkpoint, one that cannot be read, or one of other shapes.
+            UserError: there is no checkpoint, it cannot be read, or its shapes differ.
         """
         with self._reading() as folder:
             _compare(folder, {name: _flat(item) for name, item in like.items()})
 
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
-        """The newest checkpoint's items named in `like` (trees of arrays or shapes), onto the default device.
+        """Return the newest checkpoint's items named in `like` (trees of arrays or shapes), on the default device.
 
         Raises:
-            UserError: no checkpoint, one that cannot be read, or one of other shapes.
+            UserError: there is no checkpoint, it cannot be read, or its shapes differ.
         """
         device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         wanted = {
@@ -223,16 +223,16 @@ class Checkpoints:
 
     @contextmanager
     def _reading(self) -> Iterator[Any]:
-        """The folder of the newest checkpoint; whatever fails while it is read is a UserError."""
+        """Yield the folder of the newest checkpoint; turn any failure while it is read into a UserError."""
         number = self.latest()
         if number is None:
-            raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first one")
+            raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first checkpoint")
         with _quiet():
             try:
                 yield self._manager.directory / str(number)
                 return
-            except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
-                # Orbax means to print TensorStore's details and prints the method that has them.
+            except Exception as error:  # Orbax and TensorStore raise many exception types for damaged files
+                # Orbax prints the method in place of TensorStore's details.
                 told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
                 reason = told.splitlines()[0][:160] if told else type(error).__name__
                 forbidden = mentions(error, (errno.EACCES, errno.EPERM), "PERMISSION_DENIED", "Permission denied")
@@ -242,7 +242,7 @@ class Checkpoints:
 
     @staticmethod
     def _verify(restored: dict[str, dict[str, Any]], digests: dict[str, dict[str, str]]) -> None:
-        """Raises ValueError unless items hold what was written."""
+        """Raise ValueError unless the restored items have the digests that were saved."""
         for name, item in restored.items():
             told = digests[name]
             changed = [path for path, found in _digests(item).items() if told[path] != found]
@@ -250,13 +250,13 @@ class Checkpoints:
                 raise ValueError(f"{name}{changed[0]} is not what was written")
 
     def close(self) -> None:
-        """Releases Orbax's threads."""
+        """Release Orbax's threads."""
         self._manager.close()
 
 
 @contextmanager
 def checkpoints(folder: Path, read_only: bool = False, damaged: str = DAMAGED) -> Iterator[Checkpoints]:
-    """`Checkpoints` that close by themselves. `read_only` changes nothing on disk."""
+    """Open `Checkpoints` for the duration of a context. `read_only` changes nothing on disk."""
     manager = Checkpoints(folder, read_only, damaged)
     try:
         yield manager

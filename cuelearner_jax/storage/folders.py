@@ -1,13 +1,13 @@
-"""What may be done to the folder of a run: use, resume, overwrite, keep for one process.
+"""The folder of a run: claim, check, resume and overwrite it.
 
 Folder of a run:
 
     config.json                  everything that determines the results
-    .lock                        held by the process that writes here, and says which
-    <guidance>/checkpoints/      the newest states
-    <guidance>/labels.parquet    what the teacher answered
-    <guidance>/results.jsonl     one row a seed and evaluation; results.parquet once done
-    <guidance>/guide.jsonl       how good the guides are by themselves while they ask; guide.parquet once done
+    .lock                        held by the process that writes here, which it names
+    <guidance>/checkpoints/      the newest training states
+    <guidance>/labels.parquet    the teacher's answers
+    <guidance>/results.jsonl     one row per seed and evaluation; results.parquet once done
+    <guidance>/guide.jsonl       each guide's own performance while labels are collected; guide.parquet once done
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from typing import Any
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import formats
-from cuelearner_jax.storage.locks import held
+from cuelearner_jax.storage.locks import hold
 from cuelearner_jax.storage.whole import TEMPORARY
 
 CONFIG = "config.json"
-LOCK = ".lock"  # held by the process that writes in a run's folder, and says which; it stays behind
-LEFT = (LOCK, CONFIG + TEMPORARY, "config.tmp")  # what a process leaves that ended before its first word
+LOCK = ".lock"  # held by the process that writes in a run's folder, which it names; stays on disk
+LEFT = (LOCK, CONFIG + TEMPORARY, "config.tmp")  # files left by a process that ended before it wrote config.json
 
 
 def in_use(out: Path) -> bool:
-    """Is there anything at `out`, the mark of a process that writes there apart?"""
+    """Whether `out` holds anything but the lock of a process that is about to write there."""
     return out.exists() and (not out.is_dir() or any(entry.name not in LEFT for entry in out.iterdir()))
 
 
 def check_folder(
     out: Path, described: dict[str, Any], resume: bool, overwrite: bool, defaults: dict[str, Any] | None = None
 ) -> None:
-    """Raises UserError unless `out`, whose config.json is to hold `described`, may be resumed, overwritten or begun.
+    """Raise UserError unless `out` may be resumed, overwritten or begun with `described` as its config.json.
 
-    `defaults`: as `differences` has them.
+    `defaults`: see `differences`.
     """
     if resume and overwrite:
         raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
@@ -50,7 +50,8 @@ def check_folder(
         differing = sorted(differences(formats.read("config", out / CONFIG), described, defaults))
         if differing:
             raise UserError(
-                f"{out} was run with another {', '.join(differing[:4])}: give the same options, or another --out"
+                f"{out} was run with other values of {', '.join(differing[:4])}: give the same "
+                f"options, or another --out"
             )
     elif used and not overwrite:
         raise UserError(f"{out} is not empty: give --resume to go on, --overwrite to delete it, or another --out")
@@ -61,17 +62,17 @@ def check_folder(
 def differences(
     before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any] | None = None, prefix: str = ""
 ) -> Iterator[str]:
-    """The names, as `part.field`, in which two descriptions of runs differ.
+    """Yield the names, as `part.field`, in which two descriptions of runs differ.
 
     Args:
         before, now: the descriptions.
-        defaults: values by part and field that one counts as having where it does not say: a program that had not the
-            field yet did what the default does.
-        prefix: the part, of names.
+        defaults: the value of a field, by part and field, where a description lacks it: a program without the field
+            behaved as the default does.
+        prefix: the part, prefixed to names.
     """
     defaults = defaults or {}
     for name in {**before, **now}:
-        if f"{prefix}{name}" == "task.from":  # where a task's code lies changes nothing in it
+        if f"{prefix}{name}" == "task.from":  # where a task's code lies has no effect on the run
             continue
         default = defaults.get(name)
         within, value = (default, None) if isinstance(default, dict) else (None, default)
@@ -84,21 +85,22 @@ def differences(
 
 @contextmanager
 def claimed(out: Path) -> Iterator[None]:
-    """Makes a run's folder and keeps it for this process alone; it is free again however the process ends.
+    """Make a run's folder and claim it for this process; the claim ends however the process ends.
 
-    Whatever was found in the folder before may have changed until it is kept: look again.
+    The folder may have changed before it was claimed, so check it again afterwards.
 
-    Raises UserError if another process has it.
+    Raises UserError if another process has claimed the folder.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with held(out / LOCK, out, stays=True):
+    with hold(out / LOCK, out, stays=True):
         yield
 
 
 def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
-    """Makes the folder and writes config.json, if it is not there; with `clean`, nothing else is left in it.
+    """Make the folder and write config.json where missing; with `clean`, delete everything else in the folder.
 
-    Links are removed, what they lead to stays. config.json goes last: without it nothing here could be overwritten.
+    Links are removed without what they lead to. config.json is deleted last: without it the folder could not be
+    overwritten.
     """
     out.mkdir(parents=True, exist_ok=True)
     for entry in sorted(out.iterdir(), key=lambda entry: entry.name == CONFIG) if clean else ():

@@ -1,7 +1,7 @@
-"""What a Parquet file makes its reader allocate, told by its footer and the headers of its pages before any is read.
+"""What a Parquet file declares in its footer and page headers, so that memory can be checked before reading.
 
-A few bytes can stand for many values. Arrow believes the headers, and its own description of a damaged footer can end
-the process, so the headers are read here.
+A few bytes can declare many values. Arrow trusts these headers, and its own parser of a damaged footer can crash the
+process, so they are parsed here.
 
 Source: Apache Parquet, parquet.thrift; Apache Thrift, thrift-compact-protocol.md.
 """
@@ -13,30 +13,35 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 MAGIC = b"PAR1"
-LARGEST_FOOTER = 1 << 24  # bytes; this program's have some thousand
-STRINGS = 6  # the number of a type
-TYPES = (0, 1, 2, 4, 5, STRINGS)  # truth values, whole numbers and floats beside
-# Numbers of fields in parquet.thrift.
+LARGEST_FOOTER = 1 << 24  # bytes; files of this program have a few thousand
+STRINGS = 6  # parquet.thrift's number of the type of strings
+TYPES = (0, 1, 2, 4, 5, STRINGS)  # booleans, integers and floats are the others
+# Field numbers of parquet.thrift.
 ROWS, GROUPS = 3, 4  # FileMetaData
 COLUMNS = 1  # RowGroup
 META = 3  # ColumnChunk
 TYPE, PATH, VALUES, SIZE, PAGES, DICTIONARY = 1, 3, 5, 7, 9, 11  # ColumnMetaData
 UNPACKED, PACKED = 2, 3  # PageHeader
-HEADERS = (5, 8)  # PageHeader: of data, in both versions
+HEADERS = (5, 8)  # PageHeader: the two versions of data page headers
 PAGE_VALUES = 1  # DataPageHeader
 
 
 class Declared(NamedTuple):
-    """What a file declares to hold."""
+    """The contents that a Parquet file declares."""
 
     rows: int
     values: int  # in all columns
-    page_bytes: int  # of all pages, unpacked
+    page_bytes: int  # of all pages, uncompressed
     strings: tuple[str, ...]  # names of columns
 
 
-def declared(path: Path) -> Declared:
-    """What a Parquet file declares. Raises ValueError if it is none, or damaged, and OSError if it cannot be read."""
+def read_declared(path: Path) -> Declared:
+    """Return what a Parquet file declares.
+
+    Raises:
+        ValueError: the file is not Parquet, or is damaged.
+        OSError: the file cannot be read.
+    """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         if data[-4:] != MAGIC or data[:4] != MAGIC:
             raise ValueError("it is no Parquet file, or was cut")
@@ -59,8 +64,9 @@ def declared(path: Path) -> Declared:
 
 
 def _pages(data: mmap.mmap, chunk: dict[int, Any]) -> list[tuple[int, list[dict[int, Any]]]]:
-    """(size unpacked [bytes], headers of data) of each page of a column."""
-    at = min(place for place in (chunk[PAGES], chunk.get(DICTIONARY, 0), len(data)) if place)  # 0: it has none
+    """Return (uncompressed size [bytes], data headers) of each page of a column."""
+    # 0: the column has no dictionary
+    at = min(place for place in (chunk[PAGES], chunk.get(DICTIONARY, 0), len(data)) if place)
     end = at + chunk[SIZE] if chunk[VALUES] or DICTIONARY in chunk else at
     if not 0 <= at <= end <= len(data):
         raise ValueError("its footer is damaged")
@@ -76,7 +82,7 @@ def _pages(data: mmap.mmap, chunk: dict[int, Any]) -> list[tuple[int, list[dict[
 
 
 class _Reader:
-    """Values in Thrift's compact protocol, structs as dicts by the numbers of their fields."""
+    """Parses values in Thrift's compact protocol; a struct becomes a dict by field number."""
 
     def __init__(self, data: mmap.mmap, at: int) -> None:
         self._data, self.at = data, at
@@ -105,7 +111,7 @@ class _Reader:
             return [self._value(head & 15) for _ in range(size)]
         if kind == 12:
             return self.struct()
-        raise ValueError("its footer or the header of a page is damaged")  # maps: Parquet has none
+        raise ValueError("its footer or the header of a page is damaged")  # a map, which Parquet does not use
 
     def _byte(self) -> int:
         self.at += 1

@@ -1,4 +1,4 @@
-"""Format numbers of the files that outlive the program that wrote them, of which only the current ones are read.
+"""Format numbers of the files that outlive the program that wrote them; only current formats are read.
 
 | kind      | file                   | values                 |
 |-----------|------------------------|------------------------|
@@ -8,10 +8,10 @@
 | `policy`  | `policy.json`          | its contents           |
 | `due`     | `due.json` of a run    | its contents           |
 
-A file tells its number under `format`. A change of what is written raises the number here, and the files of the
-repository are rewritten by a script; readers know the current format only.
+A file has its format number under `format`. Whoever changes what is written raises the number here and rewrites the
+repository's files by a script; readers support the current format only.
 
-A JSON file carries a digest of its values, and is not read if they are others: a changed bit is no configuration.
+A JSON file carries a digest of its values and is refused if the values have another digest.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cuelearner_jax.storage.whole import replacing, unreadable
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
 FORMATS = {"config": 1, "labels": 1, "teacher": 1, "policy": 1, "due": 1}
 LARGEST = 1 << 26  # bytes of a JSON file
-REMEDIES = {  # what a message says of a damaged file, after its path
+REMEDIES = {  # the remedy in the message about a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
     "teacher": "is damaged: restore it, or train the teacher anew",
@@ -39,16 +39,16 @@ Values = dict[str, Any]
 
 
 def damaged(kind: str, path: Path, reason: object = "") -> UserError:
-    """Build the error for a file that makes no sense; `reason`: why, where that is known."""
+    """Return the error for a file that cannot be parsed; `reason` says why, where known."""
     why = (str(reason).splitlines() or [""])[0][:200]
     return UserError(f"{path} {REMEDIES[kind]}{f' ({why})' if why else ''}")
 
 
 def read(kind: str, path: Path) -> Values:
-    """A JSON file in the current format of its kind, without its digest.
+    """Read a JSON file in the current format of its kind; return its values without the digest.
 
     Raises:
-        UserError: it cannot be read, is damaged, was changed since it was written, or is of another format.
+        UserError: the file cannot be read, is damaged, was changed since it was written, or has another format.
     """
     try:
         if (size := path.stat().st_size) > LARGEST:
@@ -67,14 +67,14 @@ def read(kind: str, path: Path) -> Values:
 
 
 def write(kind: str, path: Path, values: Values) -> None:
-    """Writes a JSON file of the current format with its digest, replacing `path` in one step."""
+    """Write a JSON file of the current format with its digest, replacing `path` atomically."""
     values = json.loads(json.dumps({**values, "format": FORMATS[kind]}))
     with replacing(path) as file:
         file.write(json.dumps({**values, DIGEST: configuration.digest(values)}, indent=1) + "\n")
 
 
 def check(kind: str, values: Any, path: Path) -> None:
-    """Raises UserError unless what a file holds is of the current format of its kind (a key of `FORMATS`)."""
+    """Raise UserError unless a file's values have the current format of its kind (a key of `FORMATS`)."""
     number = values.get("format") if isinstance(values, dict) else None
     if not isinstance(number, int) or isinstance(number, bool):
         raise damaged(kind, path)

@@ -1,4 +1,4 @@
-"""Whether the head and the rows of a label file make sense, before they are used; knows no form of answer."""
+"""Validate the head and the rows of a label file before use, whatever the form of answers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import pyarrow as pa
 
 from cuelearner_jax import spaces
 
-ANSWERED, UNSURE, UNDONE = SAID = ("answer", "unsure", "undone")  # an answer, "don't know", taken back
-ROW = ("obs", "action", "answer")  # columns of lists
-PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of rows that a person gave
-SESSION = ("guidance", "base", "base_digest", "robot", "again_of")  # what is text of a session
+ANSWERED, UNSURE, UNDONE = SAID = ("answer", "unsure", "undone")  # an answer, "don't know", an answer taken back
+ROW = ("obs", "action", "answer")  # columns that hold lists
+PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of a person's rows
+SESSION = ("guidance", "base", "base_digest", "robot", "again_of")  # text fields of a session
 
 
 def check_head(head: dict[str, Any]) -> None:
-    """Raises ValueError, with the reason, unless a file says of itself what labels need."""
+    """Raise ValueError, with the reason, unless a file's head has what labels need."""
     task, eps = head.get("task"), head.get("eps", "absent")
     if not isinstance(task, dict) or not isinstance(task.get("name"), str):
         raise ValueError("it does not name its task")
@@ -25,23 +25,23 @@ def check_head(head: dict[str, Any]) -> None:
         raise ValueError("it does not name the form of its answers")
     space = spaces.from_json(head.get("space") or {})
     if eps is not None and not (_is_number(eps) and 0 < eps <= space.reach):
-        raise ValueError(f"its eps is no number above 0 and up to {space.reach:g} ({space.unit})")
+        raise ValueError(f"its eps is not a number above 0 and up to {space.reach:g} ({space.unit})")
     session = head.get("session")
     if session is None:
         return
     if not isinstance(session, dict) or not _is_whole(session.get("seed")):
         raise ValueError("its session has no seed")
     if not all(isinstance(session.get(name, ""), str) for name in SESSION):
-        raise ValueError(f"one of {', '.join(SESSION)} of its session is no text")
+        raise ValueError(f"one of {', '.join(SESSION)} of its session is not text")
     bound, layout = session.get("bound"), session.get("observation", [])
     if bound is not None and not (_is_number(bound) and 0 < bound <= space.reach):
-        raise ValueError(f"the bound of its session is no number above 0 and up to {space.reach:g} ({space.unit})")
+        raise ValueError(f"the bound of its session is not a number above 0 and up to {space.reach:g} ({space.unit})")
     if not isinstance(layout, list) or not all(_is_part(part) for part in layout):
-        raise ValueError("the observation of its session is no list of names and sizes")
+        raise ValueError("the observation of its session is not a list of names and sizes")
 
 
 def check_rows(table: pa.Table, head: dict[str, Any]) -> None:
-    """Raises ValueError, with the reason, unless rows are such as were written; numbers are not looked at."""
+    """Raise ValueError, with the reason, unless the rows have a valid structure; their numbers are not checked."""
     if not table.num_rows:
         return
     for name in ("seed", "obs", "action"):
@@ -64,9 +64,9 @@ def check_rows(table: pa.Table, head: dict[str, Any]) -> None:
         if answered[row] != (said in (None, ANSWERED)):
             raise ValueError(f"row {row + 1} says {said!r} and has {'an' if answered[row] else 'no'} answer")
         if said is None and item is None:
-            continue  # a simulated teacher's
+            continue  # a simulated teacher's row
         if said is None or not _is_whole(item) or not (_is_number(seconds) and seconds >= 0) or None in (who, when):
-            raise ValueError(f"row {row + 1} lacks one of {', '.join(PEOPLE)}, or it makes no sense")
+            raise ValueError(f"row {row + 1} lacks a valid value of one of {', '.join(PEOPLE)}")
 
 
 def _width(table: pa.Table, name: str) -> int:
@@ -81,7 +81,7 @@ def _is_part(part: Any) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    """Is it a whole number from 0 that 32 bits hold?"""
+    """Whether a value is an integer from 0 to 2^31 - 1."""
     return type(value) is int and 0 <= value < 1 << 31
 
 

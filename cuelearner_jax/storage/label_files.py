@@ -1,24 +1,24 @@
-"""Label files: one row a label, with what the numbers mean written into the file.
+"""Label files: one row per label, with the meaning of the numbers written into the file.
 
-A label is what a teacher said of an action in a state: the answer, not what some model is to learn from it, so that one
-file serves every kind of guidance that takes this form of answer. A file holds one set of labels, or one for each seed
-of a run. `write` writes a whole file; `LabelWriter` one row at a time, each of which is safe once the call returns.
+A label is what a teacher said of an action in a state: the answer, not a model's training target. So one file serves
+every kind of guidance with this form of answers. A file holds one set of labels, or one for each seed of a run.
+`write` writes a whole file; `LabelWriter` appends rows, each of which is on disk once the call returns.
 
 | column  | type           | meaning                                                                              |
 |---------|----------------|--------------------------------------------------------------------------------------|
 | seed    | int            | whose label it is                                                                    |
-| obs     | list of floats | the task's observation at the question                                               |
+| obs     | list of floats | the task's observation in the question                                               |
 | action  | list of floats | the action asked about                                                               |
 | answer  | list of floats | what the teacher said; the file names the form of it; absent where nothing was said  |
 | item    | int            | people: number of the question, from 0                                               |
-| said    | string         | people: one of `SAID`; of several rows of one item the last one holds                |
+| said    | string         | people: one of `SAID`; the last row of an item counts                            |
 | seconds | float          | people: from the question on the screen to the answer [s]                            |
 | who     | string         | people: a name                                                                       |
 | when    | string         | people: time of the answer, ISO 8601 in UTC                                          |
 
-Rows of simulated teachers have the first four columns. A row is never changed: what is taken back stays, and a later
-row of the same item says so. Readers give the labels that stand. The head names the space of the actions, with the
-names, words and unit of its cues, and the strength of all answers in that unit.
+Rows of simulated teachers have the first four columns. A row is never changed: an answer that is taken back stays, and
+a later row of the same item says so. Readers return only the labels that still count. The head describes the space of
+the actions, with names, words and unit of its cues, and the strength of all answers in that unit.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ CONVENTIONS = {
     "answer": "what the teacher said of the action, in the form that `answers` names",
     "eps": "strength of an answer in the unit of the space's cues, null where the form has none",
 }
-TOLD = ("format", "answers", "eps", "task", "space", "session")  # what must be the same for labels to share a file
+TOLD = ("format", "answers", "eps", "task", "space", "session")  # must be equal for labels to share a file
 
 
 class People(NamedTuple):
-    """What a person's labels have beside what was said, (labels,) each."""
+    """Details of a person's labels beside the answers, (labels,) each."""
 
     item: np.ndarray  # number of the question
     seconds: np.ndarray  # taken for the answer [s]
@@ -70,26 +70,26 @@ class People(NamedTuple):
 
 
 class LabelFile(NamedTuple):
-    """Label sets and where they come from."""
+    """Label sets and their origin."""
 
     task: dict[str, Any]  # {"name": ..., configuration of the task}
     answers: str  # name of the form of the answers, see `guidance.answers`
     space: Space  # of the actions
     eps: float | None  # strength of an answer, in the space's unit; None where the form has none
     seeds: np.ndarray  # (labels,)
-    labels: Label  # rows (labels, ...), in the order they were given; those that stand
-    people: People | None = None  # None: a simulated teacher's, or of several people's merged with such
-    session: dict[str, Any] | None = None  # how a page asked, see `labelling.session`
-    said: dict[str, int] | None = None  # rows of each kind (`SAID`), those that no longer stand included
+    labels: Label  # rows (labels, ...) that still count, in the order they were given
+    people: People | None = None  # None: the labels of a simulated teacher, or a merge that includes such labels
+    session: dict[str, Any] | None = None  # settings of the page that asked, see `labelling.session`
+    said: dict[str, int] | None = None  # number of rows of each kind in `SAID`, all rows counted
 
     @property
     def budget(self) -> int:
-        """The labels that each of its seeds has at least."""
+        """The number of labels that each seed has at least."""
         return int(np.unique(self.seeds, return_counts=True)[1].min())
 
 
 class LabelWriter(tables.TableWriter):
-    """Appends rows to `labels.jsonl` of a folder; each is on the disk when the call returns.
+    """Appends rows to `labels.jsonl` in a folder; each row is on disk when the call returns.
 
     Opening an existing file continues it: a torn last line, left by a crash, is dropped first, and a finished file
     (Parquet) becomes JSONL again.
@@ -106,16 +106,16 @@ class LabelWriter(tables.TableWriter):
         session: dict[str, Any] | None = None,
         **told: Any,
     ) -> None:
-        """Opens the file, creating it and the folder where needed.
+        """Open the file, creating it and the folder where needed.
 
         Args:
-            folder: where the file lies.
+            folder: the file's folder.
             task, answers, space, eps, session: see `LabelFile`.
-            meaning: of an answer's numbers, written into the file.
-            told: what else a new file says of itself, such as the versions that wrote it.
+            meaning: meaning of an answer's numbers, written into the file.
+            told: further entries of a new file's head, such as the versions that wrote it.
 
         Raises:
-            UserError: the folder holds labels of something else, or they cannot be read; nothing has been changed.
+            UserError: the folder holds labels of another kind, or unreadable ones; nothing has been changed.
         """
         about = _about(task, answers, space, eps, meaning, session)
         there = found_in(folder)
@@ -132,18 +132,18 @@ class LabelWriter(tables.TableWriter):
     def append(
         self, *, seed: int, obs: np.ndarray, action: np.ndarray, answer: np.ndarray | None, **person: Any
     ) -> None:
-        """Appends one row.
+        """Append one row.
 
         Args:
-            seed: whose label it is.
-            obs: the task's observation at the question, (obs,).
+            seed: seed that the label belongs to.
+            obs: the task's observation in the question, (obs,).
             action: the action asked about, (action,).
-            answer: what the teacher said, (width,); None: nothing, or what was said is taken back.
-            person: the columns `PEOPLE`, of a person's label.
+            answer: what the teacher said, (width,); None: nothing was said, or the answer is taken back.
+            person: the columns `PEOPLE`, for a person's label.
 
         Raises:
-            ValueError: a number is not finite, or a width is not that of the labels before.
-            OSError: the disk takes no more. The row is not in the file, now or later; the call may be repeated.
+            ValueError: a number is not finite, or a width differs from that of the labels before.
+            OSError: the disk refuses the row. The row is not in the file, now or later; the call may be repeated.
         """
         values = {name: value for name, value in zip(ROW, (obs, action, answer), strict=True) if value is not None}
         columns = {name: np.asarray(value, np.float32) for name, value in values.items()}
@@ -160,14 +160,14 @@ class LabelWriter(tables.TableWriter):
 
 
 def found_in(place: Path) -> Path | None:
-    """The label file at a place: that file, or the one in that folder; None: there is none."""
+    """Return the label file at a path, which may be its folder; None if there is none."""
     if not place.is_dir():
         return place if place.exists() else None
     return SCHEMA.found_in(place)
 
 
 def history(path: Path) -> list[dict[str, Any]]:
-    """Every row of a person's file, in the order of writing, those that no longer stand included; columns absent: None.
+    """Return every row of a person's file in the order of writing, overruled rows included; absent columns are None.
 
     Raises UserError if the file is damaged.
     """
@@ -176,7 +176,7 @@ def history(path: Path) -> list[dict[str, Any]]:
 
 
 def finish(folder: Path) -> Path:
-    """Turns the labels of a `LabelWriter` into Parquet; returns that file. Raises UserError if there are none."""
+    """Convert the labels of a `LabelWriter` to Parquet; return that file. Raises UserError if there are none."""
     return tables.finish(folder, SCHEMA)
 
 
@@ -190,14 +190,14 @@ def write(
     labels: Label,
     meaning: str = "",
 ) -> None:
-    """Writes the valid labels of lanes as Parquet, replacing `path` in one step.
+    """Write the valid labels of lanes as Parquet, replacing `path` atomically.
 
     Args:
-        path: where to.
+        path: the target.
         task, answers, space, eps: see `LabelFile`.
-        seeds: of the lanes, (lanes,).
+        seeds: the lanes' seeds, (lanes,).
         labels: (lanes, slots, ...).
-        meaning: of an answer's numbers, written into the file.
+        meaning: meaning of an answer's numbers, written into the file.
     """
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
@@ -206,9 +206,9 @@ def write(
 
 
 def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = True, **told: Any) -> None:
-    """Writes labels as a Parquet file, with what a person's have beside them.
+    """Write labels as a Parquet file, with the details of a person's labels.
 
-    `meaning` and `told`: see `LabelWriter`. Raises UserError if the file is to be `fresh` and exists.
+    `meaning` and `told`: see `LabelWriter`. Raises UserError if the file exists although it should be `fresh`.
     """
     columns = {"seed": pa.array(np.asarray(file.seeds, np.int64))}
     for name in ROW:
@@ -221,10 +221,10 @@ def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = Tru
 
 
 def read(path: Path) -> LabelFile:
-    """The labels that stand in a Parquet or JSONL file, or a folder with one.
+    """Read the labels that still count from a Parquet or JSONL file, or from the folder of one.
 
     Raises:
-        UserError: the file is missing, damaged, of a newer program, or holds no labels.
+        UserError: the file is missing, damaged, of another format, or holds no labels.
     """
     found = found_in(path)
     if found is None or not found.is_file():
@@ -249,7 +249,7 @@ def read(path: Path) -> LabelFile:
 
 
 def _standing(table: pa.Table) -> pa.Table:
-    """The rows that hold: of a person's item the last, if it is an answer; in the order of items."""
+    """Return the rows that count: of a person's item the last, if it is an answer; in the order of items."""
     if not {"item", "said"} <= set(table.column_names):
         return table
     last: dict[Any, int] = {}
@@ -261,7 +261,7 @@ def _standing(table: pa.Table) -> pa.Table:
 
 
 def readable(path: Path) -> bool:
-    """Is there a label file that is whole?"""
+    """Whether a path holds a complete label file."""
     try:
         read(path)
     except UserError:
@@ -270,17 +270,17 @@ def readable(path: Path) -> bool:
 
 
 def digest(path: Path) -> str:
-    """What tells a file's contents from others of the same name."""
+    """Return a short SHA-256 of a file's contents."""
     return hashlib.sha256((found_in(path) or path).read_bytes()).hexdigest()[:12]
 
 
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:
-    """Label sets of lanes, padded: rows (lanes, slots, ...).
+    """Return the lanes' label sets, padded: rows (lanes, slots, ...).
 
-    A file with one set serves every seed; with several, each lane gets its own seed's, up to its budget.
+    A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget.
 
     Raises:
-        UserError: a seed's labels are missing, or there are fewer than a lane's budget.
+        UserError: a seed's labels are missing, or fewer than a lane's budget.
     """
     kept = np.unique(file.seeds)
     sets = []
@@ -290,7 +290,7 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
         if own not in kept:
             raise UserError(
                 f"the label file has labels for the seeds {format_numbers(kept.tolist())}, none for seed {seed}: "
-                "give --first-seed and --seeds (train: --seed) of these, or the labels of another run"
+                "give --first-seed and --seeds (train: --seed) for these, or the labels of another run"
             )
         if len(chosen) < budget:
             raise UserError(
@@ -305,7 +305,7 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
 def _about(
     task: dict[str, Any], answers: str, space: Space, eps: float | None, meaning: str, session: dict[str, Any] | None
 ) -> dict[str, Any]:
-    """What a file of labels says of itself."""
+    """Return the head of a label file."""
     return {
         "format": formats.FORMATS["labels"],
         "task": task,
@@ -318,7 +318,7 @@ def _about(
 
 
 def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Raises UserError, with the first difference in words, unless labels may share a file."""
+    """Raise UserError, with the first difference in words, unless labels may share a file."""
     old: Any = {name: before.get(name) for name in TOLD}
     new: Any = {name: now.get(name) for name in TOLD}
     named = next(differences(old, new), None)
@@ -327,7 +327,7 @@ def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None
     for part in named.split("."):
         old, new = (value.get(part) for value in (old, new))
     raise UserError(
-        f"{path} holds labels of another {named} ({_short(old)}, asked for is {_short(new)}): "
+        f"{path} holds labels of another {named} ({_short(old)}; the command asks for {_short(new)}): "
         "give the same, or another folder (--out)"
     )
 
@@ -343,7 +343,7 @@ def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
     try:
         head = tables.about_of(table)
         if head is None and table.num_rows:
-            raise ValueError("it does not say what it holds")
+            raise ValueError("it has no head")
         if head is not None:
             formats.check("labels", head, path)
             check_head(head)
@@ -354,7 +354,7 @@ def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
 
 
 def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
-    """A column as an array. An item that has no number is -1."""
+    """Return a column as an array; -1 for an item without a number."""
     if name in SCHEMA.strings:
         return np.array([value or "" for value in column.to_pylist()])
     if name in SCHEMA.integers:

@@ -1,12 +1,12 @@
-"""LeRobot datasets, format v3.0: observations, actions and pictures of single frames; read without LeRobot.
+"""Read LeRobot datasets, format v3.0, without LeRobot: observations, actions and single camera frames.
 
     meta/info.json                                  codebase_version, fps, features
-    meta/episodes/chunk-000/file-000.parquet        where each episode lies in the videos
-    data/chunk-000/file-000.parquet                 a row a frame
-    videos/KEY/chunk-000/file-000.mp4               the frames of many episodes, one after another
+    meta/episodes/chunk-000/file-000.parquet        position of each episode in the videos
+    data/chunk-000/file-000.parquet                 one row per frame
+    videos/KEY/chunk-000/file-000.mp4               frames of consecutive episodes
 
-Source: huggingface/lerobot 0.6.2, src/lerobot/datasets/utils.py and docs/source/lerobot-dataset-v3.mdx. Paths are those
-of the format and never templates of a file; of a video only the frames that are asked for are decoded.
+Source: huggingface/lerobot 0.6.2, src/lerobot/datasets/utils.py and docs/source/lerobot-dataset-v3.mdx. Paths are
+those of the format, never templates from a file. Only the requested frames of a video are decoded.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ class Recording(NamedTuple):
     actions: Float[np.ndarray, "n action"]
     observation_entries: tuple[str, ...]  # empty: the dataset names none
     action_entries: tuple[str, ...]
-    frames: Callable[[int], Picture] | None  # row -> the picture of its first camera; None: there is no camera
+    frames: Callable[[int], Picture] | None  # row -> the first camera's picture; None: no camera
 
 
-def is_one(path: Path) -> bool:
-    """Is a folder a LeRobot dataset?"""
+def is_dataset(path: Path) -> bool:
+    """Whether a folder is a LeRobot dataset."""
     return (path / INFO).is_file()
 
 
 def read(path: Path) -> Recording:
-    """Read a dataset's rows; its pictures are read when they are asked for.
+    """Read a dataset's rows; pictures are read on demand.
 
     Raises:
-        UserError: it is of another version of the format, damaged, or has no observations or actions that are vectors.
+        UserError: the dataset has another version of the format, is damaged, or lacks vector observations or actions.
     """
     info = _info(path)
     features = info["features"]
@@ -81,7 +81,7 @@ def read(path: Path) -> Recording:
 
 
 def _info(path: Path) -> dict[str, Any]:
-    """What info.json says. Raises UserError for another version of the format, or nonsense."""
+    """Return the contents of info.json. Raises UserError for another version of the format or invalid contents."""
     file = path / INFO
     try:
         check_size(file)
@@ -108,12 +108,12 @@ def _is_vector(told: Any) -> bool:
 
 
 def _stored(features: dict[str, Any], cameras: list[str]) -> list[str]:
-    """Cameras whose pictures lie in the rows themselves."""
+    """Return the cameras whose pictures are stored in the rows themselves."""
     return [key for key in cameras if features[key].get("dtype") == "image"]
 
 
 def _rows(path: Path, columns: list[str]) -> pa.Table:
-    """These columns of all data files. Raises UserError for files that cannot be read, or lack a column."""
+    """Return these columns of all data files. Raises UserError for unreadable files or a missing column."""
     files = sorted((path / "data").glob("chunk-*/file-*.parquet"))
     if not files:
         raise UserError(f"{path / 'data'} holds no frames: restore it from where the dataset came from")
@@ -146,7 +146,7 @@ def _vectors(path: Path, table: pa.Table, key: str, told: dict[str, Any]) -> Flo
 
 
 def _entries(told: dict[str, Any], before: str) -> tuple[str, ...]:
-    """Names of a vector's entries; empty: the dataset names none, or not as many."""
+    """Return the names of a vector's entries; empty if the dataset names none, or not as many."""
     names: Any = told.get("names")
     size = told["shape"][0]
     if isinstance(names, dict):
@@ -161,7 +161,7 @@ def _entries(told: dict[str, Any], before: str) -> tuple[str, ...]:
 
 
 def _frames(path: Path, info: dict[str, Any], table: pa.Table, key: str) -> Callable[[int], Picture]:
-    """Row -> its picture by a camera."""
+    """Return a function from a row to its camera picture."""
     if info["features"][key]["dtype"] == "image":
         return lambda row: _embedded(path, key, table[key][row].as_py())
     names = {name: f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")}
@@ -191,7 +191,7 @@ def _frames(path: Path, info: dict[str, Any], table: pa.Table, key: str) -> Call
 
 
 def _embedded(path: Path, key: str, stored: Any) -> Picture:
-    """A picture that lies in its row, as {"bytes": ..., "path": ...}, or in a file that the row names."""
+    """Return the picture stored in a row, as {"bytes": ..., "path": ...}, or in a file that the row names."""
     data, name = (stored.get(part) for part in ("bytes", "path")) if isinstance(stored, dict) else (None, None)
     if data is None and isinstance(name, str):
         try:
@@ -206,7 +206,7 @@ def _embedded(path: Path, key: str, stored: Any) -> Picture:
 
 @lru_cache(maxsize=64)
 def _decoded(file: Path, number: int) -> bytes:
-    """One frame of a video as PNG. Raises UserError if it cannot be had."""
+    """Return one frame of a video as PNG. Raises UserError if the frame cannot be decoded."""
     import imageio.v2 as imageio  # takes a while to load
     from PIL import Image
 

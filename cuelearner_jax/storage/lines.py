@@ -1,8 +1,8 @@
-"""Sealed lines of JSON in a file that grows: a reader gets what was written, or is told what is wrong.
+"""Checksummed lines of JSON in a growing file, so that a reader detects any change, loss or truncation.
 
 Each line is an object that ends in a checksum of itself and of all lines before it. The closing line, `{"end": N}`,
-says how many lines there are; whoever appends writes over it and puts a new one behind, in one step. So a changed line,
-a line taken out, a line without its checksum and a cut at any byte are all seen.
+gives the number of lines; an append overwrites it and adds a new one, in one step. So a changed line, a removed line, a
+line without its checksum and a cut at any byte are all detected.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ END = "end"  # the key of the closing line
 
 
 class Damaged(ValueError):
-    """Lines that are not what was written: its message says which and why."""
+    """Raised for lines that differ from what was written; the message says which line and why."""
 
 
 class Lines(NamedTuple):
-    """Rows of a file, without checksums, and whether its closing line follows."""
+    """A file's rows without checksums, and whether the closing line is present."""
 
     rows: list[Row]
     is_closed: bool
 
 
 class Writer:
-    """Appends lines to a file; they are on the disk when the call returns, or the file is as it was before."""
+    """Appends lines; on return they are on disk or, after an error, the file is unchanged."""
 
     def __init__(self, path: Path, rows: Iterable[Row]) -> None:
-        """Replaces the file by these lines, in one step, and opens it for more."""
+        """Replace the file by these lines atomically and open it for appending."""
         text, self._closing, self._count, self._checksum = _sealed(rows, 0, 0)
         with replacing(path, "wb") as file:
             file.write(text + self._closing)
@@ -50,19 +50,19 @@ class Writer:
         self._file = path.open("r+b", buffering=0)
 
     def append(self, rows: Iterable[Row]) -> None:
-        """Appends lines. Raises OSError where the disk refuses."""
+        """Append lines. Raises OSError if the disk refuses them."""
         text, closing, count, checksum = _sealed(rows, self._count, self._checksum)
         try:
             self._put(text + closing)
         except OSError:
-            with contextlib.suppress(OSError):  # these bytes were on the disk before
+            with contextlib.suppress(OSError):  # rewrite bytes that were on the disk before
                 self._file.truncate(self._at)
                 self._put(self._closing)
             raise
         self._at, self._count, self._checksum, self._closing = self._at + len(text), count, checksum, closing
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         self._file.close()
 
     def _put(self, content: bytes) -> None:
@@ -74,14 +74,14 @@ class Writer:
 
 
 def read(path: Path) -> Lines:
-    """The lines of a file, parsed.
+    """Read and parse the lines of a file.
 
-    Where the closing line is missing, the file was cut, or torn by a crash of the machine: what is whole is given, and
-    standard error told.
+    A missing closing line means that the file was cut, or torn by a crash of the machine. Then all whole lines are
+    returned, with a warning on standard error.
 
     Raises:
         UserError: the file cannot be read, or is larger than memory.
-        Damaged: a line is not what was written.
+        Damaged: a line differs from what was written.
     """
     try:
         check_size(path)
@@ -114,13 +114,13 @@ def read(path: Path) -> Lines:
     return Lines(rows, closed)
 
 
-@functools.cache  # whoever reads a file several times is told once
+@functools.cache  # one warning per message, however often a file is read
 def _tell(words: str) -> None:
     console.print(f"warning: {one_line(words)}")
 
 
 def _sealed(rows: Iterable[Row], count: int, checksum: int) -> tuple[bytes, bytes, int, int]:
-    """Lines after so many with that checksum: (text, closing line, count and checksum with these)."""
+    """Seal lines that follow `count` others; return (text, closing line, new count, new checksum)."""
     text = []
     for row in rows:
         line, checksum = _seal(row, checksum)
@@ -130,14 +130,14 @@ def _sealed(rows: Iterable[Row], count: int, checksum: int) -> tuple[bytes, byte
 
 
 def _seal(row: Row, before: int) -> tuple[bytes, int]:
-    """A line as it is written, its checksum at its end, and that checksum; `before`: that of the line before."""
+    """Return a line with its checksum at the end, and that checksum; `before`: the checksum of the line before."""
     text = json.dumps(row, allow_nan=False).encode()
     checksum = zlib.crc32(text, before)
     return text[:-1] + f', "crc": "{checksum:08x}"}}\n'.encode(), checksum
 
 
 def _opened(line: bytes, before: int) -> tuple[Row, int]:
-    """A line without its checksum, and that; the inverse of `_seal`. Raises ValueError if it was changed."""
+    """Return a line without its checksum, and the checksum. Raises ValueError if the line was changed."""
     found = CHECKSUM.search(line)
     if not found:
         raise ValueError("it has no checksum, so it, or a line before it, is not what was written")
@@ -147,5 +147,5 @@ def _opened(line: bytes, before: int) -> tuple[Row, int]:
         raise ValueError("it, or a line before it, is not what was written")
     row = json.loads(text)
     if not isinstance(row, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     return row, checksum

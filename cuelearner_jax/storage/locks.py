@@ -1,4 +1,4 @@
-"""Files that one process holds at a time, and that say which one."""
+"""Lock files: one process holds each at a time, and its identity is written into the file."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from cuelearner_jax.errors import UserError
 
 
 @contextmanager
-def held(lock: Path, what: Path, stays: bool) -> Iterator[None]:
-    """Holds a lock file, made if it is not there, that keeps the folder `what`; it is free however the process ends.
+def hold(lock: Path, what: Path, stays: bool) -> Iterator[None]:
+    """Hold a lock file that claims the folder `what`; the lock ends however the process ends.
 
-    A file, not the folder, is locked: that is what NFS passes on between machines. `stays`: does the file stay behind?
+    A file is locked, not the folder, since NFS passes only file locks on between machines. The file is made if
+    missing; with `stays` it remains afterwards.
 
-    Raises UserError if another process holds it.
+    Raises UserError if another process holds the lock.
     """
     try:
-        descriptor = locked(lock, wait=False)
+        descriptor = open_locked(lock, wait=False)
     except BlockingIOError:
         by = f" ({found})" if (found := holder(lock)) else ""
         raise UserError(f"{what} is being written by another process{by}: wait for it, or give another --out") from None
@@ -37,10 +38,10 @@ def held(lock: Path, what: Path, stays: bool) -> Iterator[None]:
         os.close(descriptor)
 
 
-def locked(file: Path, wait: bool) -> int:
-    """A file of that name, made if it is not there, that this process alone has locked; as an open descriptor.
+def open_locked(file: Path, wait: bool) -> int:
+    """Open a file, made if missing, that this process alone has locked; return its descriptor.
 
-    Raises BlockingIOError if another process has it and `wait` is not said.
+    Raises BlockingIOError if another process has the lock and `wait` is false.
     """
     while True:
         descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
@@ -52,11 +53,11 @@ def locked(file: Path, wait: bool) -> int:
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # the process before renamed or removed it: this is another file by now
+        os.close(descriptor)  # the process before renamed or removed the file, so the name stands for another file now
 
 
 def holder(lock: Path) -> str | None:
-    """Who holds a lock, as "process N on MACHINE"; None: nobody, or nobody knows."""
+    """Return who holds a lock, as "process N on MACHINE"; None if nobody does, or the holder is unknown."""
     with contextlib.suppress(OSError), lock.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Pictures beside recorded situations: files of a folder, by names that do not lead out of the folder."""
+"""Picture files beside recorded situations, confined to one folder."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ LARGEST_PICTURE = 50_000_000  # bytes
 
 
 class Picture(NamedTuple):
-    """A picture or a short clip as it lies in a file."""
+    """A picture or a short clip as stored in a file."""
 
     data: bytes
-    kind: str  # its media type, one of `KINDS`
+    kind: str  # media type, one of `KINDS`
 
 
 def inside(folder: Path, name: str, what: str) -> Path:
-    """A file below a folder by its name there. Raises UserError for a path that leads out of the folder."""
+    """Return the path of a file below a folder. Raises UserError for a name that leads out of the folder."""
     root = folder.resolve()
     try:
         there = (root / name).resolve()
@@ -40,17 +40,19 @@ class PictureFiles:
     """Pictures in files beside a table."""
 
     def __init__(self, table: Path, names: Any, rows: int) -> None:
-        """Raises UserError for names that are none, are too few, or lead out of the folder."""
+        """Check the names. Raises UserError for invalid or missing names, or names that lead out of the folder."""
         self._folder = table.parent
         names = [
             None if name in (None, "") else name for name in (names.tolist() if hasattr(names, "tolist") else names)
         ]
         if len(names) != rows:
             raise UserError(
-                f"{table} has {len(names)} pictures for {rows} situations: give a name a row, or an empty one"
+                f"{table} has {len(names)} pictures for {rows} situations: give one name per row, or an empty one"
             )
         if wrong := next((name for name in names if name is not None and not isinstance(name, str)), None):
-            raise UserError(f"{table}: a picture is {format_value(wrong)}: give the name of a file in the folder")
+            raise UserError(
+                f"{table}: {format_value(wrong)} is not a picture's file name: give the name of a file in the folder"
+            )
         for name in {name for name in names if name is not None}:
             inside(self._folder, name, "picture")
             if Path(name).suffix.lower() not in KINDS:
@@ -60,7 +62,7 @@ class PictureFiles:
         self._names: list[str | None] = names
 
     def __call__(self, row: int) -> Picture | None:
-        """The picture of a row. Raises UserError if it cannot be read."""
+        """Return the picture of a row; None if it has none. Raises UserError for a picture that cannot be read."""
         if (name := self._names[row]) is None:
             return None
         place = inside(self._folder, name, "picture")

@@ -1,11 +1,11 @@
 """Policy folders: a finished policy with everything that acting needs, in one folder.
 
-    policy.json       what it is made of, where it was adapted, how it was judged
+    policy.json       the policy's parts, where it was adapted, how it was evaluated
     arrays/           networks and bounds, as a checkpoint with digests
-    labels.parquet    what was answered; labels-60deg.parquet and so on where lanes differ in their bounds
-    guide.parquet     what the policy was worth after so many labels
+    labels.parquet    the answers; labels-60deg.parquet and so on where lanes differ in their bounds
+    guide.parquet     the policy's performance by number of labels
 
-The folder appears in one step, once all of it is written (`whole.Place`). Code is named in it, never kept.
+The folder appears atomically, once all of it is written (`whole.Place`). It names code but never contains any.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ POLICY, ARRAYS = "policy.json", "arrays"
 
 
 def is_one(folder: Path) -> bool:
-    """Is this a policy folder?"""
+    """Whether a folder is a policy folder."""
     return (folder / POLICY).exists()
 
 
 def check_free(folder: Path, overwrite: bool) -> None:
-    """Raises UserError unless a policy folder may be written there: nothing is, or one that may be overwritten."""
+    """Raise UserError unless `folder` is free, or is a policy folder and `overwrite` is given."""
     if not is_used(folder):
         return
     if not overwrite:
@@ -38,12 +38,12 @@ def check_free(folder: Path, overwrite: bool) -> None:
 
 
 def place_of(folder: Path, overwrite: bool) -> AbstractContextManager[Place]:
-    """Keeps the place of a policy folder for this process (`whole.place_of`). Raises UserError as `check_free`."""
+    """Claim the place of a policy folder for this process (`whole.place_of`). Raises UserError as `check_free`."""
     return whole.place_of(folder, lambda there: check_free(there, overwrite), overwrite)
 
 
 def write(folder: Path, described: dict[str, Any], arrays: Any) -> None:
-    """Writes what a policy is (plain JSON values) and its arrays into a folder."""
+    """Write a policy's description (plain JSON values) and its arrays into a folder."""
     (folder / ARRAYS).mkdir()
     with checkpoints(folder / ARRAYS) as saved:
         saved.save(0, {"policy": arrays})
@@ -51,15 +51,15 @@ def write(folder: Path, described: dict[str, Any], arrays: Any) -> None:
 
 
 def read_arrays(folder: Path, like: Any, described: dict[str, Any]) -> Any:
-    """The arrays of a policy.
+    """Read the arrays of a policy.
 
     Args:
-        folder: the policy's.
-        like: a tree of their shapes.
-        described: what its policy.json says.
+        folder: the policy's folder.
+        like: a tree of the arrays' shapes.
+        described: the contents of its policy.json.
 
     Raises:
-        UserError: they cannot be read, are damaged, or are those of another policy.
+        UserError: the arrays cannot be read, are damaged, or belong to another policy.
     """
     place, remedy = folder / ARRAYS, "restore it, or adapt the policy anew"
     if not place.is_dir():

@@ -1,4 +1,4 @@
-"""Where numbers come from: what every recorded file says of the program and the machine that wrote it."""
+"""Provenance: program, machine and command, as recorded with every result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def provenance() -> dict[str, str]:
-    """The columns `commit`, `versions`, `hardware` and `command` of this process.
+    """Return the columns `commit`, `versions`, `hardware` and `command` of this process.
 
     `commit` is empty where the package does not come from a git checkout.
     """
@@ -37,13 +37,13 @@ def _version(package: str) -> str:
 
 def _commit() -> str:
     root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():  # an installed package may lie inside somebody else's repository
+    if not (root / ".git").exists():  # an installed package may lie inside an unrelated repository
         return ""
-    git = ["git", "-C", str(root), "--no-optional-locks"]  # nothing is written to the repository
+    git = ["git", "-C", str(root), "--no-optional-locks"]  # writes nothing to the repository
     asked = (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
     try:
         with warnings.catch_warnings():
-            # JAX warns of any fork; this one becomes git at once.
+            # JAX warns of any fork; this one executes git at once.
             warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
             told = [
                 subprocess.run([*git, *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()

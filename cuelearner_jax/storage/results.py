@@ -1,7 +1,7 @@
-"""Tables of a run: its results, and how good its guides are by themselves while they are asked labels.
+"""A run's tables: its results, and each guide's own performance while labels are collected.
 
-`results.jsonl` grows while a run goes on, `results.parquet` is there once it is done. One row holds one evaluation of
-one seed:
+`results.jsonl` grows during a run; `results.parquet` replaces it at the end. One row holds one evaluation of one
+seed:
 
 | column       | type  | meaning                                                          |
 |--------------|-------|------------------------------------------------------------------|
@@ -10,16 +10,16 @@ one seed:
 | guidance     | str   | "none", "relative", "heuristic", ...                             |
 | labels       | int   | label budget, 0 where the guidance takes no labels               |
 | seed         | int   | seed of the lane                                                 |
-| step         | int   | environment steps that this seed has taken                       |
+| step         | int   | environment steps taken by this seed so far                       |
 | split        | str   | "validation" or "training"                                       |
 | config_hash  | str   | hash of the configuration of the run                             |
 | wall_s       | float | seconds since the run started                                    |
-| commit, versions, hardware, command | str | where the row comes from (see `provenance`)     |
+| commit, versions, hardware, command | str | the row's provenance (see `provenance`)     |
 | failed       | float | 1 once the lane stopped being finite: its metrics are null then  |
 | all others   | float | metrics, for instance `reward`; a value that is not finite is null |
 
-`guide.jsonl` and `guide.parquet` beside them hold evaluations of uniform actions under a lane's guide, in the same
-columns and these:
+`guide.jsonl` and `guide.parquet` beside them evaluate uniform actions refined by a lane's guide, in the same columns
+and these:
 
 | column     | type  | meaning                                                                             |
 |------------|-------|-------------------------------------------------------------------------------------|
@@ -63,17 +63,17 @@ GUIDES = tables.Schema(
     remedy=SCHEMA.remedy,
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
-FAILED = "failed"  # the column that marks rows of lanes that have failed
-LANE = ("guidance", "labels", "seed")  # what tells the lanes of a run apart
+FAILED = "failed"  # column that marks the rows of failed lanes
+LANE = ("guidance", "labels", "seed")  # columns that identify a lane of a run
 LaneKey = tuple[str, int, int]
 
 
 def check_complete(
     folder: Path, schema: tables.Schema, columns: Sequence[str], rows: Iterable[tuple[int, ...]], among: pc.Expression
 ) -> None:
-    """Raises UserError unless a folder's table has each of the rows once, and no other `among` those that count.
+    """Raise UserError unless a folder's table has each of the rows exactly once, and no other row in `among`.
 
-    `rows` are values of the `columns`. A table that is missing has none.
+    `rows` are values of the `columns`. A missing table has no rows.
     """
     path = schema.found_in(folder) or folder / schema.jsonl
     wanted, found = Counter(rows), Counter[tuple[int, ...]]()
@@ -90,9 +90,9 @@ def check_complete(
 
 
 def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> list[Path]:
-    """The results files at or below the given files or folders: one a run, whether it is done or still going.
+    """Return the results files at or below the given files or folders, one per run, finished or not.
 
-    `schema`: of the tables that are meant. Raises UserError if a path does not exist, or has none below it.
+    `schema` is that of the wanted tables. Raises UserError if a path does not exist or no file is below it.
     """
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     found: dict[Path, Path] = {}
@@ -106,7 +106,7 @@ def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
                 "below it"
             )
         for file in files:
-            # Both exist only after a crash between writing one and removing the other, and then hold the same rows.
+            # Both exist only after a crash between writing one and removing the other; they then hold equal rows.
             whole = file.with_name(schema.parquet)
             file = whole if file.name == schema.jsonl and whole.exists() else file  # noqa: PLW2901
             found[file.resolve()] = file
@@ -114,19 +114,19 @@ def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
 
 
 def read(paths: PathLike | Sequence[PathLike], task: str | None = None, schema: tables.Schema = SCHEMA) -> pa.Table:
-    """Reads the results of any number of runs, done or still going, into one table.
+    """Read the results of any number of runs, finished or not, into one table.
 
     Args:
-        paths: results files, folders of runs, or folders at any height above them.
-        task: keeps the rows of this task only; needed where the runs are of several tasks.
-        schema: of the tables that are meant.
+        paths: results files, run folders, or folders at any height above them.
+        task: keeps only this task's rows; needed where the runs are of several tasks.
+        schema: that of the wanted tables.
 
     Returns:
-        A table with the columns listed at the top of this module, and `folder`, the folder of the row's run; a column
-        that some run lacks is null there.
+        A table with the columns listed at the top of this module and `folder`, the folder of the row's run. A column
+        that a run lacks is null for that run.
 
     Raises:
-        UserError: if a path is missing, holds no rows, is corrupt, or the runs are of several tasks.
+        UserError: a path is missing, holds no rows or is damaged, or the runs are of several tasks.
     """
     files = find(paths, schema)
     parts = []
@@ -148,7 +148,7 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None, schema: 
 
 
 def read_guides(paths: Sequence[PathLike], task: str | None = None) -> pa.Table | None:
-    """Like `read`, of how good guides are by themselves; None where no run asked for labels."""
+    """Read the tables of guides' own performance, as `read`; None where no run asked for labels."""
     there = [
         path for path in paths if any(next(Path(path).rglob(name), None) for name in (GUIDES.jsonl, GUIDES.parquet))
     ]
@@ -156,13 +156,13 @@ def read_guides(paths: Sequence[PathLike], task: str | None = None) -> pa.Table 
 
 
 def metrics(table: pa.Table) -> list[str]:
-    """The names of the metric columns of a table of results."""
+    """Return the names of a results table's metric columns."""
     others = (*SCHEMA.strings, *SCHEMA.integers, "wall_s", FAILED, "folder")
     return [name for name in table.column_names if name not in others]
 
 
 def failures(table: pa.Table) -> dict[LaneKey, int]:
-    """The lanes of a table of results that have failed, with the step of the first row that says so, in order."""
+    """Return the failed lanes of a results table, each with the first step marked as failed, in order."""
     if FAILED not in table.column_names:
         return {}
     marked = table.filter(pc.field(FAILED) == 1.0)
@@ -173,5 +173,5 @@ def failures(table: pa.Table) -> dict[LaneKey, int]:
 
 
 def lanes(table: pa.Table) -> int:
-    """The number of lanes in a table of results."""
+    """Return the number of lanes in a results table."""
     return table.group_by(list(LANE)).aggregate([]).num_rows

@@ -1,4 +1,4 @@
-"""Free memory: a device's, a machine's, or what a container or a batch job may have of it; and what files declare."""
+"""Free memory of a device, a machine or a container, checked before large files are read."""
 
 from __future__ import annotations
 
@@ -9,19 +9,27 @@ import jax
 
 from cuelearner_jax.errors import UserError
 
-GROWTH = 16  # bytes in memory, of a byte of JSON
+GROWTH = 16  # memory per byte of JSON [bytes]
 
 
 def check_size(path: Path) -> None:
-    """Raises UserError if a file of JSON is more than memory holds, and OSError if it cannot be looked at."""
+    """Check that memory holds a parsed JSON file.
+
+    Raises:
+        UserError: the file needs more memory than is free.
+        OSError: the file's size cannot be read.
+    """
     size = path.stat().st_size
     check_room(f"{path} has {size:,} bytes", GROWTH * size, "it is damaged, or no file of this program")
 
 
 def check_room(declared: str, needed: int, remedy: str) -> None:
-    """Raises UserError if `needed` bytes are more than are free; before any of them is taken.
+    """Raise UserError if more than the free memory is needed, before any of it is allocated.
 
-    The message begins with who `declared` how much of what, and ends with the remedy.
+    Args:
+        declared: the message's beginning: what declares how much of what.
+        needed: memory needed [bytes].
+        remedy: the message's end.
     """
     free = _least([_host_bytes(), group_bytes()])
     if free is not None and needed > free:
@@ -31,7 +39,7 @@ def check_room(declared: str, needed: int, remedy: str) -> None:
 
 
 def free_bytes() -> int | None:
-    """Free memory of the device that trains [bytes], where known; of a CPU no more than its control groups grant."""
+    """Return the free memory of the training device [bytes]; for a CPU at most what control groups grant."""
     device = jax.devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
@@ -48,13 +56,13 @@ def _host_bytes() -> int | None:
 
 
 def group_bytes(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Memory that the control groups of this process (a container, a batch job) still grant [bytes]; None if unlimited.
+    """Return the memory that the process's control groups (container, batch job) still grant [bytes]; None: no limit.
 
     Source: Linux, Documentation/admin-guide/cgroup-v2.rst.
 
     Args:
-        groups: names the process's own group, in the line that begins with "0::".
-        root: where the groups' files lie; a group is bound by those above it too.
+        groups: the file that names the process's own group, in the line that begins with "0::".
+        root: the folder of the groups' files; a group is limited by those above it too.
     """
     try:
         own = next((line[3:] for line in groups.read_text().splitlines() if line.startswith("0::")), "/")
@@ -66,7 +74,7 @@ def group_bytes(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sy
 
 
 def _granted(group: Path) -> int | None:
-    """What one group grants; caches of files, which the kernel would give up, count as free."""
+    """Return what one group grants [bytes]; file caches, which the kernel would release, count as free."""
     try:
         limit = (group / "memory.max").read_text().strip()
         used = int((group / "memory.current").read_text())

@@ -1,16 +1,16 @@
-"""Recorded situations: what was seen, the action that was proposed, and a picture of each where there is one.
+"""Recorded situations: observations, the proposed actions, and optionally a picture of each.
 
-A folder holds `situations.parquet`, `.csv` or `.npz`, and pictures beside it; a LeRobot dataset folder is read too, see
-`storage.lerobot`. Columns of the table:
+A folder holds `situations.parquet`, `.csv` or `.npz`, with pictures beside the table. A LeRobot dataset folder is read
+too, see `storage.lerobot`. Columns of the table:
 
 | column      | type                        | meaning                                                             |
 |-------------|-----------------------------|---------------------------------------------------------------------|
-| observation | list of floats (obs,)       | what a policy would see; in CSV numbers with spaces between         |
-| action      | list of floats (action,)    | what was proposed, or done                                          |
+| observation | list of floats (obs,)       | the policy's input; in CSV numbers separated by spaces             |
+| action      | list of floats (action,)    | the proposed or executed action                                     |
 | picture     | string                      | optional: a file in the folder, PNG or JPEG, or a clip, GIF or MP4  |
 
-In place of a list there may be one column an entry, `observation.NAME` or `action.NAME`: the names then are those of
-the entries. Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
+In place of a list there may be one column per entry, `observation.NAME` or `action.NAME`, which names the entries.
+Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from cuelearner_jax.storage.room import check_room
 
 STEM = "situations"
 OBSERVATION, ACTION, PICTURE = "observation", "action", "picture"
-MOST_NAMED = 64  # entries of an observation that are slices of their own
+MOST_NAMED = 64  # largest number of observation entries that each get a slice of their own
 
 
 class Situations(NamedTuple):
-    """Recorded situations, a row each."""
+    """Recorded situations, one per row."""
 
     observations: Float[np.ndarray, "n obs"]
     actions: Float[np.ndarray, "n action"]
     slices: tuple[Quantity, ...]  # of an observation
     entries: tuple[str, ...]  # names of an action's entries; empty: the recording names none
-    digest: str  # tells these situations from others
+    digest: str  # of these situations
     has_pictures: bool
     # row -> its picture; None: that row has none. Raises UserError for a picture that cannot be read.
     picture: Callable[[int], Picture | None]
@@ -56,9 +56,9 @@ def read(path: Path) -> Situations:
     """Read a folder of situations, its table alone, or a LeRobot dataset folder.
 
     Raises:
-        UserError: there is nothing to read, columns are missing or do not fit, or a number is not finite.
+        UserError: nothing to read, missing columns, sizes that do not fit, or a number that is not finite.
     """
-    if lerobot.is_one(path):
+    if lerobot.is_dataset(path):
         found = lerobot.read(path)
         slices = named_slices(found.observation_entries, found.observations.shape[1])
         return _whole(path, found.observations, found.actions, slices, found.action_entries, found.frames)
@@ -67,9 +67,7 @@ def read(path: Path) -> Situations:
     observations, seen = _matrix(table, columns, OBSERVATION)
     actions, entries = _matrix(table, columns, ACTION)
     if len(actions) != len(observations):
-        raise UserError(
-            f"{table} has {len(observations)} observations and {len(actions)} actions: give as many of both"
-        )
+        raise UserError(f"{table} has {len(observations)} observations and {len(actions)} actions: give equally many")
     files = columns.get(PICTURE)
     return _whole(
         table,
@@ -89,7 +87,7 @@ def _whole(
     entries: tuple[str, ...],
     pictures: Any,
 ) -> Situations:
-    """Checked situations. Raises UserError for none, or for numbers that are not finite."""
+    """Check and build `Situations`. Raises UserError if there are none or a number is not finite."""
     for name, rows in ((OBSERVATION, observations), (ACTION, actions)):
         if not rows.size:
             raise UserError(f"{path} holds no {name}s: record some situations first")
@@ -106,17 +104,17 @@ def _whole(
 
 
 def named_slices(entries: tuple[str, ...], size: int) -> tuple[Quantity, ...]:
-    """Return the slices of an observation: one an entry where entries have names and are few, or else a single one."""
+    """Return an observation's slices: one per entry where entries are named and few, else a single one."""
     if len(entries) == size and size <= MOST_NAMED:
         return tuple(Quantity(name, 1, "1", "as recorded") for name in entries)
     return (Quantity(OBSERVATION, size, "1", "as recorded"),)
 
 
 def _table_in(path: Path) -> Path:
-    """The table of a folder, or the one that is given. Raises UserError if there is none."""
+    """Return the table in a folder, or the given table. Raises UserError if there is none."""
     if path.is_file():
         if path.suffix not in _READERS:
-            raise UserError(f"{path} is no table of situations: give a folder, or a file {', '.join(_READERS)}")
+            raise UserError(f"{path} is not a table of situations: give a folder, or a file {', '.join(_READERS)}")
         return path
     if not path.is_dir():
         raise UserError(f"there is no folder of situations at {path}: give one that holds {STEM}.parquet")
@@ -124,11 +122,11 @@ def _table_in(path: Path) -> Path:
     if not found:
         empty = "is empty" if not any(path.iterdir()) else f"holds no {STEM}.parquet, .csv or .npz"
         raise UserError(
-            f"{path} {empty}, and is no LeRobot dataset either: give a folder with such a table, with the columns "
+            f"{path} {empty}, and is not a LeRobot dataset either: give a folder with such a table, with the columns "
             f"{OBSERVATION} and {ACTION}"
         )
     if len(found) > 1:
-        raise UserError(f"{path} holds {' and '.join(table.name for table in found)}: give the one that is meant")
+        raise UserError(f"{path} holds {' and '.join(table.name for table in found)}: give the path of one of them")
     return found[0]
 
 
@@ -181,28 +179,28 @@ def _damaged(table: Path, error: Exception) -> UserError:
 
 
 def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.ndarray, "n size"], tuple[str, ...]]:
-    """Numbers (n, size) of a column of lists, or of one column an entry, and the names of the entries.
+    """Return the numbers (n, size) of a column of lists, or of one column per entry, and the names of the entries.
 
-    Raises UserError for what is missing or does not fit.
+    Raises UserError for a missing column, or sizes that do not fit.
     """
     entries = tuple(column.partition(".")[2] for column in columns if column.startswith(f"{name}."))
     if name not in columns and not entries:
         there = ", ".join(columns) or "none"
         raise UserError(
-            f"{table} has no column {name} (its columns: {there}): give a list a row, or {name}.NAME columns"
+            f"{table} has no column {name} (its columns: {there}): give a list per row, or {name}.NAME columns"
         )
     if name in columns and entries:
-        raise UserError(f"{table} has the columns {name} and {name}.{entries[0]}: give one form of both")
+        raise UserError(f"{table} has the columns {name} and {name}.{entries[0]}: give only one of the two forms")
     if entries:
         parts = [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries]
         if len({len(part) for part in parts}) > 1:
-            raise UserError(f"{table}: columns {name}.NAME have several lengths: give as many rows of each")
+            raise UserError(f"{table}: columns {name}.NAME have several lengths: give equally many rows of each")
         return np.stack(parts, -1), entries
     return _numbers(table, name, columns[name], 2), ()
 
 
 def _numbers(table: Path, name: str, values: Any, axes: int) -> np.ndarray:
-    """A column as 32-bit floats. Raises UserError for rows of several sizes, or for what is no number."""
+    """Convert a column to 32-bit floats. Raises UserError for rows of several sizes, or non-numbers."""
     try:
         found = np.asarray(values)
         if found.dtype.kind in "US" or found.dtype == object:
@@ -214,7 +212,7 @@ def _numbers(table: Path, name: str, values: Any, axes: int) -> np.ndarray:
         why = (
             f"rows of {format_numbers(sizes)} entries"
             if len(sizes) > 1
-            else f"what is no number ({format_value(values[0])[:60]} ...)"
+            else f"values that are not numbers ({format_value(values[0])[:60]} ...)"
         )
         raise UserError(
             f"{table}: the column {name} holds {why}: give the same number of numbers in every row"

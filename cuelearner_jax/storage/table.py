@@ -1,13 +1,13 @@
-"""An append-only table on disk: JSONL while it grows, Parquet once it is done; nothing here knows what a row means.
+"""An append-only table on disk: JSONL while it grows, Parquet once finished, whatever the rows mean.
 
 Each line of the JSONL file is an object, of one of three kinds:
 
-    {"about": {...}}         what the table is, once, at its head; in Parquet it is metadata of the schema
-    {"constants": {...}}     columns that stay the same: they hold for all lines after it, until the next such line
+    {"about": {...}}         a description of the table, once, at its head; in Parquet it is metadata of the schema
+    {"constants": {...}}     columns with one value for all later lines, until the next such line
     {"step": 10, ...}        a row
 
-A line is on the disk when the call that writes it returns; `records.lines` says how lines are sealed. Whatever replaces
-a file does so in one step. Parquet holds a digest of its contents. A file without these is refused.
+A line is on disk when the call that writes it returns; `storage.lines` says how lines are sealed. A file is always
+replaced atomically. Parquet holds a digest of its contents. A file without seals or digest is refused.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ import pyarrow.parquet as pq
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import lines
-from cuelearner_jax.storage.footer import declared
+from cuelearner_jax.storage.footer import read_declared
 from cuelearner_jax.storage.lines import Row
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.storage.whole import replacing, unreadable
 
-META = b"cuelearner"  # the key under which Parquet holds what the table is
-DIGEST = b"cuelearner.sha256"  # and the one of the digest of its contents
-VALUE = 64  # of memory, that a value takes while it is read: as Arrow's, as Python's, as NumPy's [bytes]
+META = b"cuelearner"  # Parquet metadata key of the table's description
+DIGEST = b"cuelearner.sha256"  # Parquet metadata key of the digest of the contents
+VALUE = 64  # memory per value while a table is read, in Arrow, Python and NumPy together [bytes]
 
 PathLike = str | os.PathLike[str]
 Writer = TypeVar("Writer", bound="TableWriter")
@@ -42,15 +42,15 @@ Writer = TypeVar("Writer", bound="TableWriter")
 
 @dataclass(frozen=True)
 class Schema:
-    """What the rows of a kind of table are. Columns that are not named here hold floats."""
+    """Column types of a kind of table. Columns that are not named here hold floats."""
 
-    stem: str  # of the files' names, and what messages call the rows
-    mark: str  # a line of JSON with this key is a row
+    stem: str  # of the file names; messages call the rows so
+    mark: str  # a JSON line with this key is a row
     required: tuple[str, ...]
     strings: tuple[str, ...] = ()
     integers: tuple[str, ...] = ()
     lists: tuple[str, ...] = ()  # of 32-bit floats
-    remedy: str = "is damaged: restore it"  # what a message says of a damaged file, after its path
+    remedy: str = "is damaged: restore it"  # the remedy in the message about a damaged file, after its path
 
     @property
     def jsonl(self) -> str:
@@ -63,11 +63,11 @@ class Schema:
         return f"{self.stem}.parquet"
 
     def found_in(self, folder: Path) -> Path | None:
-        """The table's file in a folder; None: there is none. A finished one goes before one that grows."""
+        """Return the table's file in a folder, a finished one first; None if there is none."""
         return next((folder / name for name in (self.parquet, self.jsonl) if (folder / name).exists()), None)
 
     def type(self, name: str) -> pa.DataType:
-        """The type of a column."""
+        """Return the Arrow type of a column."""
         if name in self.strings:
             return pa.string()
         if name in self.integers:
@@ -76,7 +76,7 @@ class Schema:
 
 
 class TableWriter:
-    """Appends rows to the JSONL file of one table; every append is on the disk when the call returns.
+    """Appends rows to the JSONL file of one table; each append is on disk when the call returns.
 
     Opening an existing table continues it: a torn last line, left by a crash, is dropped first, and a table that was
     already finished (Parquet) becomes JSONL again.
@@ -85,12 +85,12 @@ class TableWriter:
     def __init__(
         self, folder: PathLike, schema: Schema, constants: Row | None = None, about: Row | None = None
     ) -> None:
-        """Opens the table in `folder`, creating both where needed.
+        """Open the table in `folder`, creating both where needed.
 
         Args:
-            folder, schema: where the table lies, and what its rows are.
-            constants: columns with one value for all rows to come; None: there are none.
-            about: what the table is, written at the head of a new one; that of an existing one stays.
+            folder, schema: the table's folder and kind.
+            constants: columns with one value for all rows to come; None: no such columns.
+            about: the description written at the head of a new table; an existing table keeps its own.
         """
         self.path = Path(folder) / schema.jsonl
         self._schema, self._columns = schema, set(constants or ())
@@ -106,25 +106,26 @@ class TableWriter:
         self._lines = lines.Writer(self.path, rows)
 
     def append(self, **columns: Any) -> None:
-        """Appends rows.
+        """Append rows.
 
         Args:
-            columns: what holds for all rows (a scalar; for a column of lists, one list), or arrays with the rows as
-                leading axis, all of one length. For instance `append(step=1000, seed=seeds, reward=rewards)`.
+            columns: values for all rows (a scalar; for a column of lists, one list), or arrays with the rows as leading
+                axis, all of one length. For instance `append(step=1000, seed=seeds, reward=rewards)`.
 
         Raises:
-            ValueError: if a required column is missing or the lengths differ.
-            OSError: the disk takes no more. None of the rows is in the table, now or later; the call may be repeated.
+            ValueError: a required column is missing or the lengths differ.
+            OSError: the disk refuses the rows. None of them is in the table, now or later; the call may be repeated.
         """
         missing = [name for name in self._schema.required if name not in columns and name not in self._columns]
         if missing:
             raise ValueError(f"a row of {self._schema.stem} needs the columns {', '.join(missing)}")
         arrays = {name: np.asarray(value) for name, value in columns.items()}
-        own = {name: array.ndim == (name in self._schema.lists) for name, array in arrays.items()}  # one for all rows
+        # one value for all rows
+        own = {name: array.ndim == (name in self._schema.lists) for name, array in arrays.items()}
         lengths = {len(array) for name, array in arrays.items() if not own[name]}
         if len(lengths) > 1:
             raise ValueError(f"columns of one append must have one length, got {sorted(lengths)}")
-        # tolist() turns NumPy and JAX values into plain Python ones, in one transfer for each column.
+        # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
         values = {name: array.tolist() for name, array in arrays.items()}
         self._lines.append(
             {name: _plain(value if own[name] else value[row]) for name, value in values.items()}
@@ -132,7 +133,7 @@ class TableWriter:
         )
 
     def close(self) -> None:
-        """Closes the file; the table stays JSONL until `finish`."""
+        """Close the file; the table stays JSONL until `finish`."""
         self._lines.close()
 
     def __enter__(self: Writer) -> Writer:
@@ -143,7 +144,7 @@ class TableWriter:
 
 
 def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
-    """Drops a folder's rows that `keep` does not choose, and a torn last line; without a table nothing happens."""
+    """Drop a folder's rows for which `keep` is false, and a torn last line; do nothing without a table."""
     path = Path(folder) / schema.jsonl
     _reopen(path, schema)
     if path.exists():
@@ -152,9 +153,9 @@ def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> N
 
 
 def finish(folder: PathLike, schema: Schema) -> Path:
-    """Turns the JSONL of a folder's table into Parquet and removes it, unless that is done; returns the Parquet file.
+    """Convert a folder's JSONL table to Parquet, unless it is finished already; return the Parquet file.
 
-    Raises UserError if there is no table, it has no rows or it cannot be read.
+    Raises UserError if there is no table, or it has no rows or cannot be read.
     """
     path, target = (Path(folder) / name for name in (schema.jsonl, schema.parquet))
     if path.exists():
@@ -169,9 +170,9 @@ def finish(folder: PathLike, schema: Schema) -> Path:
 
 
 def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None, fresh: bool = False) -> None:
-    """Writes a whole table as Parquet, in one step.
+    """Write a whole table as Parquet, atomically.
 
-    `about`: what the table is (default: what it says already). `fresh`: see `whole.replacing`.
+    `about`: the table's description (default: its present one). `fresh`: see `whole.replacing`.
     """
     told = about_of(table) if about is None else about
     table = _typed(table, schema)
@@ -182,7 +183,7 @@ def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None,
 
 
 def digest(table: pa.Table, about: bytes = b"") -> str:
-    """SHA-256 of a table's columns: their names, types and values, in order; and of what it says of itself."""
+    """Return the SHA-256 of a table's column names, types and values, in order, and of its description."""
     found = hashlib.sha256(about)
     for name in table.column_names:
         column = table[name].combine_chunks()
@@ -200,17 +201,17 @@ def digest(table: pa.Table, about: bytes = b"") -> str:
 
 
 def read(path: Path, schema: Schema) -> pa.Table:
-    """One file of a table with its types; no rows, no columns where it has just begun.
+    """Read one file of a table with its column types; a table that has just begun has no rows and no columns.
 
     Raises:
-        UserError: if the file is corrupt or is no table of this schema.
+        UserError: the file is damaged or is not a table of this schema.
     """
     if path.suffix != ".parquet" and not path.exists():
-        path = path.with_name(schema.parquet)  # the table was finished since the file was found
+        path = path.with_name(schema.parquet)  # the table was finished after the file was found
     try:
         table = _finished(path, schema) if _is_parquet(path) else _grown(path, schema)
     except OSError as error:
-        if error.errno is None:  # Arrow's own
+        if error.errno is None:  # an error of Arrow's own
             raise _damaged(path, schema, error) from error
         raise unreadable(path, error) from error
     except (KeyError, TypeError, ValueError, MemoryError, OverflowError, pa.ArrowException) as error:
@@ -224,11 +225,11 @@ def read(path: Path, schema: Schema) -> pa.Table:
 
 
 def about_of(table: pa.Table) -> Row | None:
-    """What a table says of itself. Raises ValueError if that is no JSON object."""
+    """Return a table's description. Raises ValueError if it is not a JSON object."""
     told = (table.schema.metadata or {}).get(META)
     about = None if told is None else json.loads(told)
     if not isinstance(about, dict | None):
-        raise ValueError(f"a table says of itself {about!r}, which is no JSON object")
+        raise ValueError(f"the table's description {about!r} is not a JSON object")
     return about
 
 
@@ -237,17 +238,17 @@ def _damaged(path: Path, schema: Schema, reason: object) -> UserError:
 
 
 def _typed(table: pa.Table, schema: Schema) -> pa.Table:
-    """With the columns' types, and what it says of itself."""
+    """Cast the columns to their types and keep the metadata."""
     types = [(name, schema.type(name)) for name in table.column_names]
     return table.cast(pa.schema(types, metadata=table.schema.metadata))
 
 
 def _finished(path: Path, schema: Schema) -> pa.Table:
-    """The table of a Parquet file. Raises ValueError if it is not what was written."""
-    held = declared(path)
+    """Read the table of a Parquet file. Raises ValueError if it differs from what was written."""
+    held = read_declared(path)
     what, remedy = f"{path} declares {held.rows:,} rows with {held.values:,} values", f"it {schema.remedy}"
     check_room(what, VALUE * held.values + held.page_bytes, remedy)
-    # Equal strings stand once in the file and need not do so in memory.
+    # Equal strings are stored once in the file, but possibly many times in memory.
     table = pq.read_table(path, page_checksum_verification=True, read_dictionary=list(held.strings))
     chunks = [chunk for name in held.strings for chunk in table[name].chunks]
     check_room(what, VALUE * held.values + 2 * sum(map(_letters, chunks)), remedy)
@@ -261,7 +262,7 @@ def _finished(path: Path, schema: Schema) -> pa.Table:
 
 
 def _letters(texts: pa.DictionaryArray) -> int:
-    """Length of all strings of a column together, where equal ones stand once [bytes]."""
+    """Return the length of all strings of a column together, duplicates included [bytes]."""
     used = np.bincount(np.asarray(texts.indices.drop_null()), minlength=len(texts.dictionary))
     return sum(int(count) * len(text or "") for count, text in zip(used, texts.dictionary.to_pylist(), strict=True))
 
@@ -274,7 +275,7 @@ def _is_parquet(path: Path) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """A JSON value: strict JSON has no NaN and no infinity, so they become null; a success is 1.0, not true."""
+    """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
     if isinstance(value, list):
         return [_plain(entry) for entry in value]
     value = value.item() if isinstance(value, np.generic) else value
@@ -283,7 +284,7 @@ def _plain(value: Any) -> Any:
 
 
 def _rows(path: Path, schema: Schema) -> list[Row]:
-    """The lines of a JSONL file, parsed. Raises UserError for one that is damaged."""
+    """Return the parsed lines of a JSONL file. Raises UserError if the file is damaged."""
     try:
         rows = lines.read(path).rows
     except lines.Damaged as error:
@@ -296,7 +297,7 @@ def _rows(path: Path, schema: Schema) -> list[Row]:
 
 
 def _reopen(path: Path, schema: Schema) -> None:
-    """Turns a finished table back into JSONL, so that it can be continued."""
+    """Convert a finished table back to JSONL, so that it can be continued."""
     whole = path.with_name(schema.parquet)
     if not whole.exists():
         return
@@ -310,7 +311,7 @@ def _reopen(path: Path, schema: Schema) -> None:
 
 
 def _grown(path: Path, schema: Schema) -> pa.Table:
-    """The table of a JSONL file, constants included."""
+    """Return the table of a JSONL file, constants included."""
     told: Row | None = None
     constants: Row = {}
     columns: dict[str, list[Any]] = {}
@@ -322,10 +323,10 @@ def _grown(path: Path, schema: Schema) -> pa.Table:
             continue
         for name, value in (constants | line).items():
             column = columns.setdefault(name, [])
-            column.extend([None] * (count - len(column)))  # a column that earlier rows lacked
+            column.extend([None] * (count - len(column)))  # earlier rows lacked this column
             column.append(value)
         count += 1
-    # Whole numbers are cast, since Arrow would cut a broken one off.
+    # Integers are cast last, since Arrow would truncate a fractional value.
     types = {name: None if name in schema.integers else schema.type(name) for name in columns}
     padded = {name: column + [None] * (count - len(column)) for name, column in columns.items()}
     table = pa.table({name: pa.array(column, types[name]) for name, column in padded.items()})
@@ -334,7 +335,7 @@ def _grown(path: Path, schema: Schema) -> pa.Table:
 
 
 def _extent(rows: Iterable[Row]) -> int:
-    """Memory that the table of these lines takes [bytes]: constants hold for each row, a column for all."""
+    """Return the memory that the table of these lines needs [bytes]; constants count in every row."""
     names: set[str] = set()
     count, found, shared = 0, 0, 0
     for row in rows:

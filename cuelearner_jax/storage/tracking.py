@@ -1,6 +1,6 @@
-"""Where a run can be followed while it goes on, beside its own table: in TensorBoard or Weights & Biases.
+"""Trackers for following a run while it trains: TensorBoard or Weights & Biases.
 
-Trackers get means over seeds; the table of results stays what reports are made of.
+Trackers get means over seeds; reports are made from the results table alone.
 """
 
 from __future__ import annotations
@@ -16,38 +16,38 @@ import numpy as np
 
 from cuelearner_jax.errors import UserError, suggestion
 
-LANE = ("seed", "labels", "step")  # columns that say which row it is
+LANE = ("seed", "labels", "step")  # columns that identify a row
 
 
 class TensorBoard:
-    """Event files for TensorBoard, by tensorboardX: `tensorboard --logdir RUN_FOLDER`."""
+    """Event files for TensorBoard, written by tensorboardX: `tensorboard --logdir RUN_FOLDER`."""
 
     package = "tensorboardX"
 
     def __init__(self, folder: Path, described: dict[str, Any], step: int) -> None:
-        """Goes on in a folder; what was written past `step` is void."""
+        """Continue in a folder; points written after `step` are discarded."""
         self._writer = importlib.import_module(self.package).SummaryWriter(
             str(folder), purge_step=step + 1 if step else None
         )
 
     def log(self, step: int, metrics: dict[str, float]) -> None:
-        """One point of each curve."""
+        """Log one point of each curve."""
         for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
         self._writer.flush()
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Write what is buffered and close."""
         self._writer.close()
 
 
 class Wandb:
-    """Weights & Biases, offline: nothing leaves the machine before `wandb sync RUN/KIND/wandb/wandb/offline-run-*`."""
+    """Weights & Biases offline; nothing is uploaded before `wandb sync RUN/KIND/wandb/wandb/offline-run-*`."""
 
     package = "wandb"
 
     def __init__(self, folder: Path, described: dict[str, Any], step: int) -> None:
-        """A run of its own below the folder, named as the folders above say; one that goes on gets another."""
+        """Start a wandb run below the folder, named after the folders above; a resumed run gets a new one."""
         folder.mkdir(parents=True, exist_ok=True)
         kind, run = folder.parent.name, folder.parent.parent.name
         self._run = importlib.import_module(self.package).init(
@@ -58,15 +58,15 @@ class Wandb:
             project="cuelearner",
             group=run,
             name=f"{run} {kind}",
-            settings={"silent": True},  # its summary of forty lines would stand between ours
+            settings={"silent": True},  # its summary of forty lines would interrupt our output
         )
 
     def log(self, step: int, metrics: dict[str, float]) -> None:
-        """One point of each curve."""
+        """Log one point of each curve."""
         self._run.log(metrics, step=step)
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Write what is buffered and close."""
         self._run.finish()
 
 
@@ -75,7 +75,7 @@ TRACKERS: dict[str, type[Tracker]] = {"tensorboard": TensorBoard, "wandb": Wandb
 
 
 def check(name: str | None) -> None:
-    """Raises UserError unless there is such a tracker, and its package is installed (None: no tracker)."""
+    """Raise UserError unless the tracker is known and its package installed (None: no tracker)."""
     if name is None:
         return
     if name not in TRACKERS:
@@ -85,8 +85,8 @@ def check(name: str | None) -> None:
 
 
 @contextmanager
-def opened(name: str | None, folder: Path, described: dict[str, Any], step: int) -> Iterator[Tracker | None]:
-    """A tracker that writes below a folder, going on after a step; None where none is asked for."""
+def open_tracker(name: str | None, folder: Path, described: dict[str, Any], step: int) -> Iterator[Tracker | None]:
+    """Open a tracker that writes below a folder, continuing after `step`; yields None without a name."""
     if name is None:
         yield None
         return
@@ -98,10 +98,10 @@ def opened(name: str | None, folder: Path, described: dict[str, Any], step: int)
 
 
 def means(row: dict[str, Any]) -> dict[str, float]:
-    """Means over the seeds of each budget, as "metric/labels_N", of an evaluation's columns; without failed lanes.
+    """Return means over the seeds of each budget, as "metric/labels_N", without failed lanes.
 
     Args:
-        row: scalars, or one entry for each lane; "labels" says the lanes' budgets.
+        row: the columns of one evaluation: scalars, or one entry per lane; "labels" gives the lanes' budgets.
     """
     budgets, found = np.asarray(row["labels"]), {}
     for name in row.keys() - set(LANE):

@@ -1,13 +1,13 @@
-"""Files and folders that are there as a whole or not at all, and what is said of a file that cannot be read.
+"""Atomic replacement of files and folders, and errors for files that cannot be read.
 
 While a folder NAME is written these lie beside it:
 
     .NAME.lock    held by the process that writes, from before its work until its end
-    .NAME.new     what is written, until it is whole
-    .NAME.old     what is to be replaced, until the new folder is in its place
+    .NAME.new     the new folder, until it is complete
+    .NAME.old     the folder to be replaced, until the new folder is in its place
 
-A process that is killed leaves some of them; the next one that writes there clears them away, or puts the old folder
-back where the new one had not come yet.
+A killed process leaves some of them. The next process that writes there removes them, or puts the old folder back if
+the new one had not yet taken its place.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from typing import IO, Any
 
 from cuelearner_jax.errors import UserError, no_space
 from cuelearner_jax.signals import saving
-from cuelearner_jax.storage.locks import held, locked
+from cuelearner_jax.storage.locks import hold, open_locked
 from cuelearner_jax.terminal import console
 
-TEMPORARY = ".tmp"  # the end of the name of a file that is not whole yet
-TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # of a folder that cannot be moved: something is there
+TEMPORARY = ".tmp"  # suffix of an incomplete file
+TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # errors of a rename onto something that exists
 
 
 @contextmanager
 def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[Any]]:
-    """A file that takes the place of `path` in one step, once it is whole and on the disk; text is UTF-8.
+    """Open a file that replaces `path` atomically once complete and on disk; text is UTF-8.
 
-    Of what fails nothing is left; what a kill left is used by whoever writes the file next. A second process that
-    writes the same file waits for the first.
+    A failure leaves nothing behind; what a kill left is reused by the next writer. A second process that writes the
+    same file waits for the first.
 
     Args:
         path: the file.
@@ -50,7 +50,7 @@ def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[A
     try:
         if fresh:
             path.parent.mkdir(parents=True, exist_ok=True)
-        with open(locked(temporary, wait=True), mode, encoding=None if "b" in mode else "utf-8") as file:
+        with open(open_locked(temporary, wait=True), mode, encoding=None if "b" in mode else "utf-8") as file:
             try:
                 file.truncate(0)
                 if fresh and os.path.lexists(path):
@@ -64,14 +64,14 @@ def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[A
                 raise
     except BaseException:
         for folder in folders:
-            with contextlib.suppress(OSError):  # it holds something, or was never made
+            with contextlib.suppress(OSError):  # the folder is not empty, or was never made
                 folder.rmdir()
         raise
     _sync(path.parent)
 
 
 def _sync(folder: Path) -> None:
-    """Puts a folder's names on the disk, where the file system can."""
+    """Flush a folder's directory entries to disk, where the file system supports that."""
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -81,12 +81,12 @@ def _sync(folder: Path) -> None:
 
 
 def unreadable(path: Path, error: OSError) -> UserError:
-    """What is raised for a file that the system does not let us read: nothing is known of what is in it."""
+    """Return the error for a file that the system does not let this process read."""
     return UserError(f"{path} cannot be read ({error.strerror or error}): check its permissions, nothing was changed")
 
 
 class Place:
-    """The place of a folder, kept for this process alone; see `place_of`."""
+    """A folder's path, claimed for this process alone; see `place_of`."""
 
     def __init__(self, folder: Path, check: Callable[[], None], overwrite: bool) -> None:
         self.folder, self._check, self._overwrite = folder, check, overwrite
@@ -94,9 +94,9 @@ class Place:
 
     @contextmanager
     def writing(self) -> Iterator[Path]:
-        """A new folder to write in, which is moved to its place at the end; of what fails before nothing is left.
+        """Make a new folder to write in and move it to the place at the end; a failure leaves nothing behind.
 
-        Raises UserError if something has come to the place that may not be replaced.
+        Raises UserError if something that may not be replaced appeared at the place meanwhile.
         """
         with saving():
             self._new.mkdir()
@@ -107,16 +107,18 @@ class Place:
                 shutil.rmtree(self._new, ignore_errors=True)
 
     def recover(self) -> None:
-        """Clears away what a process left that was killed."""
+        """Remove or restore what a killed process left."""
         if self._new.exists():
             shutil.rmtree(self._new)
         if not self._old.exists():
             return
-        if is_used(self.folder):  # by the new one: the last step was missing
+        if is_used(self.folder):  # the new folder is in place: only the last step was missing
             shutil.rmtree(self._old)
             return
         os.rename(self._old, self.folder)
-        console.print(f"{self.folder}: replacing it was cut short before, the old folder is back in its place")
+        console.print(
+            f"{self.folder}: an earlier replacement of this folder was interrupted, so the old folder was put back"
+        )
 
     def _move(self) -> None:
         self._check()
@@ -130,61 +132,62 @@ class Place:
                 os.rename(self._old, self.folder)
             if isinstance(error, OSError) and error.errno in TAKEN:
                 raise UserError(
-                    f"{self.folder} was made meanwhile by another program and stays: give another --out"
+                    f"{self.folder} was created meanwhile by another program and is left as it is: give another --out"
                 ) from None
             raise
         if replaces:
-            _sync(self.folder.parent)  # before the old one goes
+            _sync(self.folder.parent)  # before the old folder is removed
             shutil.rmtree(self._old)
 
 
 def beside(folder: Path, what: str) -> Path:
-    """What lies beside a folder while it is written: "lock", "new" or "old"."""
+    """Return the path beside a folder that is used while it is written: "lock", "new" or "old"."""
     return folder.with_name(f".{folder.name}.{what}")
 
 
 def is_used(folder: Path) -> bool:
-    """Is there anything at a place but an empty folder?"""
+    """Whether a path holds anything but an empty folder."""
     return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
 @contextmanager
 def _writable(told: Path) -> Iterator[None]:
-    """Raises UserError where the file system cannot have a folder; a full disk is told as everywhere."""
+    """Raise UserError where the file system cannot have a folder; a full disk keeps its own error."""
     try:
         yield
-    except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle
+    except (OSError, RuntimeError) as error:  # RuntimeError: a circle of links
         if no_space(error):
             raise
-        why = getattr(error, "strerror", None) or "links that lead in a circle"
+        why = getattr(error, "strerror", None) or "a circle of links"
         raise UserError(f"{told} cannot be written ({why}): give another --out") from error
 
 
 def check_not_aside(folder: Path) -> None:
-    """Raises UserError for a folder whose replacement was cut short, so that what was there stands aside."""
+    """Raise UserError for a folder whose replacement was interrupted, with the old folder still set aside."""
     try:
         place = folder.resolve()
         if not place.name or is_used(place) or not (old := beside(place, "old")).exists():
             return
-    except (OSError, RuntimeError):  # a name that is too long, or links in a circle: nothing can stand there
+    except (OSError, RuntimeError):  # the name is too long, or a circle of links: nothing can be there
         return
     raise UserError(
-        f"{folder}: replacing it was cut short, and the folder that was there stands aside as {old}: "
-        "rename it back, or give the command that was cut short again"
+        f"{folder}: its replacement was interrupted, and the old folder was set aside as {old}: "
+        "rename that folder back, or run the interrupted command again"
     )
 
 
 @contextmanager
 def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = False) -> Iterator[Place]:
-    """Keeps the place of a folder for this process while it works on what goes there (`Place.writing`).
+    """Claim the place of a folder for this process while its new contents are prepared (`Place.writing`).
 
     Args:
-        folder: where to; a link leads on.
-        check: raises UserError for a folder that is there and may not be replaced; asked now, and before it is.
-        overwrite: may a folder be replaced at all? Without it a new one is moved to where nothing is.
+        folder: the target; links are followed.
+        check: raises UserError for an existing folder that may not be replaced; called now, and again before the
+            replacement.
+        overwrite: whether an existing folder may be replaced at all.
 
     Raises:
-        UserError: as `check`, or another process has the place.
+        UserError: as `check`, or another process has claimed the place.
     """
     told = folder
     with _writable(told):
@@ -195,12 +198,12 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
         with contextlib.ExitStack() as stack:
             with _writable(told):
                 folder.parent.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(held(beside(folder, "lock"), told, stays=False))
+                stack.enter_context(hold(beside(folder, "lock"), told, stays=False))
             place = Place(folder, lambda: check(told), overwrite)
             place.recover()
-            check(told)  # nobody else who asks can change it any more
+            check(told)  # no other process that claims places can change it any more
             yield place
     finally:
-        for parent in missing:  # the innermost first; one in which something was made stays
+        for parent in missing:  # the innermost first; a folder with contents stays
             with contextlib.suppress(OSError):
                 parent.rmdir()

@@ -1,1 +1,1 @@
-"""Studies as requests: what is asked for, the rules that fill the rest, and the way from there to a result."""
+"""Studies as requests: training, adaptation and evaluation, each checked before it runs."""

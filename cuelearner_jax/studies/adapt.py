@@ -1,6 +1,6 @@
-"""Adaptation as one request, which the command line and Python fill alike; the rules of scenarios are applied here.
+"""Adaptation as one request, filled alike by the command line and Python; applies the rules of scenarios.
 
-request = suggested(source, scenario="rooms")    # what holds where nothing else is given
+request = suggested(source, scenario="rooms")    # the defaults
 found = run(Subject(source), replace(request, labels=(250,)))
 with policy_folders.place_of(out) as place:
     found.write(place)
@@ -49,40 +49,40 @@ from cuelearner_jax.types import Label, Teacher
 TaskT = TypeVar("TaskT")
 KindsT = TypeVar("KindsT")
 
-MOST_ENVS = 100_000  # that memory has room for
+MOST_ENVS = 100_000  # more do not fit into memory
 AS_IT_IS = Scenario("the world as it is", {})
 
 
 @dataclass(frozen=True)
 class BaseLanes:
-    """Which lanes of the folder are adapted."""
+    """Choice of the lanes of the folder to adapt."""
 
     policy: str = "agent"
     """Which of its policies."""
     guidance: str | None = None
-    """Kind of guidance of the lanes (default: the run's last)."""
+    """Kind of guidance of the lanes to adapt (default: the run's last)."""
     labels: int | None = None
-    """Their label budget (default: the largest)."""
+    """Label budget of the lanes to adapt (default: the largest)."""
     bound_deg: float | None = None
-    """Of a policy folder: their bound (default: the largest) [deg]."""
+    """Bound of the lanes to adapt, for a policy folder (default: the largest) [deg]."""
     seeds: tuple[int, ...] = ()
-    """Their seeds; several are adapted side by side, each with its own (default: the first lane)."""
+    """Seeds of the lanes to adapt, each with labels of its own (default: the first lane)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptRequest(Generic[TaskT, KindsT]):
-    """What adaptation is asked for."""
+    """A request to adapt a policy."""
 
     task: TaskT
     labels: tuple[int, ...] = (500,)
-    """Label budgets (with --labels-from by default all that the file has)."""
+    """Label budgets (default with --labels-from: all labels in the file)."""
     bound_deg: tuple[float, ...] = ()
     """How far corrections may lead from the policy's own actions [deg]. One bound or several (default: the scenario's,
     as far as the labels of a file reach, or else a quarter of the space's reach, 45)."""
     seeds: int = 1
-    """Number of seeds; not with several base policies, of which each is adapted with its own."""
+    """Number of seeds. Several base policies are each adapted with their own seed, so leave this out then."""
     first_seed: int = 0
-    """The first seed; the others follow."""
+    """First seed; the others count up from it."""
     guidance: str = KIND.name
     """Kind of guidance: what is asked, and what a model makes of the answers."""
     scenario: str | None = None
@@ -91,43 +91,43 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
     labels_from: Path | None = None
-    """Use the labels of this file instead of asking the teacher."""
+    """Label file to use instead of asking the teacher."""
     judge_by: str = "reward"
     """What decides whether the correction is used: a metric on tuning episodes, or held-out answers (labels). A model
     that makes the policy worse than it was is not used."""
     judge_episodes: int = 100
-    """Tuning episodes that policies are judged on; where the task counts steps, each is 100 of them."""
+    """Number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
     judge_every: int = 0
-    """Also measure the policy after every so many labels on the way, kept in guide.parquet (0: at the end alone)."""
+    """Measure the policy each time this many labels are new, into guide.parquet (0: only at the end)."""
     judge_bounds: tuple[float, ...] = ()
-    """Also try the model within these shares of its bound (0.5 0.25), and use it within what is worth most on the
-    tuning episodes."""
+    """Also try the model within these shares of its bound, for instance 0.5 0.25, and use the bound that scores best on
+    the tuning episodes."""
     sizes: GuideSizes = by_model.SIZES
     scalars: Scalars = field(default_factory=Scalars)
     kinds: KindsT = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
-    """Options of kinds by their names, as a run's."""
+    """Options of kinds of guidance, by the kind's name."""
 
 
 class Subject(NamedTuple):
-    """What is adapted, and who answers."""
+    """The policy to adapt, and who answers."""
 
-    source: PolicySource  # with the task that acts, and the configuration that policies were trained with
+    source: PolicySource  # gives the task that acts, and the configuration of the policies' training
     base: BaseLanes = BaseLanes()  # which of the source's policies
-    policy: Any = None  # in place of one of the source's; None: none
-    named: str | None = None  # package.module:NAME of the code, that policy or what the source's folder holds
-    teacher: Teacher | None = None  # None: the task's own
-    rows: Label | None = None  # labels (labels, ...) in place of questions; None: none
+    policy: Any = None  # a policy in place of one of the source's; None: use the source's
+    named: str | None = None  # package.module:NAME of the code of `policy`, or of the code in the source's folder
+    teacher: Teacher | None = None  # None: the task's teacher
+    rows: Label | None = None  # labels (labels, ...) in place of questions; None: ask
     changes: Any = None  # what may have changed, as `changes.family_of` takes it; None: what the world declares
-    changes_named: str = "code"  # package.module:NAME of these
+    changes_named: str = "code"  # package.module:NAME of `changes`
 
 
 class AdaptedStudy(NamedTuple):
-    """What an adaptation has led to, and from what."""
+    """The result of an adaptation, with its request."""
 
     found: AdaptationResult
     subject: Subject
     request: AdaptRequest
-    origin: dict[str, Any]  # what was adapted, in plain values
+    origin: dict[str, Any]  # the base policies, in plain values
 
     def write(self, place: Place) -> None:
         """Write the policy folder. Raises UserError if the policy cannot be kept."""
@@ -146,16 +146,16 @@ def suggested(
     sizes: GuideSizes | None = None,
     scalars: Scalars | None = None,
 ) -> AdaptRequest:
-    """The request that holds where nothing else is given: the only place where the rules of scenarios are applied.
+    """Return the default request; the only place where the rules of scenarios are applied.
 
     Args:
-        source: what is adapted; a model takes the frame and the scalars that the source's policies were trained with.
-        scenario: the changed world. Its suggestions hold for the kind of guidance that it suggests, and its shares of a
-            bound for what is judged on episodes.
-        guidance, judge_by: where these are chosen; None: as the scenario suggests, or as for any world.
-        labels_from: a label file, whose budget and strength of answers hold.
+        source: the origin of the policy to adapt; the model uses the frame and scalars of its training.
+        scenario: the changed world. Its suggestions apply to the kind of guidance that it suggests, and its shares of
+            a bound to judging on episodes.
+        guidance, judge_by: the chosen values; None: as the scenario suggests, or the general default.
+        labels_from: a label file, which determines budget and strength of answers.
         eps_deg: strength of an answer [deg]; None: the file's, that of given scalars, the scenario's, or the source's.
-        sizes, scalars: where all of them are given.
+        sizes, scalars: complete values in place of the defaults.
 
     Raises:
         UserError: there is no such scenario or label file.
@@ -163,11 +163,11 @@ def suggested(
     rules = source.task.scenario(scenario) if scenario else AS_IT_IS
     kind = guidances.resolve(guidance or rules.guidance or AdaptRequest.guidance)
     if guidance not in (None, rules.guidance):
-        rules = replace(rules, guidance=None, sizes={}, scalars={}, options={})  # which are for the suggested kind
+        rules = replace(rules, guidance=None, sizes={}, scalars={}, options={})  # these apply to the suggested kind
         if kind.by_evidence:
             rules = replace(rules, bound_deg=None, judge_by=None, judge_bounds=())
     if judge_by == judging.LABELS:
-        rules = replace(rules, judge_bounds=())  # which are tried on episodes
+        rules = replace(rules, judge_bounds=())  # these need episodes to be tried on
     labels = (by_calibration.USUAL,) if kind.by_evidence else AdaptRequest.labels
     if labels_from is not None:
         file = label_files.read(labels_from)
@@ -212,18 +212,20 @@ def run(
     watch: Callable[[str], Tell] = lambda what: ignore_progress,
     note: Callable[[str], None] = console.print,
 ) -> AdaptedStudy:
-    """Check a request and adapt; nothing is written. Raises UserError for what makes no sense, or cannot be adapted.
+    """Check a request and adapt; nothing is written. Raises UserError for an invalid or impossible request.
 
-    `watch`: by what is being done, who is told how far it is; `note` takes what may be meant otherwise.
+    `watch`: given the name of a step, returns the function that reports its progress. `note`: called with warnings.
     """
     release_programs()
     task, sizes, scalars = subject.source.task, request.sizes, request.scalars
     check_guide(sizes, scalars)
     kind = guidances.resolve(request.guidance)
     if not kind.asks:
-        raise UserError(f"guidance {kind.name!r} asks nothing that could be learned from: choose another kind")
+        raise UserError(
+            f"guidance {kind.name!r} asks no questions, so there is nothing to learn from: choose another kind"
+        )
     if subject.changes is not None and not kind.by_evidence:
-        raise UserError(f"changes is given, but guidance {kind.name!r} knows none: give guidance calibration")
+        raise UserError(f"changes is given, but guidance {kind.name!r} does not use it: give guidance calibration")
     if kind.by_evidence:
         by_calibration.check_unused(sizes, scalars, bound_deg=request.bound_deg, judge_bounds=request.judge_bounds)
     env = task.environment(request.task)
@@ -247,7 +249,7 @@ def run(
         check_teacher(teacher, scalars)
     if rows is not None:
         rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))
-    kept = subject.policy is None or subject.named  # in a folder
+    kept = subject.policy is None or subject.named  # written to a folder
     if kind.by_evidence:
         of = Calibrating(guidance, sizes, scalars, env, bases, *_family(subject, request, kind.name, env))
         if kept:
@@ -262,24 +264,26 @@ def run(
 
 
 def _family(subject: Subject, request: AdaptRequest, kind: str, env: Environment) -> tuple[Any, str]:
-    """What may have changed, and the code of it. Raises UserError for what makes no sense."""
+    """Return what may have changed, and the name of its code. Raises UserError if the two do not fit."""
     options = request.kinds.get(kind)
     asked = {} if options is None else dataclasses.asdict(options)
     if subject.changes is None:
         return declared_distortions(env, **asked), ""
     if given := [name for name, value in asked.items() if value]:
-        raise UserError(f"{kind}.{given[0]} is about changes that the world declares: leave it out beside changes")
+        raise UserError(
+            f"{kind}.{given[0]} applies to changes that the world declares: leave it out where changes is given"
+        )
     family = changes.family_of(subject.changes, env)
     changes.check_acts(family, env)
     return family, subject.changes_named
 
 
 def _bases(subject: Subject, request: AdaptRequest, env: Any) -> tuple[Any, tuple[int, ...], dict[str, Any]]:
-    """The base policies, their seeds, and what they are in plain values."""
+    """Return the base policies, their seeds, and their origin in plain values."""
     source, base, named = subject.source, subject.base, subject.named
     if subject.policy is not None:
         if base != BaseLanes(policy=source.default_policy):
-            raise UserError(f"--base.… chooses among the lanes of a folder, and {named} is none: leave it out")
+            raise UserError(f"--base.… chooses among the lanes of a folder, but {named} is not a folder: leave it out")
         policy = in_space(subject.policy, actions_of(env))
         user_code.acts_in(named or "policy", policy, env)
         return Common(policy), (0,), {"code": named}
@@ -300,7 +304,7 @@ def _bases(subject: Subject, request: AdaptRequest, env: Any) -> tuple[Any, tupl
 def _rows(
     subject: Subject, request: AdaptRequest, guidance: Guide, env: Environment, bases: Any, seeds: tuple[int, ...]
 ) -> tuple[label_files.LabelFile | None, AdaptRequest]:
-    """Labels in place of questions (None: none), and the request with its budgets and bounds in it.
+    """Return the labels used in place of questions (None: none), and the request with the labels' budgets and bounds.
 
     Raises UserError for labels that do not fit.
     """
@@ -309,10 +313,10 @@ def _rows(
     check_grid(grid, adapts=True)
     if guidance.kind.by_evidence:
         if (least := min(request.labels)) < by_calibration.LEAST:
-            raise UserError(f"labels is {least}: give at least {by_calibration.LEAST}, of which some are held out")
-        request = replace(request, bound_deg=(space.reach,))  # there is none
+            raise UserError(f"labels is {least}: give at least {by_calibration.LEAST}, since some are held out")
+        request = replace(request, bound_deg=(space.reach,))  # no bound
     file, form = None, guidance.form
-    assert form is not None  # it asks
+    assert form is not None  # a kind that asks has a form
     if path is not None:
         file = read_labels(path, task, request.task, request.sizes, request.scalars, grid)
     elif rows is not None:
@@ -325,14 +329,14 @@ def _rows(
     widest = by_model.usual_bound(space)
     if file is not None:
         if lanes_in(bases) is not None:
-            raise UserError("labels of several base policies reach differently far: give --bound-deg")
+            raise UserError("the labels of several base policies differ in their largest change: give --bound-deg")
         reach = by_model.reach(space, bases.policy, file.labels.obs, file.labels.action)
         widest = max(reach, request.scalars.eps_deg)
     return file, replace(request, bound_deg=(widest,))
 
 
 def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
-    """How policies are judged. Raises UserError for what makes no sense."""
+    """Return how policies are judged. Raises UserError for invalid settings."""
     by, envs, unit = request.judge_by, request.judge_episodes, request.sizes.labels_per_round
     if not 1 <= envs <= MOST_ENVS:
         raise UserError(f"judge_episodes is {envs}: give a number from 1 to {MOST_ENVS:,}")
@@ -341,7 +345,7 @@ def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
     judging.check_bounds(request.judge_bounds, by)
     known = [*judging.metrics_of(env), judging.LABELS]
     if by not in known:
-        raise UserError(f"judge_by is {by!r}, no metric of {task.name}{suggestion(by, known)}")
+        raise UserError(f"judge_by is {by!r}, which is not a metric of {task.name}{suggestion(by, known)}")
     steps = task.longest(request.task) if task.longest else judging.STEPS
     plays = by != judging.LABELS or request.judge_every
     tuned = task.environment(request.task, "tuning") if plays else None
@@ -349,7 +353,7 @@ def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
 
 
 def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
-    """Differences (lanes, 3) and rewarded steps (lanes,) in words: one with its interval, or how many exclude 0."""
+    """Describe differences (lanes, 3) and rewarded steps (lanes,): one with its interval, or how many exclude 0."""
     count, told = len(steps), f"{int(np.mean(steps)):,} rewarded steps"
     if count > 1:
         above = int((difference[:, 1] > 0).sum())
@@ -360,7 +364,7 @@ def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
 
 
 def sentences(found: AdaptationResult) -> list[str]:
-    """What adaptation has led to, a line for each budget and bound."""
+    """Describe an adaptation's result, one line per budget and bound."""
     if found.results:
         return by_calibration.sentences(found)
     lanes, judged, lines = found.lanes, found.judged, []
@@ -381,5 +385,5 @@ def sentences(found: AdaptationResult) -> list[str]:
         left = lanes.seed[own & ~judged.used]
         if len(left):
             which = f"seed {left[0]}" if len(left) == 1 else f"{len(left)} of {int(own.sum())} seeds"
-            lines[-1] += f"; {which}: {worse}, so the model is not used and the policy stays what it was"
+            lines[-1] += f"; {which}: {worse}, so the model is not used and the policy stays unchanged"
     return lines

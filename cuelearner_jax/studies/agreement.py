@@ -1,7 +1,7 @@
-"""How many answers of people or teachers a policy agrees with: evaluation without a simulator.
+"""Agreement of a policy with the answers of people or teachers: evaluation without a simulator.
 
-A policy agrees with what was said of a cue if it would say the same: that its own action lies at more, at less, or
-within eps / 2 of the action asked about. Give answers that it was not corrected by.
+A policy agrees with an answer about a cue if it would give that answer itself: its own action lies at more, at less,
+or within eps / 2 of the action asked about. Use answers that were not used for its correction.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from cuelearner_jax.policies import policy_name
 from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import Label
 
-Share = tuple[float, float, float]  # and the ends of its 95% interval
+Share = tuple[float, float, float]  # estimate, and the ends of its 95% interval
 
 
 class Agreement(NamedTuple):
     """Shares of answers, with 95% bootstrap intervals over labels."""
 
     labels: int
-    policy: Share  # that the policy agrees with
-    right: Share  # that are "already right"
-    base: Share | None = None  # that the policy as it was agrees with; None: it is not known
-    difference: Share | None = None  # the policy's less the base's, label by label
+    policy: Share  # answers that the policy agrees with
+    right: Share  # answers that are "already right"
+    base: Share | None = None  # answers that the uncorrected policy agrees with; None: unknown
+    difference: Share | None = None  # the policy's share less the base's, paired by label
 
     def words(self) -> list[str]:
-        """The agreement, a line each."""
+        """Return the agreement in words, line by line."""
         rows = (("the policy", self.policy), ("the policy as it was", self.base), ("always already right", self.right))
         lines = [f"{name}: agrees with {_told(share)}" for name, share in rows if share is not None]
         less = [] if self.difference is None else [f"difference from the policy as it was: {_told(self.difference)}"]
@@ -49,17 +49,17 @@ def _told(share: Share) -> str:
 
 
 def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = None) -> Agreement:
-    """Return how many answers a policy agrees with.
+    """Return the share of answers that a policy agrees with.
 
     Args:
-        policy: what acts; see `types.Policy`. It gets observations alone.
+        policy: the acting policy, see `types.Policy`, called with observations only.
         rows: relative labels (labels, ...) as arrays.
-        space: of the actions.
+        space: the actions' space.
         eps: strength of an answer, in the space's unit.
-        base: the policy before its correction; None: it is not known.
+        base: the policy before its correction; None: unknown.
 
     Raises:
-        UserError: a policy gives something else than actions.
+        UserError: a policy returns something other than actions.
     """
     told = (
         np.asarray(is_answered(jnp.asarray(rows.answer))) if len(space.cues) > 1 else np.ones(rows.answer.shape, bool)
@@ -79,7 +79,7 @@ def _interval(values: Float[np.ndarray, " labels"]) -> Share:
 
 
 def _says(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarray, "labels cues"]:
-    """What a policy would answer about the actions of labels."""
+    """Return the answers (labels, cues) that a policy would give about the labels' actions."""
 
     @jax.jit
     def answered(policy: Any, obs: Any, action: Any) -> Any:

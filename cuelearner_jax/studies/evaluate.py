@@ -1,4 +1,4 @@
-"""Evaluation as one request, which the command line and Python fill alike: policies on validation episodes."""
+"""Evaluation as one request, filled alike by the command line and Python: policies on validation episodes."""
 
 from __future__ import annotations
 
@@ -19,56 +19,59 @@ from cuelearner_jax.task import Task
 
 TaskT = TypeVar("TaskT")
 
-MOST_ENVS = 100_000  # that memory has room for
-MOST_STEPS = 1_000_000  # of an environment
+MOST_ENVS = 100_000  # more do not fit into memory
+MOST_STEPS = 1_000_000  # per environment
 MOST = MOST_ENVS * MOST_STEPS
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateRequest(Generic[TaskT]):
-    """What an evaluation is asked for."""
+    """A request to evaluate a policy."""
 
     task: TaskT
     policy: str = "agent"
     """Who acts."""
     guidance: tuple[str, ...] = ()
-    """Only these kinds of guidance of the run (default: all)."""
+    """Kinds of guidance of the run to evaluate (default: all)."""
     episodes: int | None = None
-    """Whole episodes for each lane, where the task counts episodes (default: 100)."""
+    """Number of whole episodes per lane, where the task counts episodes (default: 100)."""
     steps: int | None = None
-    """Instead: environment steps for each lane (default, where the task counts steps: 10,000)."""
+    """Number of environment steps per lane, instead of episodes (default where the task counts steps: 10,000)."""
     envs: int | None = None
-    """Environments that share the steps (default: 100)."""
+    """Number of environments that share the steps (default: 100)."""
     engine: str | None = None
-    """Other physics that the robot has; anymal: mujoco, for C MuJoCo at a finer step instead of MJX; first episodes
-    only."""
+    """Alternative physics engine of the robot. `mujoco` for anymal is C MuJoCo with a finer step instead of MJX; it
+    measures first episodes only."""
 
 
 class Measured(NamedTuple):
-    """A policy's metrics under one guidance and budget."""
+    """A policy's metrics for one guidance and budget."""
 
     guidance: str
     labels: int
-    step: int  # of its training; 0: nothing was trained
+    step: int  # of the policy's training; 0: untrained
     seeds: np.ndarray  # (seeds,)
     metrics: dict[str, np.ndarray]  # each (seeds,)
-    each: dict[str, np.ndarray]  # the same of each environment (seeds, envs), nan where its first episode goes on
-    bound_deg: float | None = None  # of a policy folder's lanes, in `unit`
-    is_shared: bool = False  # do all seeds have one policy?
+    each: dict[str, np.ndarray]  # metrics per environment (seeds, envs); NaN where the first episode has not ended
+    bound_deg: float | None = None  # bound of a policy folder's lanes, in `unit`
+    is_shared: bool = False  # whether all seeds have one policy
     unit: str = "deg"  # of the space of actions
 
     @property
     def within(self) -> str:
-        """The bound with its unit; empty: there is none."""
+        """The bound with its unit; empty without a bound."""
         return "" if self.bound_deg is None else f"{self.bound_deg:g} {self.unit}"
 
 
 def amount(task: Task, asked: EvaluateRequest[Any]) -> tuple[int, int]:
-    """Return environments, and steps that they share. Raises UserError for nonsense, or what cuts episodes short."""
+    """Return the number of environments and the number of steps that they share.
+
+    Raises UserError for invalid numbers, or steps that cut episodes short.
+    """
     longest = None if task.longest is None else task.longest(asked.task)
     if asked.episodes is not None:
         if asked.steps is not None or asked.envs is not None:
-            raise UserError("episodes says how many environments take how many steps: leave out steps and envs")
+            raise UserError("episodes determines environments and steps: leave out steps and envs")
         if longest is None:
             raise UserError(f"{task.name} counts steps, not episodes: give steps in place of episodes")
         if not 1 <= asked.episodes <= MOST_ENVS:
@@ -93,16 +96,16 @@ def run(
     watch: Callable[[str], Tell] = lambda kind: ignore_progress,
     policy: Any = None,
 ) -> list[Measured]:
-    """Metrics of a policy on validation episodes of a world, for each guidance and budget.
+    """Return metrics of a policy on validation episodes of a world, for each guidance and budget.
 
     Args:
-        source: where the policy comes from.
+        source: the policy's origin.
         asked: the request, whose `task` is the world (a configuration).
-        watch: by kind of guidance, who is told how far its lanes are.
-        policy: a policy in place of one of the source's; None: none.
+        watch: given a kind of guidance, returns the function that reports the progress of its lanes.
+        policy: a policy in place of one of the source's; None: use the source's.
 
     Raises:
-        UserError: what makes no sense, or cannot be had (`PolicySource.check` says more, and sooner).
+        UserError: an invalid request, or a policy that is not available (`PolicySource.check` finds that sooner).
     """
     release_programs()
     task, world, name = source.task, asked.task, asked.policy
@@ -128,7 +131,7 @@ def run(
             means = {metric: values.mean(-1) for metric, values in each.items()}
         else:
             means, each, _ = rollout_lanes(env, block.policy, key, num_envs, steps, tell)
-        place = np.zeros(count, int) if is_shared and not engine else np.arange(count)  # of each lane's row
+        place = np.zeros(count, int) if is_shared and not engine else np.arange(count)  # row of each lane
         for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
             own = (block.budgets == budget) & (block.bounds == bound)
             mine, apart = ({metric: np.asarray(of[metric])[place[own]] for metric in of} for of in (means, each))

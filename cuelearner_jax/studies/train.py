@@ -1,8 +1,8 @@
-"""Training as one request, which the command line and Python fill alike: kinds of guidance x seeds x label budgets.
+"""Training as one request, filled alike by the command line and Python: kinds of guidance x seeds x label budgets.
 
-Kinds are trained in turn, the lanes of a kind (seeds x label budgets) side by side.
+Kinds are trained in turn; the lanes of a kind (seeds x label budgets) are trained side by side.
 
-    request = suggested(task, preset)    # what the preset compares, where nothing else is given
+    request = suggested(task, preset)    # the preset's grid
     run(Order(request.task, request.config, request.grid, out))    # in a folder, resumable
     found = in_memory(request, env, examined, teacher)    # for Python
 """
@@ -26,7 +26,7 @@ from cuelearner_jax.runs.judging import judges_world
 from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
-from cuelearner_jax.runs.order import Order, Plan, TrainRequest, checked, labels_of, planned
+from cuelearner_jax.runs.order import Order, Plan, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.storage import formats
@@ -37,18 +37,18 @@ from cuelearner_jax.types import Teacher
 
 
 def preset_kinds(task: Task, preset: Preset) -> tuple[str, ...]:
-    """The kinds of guidance that a preset compares: those it names, or all that the task can have."""
+    """Return the kinds of guidance that a preset compares: those it names, or all that the task supports."""
     return preset.guidance or guidances.possible(shape_of(task, preset.config.task), taught=task.teacher is not None)
 
 
 def suggested(task: Task, preset: Preset) -> TrainRequest:
-    """What a preset compares: its kinds of guidance, label budgets and seeds."""
+    """Return the request of a preset: its kinds of guidance, label budgets and seeds."""
     seeds = seeds_of(preset.first_seed, preset.seeds)
     return TrainRequest(task, preset.config, Grid(preset_kinds(task, preset), seeds, preset.labels))
 
 
 def _groups(request: TrainRequest, env: Any, tell: Callable[[str], None]) -> list[LaneGroup]:
-    """The lanes of each kind in an environment, or in its shape; `tell` takes what memory they need.
+    """Return the lane group of each kind in an environment, or in its shape; report their memory by `tell`.
 
     Raises UserError for too little memory.
     """
@@ -60,17 +60,17 @@ def _groups(request: TrainRequest, env: Any, tell: Callable[[str], None]) -> lis
 
 
 def run(order: Order) -> None:
-    """Trains every lane of the grid and leaves the results in the order's folder.
+    """Train every lane of the grid and write the results to the order's folder.
 
-    With a shard, trains its share of the seeds alone, from wherever that stands.
+    With a shard, train only its share of the seeds, resuming where the shard stands.
 
     Raises:
-        UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
+        UserError: invalid configuration, a folder in use, or too little memory; nothing has been changed.
         Interrupted: Ctrl-C or SIGTERM; everything is saved.
-        NotFinite: all is done, but some lanes stopped being finite.
+        NotFinite: everything is finished, but some lanes stopped being finite.
     """
     release_programs()
-    plan = planned(order)
+    plan = make_plan(order)
     order = plan.order
     _groups(order, shape_of(order.task, order.config.task), console.print)  # before anything that has a size is made
     with progress_bars() as bars:
@@ -116,29 +116,29 @@ def _made(order: Order, plan: Plan) -> _Made:
 
 
 class Trained(NamedTuple):
-    """What a training in memory has led to."""
+    """The result of a training in memory."""
 
     request: TrainRequest
-    results: pa.Table  # a row a lane and evaluation: guidance, labels, seed, step, wall_s, failed and metrics
-    trainings: dict[str, Training]  # by kind of guidance, at their end
+    results: pa.Table  # a row per lane and evaluation: guidance, labels, seed, step, wall_s, failed and metrics
+    trainings: dict[str, Training]  # by kind of guidance, in their final state
 
 
 def in_memory(
     request: TrainRequest, env: Environment, examined: Environment, teacher: Teacher | None, progress: bool = True
 ) -> Trained:
-    """Trains every lane of the grid; nothing is written.
+    """Train every lane of the grid; write nothing.
 
     Args:
-        request: what is asked for.
-        env, examined: of the request's world, for learning and for evaluations.
-        teacher: who answers; None where nothing is asked of one.
+        request: what to train.
+        env, examined: environments of the request's world, for learning and for evaluations.
+        teacher: who answers; None where no kind asks.
         progress: show progress bars on standard error.
 
     Raises:
-        UserError: a configuration that makes no sense, no teacher where one is asked, or too little memory.
+        UserError: invalid configuration, no teacher where one is needed, or too little memory.
     """
     release_programs()
-    request = checked(request)
+    request = resolve_request(request)
     labels, mesh = labels_of(request), lane_mesh()
     groups = _groups(request, place(mesh, env, SHARED), lambda told: None)
     asking = [group.guidance.name for group in groups if group.guidance.asks]
@@ -157,7 +157,7 @@ def in_memory(
                 training.take(labels)
             bar = bars.add_task(name, total=request.config.schedule.total_steps, note="")
             if not training.labelled:
-                assert teacher is not None  # asked for above
+                assert teacher is not None  # checked above
                 asked = bars.add_task(f"{name}: labels", total=group.rounds, note="")
                 for done in training.label_rounds(teacher):
                     bars.update(asked, completed=done)
@@ -169,7 +169,7 @@ def in_memory(
 
 
 def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
-    """The columns of one evaluation, with a row for each lane."""
+    """Return the columns of one evaluation as a table with a row per lane."""
     names = pa.array([group.guidance.name] * len(group.seeds))
     columns = {name: np.broadcast_to(np.asarray(value), len(names)) for name, value in row.items()}
     told = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}

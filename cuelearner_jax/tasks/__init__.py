@@ -1,1 +1,1 @@
-"""The tasks: their registry and those that come with the package. The only place that imports cuelearner_envs."""
+"""Tasks: the registry, and the tasks of the package. The only package that imports cuelearner_envs."""

@@ -1,4 +1,4 @@
-"""The arm as a task: its skills, presets, changed worlds and pictures."""
+"""Define the arm task: its skills, presets, changed worlds and pictures."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from cuelearner_jax.types import Policy, Teacher
 
 FETCH = {"reach": "FetchReach", "push": "FetchPush", "pick": "FetchPickAndPlace"}
 RELATIVE = "object relative position"
-PLACES = ("achieved goal", "desired goal", "object position")  # that a camera tells
+PLACES = ("achieved goal", "desired goal", "object position")  # slices that a camera measures
 
 
 def observation_of(skill: str) -> tuple[Quantity, ...]:
-    """Return the slices of a skill's observation: Fetch's, with the point about which a camera turns what it tells."""
+    """Return the slices of a skill's observation: Fetch's, with the centre of the camera's rotation."""
     layout = fetch_layout.layout_of(FETCH[skill])
     assert layout is not None
     return tuple(_seen(quantity) for quantity in layout)
@@ -43,14 +43,14 @@ def _seen(quantity: Quantity) -> Quantity:
 
 
 def make_environment(config: ArmConfig, split: str = "training") -> Environment:
-    """Return the world of a configuration; whatever the split is, episodes differ by their keys alone."""
+    """Return the world of a configuration; splits differ only in their episodes' keys."""
     return arm.make_environment(config, observation_of(config.skill))
 
 
 def make_fetch(config: ArmConfig, split: str = "training") -> Environment:
-    """Return the world of a configuration in Fetch, played by the Gymnasium bridge in processes of their own.
+    """Return the world of a configuration in Fetch, run by the Gymnasium bridge in separate processes.
 
-    Raises UserError for a change that Fetch cannot have, or where Gymnasium-Robotics is not installed.
+    Raises UserError for a change that Fetch does not support, or where Gymnasium-Robotics is not installed.
     """
     from cuelearner_envs.arm import fetch
     from cuelearner_jax.bridges.gymnasium.environment import GymnasiumTask
@@ -65,7 +65,7 @@ def make_fetch(config: ArmConfig, split: str = "training") -> Environment:
 
 
 def make_teacher(config: ArmConfig, env: Any) -> Teacher:
-    """Return the script of the skill, which sees true places."""
+    """Return the skill's script, which uses the true positions."""
     from cuelearner_envs.arm.teacher import ScriptTeacher
 
     return ScriptTeacher(env, jnp.float32(SIDES[config.preferred_side]))
@@ -160,7 +160,7 @@ QUICKSTART = RunConfig(
         actor_rate=1e-3,
         critic_rate=1e-3,
         temperature_rate=1e-3,
-        first_temperature=0.1,  # rewards are ways in metres
+        first_temperature=0.1,  # rewards are distances in metres
         polyak=0.02,
     ),
     paced.Config(lead=0.0),
@@ -197,7 +197,7 @@ ARM = Task(
     proposed=_proposed,
     longest=lambda config: config.max_steps,
     judge_by=lambda config: "success",
-    labels_hold=("reward", "max_steps", "within"),  # a label is of what one observation shows
+    labels_hold=("reward", "max_steps", "within"),  # a label depends on one observation only
     scenarios=SCENARIOS,
     presets={
         "paper": Preset(

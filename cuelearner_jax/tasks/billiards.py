@@ -1,4 +1,4 @@
-"""Billiards as a task: its teachers, presets, changed worlds and pictures."""
+"""Define the billiards task: its teachers, presets, changed worlds and pictures."""
 
 from __future__ import annotations
 
@@ -28,32 +28,33 @@ from cuelearner_jax.types import Teacher
 SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
 
 
-# Fields in which a learned teacher's world may differ from its own: who teaches and how, what multiplies data, and what
-# `Transferred` sees to.
+# Fields in which a learned teacher's world may differ from its own: the teacher and its search, data augmentation, and
+# changes that `Transferred` accounts for.
 TEACHERS = ("teacher", "aim_error_deg", "habit", "search_directions")
 TRANSFERRED = (*TEACHERS, "mirrors", "action_turn_deg", "observation_bias")
-SLIGHT_TILT = 0.02  # up to which a learned teacher's proposals lie near good shots [m/s^2], see docs/billiards.md
+# largest tilt at which a learned teacher still proposes nearly good shots [m/s^2], see docs/billiards.md
+SLIGHT_TILT = 0.02
 LOCAL_SEARCH = "local_search"
 
 
-# The paper's networks, searched as fast as they can be.
+# The paper's networks, with the fastest search.
 AGENT = ddqn.Config(coarse_directions=720, coarse_dtype="bfloat16", peaks=8)
-# Seen from the strike and paced: what learns fastest here, see docs/results.
+# The action frame and pacing learn fastest here, see docs/results.
 SEEN_FROM_THE_STRIKE = Sizes(frame="action", num_envs=100)
-PACED = paced.Config(lead=0.5)  # a guide that earns half a shot more than the agent has its whole share, a weaker less
+PACED = paced.Config(lead=0.5)  # a guide gets its whole share if it earns half a shot more than the agent, less below
 
 
 def teacher_folder(config: BilliardsConfig) -> Path | None:
-    """Where the teacher that a configuration names lies (None: it is none that was trained)."""
+    """Return the folder of a configuration's teacher; None for one that was not trained."""
     if config.teacher == "search":
         return None
     return SHIPPED_TEACHERS / config.table if config.teacher in ("learned", LOCAL_SEARCH) else Path(config.teacher)
 
 
 def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
-    """The teacher that a configuration names.
+    """Return the teacher of a configuration.
 
-    Raises UserError if there is none, or if it knows nothing of a change in this world.
+    Raises UserError if there is none, or if it cannot account for a change in this world.
     """
     aim_error = jnp.deg2rad(jnp.array(config.aim_error_deg, jnp.float32))
     habit = jnp.array(config.habit, jnp.float32)
@@ -63,7 +64,7 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     told = _learned_in(folder, config)
     own = make_environment(told)
     network = teachers.load(folder, own, aim_error, habit)
-    if type(env) is not Billiards:  # other physics, of which a network knows only where to try
+    if type(env) is not Billiards:  # for other physics, the network only proposes where to try
         return NearbyTeacher(Transferred(network, own, env), env, aim_error)
     if config.teacher == LOCAL_SEARCH or told.acceleration != config.acceleration:
         return LocalSearchTeacher(network, own, env, aim_error, habit)
@@ -71,9 +72,9 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
 
 
 def _learned_in(folder: Path, config: BilliardsConfig) -> BilliardsConfig:
-    """The world of a teacher that is asked in another. Raises UserError if it knows nothing of a change between them.
+    """Return the training world of a teacher used in another world. Raises UserError for a change it cannot handle.
 
-    On a slightly tilted table its proposals are still near good shots, among which shots then decide.
+    On a slightly tilted table its proposals are still near good shots; simulated shots then decide among them.
     """
     try:
         return teachers.world_of(folder, "billiards", config, TRANSFERRED)
@@ -86,7 +87,7 @@ def _learned_in(folder: Path, config: BilliardsConfig) -> BilliardsConfig:
 
 
 def _files(config: BilliardsConfig) -> dict[str, str]:
-    """The user's own teacher, by its digest."""
+    """Return the digest of the user's own teacher, if there is one."""
     folder = teacher_folder(config)
     own = folder and config.teacher not in ("learned", LOCAL_SEARCH)
     return {"teacher": teachers.digest(folder)} if folder and own else {}
@@ -107,15 +108,16 @@ def _pictures() -> Pictures:
         sketch=sketch,
         reel=reel,
         trails=trails,
-        legend="Thin lines: the ways of the white ball (solid) and of the ball that it hits (dashed), within three "
-        "seconds. A disc: a ball is pocketed. A cross: the white one is, a foul.",
+        legend="Thin lines: the paths of the white ball (solid) and of the ball that it hits (dashed), within three "
+        "seconds. A disc: a ball is pocketed. A cross: the white ball is pocketed, a foul.",
     )
 
 
 PLAYER = Body(
     name="player",
     about="strikes the cue ball with a fixed speed",
-    environment=lambda config, split: make_environment(config),  # racks alone differ, and they by the key
+    # splits differ only in the racks, which the key determines
+    environment=lambda config, split: make_environment(config),
     pictures=_pictures,
 )
 
@@ -132,8 +134,8 @@ POOLTOOL = Body(
     environment=_foreign,
 )
 
-# How the adapted agents of docs/results/adaptation.md were corrected: a teacher that plays its shots in the changed
-# world means the good shot nearest to the agent's own, and a guide sees how far a shot has been turned.
+# Settings of the adapted agents in docs/results/adaptation.md. The teacher tries shots in the changed world and prefers
+# the good shot nearest to the agent's, and the guide sees how far a shot has been turned.
 NEAREST: dict[str, Any] = {"answer": "nearest", "nearest_aim_deg": 0.1, "feedback_learning_rate": 3e-4}
 RECIPE: dict[str, Any] = {"eps_deg": 0.1, "guidance": "offset", "sizes": PAPERS_FIT}
 
@@ -166,7 +168,7 @@ BILLIARDS = Task(
     name="billiards",
     about="pocket the target balls with one shot a step",
     wants=lambda config: (
-        "The white ball is struck along the arrow. A coloured ball is to fall into a pocket, the white one never."
+        "The white ball is struck along the arrow. A coloured ball should be pocketed, the white ball never."
     ),
     near_aims=True,
     config=BilliardsConfig,
@@ -180,7 +182,7 @@ BILLIARDS = Task(
             "the paper's figure: regulation table, its networks, 10 million steps a seed",
             RunConfig(
                 BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
-                # The reference alternates 1,000 steps with 1,000 gradient steps, this a hundred with a hundred.
+                # The reference alternates 1,000 steps with 1,000 gradient steps; this alternates 100 with 100.
                 Sizes(num_envs=100),
                 schedule=Schedule(guide_eval_every=50),
                 agent=AGENT,
@@ -196,7 +198,7 @@ BILLIARDS = Task(
                 SEEN_FROM_THE_STRIKE,
                 schedule=Schedule(
                     total_steps=2_000_000,
-                    guidance_until=500_000,  # as measured to help
+                    guidance_until=500_000,  # until this step guidance was measured to help
                     eval_every=50_000,
                     checkpoint_every=250_000,
                     guide_eval_every=50,
@@ -212,7 +214,7 @@ BILLIARDS = Task(
             "the table of regulation, its rule and 100 labels as a prior of the choice: good from the first step on",
             RunConfig(
                 BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
-                # Of few labels one model in long fits forgets the rule.
+                # With few labels, a single model in long fits forgets the rule.
                 dataclasses.replace(SEEN_FROM_THE_STRIKE, ensemble=5, fit_steps=200),
                 schedule=Schedule(
                     total_steps=1_000_000,
@@ -266,7 +268,7 @@ BILLIARDS = Task(
             guidance=("none", "relative"),
             labels=(100,),
             seeds=24,
-            first_seed=2000,  # the settings were chosen on seeds below
+            first_seed=2000,  # the settings were chosen on seeds below 2000
             takes="24 seeds under two kinds of guidance: two minutes on 2 cores",
         ),
     },

@@ -1,4 +1,4 @@
-"""brax's environments as tasks, by name: `brax:pusher`."""
+"""Define brax's environments as tasks, by name: `brax:pusher`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from cuelearner_envs.bounds import check_word
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.task import Body, Task
-from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, pictures, presets
+from cuelearner_jax.tasks.simulators import (
+    SimulatorConfig,
+    check_layout,
+    config_fields,
+    environment_of,
+    pictures,
+    presets,
+)
 
 FAMILY = "brax"
 Backend = Literal["generalized", "spring", "positional", "mjx"]
@@ -22,15 +29,15 @@ Backend = Literal["generalized", "spring", "positional", "mjx"]
 
 @dataclass(frozen=True)
 class BraxConfig(SimulatorConfig):
-    """One of brax's environments. Every field is an option `--task.…`, the line below it its help."""
+    """Configuration of a brax environment. Every field is an option `--task.…`; its docstring is the help."""
 
     backend: Backend = "generalized"
-    """Which of brax's physics."""
+    """Physics backend of brax."""
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """Gives the brax environment of a name; equal ones give one object, and so share what is compiled."""
+    """Makes the brax environment of a name; equal instances return one object, and so share compilations."""
 
     environment: str
     backend: str
@@ -47,11 +54,12 @@ class Simulator:
 def _made(name: str, backend: str) -> Any:
     from brax import envs  # takes seconds to load
 
-    known: dict[str, Any] = envs._envs  # brax lists its environments nowhere else
+    known: dict[str, Any] = envs._envs  # brax has no public list of its environments
     if name not in known:
         raise UserError(f"brax has no environment {name!r}{suggestion(name, known)}")
-    with warnings.catch_warnings(), jax.ensure_compile_time_eval():  # it holds arrays, and something may be traced
-        warnings.filterwarnings("ignore", message="Brax System")  # that brax is not being developed any more
+    # the environment holds arrays, and the caller may be tracing
+    with warnings.catch_warnings(), jax.ensure_compile_time_eval():
+        warnings.filterwarnings("ignore", message="Brax System")  # a notice that brax is no longer developed
         return envs.get_environment(name, backend=backend)
 
 
@@ -66,12 +74,12 @@ BRAX = Task(
     about="brax's environments, each as brax:NAME, brax:pusher for instance",
     config=BraxConfig,
     bodies=(Body(FAMILY, "brax's own", make_environment, pictures=pictures),),
-    labels_hold=("max_steps", "backend"),  # a label is about what one observation shows
+    labels_hold=("max_steps", "backend"),  # a label depends on one observation only
 )
 
 
 @cache
 def task_of(name: str) -> Task:
-    """Return the task of one of brax's environments, whole box of actions. Raises UserError if brax has none."""
-    config = BraxConfig(**described(FAMILY, name, _made(name, BraxConfig.backend)))
+    """Return the task of a brax environment with its whole box of actions. Raises UserError for an unknown name."""
+    config = BraxConfig(**config_fields(FAMILY, name, _made(name, BraxConfig.backend)))
     return dataclasses.replace(BRAX, about=f"brax's {name}", default=config, presets=presets(config))

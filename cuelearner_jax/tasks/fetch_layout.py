@@ -1,4 +1,4 @@
-"""What the numbers of Fetch's observations are (gymnasium_robotics): names and units that Gymnasium does not tell.
+"""Names and units of the numbers in Fetch's observations (gymnasium_robotics), which Gymnasium does not give.
 
 Source: `generate_mujoco_observations` and `_get_obs` of `gymnasium_robotics/envs/fetch/fetch_env.py`, version 1.4.2.
 """
@@ -12,10 +12,10 @@ from typing import Any
 from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
 from cuelearner_jax.environment import OWN, Quantity
 
-__all__ = ["CUES", "CUE_NAMES", "drawn_with", "layout_of", "points_of"]
+__all__ = ["CUES", "CUE_NAMES", "layout_of", "picture_arguments", "points_of"]
 
-# What a camera tells of the object and the goal is in metres, and shifts with the camera. What the robot measures of
-# itself does not.
+# A camera measures object and goal in metres, shifted with the camera. The robot's measurements of itself are not
+# shifted.
 _GRIPPER = Quantity("gripper position", 3, "m", "x forward, y to the left, z up, of the world", OWN)
 _OBJECT = (
     Quantity("object position", 3, "m", "x forward, y to the left, z up, of the world"),
@@ -32,7 +32,7 @@ _GRIPPER_MOTION = (
     Quantity("finger velocities", 2, "m a step"),
 )
 _DESIRED = Quantity("desired goal", 3, "m", "where the gripper, or the object, is to be")
-# Of pictures: over the robot's shoulder, so that its left is to the left. Fetch's own camera faces the robot.
+# The camera looks over the robot's shoulder, so that its left is to the left. Fetch's own faces the robot.
 CAMERA = {"distance": 1.6, "azimuth": 45.0, "elevation": -30.0, "lookat": [1.3, 0.75, 0.5]}
 FETCH = "FetchReach", "FetchPush", "FetchSlide", "FetchPickAndPlace"
 
@@ -48,8 +48,8 @@ def layout_of(environment: str) -> tuple[Quantity, ...] | None:
     return None
 
 
-def drawn_with(environment: str, arguments: str) -> str:
-    """Return the arguments of an environment (JSON) for pictures: with the camera, where Fetch is given none."""
+def picture_arguments(environment: str, arguments: str) -> str:
+    """Return an environment's arguments (JSON) for pictures: with this camera, where Fetch is given none."""
     named: dict[str, Any] = json.loads(arguments)
     if not environment.startswith(FETCH) or "default_camera_config" in named:
         return arguments
@@ -57,7 +57,7 @@ def drawn_with(environment: str, arguments: str) -> str:
 
 
 def points_of(environment: str, arguments: str) -> tuple[tuple[float, float] | None, ...]:
-    """Return which way more of each cue points in Fetch's pictures (`Sketch.points`); none for other environments."""
+    """Return the screen direction for "more" of each cue in Fetch's pictures (`Sketch.points`); else empty."""
     if not environment.startswith(FETCH):
         return ()
     up = (0.0, -1.0)
@@ -65,6 +65,6 @@ def points_of(environment: str, arguments: str) -> tuple[tuple[float, float] | N
         return None, None, up, None
     turn, tilt = (math.radians(float(CAMERA[name])) for name in ("azimuth", "elevation"))  # pyright: ignore
     sight, rise = (math.cos(turn), math.sin(turn)), math.sin(-tilt)
-    # A step away from the camera leads up the picture, by as much as the camera looks down.
+    # A step away from the camera moves up in the picture, in proportion to the camera's downward tilt.
     forward, left = (sight[1], -sight[0] * rise), (-sight[0], -sight[1] * rise)
     return forward, left, up, None

@@ -1,10 +1,10 @@
-"""Any environment of Gymnasium as a task: `gymnasium:FetchReach-v4`, or a class or function of the user's own.
+"""Any Gymnasium environment as a task: `gymnasium:FetchReach-v4`, or a class or function of the user's own.
 
     task = task_of("FetchReach-v4")
     env = task.environment(task.plain())
 
-A configuration says how observations and actions are made up: a policy is loaded without its environment, and reading
-a folder imports no code but that of Gymnasium's own registry.
+The configuration describes observations and actions, so that a policy is loaded without its environment. Reading a
+folder imports no code beyond that of Gymnasium's own registry.
 """
 
 from __future__ import annotations
@@ -38,27 +38,28 @@ from cuelearner_jax.terminal import console
 
 FAMILY = "gymnasium"
 NUM_ENVS = 8
-UNLIMITED = 1_000  # steps after which an episode is truncated, where neither environment nor caller has a limit
-TRIED = 100  # steps of an episode, to see whether the environment tells of success
+UNLIMITED = 1_000  # steps of an episode, where neither environment nor caller gives a limit
+TRIED = 100  # steps of an episode, to find out whether the environment reports success
 MOST_PROCESSES = 256
 UNKNOWN_UNIT = "as given"
 
 
 @dataclass(frozen=True)
 class GymnasiumConfig:
-    """One environment of Gymnasium. Every field is an option `--task.…`, the line below it its help.
+    """Configuration of a Gymnasium environment. Every field is an option `--task.…`; its docstring is the help.
 
-    The fields from `slices` on say what policies look at, so that a stored policy is read without the environment.
+    The fields from `slices` on describe observations and actions, so that a stored policy is read without the
+    environment.
     """
 
     environment: str = ""
-    """Its id in Gymnasium's registry, or what code makes it; gymnasium:NAME fills this, and the layout below."""
+    """Id in Gymnasium's registry, or the name of code; gymnasium:NAME fills this field and the layout below."""
     arguments: str = "{}"
-    """Arguments of the environment, by name, as JSON."""
+    """Arguments of the environment by name, as JSON."""
     max_steps: int = 1
-    """Steps after which an episode is truncated, if the environment does not end it before."""
+    """Largest number of steps of an episode, after which it is truncated."""
     processes: int = 0
-    """Processes that play it (0: one for each processor; 1: none, it is played where it is trained)."""
+    """Number of processes that run environments (0: one per processor; 1: run them in the training process)."""
     slices: tuple[str, ...] = ()
     """Layout: names of an observation's slices."""
     slice_sizes: tuple[int, ...] = ()
@@ -78,11 +79,11 @@ class GymnasiumConfig:
     cue_names: tuple[str, ...] = ()
     """Layout: a name for each cue (default: its words)."""
     succeeds: bool = False
-    """Layout: whether the environment tells of success."""
+    """Layout: whether the environment reports success."""
 
     @property
     def observation(self) -> tuple[Quantity, ...]:
-        """The slices. Raises UserError where their columns do not fit together."""
+        """The slices of an observation. Raises UserError where their columns do not fit together."""
         rows = self.slices, self.slice_sizes, self.units, self.slice_kinds
         if not self.slices or len({len(row) for row in rows}) > 1 or not all(size > 0 for size in self.slice_sizes):
             raise UserError(
@@ -118,25 +119,25 @@ def space_of(actions: Actions, cues: Sequence[str] = (), cue_names: Sequence[str
 
 
 def _refusal(config: GymnasiumConfig) -> str:
-    """Why a configuration out of a file makes no environment: it names code."""
+    """Return why a configuration from a file cannot be made (it names code); empty if it can."""
     if ":" not in config.environment:
         return ""
     return (
-        f"environment {config.environment} is code, which no file may import: name it anew, as "
+        f"environment {config.environment} is code, which is not imported because a file names it: name it again, as "
         f"{FAMILY}:{config.environment} in place of the task, or by cl.from_gymnasium"
     )
 
 
 def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig, split: str) -> GymnasiumTask:
-    """Return the environment of a configuration; nothing of Gymnasium is loaded until it is reset.
+    """Return the environment of a configuration; Gymnasium is loaded only when it is reset.
 
     Args:
-        factory: makes it; None: Gymnasium's registry.
+        factory: makes the environment; None: Gymnasium's registry.
         config: the configuration.
-        split: whatever it is, episodes differ by their keys alone.
+        split: has no effect, since episodes differ only in their keys.
 
     Raises:
-        UserError: a value that makes none.
+        UserError: an invalid value.
     """
     if not config.environment:
         raise UserError(f"task.environment is empty: name the task {FAMILY}:ENVIRONMENT, as {FAMILY}:FetchReach-v4")
@@ -182,7 +183,7 @@ def _pictures() -> Pictures:
 
 
 def body(factory: Callable[..., Any] | None = None) -> Body:
-    """Return what acts in the task."""
+    """Return the body that acts in the task."""
     return Body(FAMILY, "Gymnasium's own simulation", partial(make_environment, factory), pictures=_pictures)
 
 
@@ -193,15 +194,15 @@ GYMNASIUM = Task(
     bodies=(body(),),
     longest=_longest,
     judge_by=_judge_by,
-    labels_hold=("max_steps", "processes", "succeeds"),  # a label is about what one observation shows
+    labels_hold=("max_steps", "processes", "succeeds"),  # a label depends on one observation only
 )
 
 
 def task_of(name: str) -> Task:
     """Return the task of an environment: an id of Gymnasium's registry, or package.module:NAME, which is imported.
 
-    Call it with what a caller or the command line names, never with what a file says. Raises UserError if the
-    environment cannot be had.
+    Call this only with names from a caller or the command line, never from a file. Raises UserError if the environment
+    is not available.
     """
     return task_from(plugins.load(name, object, "an environment") if REFERENCE.fullmatch(name) else name, called=name)
 
@@ -219,17 +220,17 @@ def task_from(
     units: Mapping[str, str] | None = None,
     note: Callable[[str], None] = console.print,
 ) -> Task:
-    """Return an environment as a task. One instance is made, and plays an episode, to see how it is made up.
+    """Return an environment as a task. One instance is made and plays an episode, to find out its layout.
 
     Args:
-        given: an id of Gymnasium's registry, or a class or function that gives an environment.
-        arguments: of the environment, by name.
-        called: what code is called in messages and files (default: module:NAME of it).
-        num_envs, max_steps, processes, cues, observation, units: as `cl.from_gymnasium` has them.
-        note: is told which limit of steps was chosen for want of one, in one line.
+        given: an id of Gymnasium's registry, or a class or function that returns an environment.
+        arguments: arguments of the environment, by name.
+        called: name of code in messages and files (default: its module:NAME).
+        num_envs, max_steps, processes, cues, observation, units: see `cl.from_gymnasium`.
+        note: called with one line if a limit of steps had to be chosen.
 
     Raises:
-        UserError: it cannot be made, or its spaces are none that are served.
+        UserError: the environment cannot be made, or its spaces are not supported.
     """
     check_installed()
     factory = None if isinstance(given, str) else given
@@ -273,7 +274,7 @@ def task_from(
         cue_names=names,
         succeeds=succeeds,
     )
-    config.space  # noqa: B018 (cues that do not fit are told here)
+    config.space  # noqa: B018 (raises for cues that do not fit)
     return dataclasses.replace(
         GYMNASIUM,
         about=f"Gymnasium's {name}",
@@ -284,7 +285,7 @@ def task_from(
 
 
 def _kept(name: str, arguments: Mapping[str, Any]) -> str:
-    """Arguments as a file keeps them."""
+    """Return arguments as JSON for a file."""
     try:
         return json.dumps(dict(arguments))
     except (TypeError, ValueError) as error:
@@ -295,14 +296,14 @@ def _kept(name: str, arguments: Mapping[str, Any]) -> str:
 
 
 def _called(code: Any) -> str:
-    """How a file names code, which nothing is imported by."""
+    """Return the name of code for files; nothing is imported by this name."""
     inner = getattr(code, "func", code)
     return f"{getattr(inner, '__module__', '')}:{getattr(inner, '__qualname__', type(inner).__name__)}"
 
 
 def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
-    """How an environment is made up: actions, slices of an observation, its limit of steps (0: none), and whether it
-    tells of success within an episode."""
+    """Return an environment's layout: actions, slices of an observation, limit of steps (0: none), and whether it
+    reports success within an episode."""
     whose, when, succeeds = f"environment {source.name}", "in its first reset,", False
     try:
         env = source.make()
@@ -335,7 +336,7 @@ def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
 
 
 def _limit(env: Any) -> int:
-    """Steps after which an environment truncates an episode; 0: it does not say."""
+    """Return the number of steps after which an environment truncates an episode; 0: unknown."""
     spec = getattr(env, "spec", None)
     limit = getattr(spec, "max_episode_steps", None)
     while not limit and env is not None:
@@ -346,7 +347,7 @@ def _limit(env: Any) -> int:
 def _named(
     name: str, slices: list[Quantity], given: Sequence[Any] | None, units: Mapping[str, str]
 ) -> tuple[Quantity, ...]:
-    """The slices with the names and units that the caller, or this package, knows."""
+    """Return the slices with names and units that the caller, or this package, knows."""
     if given is not None:
         try:
             found = tuple(one if isinstance(one, Quantity) else Quantity(*one) for one in given)

@@ -1,4 +1,4 @@
-"""Pictures of Gymnasium's environments: what `render` gives in a spare instance that repeats an episode's actions."""
+"""Pictures of Gymnasium environments: `render` of a spare instance that replays an episode's actions."""
 
 from __future__ import annotations
 
@@ -17,49 +17,49 @@ from cuelearner_jax.task import Pictures
 from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.types import Reel, Sketch
 
-HELD = 5  # steps for which a clip holds an action: one alone is hardly seen
-PERIOD = 0.1  # between two frames of a clip [s]
-FPS = 25.0  # of a film, a step a frame
-STILLS, CLIPS, FILMS = 0, 1, 2  # the spare instances: each goes on where it stands, if that is on the way
+HELD = 5  # steps for which a clip holds an action, since one step is hardly visible
+PERIOD = 0.1  # time between two frames of a clip [s]
+FPS = 25.0  # of a film, one frame per step
+STILLS, CLIPS, FILMS = 0, 1, 2  # spare instances by purpose; each continues from its state where that lies on the way
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def frames_of(env: GymnasiumTask, slot: int, seed: int, actions: Any, first: int) -> list[Frame]:
-    """Return pictures of an episode from after `first` of its actions on. Raises UserError where there are none."""
+    """Return pictures of an episode after its first `first` actions. Raises UserError where there are none."""
     rows = np.asarray(actions, np.float32).reshape(-1, env.actions.size)
     source = env.source
     if source.factory is None:
-        source = dataclasses.replace(source, arguments=fetch_layout.drawn_with(source.name, source.arguments))
+        source = dataclasses.replace(source, arguments=fetch_layout.picture_arguments(source.name, source.arguments))
     return pool_of(dataclasses.replace(source, drawn=True)).filmed(slot, seed, rows, first)
 
 
 def _went(state: Episode) -> tuple[int, np.ndarray]:
-    """The seed of an episode and its actions so far."""
+    """Return the seed of an episode and its actions so far."""
     seed, steps, actions = jax.device_get((state.seed, state.steps, state.actions))
     return int(seed), np.asarray(actions)[: int(steps)]
 
 
 def picture(env: GymnasiumTask, state: Episode) -> Frame:
-    """Return what a state looks like. Raises UserError where the environment gives no picture."""
+    """Return a picture of a state. Raises UserError where the environment gives none."""
     seed, actions = _went(state)
     return frames_of(env, STILLS, seed, actions, len(actions))[-1]
 
 
 def check(env: GymnasiumTask) -> None:
-    """Raises UserError where the environment cannot be drawn."""
+    """Raise UserError where the environment cannot be drawn."""
     frames_of(env, STILLS, 0, np.zeros((0, env.actions.size)), 0)
 
 
 def sketch(env: GymnasiumTask, state: Episode) -> Sketch:
-    """Return what a state looks like, for the page."""
+    """Return a sketch of a state for the labelling page."""
     found = pictures.sketch(picture(env, state), f"step {int(state.steps) + 1}")
     source = env.source
     return found if source.factory else found._replace(points=fetch_layout.points_of(source.name, source.arguments))
 
 
 def reel(env: GymnasiumTask, state: Episode, action: Float[Array, " action"]) -> Reel:
-    """Return what an action leads to that is held for a few steps."""
+    """Return a clip of holding an action for a few steps."""
     seed, actions = _went(state)
     held = np.repeat(np.asarray(action, np.float32)[None], HELD, 0)
     frames = frames_of(env, CLIPS, seed, np.concatenate([actions, held]), len(actions))
@@ -92,7 +92,7 @@ def record(env: GymnasiumTask, policy: Any, key: PRNGKeyArray, steps: int) -> tu
 
 
 def question(env: GymnasiumTask, state: Episode, obs: Any, action: Any, file: Path) -> None:
-    """Write what a state looks like, and what it looks like after the action was held, side by side."""
+    """Write two pictures side by side: the state, and the state after holding the action."""
     seed, actions = _went(state)
     held = np.repeat(np.asarray(action, np.float32)[None], HELD, 0)
     frames = frames_of(env, CLIPS, seed, np.concatenate([actions, held]), len(actions))

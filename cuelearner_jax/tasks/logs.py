@@ -1,10 +1,10 @@
-"""Recorded situations as a task: no simulator, no reward; a step goes on to the next situation whatever is done.
+"""Recorded situations as a task without simulator and reward; each step moves to the next situation.
 
     task = task_of("situations", cues="left,right;up,down;open,close")
     env = task.environment(task.plain())
 
-Its configuration says where the situations lie, and how an observation and an action are made up: a policy that was
-corrected by labels about them is loaded without the folder.
+The configuration gives the situations' path and the layout of observations and actions, so that a policy corrected by
+labels about them is loaded without the folder.
 """
 
 from __future__ import annotations
@@ -44,33 +44,33 @@ from cuelearner_jax.types import Reel, Sketch, Step
 NAME = "logs"
 Actions = Literal["box", "directions", "choices"]
 Order = Literal["shuffled", "recorded"]
-CLIP_FRAMES, CLIP_PERIOD = 60, 0.1  # of a clip, at most; between two of them [s]
-FARTHEST = 5.0  # spreads from the centre, beyond which entries of an observation look alike to networks
-FRAME = "action"  # in which networks see: by `Layout.features`
+CLIP_FRAMES, CLIP_PERIOD = 60, 0.1  # most frames of a clip, and the time between two of them [s]
+FARTHEST = 5.0  # networks' input entries are clipped at this many spreads from the centre
+FRAME = "action"  # frame of the networks' input, computed by `Layout.features`
 
 
 @dataclasses.dataclass(frozen=True)
 class LogsConfig:
-    """Where situations lie, and what an observation and an action of theirs are."""
+    """Path of recorded situations, and the layout of their observations and actions."""
 
     path: str = ""
-    """Folder of the situations, or their table."""
+    """Folder of the situations, or the path of their table."""
     digest: str = ""
-    """What tells these situations from others (empty: any will do)."""
+    """Digest of the situations, which is verified (empty: accept any situations)."""
     rows: int = 1
     """Number of situations."""
     order: Order = "shuffled"
-    """In which they come, one after another from a random one on."""
+    """Order of the situations, from a random one on."""
     names: tuple[str, ...] = ("observation",)
-    """Slices of an observation."""
+    """Names of the slices of an observation."""
     entries: tuple[int, ...] = (1,)
-    """Entries of each slice."""
+    """Number of entries of each slice."""
     actions: Actions = "box"
-    """Kind of actions."""
+    """Kind of action space."""
     low: tuple[float, ...] = (-1.0,)
-    """Of a box: the lower bound of each entry."""
+    """Lower bound of each entry of a box."""
     high: tuple[float, ...] = (1.0,)
-    """Of a box: the upper bound of each entry."""
+    """Upper bound of each entry of a box."""
     cues: tuple[str, ...] = ()
     """Words for more and less of each entry, as "left,right" (default: "more,less")."""
     cue_names: tuple[str, ...] = ()
@@ -78,13 +78,13 @@ class LogsConfig:
     keys: tuple[str, ...] = ()
     """Keys for more and less of each cue, as "q,a" (default: arrows for left and right, or letters of the words)."""
     centre: tuple[float, ...] = ()
-    """What networks subtract of each entry of an observation (default: nothing)."""
+    """Value subtracted from each entry of an observation before networks see it (default: 0)."""
     spread: tuple[float, ...] = ()
-    """What networks divide the rest by (default: nothing)."""
+    """Value by which each entry is divided afterwards (default: 1)."""
 
 
 def space_of(config: LogsConfig) -> Space:
-    """The actions of a configuration. Raises UserError for bounds or cues that fit no space."""
+    """Return a configuration's action space. Raises UserError for bounds or cues that fit no space."""
     if config.actions == "directions":
         return DIRECTIONS
     unit = STEPS if config.actions == "choices" else SHARE
@@ -98,7 +98,7 @@ def space_of(config: LogsConfig) -> Space:
 
 
 class Layout(WholeObservations, struct.PyTreeNode):
-    """What policies look at of recorded situations: how they are made up, and how networks see them."""
+    """Layout of recorded situations, and the features that networks see of them."""
 
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
@@ -106,7 +106,7 @@ class Layout(WholeObservations, struct.PyTreeNode):
     scale: Float[Array, " obs"]
 
     def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
-        """The observation and the actions, each entry of the order of one."""
+        """Return the observation and actions, scaled to entries of the order of 1."""
         own = jnp.clip((obs - self.centre) / self.scale, -FARTHEST, FARTHEST)
         if not isinstance(self.actions, Box):
             return Features(own, jnp.asarray(actions))
@@ -115,35 +115,35 @@ class Layout(WholeObservations, struct.PyTreeNode):
 
 
 class Place(struct.PyTreeNode):
-    """Where a walk is."""
+    """Position in a walk over the situations."""
 
     row: Int[Array, ""]  # of the situation
-    met: Int[Array, ""]  # situations of this episode before it
+    met: Int[Array, ""]  # number of situations before it in this episode
 
 
 class Logs(Layout):
-    """A walk over recorded situations, from a random one on in their order; the first follows the last.
+    """A walk over recorded situations in their order, from a random one on; after the last comes the first.
 
-    An episode ends when it has met each situation once. Nothing is rewarded. The metric `change` is how far an action
-    is from the recorded one, in the space's unit.
+    An episode ends when it has met each situation once. There is no reward. The metric `change` is the distance of an
+    action from the recorded action, in the space's unit.
     """
 
     rows: Float[Array, "n obs"]
     recorded: Float[Array, "n action"]
-    places: Int[Array, " n"]  # in the recording, of each row
+    places: Int[Array, " n"]  # each row's place in the recording
     path: str = struct.field(pytree_node=False, default="")
 
     def view(self) -> Layout:
-        """The same without the situations."""
+        """Return the layout without the situations."""
         return Layout(self.observation, self.actions, self.centre, self.scale)
 
     def reset(self, key: PRNGKeyArray) -> tuple[Place, Float[Array, " obs"]]:
-        """A random situation."""
+        """Return a random situation."""
         row = jax.random.randint(key, (), 0, len(self.rows))
         return Place(row, jnp.zeros((), jnp.int32)), self.rows[row]
 
     def step(self, key: PRNGKeyArray, state: Place, action: Float[Array, " action"]) -> tuple[Place, Step]:
-        """The next situation, whatever the action is; after all of them a random one."""
+        """Return the next situation, whatever the action; after all of them a random one."""
         following = Place((state.row + 1) % len(self.rows), state.met + 1)
         final_obs, (anew, first) = self.rows[following.row], self.reset(key)
         change = self.actions.to_unit(self.actions.distance(self.recorded[state.row], action))
@@ -154,19 +154,19 @@ class Logs(Layout):
 
 
 class Recorded(PolicyNode):
-    """The recorded actions: of a state that of its row, else that of the nearest recorded observation."""
+    """The recorded actions: those of the states' rows, or else of the nearest recorded observations."""
 
     env: Logs
 
     def act(self, key: PRNGKeyArray, states: Any, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """What was done, or proposed."""
+        """Return the recorded actions (n, action)."""
         env = self.env
         nearest = lambda one: jnp.argmin(jnp.square(env.rows - one[None]).sum(-1))  # noqa: E731
         rows = jax.lax.map(nearest, obs) if states is None else states.row
         return env.actions.retract(env.recorded[rows])
 
     def describe(self) -> dict[str, Any]:
-        """By its name."""
+        """Describe the policy by its name."""
         return {"policy": "recorded"}
 
 
@@ -179,15 +179,15 @@ def task_of(
     order: str = "shuffled",
     note: Callable[[str], None] = console.print,
 ) -> Task:
-    """A folder of situations as a task.
+    """Return a folder of situations as a task.
 
     Args:
-        folder: see `storage.situations`; a LeRobot dataset folder will do.
+        folder: see `storage.situations`; a LeRobot dataset folder is read too.
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
-        low, high: bounds of the actions, one an entry (default: the range of the recorded ones, which `note` is told).
-        actions: their kind, "box", "directions" or "choices".
-        order: of the situations, "shuffled" or "recorded".
-        note: is told what was chosen for want of better, in one line.
+        low, high: bounds of the actions, one per entry (default: the recorded actions' range, reported by `note`).
+        actions: kind of action space, "box", "directions" or "choices".
+        order: order of the situations, "shuffled" or "recorded".
+        note: called with one line about each value that had to be chosen.
 
     Raises:
         UserError: the situations cannot be read, or bounds or cues do not fit their actions.
@@ -201,7 +201,7 @@ def task_of(
     if actions == "box":
         bounds = bounds_of(found.actions, low, high, found.entries, note)
     elif low is not None or high is not None:
-        raise UserError(f"low and high bound a box, and actions are {actions}: leave them out")
+        raise UserError(f"low and high are bounds of a box, but actions are {actions}: leave them out")
     else:
         bounds = (0.0,) * size, (1.0,) * size
     names = found.entries if actions == "box" else ()
@@ -227,7 +227,7 @@ def task_of(
 
 
 def configured(config: LogsConfig, body: Body | None = None) -> Task:
-    """The task of a configuration, with other situations in it where a `body` holds some."""
+    """Return the task of a configuration; `body` gives it other situations."""
     sizes, scalars = Sizes(frame=FRAME), plain_scalars(space_of(config))
     run = RunConfig(config, sizes, scalars)
     preset = Preset("labels about recorded situations", run, (KIND.name,), (200,))
@@ -235,7 +235,7 @@ def configured(config: LogsConfig, body: Body | None = None) -> Task:
 
 
 def scales_of(observations: Float[np.ndarray, "n obs"]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """`centre` and `spread` of a configuration: mean and standard deviation of each entry, 1 where it never changes."""
+    """Return `centre` and `spread` of a configuration: mean and standard deviation per entry (1 if constant)."""
     rounded = lambda values: tuple(float(f"{value:.6g}") for value in values)  # noqa: E731
     with np.errstate(over="ignore"):
         spread = observations.std(0, dtype=np.float64)
@@ -250,12 +250,14 @@ def bounds_of(
     entries: Sequence[str] = (),
     note: Callable[[str], None] = console.print,
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """Bounds of a box of actions: those that are given, or the range of the actions, which `note` is told.
+    """Return the bounds of a box of actions: the given ones, or the range of the actions, reported by `note`.
 
     Raises UserError for one bound without the other, or an entry that never changes.
     """
     if (low is None) != (high is None):
-        raise UserError(f"{'high' if low is None else 'low'} is given alone: give low and high, a number an entry each")
+        raise UserError(
+            f"{'high' if low is None else 'low'} is given alone: give both low and high, one number per entry"
+        )
     if low is not None and high is not None:
         return low, high
     least, most = actions.min(0).tolist(), actions.max(0).tolist()
@@ -268,7 +270,7 @@ def bounds_of(
 
 
 def _check_actions(path: Path, found: Situations, space: Space) -> None:
-    """Raises UserError unless the recorded actions are some of a space."""
+    """Raise UserError unless the recorded actions belong to a space."""
     if space.size != found.actions.shape[1]:
         raise UserError(
             f"{path} has actions of {found.actions.shape[1]} entries, {space.name} have {space.size}: give another kind"
@@ -278,25 +280,27 @@ def _check_actions(path: Path, found: Situations, space: Space) -> None:
     if len(wrong):
         action = ", ".join(f"{value:.3g}" for value in found.actions[wrong[0]])
         what = "bounds that hold the recorded actions" if space.name == "box" else "another kind of actions"
-        raise UserError(f"{path}: the action of row {wrong[0]} ({action}) is none of {space.about}: give {what}")
+        raise UserError(
+            f"{path}: the action of row {wrong[0]} ({action}) does not belong to {space.about}: give {what}"
+        )
 
 
 @lru_cache(maxsize=4)
 def _read(path: Path) -> Situations:
-    """Situations, read once."""
+    """Read situations once."""
     return situations.read(path)
 
 
 def filled(config: LogsConfig, observations: Any = None, actions: Any = None) -> Logs:
-    """The environment of situations (n, obs) and (n, action) in their order; of zeros where none are given.
+    """Return the environment of situations (n, obs) and (n, action) in their order; zeros where none are given.
 
-    Raises UserError for a configuration that describes none.
+    Raises UserError for an invalid configuration.
     """
     space, size = space_of(config), sum(config.entries)
     sound = len(config.names) == len(config.entries) and min(config.entries, default=0) > 0 and config.rows > 0
     if not sound or not all(len(part) in (0, size) for part in (config.centre, config.spread)):
         raise UserError(
-            "task.names, entries, rows, centre or spread describe no situations: give the folder by logs:FOLDER"
+            "task.names, entries, rows, centre or spread do not describe situations: give the folder by logs:FOLDER"
         )
     if not all(value > 0 for value in config.spread):
         raise UserError(f"task.spread is {config.spread}: give a number above 0 for each entry of an observation")
@@ -310,15 +314,15 @@ def filled(config: LogsConfig, observations: Any = None, actions: Any = None) ->
 
 
 def _environment(config: LogsConfig, split: str) -> Logs:
-    """The situations of a configuration, which are the same in every split.
+    """Return the situations of a configuration, which are equal in every split.
 
-    Raises UserError where they are not there, or are others.
+    Raises UserError where they are missing, or differ from the configuration's digest.
     """
     if not config.path:
         raise UserError("no situations are given: name their folder, as logs:FOLDER or by --task.path")
     found, layout = _read(Path(config.path)), filled(config)
     if config.digest not in ("", found.digest):
-        raise UserError(f"{config.path} holds other situations than it did: give the folder as it was, or label anew")
+        raise UserError(f"{config.path} holds other situations than before: restore the folder, or collect new labels")
     if (found.observations.shape[1], found.actions.shape[1]) != (layout.obs_size, layout.actions.size):
         raise UserError(
             f"{config.path} has observations of {found.observations.shape[1]} entries and actions of "
@@ -335,7 +339,7 @@ def _environment(config: LogsConfig, split: str) -> Logs:
 
 
 def _picture(env: Logs, row: Any) -> tuple[situations.Picture, int]:
-    """The picture of a row, and its place in the recording. Raises UserError if there is none."""
+    """Return the picture of a row, and its place in the recording. Raises UserError if there is none."""
     if not env.path:
         raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
     place = int(env.places[row])
@@ -346,38 +350,38 @@ def _picture(env: Logs, row: Any) -> tuple[situations.Picture, int]:
 
 
 def _frames(picture: situations.Picture) -> list[Any]:
-    """The frames of a picture, of a clip several. Raises UserError if it cannot be read."""
+    """Return the frames of a picture or clip. Raises UserError if it cannot be read."""
     if picture.kind.startswith("image/") and picture.kind != "image/gif":
         return [picture.data]
     try:
         suffix = "." + picture.kind.partition("/")[2]
         found = imageio.mimread(io.BytesIO(picture.data), format=suffix, memtest=False)  # pyright: ignore
-    except Exception as error:  # readers of films raise many kinds
+    except Exception as error:  # film readers raise many exception types
         raise UserError(f"a clip cannot be read ({' '.join(str(error).split())[:80]}): give GIF or MP4") from error
     chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), CLIP_FRAMES)).round().astype(int))
     return [np.ascontiguousarray(np.asarray(found[number])[..., :3]) for number in chosen]
 
 
 def _sketch(env: Logs, state: Place) -> Sketch:
-    """The picture of a situation; of a clip its first frame."""
+    """Return the picture of a situation as a sketch; of a clip its first frame."""
     picture, place = _picture(env, state.row)
     return pictures.sketch(_frames(picture)[0], f"situation {place}")
 
 
 def _reel(env: Logs, state: Place, action: Any) -> Reel | None:
-    """A situation's clip, as recorded; None: it has a picture alone."""
+    """Return a situation's recorded clip; None if it has a single picture."""
     frames = _frames(_picture(env, state.row)[0])
     return pictures.clip(frames, CLIP_PERIOD, "as recorded") if len(frames) > 1 else None
 
 
 def _record(env: Logs, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Any], list[float]]:
-    """A picture a situation, one after another; there are no rewards."""
+    """Return one picture per situation, in order; there are no rewards."""
     rows = [row % len(env.rows) for row in range(steps)]
     return [pictures.pixels(_frames(_picture(env, row)[0])[0]) for row in rows], [0.0] * steps
 
 
 def _question(env: Logs, state: Place, obs: Any, action: Any, file: Path) -> None:
-    """The picture of a situation as PNG."""
+    """Write the picture of a situation as PNG."""
     pictures.still(_frames(_picture(env, state.row)[0])[:1], file)
 
 
@@ -397,7 +401,7 @@ LOGS = Task(
     config=LogsConfig,
     bodies=(BODY,),
     proposed=Recorded,
-    # A label is of what was seen and proposed, wherever that lies now.
+    # A label depends on what was seen and proposed, wherever the files lie now.
     labels_hold=("path", "digest", "rows", "order", "cues", "cue_names", "keys", "centre", "spread"),
     files=lambda config: {"path": config.digest} if config.path else {},
     judge_by=lambda config: LABELS,

@@ -1,4 +1,4 @@
-"""Navigation as a task: its bodies, presets, changed worlds and pictures."""
+"""Define the navigation task: its robots, presets, changed worlds and pictures."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NAVIGATION_AGENT = ddqn.Config(
 
 
 def make_teacher(config: NavigationConfig, env: Any) -> Teacher:
-    """The road map of an environment's worlds; with a preferred side, of worlds whose other side is closed."""
+    """Return the road map of the worlds; with a preferred side, of worlds with the other side closed."""
     side = SIDES[config.preferred_side]
     return make_sided_teacher(env, jnp.float32(side)) if side else make_road_map(env)
 
@@ -83,7 +83,7 @@ def _judged(*arguments: Any) -> dict[str, Any]:
 def _legged_pictures() -> Pictures:
     from cuelearner_envs.anymal import recording
 
-    above = _pictures()  # as the simple robot: it has a pose and the same lidar
+    above = _pictures()  # as for the simple robot, which has a pose and the same lidar
     return Pictures(
         record=recording.record,
         still=lambda env, frames, file: recording.still(frames, file),
@@ -98,7 +98,7 @@ SIMPLE = Body("simple", "a motion that follows its command with a lag", make_env
 
 
 def _anymal(folder: Path | None = None) -> Body:
-    """With the walking policy of a folder (None: the shipped one). Raises UserError if there is none."""
+    """Return the robot with the walking policy of a folder (None: the shipped one). Raises UserError if missing."""
     digest = ""
     if folder is not None:
         from cuelearner_envs.anymal import policy
@@ -112,8 +112,8 @@ def _anymal(folder: Path | None = None) -> Body:
 
 ANYMAL = _anymal()
 
-# What adapts agents best where a way has to be chosen, see docs/results/adaptation.md: labels read as a choice among
-# the ways that the lidar sees, the likeliest of which is always gone; questions far apart, in rounds of fifty.
+# The best settings of adaptation where a way has to be chosen, see docs/results/adaptation.md. Labels are read as a
+# choice among the ways seen by the lidar, and the likeliest is taken. Questions are far apart, in rounds of fifty.
 BY_WAYS: dict[str, Any] = {
     "guidance": "intent",
     "eps_deg": 20.0,
@@ -130,12 +130,12 @@ SCENARIOS = {
         eps_deg=2.0,
         guidance="relative",
         judge_by="success",
-        judge_bounds=(0.5, 0.25),  # which brought back most, see docs/results/adaptation.md
+        judge_bounds=(0.5, 0.25),  # these recovered most of the loss, see docs/results/adaptation.md
         sizes={"frame": "action", **PAPERS_FIT},
     ),
     "rooms": Scenario(
         "rooms, doorways and thin obstacles",
-        {"style": "rooms", "look_ahead": True},  # which took agents farther, see docs/results/adaptation.md
+        {"style": "rooms", "look_ahead": True},  # improved agents' distance, see docs/results/adaptation.md
         bound_deg=180.0,
         judge_by="success",
         **BY_WAYS,
@@ -165,7 +165,7 @@ NAVIGATION = Task(
     brief_teacher=make_brief_teacher,
     scenarios=SCENARIOS,
     longest=lambda config: config.max_steps,
-    labels_hold=("worlds", "world_seed", "max_steps", "mirrors", "look_ahead"),  # a label is of what one scan shows
+    labels_hold=("worlds", "world_seed", "max_steps", "mirrors", "look_ahead"),  # a label depends on one scan only
     presets={
         "paper": Preset(
             "the paper's figure: cluttered halls, its networks, 1 million steps a seed",
@@ -217,13 +217,13 @@ NAVIGATION = Task(
                     replay_capacity=50_000,
                     learning_rate=0.003,
                 ),
-                paced.Config(lead=0.0),  # returns up to 10: leads of 2, 5 and 10 were not shown to help
+                paced.Config(lead=0.0),  # returns go up to 10; leads of 2, 5 and 10 were not shown to help
                 NAVIGATION_KINDS,
             ),
             guidance=("none", "relative"),
             labels=(350,),
             seeds=4,
-            first_seed=1000,  # the settings were chosen on seeds below
+            first_seed=1000,  # the settings were chosen on seeds below 1000
             takes="4 seeds under two kinds of guidance: two to three minutes on 2 cores",
         ),
     },

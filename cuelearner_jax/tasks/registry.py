@@ -1,7 +1,7 @@
-"""The tasks by name: those of the package, of installed packages, and of files that the user names.
+"""Find tasks by name: those of the package, of installed packages, and of files that the user names.
 
-A task's code is loaded when the task is asked for, and that of a task from outside only when the user or an installed
-package names it, never because a file does.
+A task's code is loaded when the task is asked for. The code of an outside task is loaded only if the user or an
+installed package names it, never because a file does.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cuelearner_jax.errors import UserError, suggestion
 if TYPE_CHECKING:
     from cuelearner_jax.task import Task
 
-GROUP = "cuelearner.tasks"  # of entry points: the task's name = "package.module:name"
+GROUP = "cuelearner.tasks"  # entry points of the form: the task's name = "package.module:name"
 BUILT_IN = {
     "arm": "cuelearner_jax.tasks.arm:ARM",
     "billiards": "cuelearner_jax.tasks.billiards:BILLIARDS",
@@ -27,8 +27,8 @@ BUILT_IN = {
     "brax": "cuelearner_jax.tasks.brax:BRAX",
     "playground": "cuelearner_jax.tasks.playground:PLAYGROUND",
 }
-# Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task, which
-# bears the family's name. The family's own task, by which its folders are read, is built in.
+# Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task with the
+# family's name. The family's own task, which reads its folders, is built in.
 FAMILIES: dict[str, str] = {
     "gymnasium": "cuelearner_jax.tasks.gymnasium:task_of",
     "logs": "cuelearner_jax.tasks.logs:task_of",
@@ -40,12 +40,12 @@ _registered: dict[str, Task] = {}
 
 
 def names() -> tuple[str, ...]:
-    """Every task that can be found by its name alone; nothing of them is loaded."""
+    """Return the names of all tasks that can be found by name, without loading any."""
     return tuple(dict.fromkeys([*BUILT_IN, *_installed(), *_registered]))
 
 
 def find(name: str) -> Task:
-    """The task called `name`. Raises UserError if there is none, or an installed package's cannot be had."""
+    """Return the task called `name`. Raises UserError if it is unknown, or an installed package's does not load."""
     if name in BUILT_IN:
         return _built_in(BUILT_IN[name])
     if name in _registered:
@@ -62,7 +62,7 @@ def find(name: str) -> Task:
 
 
 def register(task: Task) -> Task:
-    """Makes a task known by its name to this process. Raises UserError if another has the name."""
+    """Make a task known by its name to this process. Raises UserError if another task has the name."""
     before = _registered.get(task.name)
     taken = task.name in BUILT_IN or task.name in _installed() or (before and before.origin != task.origin)
     if taken:
@@ -72,10 +72,9 @@ def register(task: Task) -> Task:
 
 
 def resolve(text: str) -> Task:
-    """The task that the user names: by its name, as FAMILY:ENVIRONMENT (`FAMILIES`), or from outside as
-    package.module:name, which registers it.
+    """Return the task that the user names: by its name, as FAMILY:ENVIRONMENT (`FAMILIES`), or as package.module:name.
 
-    The current folder counts as a place to import from, after all others.
+    A task from outside is registered. The current folder is searched for modules last.
 
     Raises:
         UserError: no such task, or its code cannot be loaded.
@@ -91,7 +90,7 @@ def resolve(text: str) -> Task:
 
 
 def _built_in(reference: str) -> Any:
-    """Return what the package itself has under module:NAME."""
+    """Import what the package itself has under module:NAME."""
     module, _, attribute = reference.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
@@ -103,5 +102,5 @@ def _loaded(reference: str) -> Task:
 
 
 def _installed() -> dict[str, EntryPoint]:
-    """What installed packages offer; the package's own names stay its own."""
+    """Return the entry points of installed packages, except those with the name of a built-in task."""
     return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN}

@@ -1,4 +1,4 @@
-"""Pictures of brax's and Playground's environments: what MuJoCo's renderer sees of their models."""
+"""Pictures of brax's and Playground's environments, drawn from their models by MuJoCo's renderer."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's compiled module has no stubs)
@@ -22,22 +22,22 @@ from cuelearner_jax.task import Pictures
 from cuelearner_jax.types import Reel, Sketch
 
 SIZE = (480, 360)  # width and height [pixels]
-HELD = 5  # steps for which a clip holds an action: one alone is hardly seen
-PERIOD = 0.1  # between two frames of a clip [s]
-FPS = 25.0  # of a film, a step a frame
+HELD = 5  # steps for which a clip holds an action, since one step is hardly visible
+PERIOD = 0.1  # time between two frames of a clip [s]
+FPS = 25.0  # of a film, one frame per step
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
 
 class Pose(NamedTuple):
-    """Where a model's bodies are."""
+    """Positions of a model's bodies."""
 
     qpos: Float[Array, "*steps qpos"]
-    mocap: Float[Array, "*steps bodies 3"] | None  # places of bodies that no joint moves; None: the simulator has none
+    mocap: Float[Array, "*steps bodies 3"] | None  # positions of bodies without joints; None: the simulator has none
 
 
 def pose_of(state: Running) -> Pose:
-    """Return where a state's bodies are. Raises UserError for a simulator that is not MuJoCo's kind."""
+    """Return the positions of a state's bodies. Raises UserError for a simulator unlike MuJoCo's."""
     inner = state.state
     if hasattr(inner, "data"):
         return Pose(inner.data.qpos, inner.data.mocap_pos)
@@ -47,7 +47,7 @@ def pose_of(state: Running) -> Pose:
     return Pose(physics.q, None)
 
 
-def drawn(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
+def draw_poses(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
     """Return a picture of each pose. Raises UserError for an environment without a MuJoCo model, or without OpenGL."""
     model = model_of(env.simulator())
     if model is None:
@@ -67,18 +67,18 @@ def drawn(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
 
 
 def picture(env: JaxEnvironment, state: Running) -> Frame:
-    """Return what a state looks like. Raises UserError as `drawn`."""
-    return drawn(env, [jax.device_get(pose_of(state))])[0]
+    """Return a picture of a state. Raises UserError as `draw_poses`."""
+    return draw_poses(env, [jax.device_get(pose_of(state))])[0]
 
 
 def sketch(env: JaxEnvironment, state: Running) -> Sketch:
-    """Return what a state looks like, for the page."""
+    """Return a sketch of a state for the labelling page."""
     return pictures.sketch(picture(env, state), f"step {int(state.steps) + 1}")
 
 
 @jax.jit
 def _held(env: JaxEnvironment, state: Running, action: Float[Array, " action"]) -> tuple[Pose, Array]:
-    """Where bodies are after each step of holding an action, and which of the steps ended the episode."""
+    """Return the pose after each step of holding an action, and whether that step ended the episode."""
 
     def advance(state: Running, number: Array) -> Any:
         after, step = env.step(jax.random.key(number), state, action)
@@ -88,26 +88,26 @@ def _held(env: JaxEnvironment, state: Running, action: Float[Array, " action"]) 
 
 
 def _clip(env: JaxEnvironment, state: Running, action: Any) -> list[Frame]:
-    """Pictures from a state on while an action is held, up to the end of the episode."""
+    """Return pictures from a state on while an action is held, up to the end of the episode."""
     poses, ended = jax.device_get(_held(env, state, jax.numpy.asarray(action)))
     whole = int(np.flatnonzero(ended)[0]) if ended.any() else HELD
-    return drawn(env, [jax.device_get(pose_of(state)), *_rows(poses, whole)])
+    return draw_poses(env, [jax.device_get(pose_of(state)), *_rows(poses, whole)])
 
 
 def _rows(poses: Pose, count: int) -> list[Pose]:
-    """The first poses of many."""
+    """Return the first `count` poses, one by one."""
     mocap = [None] * count if poses.mocap is None else poses.mocap
     return [Pose(poses.qpos[number], mocap[number]) for number in range(count)]
 
 
 def reel(env: JaxEnvironment, state: Running, action: Float[Array, " action"]) -> Reel:
-    """Return what an action leads to that is held for a few steps."""
+    """Return a clip of holding an action for a few steps."""
     frames = _clip(env, state, action)
     return pictures.clip(frames, PERIOD, f"held for {len(frames) - 1} steps")
 
 
 def record(env: JaxEnvironment, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
-    """Return a picture before each step, and each step's reward. Raises UserError as `drawn`."""
+    """Return a picture before each step, and each step's reward. Raises UserError as `draw_poses`."""
 
     @jax.jit
     def play(env: JaxEnvironment, key: PRNGKeyArray) -> Any:
@@ -124,11 +124,11 @@ def record(env: JaxEnvironment, policy: Any, key: PRNGKeyArray, steps: int) -> t
 
     poses, rewards = jax.device_get(play(env, key))
     user_code.tell()
-    return drawn(env, _rows(poses, steps)), rewards.tolist()
+    return draw_poses(env, _rows(poses, steps)), rewards.tolist()
 
 
 def question(env: JaxEnvironment, state: Running, obs: Any, action: Any, file: Path) -> None:
-    """Write what a state looks like, and what it looks like after the action was held, side by side."""
+    """Write two pictures side by side: the state, and the state after holding the action."""
     frames = _clip(env, state, action)
     pictures.still([frames[0], frames[-1]], file)
 

@@ -1,4 +1,4 @@
-"""What the families of tasks over JAX simulators share: the configuration, the environment, the preset."""
+"""Shared parts of the task families over JAX simulators: configuration, environment and preset."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ from cuelearner_jax.task import Pictures, Preset
 
 @dataclass(frozen=True)
 class SimulatorConfig:
-    """One environment of a family. Every field is an option `--task.…`, the line below it its help.
+    """Configuration of a family's environment. Every field is an option `--task.…`; its docstring is the help.
 
-    The fields after `max_steps` say what policies look at, so that a stored policy is read without the simulator.
+    The fields after `max_steps` describe observations and actions, so that a stored policy is read without the
+    simulator.
     """
 
     environment: str = ""
-    """The family's name of the environment; FAMILY:NAME fills it, and the layout below."""
+    """Name of the environment in its library; FAMILY:NAME fills this field and the layout below."""
     max_steps: int = 1000
-    """Steps after which an episode is truncated."""
+    """Largest number of steps of an episode, after which it is truncated."""
     slices: tuple[str, ...] = ()
     """Layout: names of an observation's slices."""
     slice_sizes: tuple[int, ...] = ()
@@ -39,14 +40,14 @@ class SimulatorConfig:
 
     @property
     def layout(self) -> Layout:
-        """What policies look at."""
+        """The layout of observations and actions."""
         return Layout(self.slices, self.slice_sizes, self.entries)
 
 
 def environment_of(family: str, config: SimulatorConfig, simulator: Callable[[], Any]) -> JaxEnvironment:
-    """Return the environment of a configuration; the simulator is made when it is first stepped or reset.
+    """Return the environment of a configuration; the simulator is made at the first step or reset.
 
-    Raises UserError for a configuration that names no environment, or a number that makes no sense.
+    Raises UserError for a configuration without an environment, or an invalid number.
     """
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     if not isinstance(config.environment, str) or not config.environment:
@@ -76,13 +77,13 @@ def _check_row(name: str, values: Any, kind: type) -> None:
 
 
 def pictures() -> Pictures:
-    """Return how these environments are drawn."""
+    """Return the drawing functions of these environments."""
     from cuelearner_jax.tasks import simulator_pictures  # MuJoCo's loading is not for every command
 
     return simulator_pictures.PICTURES
 
 
-def described(family: str, name: str, simulator: Any) -> dict[str, Any]:
+def config_fields(family: str, name: str, simulator: Any) -> dict[str, Any]:
     """Return the fields of a configuration that follow from a simulator."""
     slices, sizes, entries = layout_of(simulator, name)
     return {"environment": name, "slices": slices, "slice_sizes": sizes, "entries": entries}

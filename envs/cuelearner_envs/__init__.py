@@ -1,1 +1,1 @@
-"""The tasks of CueLearner: environments, teachers and drawings. They know no agent."""
+"""The tasks of CueLearner: environments, teachers and drawings. No agent is used here."""

@@ -1,4 +1,4 @@
-"""Whether a number of a task's configuration can be worked with: refused in one line, before anything is made of it."""
+"""Validate numbers and words of a task's configuration; an invalid one is refused in one line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def check_number(
     whole: bool = False,
     unit: str = "",
 ) -> None:
-    """Raises UserError unless a field holds a number that stays one in single precision, and lies within bounds.
+    """Raise UserError unless a field holds a number that stays one in single precision, and lies within bounds.
 
     Args:
         name: of the field.
@@ -47,13 +47,13 @@ def check_number(
 
 
 def check_word(name: str, value: Any, known: Iterable[str]) -> None:
-    """Raises UserError unless a field holds one of the words that it can."""
+    """Raise UserError unless a field holds one of the words that it can."""
     if not isinstance(value, str) or value not in tuple(known):
         raise UserError(f"task.{name} is {format_value(value)}{suggestion(str(value), known)}")
 
 
 def check_vector(name: str, value: Any, size: int, least: float, most: float, unit: str = "") -> None:
-    """The same of a field that holds `size` numbers."""
+    """Like `check_number`, for a field that holds `size` numbers."""
     if not isinstance(value, (tuple, list)) or len(value) != size:
         raise UserError(f"task.{name} is {format_value(value)}: give {size} numbers")
     for entry in value:

@@ -216,7 +216,7 @@ def test_threads_are_told_of_their_own_policy():
 
 def test_a_folder_whose_replacement_was_cut_short_is_said_to_stand_aside(tmp_path):
     os.mkdir(tmp_path / ".mine.old")
-    with pytest.raises(cl.UserError, match=r"stands aside as .*\.mine\.old: rename it back"):
+    with pytest.raises(cl.UserError, match=r"set aside as .*\.mine\.old: rename that folder back"):
         cl.load_policy(tmp_path / "mine")
 
 

@@ -299,19 +299,19 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
 
 def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
-    refused(["adapt", "own_turned:straight", *new], "is to act in some task: name it, as --task", tmp_path)
+    refused(["adapt", "own_turned:straight", *new], "needs a task to act in: give one, for instance --task", tmp_path)
     plain = ["adapt", "own_turned:straight", *TASK, *new]
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
     refused([*plain, "--bound-deg", "200"], "bound_deg is 200: give a number above 0 and up to 180", tmp_path)
     refused([*plain, "--bound-deg", "0.3"], "say nothing within a bound of 0.3: give a smaller", tmp_path)
-    refused([*plain, "--guidance", "none"], "asks nothing that could be learned from", tmp_path)
+    refused([*plain, "--guidance", "none"], "asks no questions", tmp_path)
     refused([*plain, "--guidance", "relativ"], "did you mean 'relative'", tmp_path)
-    refused([*plain, "--judge-by", "hits"], "no metric of turned, did you mean 'hit'", tmp_path)
+    refused([*plain, "--judge-by", "hits"], "not a metric of turned, did you mean 'hit'", tmp_path)
     refused([*plain, "--judge-episodes", "0"], "judge_episodes is 0", tmp_path)
     refused([*plain, "--judge-every", "7"], "judge_every is 7: give a multiple", tmp_path)
     refused([*plain, "--judge-bounds", "0.5", "1.5"], "judge_bounds is 0.5 1.5: give shares", tmp_path)
     refused([*plain, "--judge-bounds", "0.5", "--judge-by", "labels"], "judge_bounds needs episodes", tmp_path)
-    refused([*plain, "--base.seeds", "3"], "own_turned:straight is none: leave it out", tmp_path)
+    refused([*plain, "--base.seeds", "3"], "own_turned:straight is not a folder: leave it out", tmp_path)
     refused([*plain, "--labels-from", tmp_path / "no.parquet"], "no label file at", tmp_path)
     refused(["adapt", "own_turned:narrow", *TASK, *new], "returned actions of shape (1, 1)", tmp_path)
     refused(["adapt", "own_turned:failing", *TASK, *new], "failing raised RuntimeError: out of ink: mend", tmp_path)

@@ -227,4 +227,8 @@ def test_what_calibration_cannot_use_is_refused(home, refused, tmp_path):
     relative = [word for word in relative if word != "calibration"]
     relative.remove("--guidance")
     refused(relative, "give guidance calibration", tmp_path)
-    refused(["train", "own_askew:TASK", "--guidance", "calibration", *ask[-2:]], "give it to `adapt` alone", tmp_path)
+    refused(
+        ["train", "own_askew:TASK", "--guidance", "calibration", *ask[-2:]],
+        "use it with `cuelearner adapt` only",
+        tmp_path,
+    )

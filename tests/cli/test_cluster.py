@@ -112,7 +112,7 @@ REFUSED = [
     ([*SLURM, "--overwrite"], "would delete its own work"),
     ([*SWEEP, "--cluster", "slurm"], "--shards of at least 1"),
     ([*SWEEP, "--cluster", "slurm", "--shards", "0"], "it is 0"),
-    ([*SWEEP, "--cluster", "slurm", "--shards", "3"], "2 seeds do not make 3 pieces"),
+    ([*SWEEP, "--cluster", "slurm", "--shards", "3"], "2 seeds cannot be divided into 3 shards"),
     ([*SWEEP, "--cluster", "lsf", "--shards", "2"], "'slurm'"),
     ([*SWEEP, "--shards", "2"], "belong to --cluster"),
     ([*SWEEP, "--job.gpus", "2"], "belong to --cluster"),
@@ -121,7 +121,7 @@ REFUSED = [
     ([*SLURM, "--job.slurm", "qos"], "give KEY=VALUE"),
     ([*SLURM, "--job.slurm", "array=0-9"], "cannot set 'array'"),
     ([*SLURM, "--job.minutes", "2"], "give less than the 120 s"),
-    (SLURM, "no srun here"),
+    (SLURM, "srun is not installed here"),
 ]
 
 
@@ -146,10 +146,10 @@ def test_what_slurm_refuses_leaves_nothing_behind(refused, slurm, tmp_path):
 
 def test_a_folder_of_another_cut_is_refused(refused, tmp_path):
     (tmp_path / "run" / "shard-1-of-3").mkdir(parents=True)
-    refused([*SLURM, "--out", tmp_path / "run"], "shard-1-of-3 is a piece of another cut", tmp_path)
+    refused([*SLURM, "--out", tmp_path / "run"], "shard-1-of-3 is a shard of another division", tmp_path)
     (tmp_path / "whole").mkdir()
     (tmp_path / "whole" / "config.json").write_text("{}")
-    refused([*SLURM, "--out", tmp_path / "whole"], "not cut into pieces", tmp_path)
+    refused([*SLURM, "--out", tmp_path / "whole"], "not cut into shards", tmp_path)
 
 
 def test_a_piece_gets_the_sweeps_options_alone():

@@ -27,7 +27,7 @@ def test_a_runs_agent_is_exported_and_checked(run_folder, refused, tmp_path, cap
     own = load_policy(run_folder, guidance="relative", labels=20, seed=2001)
     np.testing.assert_allclose(own(obs), actions, atol=1e-5)
     assert main(["export", "--check", str(out)]) == 0
-    assert "is as it was exported" in capsys.readouterr().out
+    assert "is unchanged since its export" in capsys.readouterr().out
 
     def no(command, says):
         refused([str(part) for part in command], says, tmp_path)

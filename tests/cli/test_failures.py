@@ -81,7 +81,7 @@ def test_an_out_that_cannot_be_is_refused_before_any_work(refused, tmp_path, com
     (tmp_path / "file").write_text("mine")
     (tmp_path / "link").symlink_to("nowhere")
     for out in (tmp_path / "file" / "run", tmp_path / "new" / ".." / "file" / "run"):
-        refused([*command, "--out", out], "file is no folder: give another --out", tmp_path)
+        refused([*command, "--out", out], "file is not a folder: give another --out", tmp_path)
     refused([*command, "--out", tmp_path / "link"], "is a link to nothing", tmp_path)
     refused([*command, "--out", tmp_path / ("x" * 300)], "File name too long", tmp_path)
     refused([*command, "--out", "/proc/run"], "nothing can be made in /proc", tmp_path)
@@ -192,7 +192,7 @@ def test_labels_that_do_not_fit_are_refused(refused, copy, tmp_path):
     new = ["--out", tmp_path / "new"]
     relative = [*QUICK, "--guidance", "relative", "--labels-from", file]
     other = [*relative, "--labels", "20", "--seeds", "2", "--task.table", "easy", *new]
-    refused(other, "labels of a world with another task.table (one_ball, this run's is easy)", copy)
+    refused(other, "labels of a world with another task.table (one_ball; this run has easy)", copy)
     refused([*relative, "--labels", "500", "--seeds", "2", *new], "lower --labels or collect more", copy)
     refused([*relative, "--labels", "20", "--seeds", "3", *new], "seeds 2000, 2001, none for seed 2002", copy)
     refused([*QUICK, "--guidance", "none", "--labels-from", file, *new], "add --guidance relative", copy)

@@ -47,7 +47,9 @@ def test_a_run_is_opened_without_its_environment_and_played_where_its_code_is_na
     assert (described["name"], described["environment"]) == ("gymnasium", "gymnasium_worlds:reach")
     policy = cl.load_policy(run)  # nothing is imported for it
     assert policy(np.zeros(6)).shape == (3,)
-    says = "environment gymnasium_worlds:reach is code, which no file may import: name it anew, as gymnasium:"
+    says = (
+        "environment gymnasium_worlds:reach is code, which is not imported because a file names it: name it again, as"
+    )
     refused(["evaluate", run, "--episodes", "4"], says, run)
     assert main(["evaluate", str(run), "--env", REACH, "--episodes", "4", "--task.processes", "1"]) == 0
     assert "success" in capsys.readouterr().out
@@ -59,7 +61,11 @@ def test_a_file_may_not_have_an_id_import_code(run, refused, tmp_path):
         folder.mkdir()
         shutil.copy(run / "config.json", folder)
         probes.edit_json(folder / "config.json", lambda told, name=name: told["task"].update(environment=name))
-        refused(["evaluate", folder, "--policy", "uniform", "--episodes", "2"], "which no file may import", folder)
+        refused(
+            ["evaluate", folder, "--policy", "uniform", "--episodes", "2"],
+            "not imported because a file names it",
+            folder,
+        )
 
 
 @pytest.mark.long

@@ -78,7 +78,7 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--sizes.candidates", "3", "--sizes.ensemble", "2"], "--sizes.candidates is above 1"),
         (["--bound-deg", "0"], "--bound-deg is 0: give a number above 0 and up to 180"),
         (["--port", "70000"], "--port is 70000: give a number"),
-        (["--base.seed", "1"], "--base.… chooses in a folder, and none is given"),
+        (["--base.seed", "1"], "--base.… chooses a folder's lane, but no folder is given"),
         (["--who", " "], "--who is empty"),
         (["--one-cue"], "--one-cue is for relative answers about several cues: leave it out"),
         (["--cues", "left,right"], "has its own: leave it out"),
@@ -104,7 +104,7 @@ def test_a_task_that_nobody_draws_is_refused_before_anything_is_made(refused, tm
     bare = "import dataclasses, page_task\nTASK = dataclasses.replace(page_task.TASK, bodies=("
     bare += "page_task.TASK.bodies[0].__class__('point', '', page_task._world),), name='undrawn')\n"
     (code / "undrawn.py").write_text(bare)
-    says = "has no pictures of point: a person cannot label what nobody draws; give its Body `pictures`"
+    says = "has no pictures of point: the page has nothing to show; give its Body `pictures`"
     refused(["label", "undrawn:TASK", "--out", "labels"], says, work)
 
 
@@ -115,7 +115,7 @@ def test_a_port_in_use_is_refused_before_anything_is_made(refused, tmp_path):
         taken.listen()
         port = taken.getsockname()[1]
         command = ["label", OWN, "--out", tmp_path / "labels", "--port", str(port)]
-        refused(command, f"port {port} of 127.0.0.1 cannot be had", tmp_path)
+        refused(command, f"port {port} of 127.0.0.1 is not available", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -229,7 +229,7 @@ def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
     refused(["labels", "merge", labelled / "one", "--out", both], "both.parquet exists: give another --out", tmp_path)
     refused(["labels", "export", both, labelled / "one", "--out", "x.csv"], "takes one label file", tmp_path)
     refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
-    refused(["labels", "inspect", both, "--teacher"], "cannot be had again", tmp_path)
+    refused(["labels", "inspect", both, "--teacher"], "replay its situations", tmp_path)
     refused(["labels", "mend"], "unknown command 'labels mend'", tmp_path)
 
 

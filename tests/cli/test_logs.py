@@ -84,7 +84,7 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(there, capsys):
 @pytest.mark.parametrize(
     ("command", "told"),
     [
-        (["adapt", "own_arm:policy", "--out", "p"], "is to act in some task: name it"),
+        (["adapt", "own_arm:policy", "--out", "p"], "needs a task to act in: give one"),
         (["adapt", "own_arm:policy", "--labels-from", "absent", "--out", "p"], "no label file at absent"),
         (["adapt", "own_arm:narrow", "--labels-from", "labels", "--out", "p", *SMALL], "returned actions of shape"),
         (["adapt", "absent.onnx", "--labels-from", "labels", "--out", "p"], "there is no file absent.onnx"),
@@ -94,7 +94,7 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(there, capsys):
         (["evaluate", "logs:absent"], "there is no folder of situations at absent"),
         (
             ["export", "logs:situations", "--policy", "uniform", "--only-correction", "--out", "p"],
-            "corrects no other one",
+            "has no correction",
         ),
     ],
 )

@@ -96,9 +96,11 @@ def test_pieces_are_of_one_sweep_though_one_was_begun_before_a_field_existed(pie
     for piece in ("1/2", "2/2"):
         assert main([*SWEEP, "--shard", piece, "--out", str(pieces)]) == 0
     edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["sizes"].update(frame="action"))
-    refused([*SWEEP, "--shard", "1/2", "--out", pieces], "is a piece of a sweep with another sizes.frame", pieces)
+    refused([*SWEEP, "--shard", "1/2", "--out", pieces], "is a shard of a sweep with another sizes.frame", pieces)
 
 
 def test_pieces_of_different_sweeps_are_refused(pieces, refused):
     edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["scalars"].update(eps_deg=3.0))
-    refused(["evaluate", pieces], "are pieces of different sweeps (another scalars.eps_deg): give the folder", pieces)
+    refused(
+        ["evaluate", pieces], "are shards of different sweeps (they differ in scalars.eps_deg): give the folder", pieces
+    )

@@ -44,7 +44,7 @@ def test_it_teaches_and_is_known_by_its_contents(trained, refused, tmp_path):
     assert json.loads(out.read_text())["files"] == described["files"]
     # Another teacher in the same place, then none.
     edit_json(own / "teacher.json", lambda about: about.update(seed=7))
-    refused([*command, "--resume"], "was run with another files.teacher", run)
+    refused([*command, "--resume"], "was run with other values of files.teacher", run)
     shutil.rmtree(own)
     refused([*command, "--resume"], f"no teacher in {own}", run)
     for policy in ("teacher", "corrected"):

@@ -12,7 +12,7 @@ import pytest
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry
-from cuelearner_jax.runs.order import planned
+from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.studies import adapt, evaluate, train
 
 FOLDER = Path(__file__).parents[2] / "experiments"
@@ -45,7 +45,7 @@ def test_pieces_are_bounded_and_every_world_has_its_controls(study):
 @pytest.mark.parametrize("scale", ["paper", "quick", "smoke"])
 def test_every_training_is_a_sweep_that_would_begin(study, scale, monkeypatch, tmp_path):
     orders = []
-    monkeypatch.setattr(train, "run", lambda order: orders.append(planned(order).order))
+    monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
     worlds = ("push",) if scale == "paper" else ("reach",)
     for piece in (piece for piece in study.TRAINED if piece.world in worlds):
         left = study.scaled(piece, study.SCALES[scale])

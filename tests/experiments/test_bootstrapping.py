@@ -26,7 +26,7 @@ from cuelearner_jax.guides import registry
 from cuelearner_jax.report.tables import write_csv
 from cuelearner_jax.report.variants import read_groups, variants_of
 from cuelearner_jax.run_config import GROUPS
-from cuelearner_jax.runs.order import planned
+from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.studies import train
@@ -111,7 +111,7 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
     if scale not in experiment.scales:
         pytest.skip(f"{experiment.task} has no scale {scale}")
     orders = []
-    monkeypatch.setattr(train, "run", lambda order: orders.append(planned(order).order))
+    monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
     pieces = modules["_pieces"]
     different = {}
     for piece in experiment.pieces:

@@ -288,7 +288,7 @@ def test_what_cannot_be_asked_is_refused_in_one_line(runs, tmp_path, capsys):
     (tmp_path / "more").mkdir()
     (runs / "frame").rename(tmp_path / "more" / "raw")
     both = [tmp_path / "raw", tmp_path / "more" / "raw"]
-    with pytest.raises(UserError, match="leave one of them out, or give --by-run"):
+    with pytest.raises(UserError, match="leave one of them out, or name each folder and add --by-run"):
         report(both, tmp_path / "report")
     with pytest.raises(UserError, match="several folders are called raw"):
         report(both, tmp_path / "report", by_run=True)

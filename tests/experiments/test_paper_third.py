@@ -12,7 +12,7 @@ from _pieces import sweep_command
 from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides import registry
-from cuelearner_jax.runs.order import planned
+from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.studies import train
 
@@ -31,7 +31,7 @@ def own_kinds():
 @pytest.mark.long
 def test_its_pieces_are_sweeps_that_would_begin_on_the_same_seeds(monkeypatch, tmp_path):
     orders = []
-    monkeypatch.setattr(train, "run", lambda order: orders.append(planned(order).order))
+    monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
     pieces = [piece for piece in paper_third.PIECES if piece.world == "third" and piece.run != "by-an-agent"]
     for piece in pieces:
         assert main(sweep_command(paper_third.EXPERIMENT.task, piece, tmp_path, resume=False)) == 0, piece.path

@@ -10,7 +10,7 @@ import pytest
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.guides import registry
-from cuelearner_jax.runs.order import planned
+from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.studies import train
 
 FOLDER = Path(__file__).parents[2] / "experiments"
@@ -36,7 +36,7 @@ def test_pieces_are_bounded_and_every_world_has_its_controls(study):
 @pytest.mark.parametrize("scale", ["paper", "start", "smoke"])
 def test_every_piece_is_a_sweep_that_would_begin(study, scale, monkeypatch, tmp_path):
     orders = []
-    monkeypatch.setattr(train, "run", lambda order: orders.append(planned(order).order))
+    monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
     different = {(str(piece.options), piece.kinds): piece for piece in study.PIECES if piece.world in ("easy", "halls")}
     for piece in different.values():
         left = study.scaled(piece, study.SCALES[scale])

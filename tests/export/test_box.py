@@ -53,7 +53,7 @@ def test_a_decision_in_a_box_is_the_policys_within_its_bound(folder, format):
     assert moved.max() > 0.01
     assert np.quantile(moved, 0.9) <= BOUND + 1e-5
     assert decide(DRAWN[0]).shape == (3,)
-    with pytest.raises(runner.ContractError, match="without an angle"):
+    with pytest.raises(runner.ContractError, match="that are not directions"):
         decide.angle(DRAWN[0])
 
 

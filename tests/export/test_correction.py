@@ -95,8 +95,8 @@ def test_what_is_given_wrongly_is_told(better, tmp_path):
     decide = cl.load_exported(tmp_path / "out")
     for given, told in (
         ((OTHERS,), r"give the base's action, decide\(obs, base_action\)"),
-        ((OTHERS, base(OTHERS)[:3]), "as many rows of both"),
-        ((OTHERS[:, :2], base(OTHERS)), "as many rows of both"),
+        ((OTHERS, base(OTHERS)[:3]), "equally many rows of both"),
+        ((OTHERS[:, :2], base(OTHERS)), "equally many rows of both"),
         ((OTHERS, np.full((7, 2), np.nan)), "not finite"),
     ):
         with pytest.raises(Exception, match=told) as error:
@@ -109,7 +109,7 @@ def test_what_is_given_wrongly_is_told(better, tmp_path):
 def test_a_whole_policy_takes_no_base_action_and_code_can_be_in_no_file(better, tmp_path):
     with pytest.raises(cl.UserError, match="or the correction alone"):
         cl.export_policy(better, tmp_path / "whole")
-    with pytest.raises(cl.UserError, match="corrects no other one"):
+    with pytest.raises(cl.UserError, match="has no correction"):
         cl.export_correction(cl.CallablePolicy(better.policy.base), tmp_path / "no", world=better.world)
 
 

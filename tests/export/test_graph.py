@@ -98,7 +98,7 @@ def test_numpy_and_onnx_say_what_jax_says(name):
     traced = trace(function, SIZE)
     assert (traced.missing, traced.random) == ((), False)
     graph = json.loads(json.dumps(traced.graph.as_json()))
-    run = operations.compiled(graph["ops"], set(graph["outputs"]))
+    run = operations.compile_ops(graph["ops"], set(graph["outputs"]))
     drawn = np.random.default_rng(0).random((6, SIZE), dtype=np.float32) * 1.2
     with jax.numpy_rank_promotion("allow"):
         wanted = np.stack([np.asarray(function(None, obs)) for obs in drawn])
@@ -111,7 +111,7 @@ def test_numpy_and_onnx_say_what_jax_says(name):
     np.testing.assert_allclose(np.stack(found), wanted, rtol=2e-6, atol=2e-6)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(onnx_graph.serialized(traced, SIZE, wanted.shape[1]), options)
+    session = onnxruntime.InferenceSession(onnx_graph.serialize(traced, SIZE, wanted.shape[1]), options)
     np.testing.assert_allclose(session.run(None, {"obs": drawn})[0], wanted, rtol=5e-6, atol=5e-6)
 
 
@@ -136,7 +136,7 @@ def test_what_no_pass_changes_is_done_once_before_a_loop():
 
 def test_units_that_no_candidate_turns_on_are_left_out_of_products(monkeypatch):
     traced = trace(lambda key, obs: layers(obs), SIZE)
-    run = operations.compiled(traced.graph.ops, set(traced.graph.outputs))
+    run = operations.compile_ops(traced.graph.ops, set(traced.graph.outputs))
     product, widths = np.matmul, []
     monkeypatch.setattr(np, "matmul", lambda x, y, out=None: widths.append(x.shape[1]) or product(x, y, out=out))
     run({**traced.constants, "obs": np.zeros(SIZE, np.float32)})

@@ -23,7 +23,7 @@ def planned(**options):
     sizes, scalars = label._part(GuideSizes, config.sizes), label._part(GuideScalars, SCALARS)
     options = {"labels": 20, "guidance": "relative", **options}
     asked = label.Label(config.task, sizes, scalars, label.Path("labels"), **options)
-    return label.planned(TASK, config, asked, None)
+    return label.make_plan(TASK, config, asked, None)
 
 
 def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():
@@ -42,9 +42,9 @@ def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():
 def test_what_is_picked_and_sent_is_the_answer_and_nothing_picked_is_no_answer():
     picked = {0: 1.0, 2: -1.0}
     for pressed, rest in ((controls.REST_RIGHT, 0.0), (controls.REST_UNSAID, UNSAID)):
-        np.testing.assert_array_equal(controls.given(GRIPPER, pressed, None, picked), [1.0, rest, -1.0])
-    assert controls.given(GRIPPER, controls.REST_UNSAID, None, {}) is None
-    assert controls.given(GRIPPER, controls.UNSURE, None, picked) is None
+        np.testing.assert_array_equal(controls.answer_of(GRIPPER, pressed, None, picked), [1.0, rest, -1.0])
+    assert controls.answer_of(GRIPPER, controls.REST_UNSAID, None, {}) is None
+    assert controls.answer_of(GRIPPER, controls.UNSURE, None, picked) is None
 
 
 def test_the_page_asks_about_each_cue_and_the_file_keeps_what_was_said(tmp_path):
@@ -93,7 +93,7 @@ def test_of_one_cue_the_page_has_its_words_and_shows_what_answers_would_make_of_
 
 
 def test_what_a_page_cannot_ask_is_refused():
-    with pytest.raises(UserError, match="pointed at, which a page can for directions alone"):
+    with pytest.raises(UserError, match="given by pointing, which the page supports only for directions"):
         planned(guidance="demonstration")
     with pytest.raises(UserError, match="no cues to ask about"):
         controls.check(RELATIVE, Choices(3))

@@ -55,7 +55,7 @@ def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, t
         await user.should_see("1 not known")
         await press(user, "undo", lambda: session.number == 10)
         await user.should_see("model 1, of 10 labels", retries=600)
-        await user.should_see("labels kept apart")
+        await user.should_see("held-out labels")
         user.find(marker="help").click()
         await user.should_see("more to the left: ←, A")
         (page,) = pages
@@ -81,7 +81,7 @@ def test_an_answer_names_its_item_and_pages_show_the_same(opened):
             await page._act("+1", 0, told)  # the key again, before the next question came
             await page._act("undo", 0, {"name": "undo", "item": 0})
         assert session.number == 1
-        assert told_it == ['cue.refused("another question had come by then")'] * 2  # each is told as not taken
+        assert told_it == ['cue.refused("the next question was already shown")'] * 2  # each is told as not taken
         await page._act("nonsense", 1, {"name": "nonsense", "item": 1})
         await page._act("point", 1, {"name": "point", "item": 1, "angle": 30.0})  # not of this form
         assert session.number == 1
@@ -137,7 +137,7 @@ def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
         assert sorted(answers) == sorted((value,) for value in (form.values(DIRECTIONS) if form.values else ()))
     left, _, right = controls.answers(RELATIVE, DIRECTIONS)
     assert (left.answer, left.keys, right.keys) == ((1.0,), ("ArrowLeft", "a", "A"), ("ArrowRight", "d", "D"))
-    assert controls.given(DIRECTIONS, controls.UNSURE, None, {}) is None
+    assert controls.answer_of(DIRECTIONS, controls.UNSURE, None, {}) is None
 
 
 def test_practice_is_marked_and_can_be_skipped(opened, tmp_path):
@@ -171,7 +171,7 @@ def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_w
         pages.update(its_pages)
         (page,) = its_pages
         user.find(marker="finish").click()
-        await user.should_see("0 of 20 labels are given, and saved")
+        await user.should_see("0 of 20 labels are given and saved")
         with pytest.raises(UserError, match="no answer to save yet"):
             await last.finish()
         user.find(marker="go-on").click()
@@ -180,7 +180,7 @@ def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_w
             await press(user, "+1", lambda number=number: session.number == number + 1)
         assert (await seen("GET", server.ADDRESS)).status_code == 404
         user.find(marker="finish").click()
-        await user.should_see("2 of 20 labels are given, and saved")
+        await user.should_see("2 of 20 labels are given and saved")
         with told_browser(user) as told_it:
             await page._end()
         assert told_it == [f'location.replace("{server.ADDRESS}")']

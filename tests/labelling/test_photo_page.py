@@ -129,7 +129,7 @@ def test_a_key_of_a_cue_is_no_other_controls():
 
 def test_one_press_about_one_cue_says_nothing_of_the_others():
     known = controls.controls(RELATIVE, box(CUES), one_cue=True)
-    said = {name: controls.given(box(CUES), one, None, {}) for name, one in known.items() if one.answer}
+    said = {name: controls.answer_of(box(CUES), one, None, {}) for name, one in known.items() if one.answer}
     assert said.keys() == {f"only-{cue}-{way}" for cue in range(3) for way in ("more", "less")} | {"rest"}
     np.testing.assert_array_equal(said["only-1-less"], [UNSAID, -1.0, UNSAID])
     np.testing.assert_array_equal(said["rest"], [0.0, 0.0, 0.0])
@@ -151,7 +151,7 @@ def test_one_cue_a_press_on_a_folder_of_pictures(folder, tmp_path):
         questions="proposed",
         one_cue=True,
     )
-    plan = label.planned(task, config, asked, None)
+    plan = label.make_plan(task, config, asked, None)
     with Session(plan, tmp_path / "labels") as session:
 
         async def acts(user, pages):

@@ -287,12 +287,12 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
     same = sum(bool(expert(item)[0] == (1 - abs(expert(item)[0]))) for item in items[6:])
     assert (found.count, found.value) == (8, (6 + same) / 8)
     assert theirs.people.who.tolist() == ["other"] * 8
-    merged, left_out = comparing.merged([file, theirs])
+    merged, left_out = comparing.merge([file, theirs])
     assert (merged.people.item.tolist(), left_out) == (list(range(16)), 0)
-    again, left_out = comparing.merged([file, file, merged])
+    again, left_out = comparing.merge([file, file, merged])
     assert (len(again.seeds), left_out) == (16, 16)
     nobodys = [one._replace(people=None) for one in (file, merged)]
-    assert [comparing.merged([one, file])[1] for one in nobodys] == [8, 8]
+    assert [comparing.merge([one, file])[1] for one in nobodys] == [8, 8]
 
 
 def test_labels_are_compared_with_the_teacher_in_the_situations_they_were_given_in(opened, tmp_path):

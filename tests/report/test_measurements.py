@@ -70,5 +70,5 @@ def test_variants_are_compared_with_their_own_kind_or_refused():
     rows = [measured([1], labels=100), measured([1], labels=500)]
     found = measurements.differences(rows, rows[::-1])
     assert [one.other.labels for one in found] == [100, 500]
-    with pytest.raises(UserError, match=r"leads to 2 variants .* none of them relative, 250 labels"):
+    with pytest.raises(UserError, match=r"has 2 variants .* but not relative, 250 labels"):
         measurements.differences([measured([1], labels=250)], rows)

@@ -142,8 +142,8 @@ def test_says_what_is_missing(runs, tmp_path):
     text = report(runs, tmp_path / "report").read_text()
     missing = text.split("## Missing")[1].split("## Where")[0]
     assert "scalar-a: at step 50 of 100 (50%)" in missing
-    assert "scalar, 100 labels: some seeds have reached step 100; shown to 50" in missing
-    assert "heuristic: one seed, so no interval" in missing
+    assert "scalar, 100 labels: some seeds have reached step 100; the curve ends at 50" in missing
+    assert "heuristic: a single seed, so there is no interval" in missing
     assert "nan" not in text
     assert "planned: no results" in missing
     assert "sweep/demonstration: at step 80 of 100 (80%)" in missing
@@ -168,7 +168,7 @@ def test_a_configuration_that_cannot_be_read_is_said_and_nothing_is_called_compl
     found = missing("one")
     assert "complete" not in found
     for name in ("unguided", "relative-100"):
-        assert f"what was planned in {(runs / name).as_posix()} is not known" in found
+        assert f"the plan of {(runs / name).as_posix()} is unknown" in found
     assert f"{(runs / 'relative-500').as_posix()}: has no config.json" in found
     for name, contents in whole.items():
         (runs / name / "config.json").write_bytes(contents)
@@ -272,7 +272,7 @@ def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path)
     for name in ("curves.csv", "label_efficiency.svg"):
         assert (tmp_path / "after" / name).read_text() == (tmp_path / "before" / name).read_text()
     marked, plain = ((tmp_path / out / "curves.svg").read_text() for out in ("after", "before"))
-    note = "a seed failed, and is left out"
+    note = "a failed seed, left out"
     assert note in marked
     crosses = marked.count("<use ") - plain.count("<use ") - len(note)  # letters are drawn so too
     assert crosses == 3 + 1  # one for each lane that a curve lacks, and the legend's

@@ -134,7 +134,7 @@ def test_a_policy_folder_refuses_it_in_one_line(whole):
 def test_aims_that_are_told_otherwise_are_refused(whole):
     of = source(whole)
     of.check("agent", AimedConfig(offset=0.1))
-    with pytest.raises(UserError, match="weighs aims of 4 features, this world's have 3"):
+    with pytest.raises(UserError, match="uses aims of 4 features, this world's have 3"):
         of.check("agent", AimedConfig(features=3))
 
 

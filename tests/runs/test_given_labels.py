@@ -101,7 +101,7 @@ def test_labels_that_nobody_can_have_given_are_refused(path, spoil, says):
 
 def test_labels_of_another_world_are_refused_but_for_what_they_do_not_depend_on(path):
     written(path, task={"name": "window", "half_width_deg": 14.0})
-    with pytest.raises(UserError, match=r"another task.half_width_deg \(14.0, this run's is 28.0\)"):
+    with pytest.raises(UserError, match=r"another task.half_width_deg \(14.0; this run has 28.0\)"):
         read_for(path)
     task = probes.make_task()
     assert len(read_for(path, task=dataclasses.replace(task, labels_hold=("half_width_deg",))).seeds) == 40
@@ -126,7 +126,7 @@ def test_demonstrations_are_written_and_taken_again_by_their_own_kind_alone(tmp_
     again = label_files.read(tmp_path / "given" / "demonstration" / "labels.parquet")
     np.testing.assert_array_equal(again.labels.answer, file.labels.answer)
     for other in ("relative", "scalar", "dcoach"):
-        with pytest.raises(UserError, match=f"holds demonstration answers, guidance {other} needs"):
+        with pytest.raises(UserError, match=f"holds demonstration answers, but guidance {other} needs"):
             read_for(path, Grid((other,), (4,), (10,)))
 
 

@@ -74,7 +74,7 @@ def test_a_run_comes_back_from_its_description(out):
 )
 def test_everything_that_determines_results_is_described(out, name, config, grid, options):
     check_folder(out, described(), resume=True, overwrite=False)
-    with pytest.raises(UserError, match=rf"was run with another {name}: give the same options"):
+    with pytest.raises(UserError, match=rf"was run with other values of {name}: give the same options"):
         check_folder(out, described(config, grid, **options), resume=True, overwrite=False)
 
 
@@ -93,7 +93,7 @@ def test_a_run_described_before_a_field_existed_had_its_default(out):
     check_folder(out, described(), resume=True, overwrite=False, defaults=runs.defaults(TASK))
     assert runs.load(out, find)[1] == probes.CONFIG
     other = described(probes.config(sizes={"frame": "action"}))
-    with pytest.raises(UserError, match=r"was run with another sizes\.frame: give"):
+    with pytest.raises(UserError, match=r"was run with other values of sizes\.frame: give"):
         check_folder(out, other, resume=True, overwrite=False, defaults=runs.defaults(TASK))
 
 
@@ -114,8 +114,8 @@ def not_loaded(folder, message):
 
 
 def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
-    not_loaded(tmp_path, "no run folder")
-    not_loaded(tmp_path / "missing", "no run folder")
+    not_loaded(tmp_path, "not a run folder")
+    not_loaded(tmp_path / "missing", "not a run folder")
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_a_save_that_was_killed_does_not_count(tmp_path):
 def test_no_checkpoint_is_said_so(tmp_path):
     with checkpoints(tmp_path) as saved:
         assert saved.latest() is None
-    with pytest.raises(UserError, match="stopped before its first one"):
+    with pytest.raises(UserError, match="stopped before its first checkpoint"):
         restore(tmp_path)
 
 

@@ -88,14 +88,14 @@ def test_overwriting_never_deletes_what_is_no_run(tmp_path):
     ],
 )
 def test_resuming_with_another_option_names_it(out, name, other):
-    refused(out, rf"was run with another {name}: give the same options", other, resume=True)
+    refused(out, rf"was run with other values of {name}: give the same options", other, resume=True)
 
 
 def test_resuming_names_several_options_and_those_that_only_one_side_has(out):
     other = described(scalars={"k_max": 3}, agent={"directions": 32, "batch_size": 8})
-    refused(out, r"another agent\.batch_size, agent\.directions, scalars\.k_max: give", other, resume=True)
-    refused(out, r"another scalars\.k_max: give", {**DESCRIBED, "scalars": {"eps_deg": 20.0}}, resume=True)
-    refused(out, r"another scalars\.more: give", described(scalars={"more": 1}), resume=True)
+    refused(out, r"other values of agent\.batch_size, agent\.directions, scalars\.k_max: give", other, resume=True)
+    refused(out, r"other values of scalars\.k_max: give", {**DESCRIBED, "scalars": {"eps_deg": 20.0}}, resume=True)
+    refused(out, r"other values of scalars\.more: give", described(scalars={"more": 1}), resume=True)
 
 
 def test_what_a_description_does_not_say_counts_as_the_default():

@@ -28,11 +28,11 @@ def small(tmp_path_factory):
 
 
 def test_a_file_declares_its_rows_values_and_pages(small):
-    assert footer.declared(small / "rows")[:2] == (ROWS, ROWS)
-    assert footer.declared(small / "lists")[:2] == (ROWS // WIDTH, ROWS)
-    assert footer.declared(small / "texts").strings == ("who",)
+    assert footer.read_declared(small / "rows")[:2] == (ROWS, ROWS)
+    assert footer.read_declared(small / "lists")[:2] == (ROWS // WIDTH, ROWS)
+    assert footer.read_declared(small / "texts").strings == ("who",)
     pq.write_table(pa.table({"seed": range(ROWS)}), small / "plain", use_dictionary=False, compression="zstd")
-    assert footer.declared(small / "plain").page_bytes > 8 * ROWS
+    assert footer.read_declared(small / "plain").page_bytes > 8 * ROWS
 
 
 @pytest.mark.parametrize("much", ["rows", "lists"])
@@ -60,14 +60,14 @@ def test_a_footer_that_says_less_than_its_pages_is_not_believed(small, monkeypat
         return found
 
     monkeypatch.setattr(footer._Reader, "struct", lies)
-    assert footer.declared(small / "lists").values >= ROWS
+    assert footer.read_declared(small / "lists").values >= ROWS
 
 
 @pytest.mark.parametrize("column", [pa.array([["Ada"]]), pa.array([b"12"], pa.binary(2)), pa.array([{"a": "b"}])])
 def test_columns_that_this_program_does_not_write_are_refused(column, tmp_path):
     pq.write_table(pa.table({"who": column}), tmp_path / "x")
     with pytest.raises(ValueError, match="has a type that this program does not write"):
-        footer.declared(tmp_path / "x")
+        footer.read_declared(tmp_path / "x")
 
 
 def test_constants_that_hold_for_many_rows_are_counted_for_each(tmp_path, monkeypatch):

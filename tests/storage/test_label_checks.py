@@ -175,5 +175,5 @@ def test_merging_a_file_with_itself_keeps_each_label_once(tmp_path, capsys):
     mine, both = seal(tmp_path / "labels", JSONL, HEAD, ROWS), tmp_path / "new" / "both.parquet"
     assert main(["labels", "merge", str(mine), str(mine), "--out", str(both)]) == 0
     assert "wrote 3 labels of 2 files" in (said := capsys.readouterr().out)
-    assert "; 3 that an earlier file holds already were left out" in said
+    assert "; 3 duplicates of an earlier file's labels were left out" in said
     np.testing.assert_array_equal(label_files.read(both).labels.answer[:, 0], [1.0, 0.0, -1.0])

@@ -204,9 +204,9 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
 @pytest.mark.parametrize(
     ("other", "named"),
     [
-        ({"answers": "scalar"}, r"answers \(relative, asked for is scalar\)"),
-        ({"eps_deg": 5.0}, r"eps \(20.0, asked for is 5.0\)"),
-        ({"answers": "scalar", "eps_deg": None}, r"answers \(relative, asked for is scalar\)"),
+        ({"answers": "scalar"}, r"answers \(relative; the command asks for scalar\)"),
+        ({"eps_deg": 5.0}, r"eps \(20.0; the command asks for 5.0\)"),
+        ({"answers": "scalar", "eps_deg": None}, r"answers \(relative; the command asks for scalar\)"),
     ],
 )
 @pytest.mark.parametrize("done", [False, True])
@@ -223,7 +223,7 @@ def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named, done):
 def test_foreign_files_are_not_continued(tmp_path):
     lines.Writer(tmp_path / files.JSONL, [{"seed": 1, "obs": [1.0], "action": [1.0], "answer": [1.0]}]).close()
     before = probes.files_of(tmp_path)
-    with pytest.raises(UserError, match=r"not a label file.*\(it does not say what it holds\)"):
+    with pytest.raises(UserError, match=r"not a label file.*\(it has no head\)"):
         said(tmp_path, [3])
     assert probes.files_of(tmp_path) == before
 

@@ -76,10 +76,10 @@ GOOD = {"observation": [[0.0, 1.0], [2.0, 3.0]], "action": [[0.5], [0.25]]}
         ({"action": None}, "has no column action (its columns: observation)"),
         ({"observation": [[0.0, 1.0], [2.0]]}, "rows of 1 to 2 entries|rows of 1, 2 entries"),
         ({"observation": [[0.0, 1.0], [2.0, float("nan")]]}, "the rows 1 are not finite"),
-        ({"action": [["a"], ["b"]]}, "what is no number"),
+        ({"action": [["a"], ["b"]]}, "values that are not numbers"),
         ({"picture": ["../secret.png", None]}, "leads out of"),
         ({"picture": ["/etc/passwd", None]}, "leads out of"),
-        ({"picture": ["notes.txt", None]}, "is of no kind that a page shows"),
+        ({"picture": ["notes.txt", None]}, "has a type that the page does not show"),
         ({"picture": [1.0, 2.0]}, "give the name of a file"),
         ({"observation": [], "action": []}, "holds no observations"),
     ],
@@ -101,7 +101,7 @@ def test_sizes_that_differ_are_told(tmp_path):
 
 def test_an_empty_folder_and_none_are_told(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match="is empty, and is no LeRobot dataset either"):
+    with pytest.raises(UserError, match="is empty, and is not a LeRobot dataset either"):
         situations.read(tmp_path / "empty")
     with pytest.raises(UserError, match="there is no folder of situations"):
         situations.read(tmp_path / "absent")
@@ -145,7 +145,7 @@ def test_nothing_is_unpickled(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda info: info.update(codebase_version="v2.1"), "of the format 'v2.1', v3.0 is wanted"),
+        (lambda info: info.update(codebase_version="v2.1"), "of the format 'v2.1', v3.0 is needed"),
         (lambda info: info.update(features=[]), "is damaged"),
         (lambda info: info.pop("fps"), "is damaged"),
         (lambda info: info["features"].pop("action"), "has no feature action"),

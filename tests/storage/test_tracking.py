@@ -64,7 +64,7 @@ def test_wandb_is_asked_to_stay_offline(tmp_path, monkeypatch):
     asked, logged, ended = {}, [], []
     run = SimpleNamespace(log=lambda metrics, step: logged.append((step, metrics)), finish=lambda: ended.append(True))
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **named: asked.update(named) or run))
-    with tracking.opened("wandb", tmp_path / "run" / "relative", {"seeds": 3}, 0) as tracker:
+    with tracking.open_tracker("wandb", tmp_path / "run" / "relative", {"seeds": 3}, 0) as tracker:
         tracker.log(100, {"reward": 1.0})
         assert not ended
     assert (asked["mode"], asked["group"], asked["name"]) == ("offline", "run", "run relative")
@@ -79,5 +79,5 @@ def test_unknown_and_missing_trackers_are_refused_and_none_is_fine(tmp_path, mon
     with pytest.raises(UserError, match="--track wandb needs wandb: pip install wandb"):
         tracking.check("wandb")
     tracking.check(None)
-    with tracking.opened(None, tmp_path, {}, 0) as tracker:
+    with tracking.open_tracker(None, tmp_path, {}, 0) as tracker:
         assert tracker is None

@@ -118,7 +118,7 @@ def test_what_was_made_meanwhile_stays(tmp_path, made, overwrite):
         (tmp_path / "out").mkdir()
         (tmp_path / "out" / made).write_text("theirs")
 
-    with pytest.raises(UserError, match=r"is not ours|was made meanwhile by another program and stays"):
+    with pytest.raises(UserError, match=r"is not ours|was created meanwhile by another program and is left as it is"):
         write(tmp_path / "out", "mine", overwrite, meanwhile)
     assert (tmp_path / "out" / made).read_text() == "theirs"
     assert names(tmp_path) == ["out"]
@@ -188,7 +188,7 @@ def test_readers_say_where_a_folder_stands_aside_and_writers_put_it_back(tmp_pat
         write(tmp_path / "out", "two")
     revive()
     assert not (tmp_path / "out").exists()
-    with pytest.raises(UserError, match=r"out: replacing it was cut short, .* stands aside as .*\.out\.old: rename it"):
+    with pytest.raises(UserError, match=r"out: its replacement was interrupted, .* set aside as .*\.out\.old: rename"):
         whole.check_not_aside(tmp_path / "out")
     with whole.place_of(tmp_path / "out", check, overwrite=True):
         whole.check_not_aside(tmp_path / "out")

@@ -132,7 +132,7 @@ def test_other_situations_in_the_folder_are_refused(folder):
     (folder / "situations.parquet").unlink()
     (folder / "pictures").rename(folder / "old")
     recorded.write(folder, rows=13)
-    with pytest.raises(UserError, match="holds other situations than it did"):
+    with pytest.raises(UserError, match="holds other situations than before"):
         logs.LOGS.environment(config)
 
 

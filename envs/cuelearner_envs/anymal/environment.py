@@ -1,4 +1,4 @@
-"""Navigation by the quadruped: the simple robot's task with legs, physics and a tilting sensor in place of a motion.
+"""Navigation by the quadruped: the simple robot's task with legs, physics and a tilting sensor.
 
 The chosen direction becomes a velocity command, as the simple robot takes it: walk there at up to 1 m/s, held in the
 world's frame for the step, while the body turns toward it. The walking policy acts on the command at 50 Hz, MJX
@@ -23,9 +23,9 @@ from cuelearner_envs.navigation.lidar import scan_tilted
 from cuelearner_jax.spaces.directions import difference, from_angle, rotate
 
 Scalar = float | Float[Array, ""]
-SENSOR_NOISE = 0.02  # standard deviation of a scanner's own error [m]
-CONTROL_STEPS = 10  # in a step of navigation: 0.2 s at 50 Hz
-TURNING_TIME = 0.3  # within which the body is told to be where it should look, at no more than the turn rate [s]
+SENSOR_NOISE = 0.02  # standard deviation of a scanner's range error [m]
+CONTROL_STEPS = 10  # per step of navigation: 0.2 s at 50 Hz
+TURNING_TIME = 0.3  # time constant of the commanded turn toward the heading; the turn rate stays bounded [s]
 # The command changes by no more than this [m/s^2, rad/s^2]: of robots told other ways at once 11% fell within 10 s
 # (experiments/fit_robot.py), with these bounds none.
 ACCELERATION, TURN_ACCELERATION = 8.0, 20.0
@@ -36,7 +36,8 @@ class LeggedWalker(struct.PyTreeNode):
 
     body: Body
     last_action: Float[Array, "12"]  # of the walking policy
-    told: Float[Array, "3"]  # what that is commanded: velocity forward and to the left [m/s], turning rate [rad/s]
+    # the walking policy's command: velocity forward and to the left [m/s], turning rate [rad/s]
+    told: Float[Array, "3"]
     goal: Float[Array, "2"]  # [m]
     previous: Float[Array, "3 2"]  # actions, the latest first, as they were given; zeros before the first
     world: Int[Array, ""]
@@ -52,21 +53,22 @@ class LeggedWalker(struct.PyTreeNode):
 
 
 class LeggedNavigation(Navigation, kw_only=True):
-    """The environment (`cuelearner_jax.environment.Environment`), to agents the same as `Navigation`."""
+    """The environment (`cuelearner_jax.environment.Environment`), with the interface of `Navigation`."""
 
     walking: WalkingPolicy
     ground: Ground = Ground()
     control_steps: int = struct.field(pytree_node=False, default=CONTROL_STEPS)  # `period` is that many times 0.02 s
 
     def moved(self, state: LeggedWalker, action: Float[Array, "2"]) -> LeggedWalker:
-        """The state after a step, without a reset."""
+        """Return the state after a step, without a reset."""
         heading = rotate(action, state.pose[2])
 
         def one(carry: tuple, _: None) -> tuple[tuple, None]:
             body, last_action, told, fallen = carry
             last_action, told = self.act(body, last_action, told, heading)
             after, felt = control(body, last_action, self.ground)
-            sound = jnp.isfinite(after.qvel).all()  # what blew up has fallen, and stays where it was
+            # a robot whose numbers diverged counts as fallen and stays where it was
+            sound = jnp.isfinite(after.qvel).all()
             body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, body)
             return (body, last_action, told, fallen | felt.fallen), None
 
@@ -84,12 +86,12 @@ class LeggedNavigation(Navigation, kw_only=True):
     def act(
         self, body: Body, last_action: Float[Array, "12"], told: Float[Array, "3"], heading: Float[Array, "2"]
     ) -> tuple[Float[Array, "12"], Float[Array, "3"]]:
-        """The walking policy's action and the command behind it, on the way from `told` to walking toward `heading`."""
+        """Return the walking policy's action and its command, on the way from `told` to walking toward `heading`."""
         told = self.command(body, told, heading)
         return self.walking(observe(body.qpos, body.qvel, last_action, told)), told
 
     def command(self, body: Body, told: Float[Array, "3"], heading: Float[Array, "2"]) -> Float[Array, "3"]:
-        """The command (as `LeggedWalker.told`) that follows `told` on the way toward a heading.
+        """Return the command (as `LeggedWalker.told`) that follows `told` on the way toward a heading.
 
         Args:
             body: the robot now.
@@ -106,11 +108,11 @@ class LeggedNavigation(Navigation, kw_only=True):
         return told + jnp.append(change, jnp.clip(turning - told[2], -most, most))
 
     def failures(self, state: LeggedWalker) -> dict[str, Bool[Array, ""]]:
-        """What ends an episode in failure, by name; at most one holds."""
+        """Return the failures that end an episode, by name; at most one holds."""
         return {"collision": self.collided(state) & ~state.fallen, "fall": state.fallen}
 
     def ranges(self, state: LeggedWalker) -> Float[Array, "271"]:
-        """The lidar's distances as the robot perceives them [m]: from the trunk's middle, tilted as it is."""
+        """Return the lidar's distances as the robot perceives them [m], from the middle of the tilted trunk."""
         place = state.body.qpos[:7]
         turn = robot.rotation(place[3:])
         cos, sin = jnp.cos(self.lidar.rotation), jnp.sin(self.lidar.rotation)
@@ -120,11 +122,11 @@ class LeggedNavigation(Navigation, kw_only=True):
         return self.lidar.faulty(true, place)
 
     def place(self, state: LeggedWalker) -> Float[Array, "7"]:
-        """Place and quaternion of the trunk."""
+        """Return position and quaternion of the trunk."""
         return state.body.qpos[:7]
 
     def at_rest(self, pose: Float[Array, "3"]) -> Float[Array, "7"]:
-        """The place of a robot that stands at a pose."""
+        """Return the trunk's position and quaternion for a robot standing at a pose."""
         return standing(pose[:2], pose[2]).qpos[:7]
 
     def placed(
@@ -135,7 +137,7 @@ class LeggedNavigation(Navigation, kw_only=True):
         world: Int[Array, ""],
         route: Int[Array, ""],
     ) -> LeggedWalker:
-        """A state at rest with the trunk at a place."""
+        """Return a state at rest with the trunk at a position."""
         body = standing(place[:2], 0.0)
         return LeggedWalker(
             body=body.replace(qpos=body.qpos.at[:7].set(place)),

@@ -1,4 +1,4 @@
-"""Many quadrupeds in C MuJoCo at a finer step, its solver run to convergence: an independent judge of what MJX says."""
+"""Simulate many quadrupeds in C MuJoCo with a finer step and a converged solver: an independent check of MJX."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's compiled module has no stubs)
@@ -24,15 +24,15 @@ class Judge:
     """Robots side by side. Each has a model of its own, for friction and payload."""
 
     def __init__(self, friction: Sequence[float], payload: Sequence[float], timestep: float = TIMESTEP):
-        """As many robots as `friction` and `payload` have entries, standing at the origin."""
+        """Make a robot for each entry of `friction` and `payload`, standing at the origin."""
         pairs = list(zip(friction, payload, strict=True))
         self.models = [robot.load(timestep, float(mu), float(mass)) for mu, mass in pairs]
         self.data = [mujoco.MjData(model) for model in self.models]
         self.knees = [self.models[0].body(f"{leg}_SHANK").id for leg in ("LF", "RF", "LH", "RH")]
         self.trunk = self.models[0].body("trunk").id
         self.steps = round(robot.CONTROL_PERIOD / timestep)
-        self.down = np.zeros(len(pairs), bool)  # has it fallen since it was placed?
-        self.retired = np.zeros(len(pairs), bool)  # is it of no interest any more?
+        self.down = np.zeros(len(pairs), bool)  # whether each robot has fallen since it was placed
+        self.retired = np.zeros(len(pairs), bool)  # whether each robot is no longer simulated
         for number in range(len(pairs)):
             self.place(number, np.zeros(3))
 
@@ -48,11 +48,11 @@ class Judge:
 
     @property
     def fallen(self) -> Bool[np.ndarray, " robots"]:
-        """Has it fallen (as `physics.fallen` says) since it was placed?"""
+        """Whether each robot has fallen (as `physics.fallen` says) since it was placed."""
         return self.down
 
     def place(self, number: int, pose: Float[np.ndarray, "3"]) -> None:
-        """Stands a robot at a pose [m, rad], its joints at home."""
+        """Stand a robot at a pose [m, rad], its joints at home."""
         data = self.data[number]
         mujoco.mj_resetDataKeyframe(self.models[number], data, 0)
         data.qpos[:2] = pose[:2]
@@ -61,14 +61,14 @@ class Judge:
         self.down[number] = False
 
     def push(self, number: int, change: Float[np.ndarray, "2"]) -> None:
-        """Changes the trunk's velocity at once [m/s]."""
+        """Change the trunk's velocity at once [m/s]."""
         self.data[number].qvel[:2] += change
 
     def control(self, actions: Float[np.ndarray, "robots 12"]) -> None:
-        """A step of control (0.02 s) of each robot that has not fallen or retired, with an action in [-1, 1]."""
+        """Apply one control step (0.02 s), with an action in [-1, 1], to each robot not fallen or retired."""
         targets = robot.HOME + robot.ACTION_SCALE * np.asarray(actions, float)
         up = np.flatnonzero(~(self.down | self.retired))
-        with ThreadPoolExecutor(os.cpu_count()) as pool:  # MuJoCo lets go of Python's lock
+        with ThreadPoolExecutor(os.cpu_count()) as pool:  # MuJoCo releases Python's lock
             list(pool.map(partial(self._control, targets), up, chunksize=max(1, len(up) // 8)))
 
     def _control(self, targets: Float[np.ndarray, "robots 12"], number: int | np.integer) -> None:

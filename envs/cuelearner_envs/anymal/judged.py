@@ -1,4 +1,4 @@
-"""Navigation episodes of the quadruped in C MuJoCo: the same starts, policies, commands and lidar; other physics."""
+"""Navigation episodes of the quadruped in C MuJoCo, with the starts, policies, commands and lidar of MJX."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _after(
     action: jax.Array,
     fallen: jax.Array,
 ) -> tuple[LeggedWalker, jax.Array, Any]:
-    """The state that a step of another engine has led to, what is seen there, and what has ended."""
+    """Return the state after a step of another engine, its observation, and what has ended."""
     after = state.replace(
         body=body,
         last_action=last,
@@ -62,7 +62,7 @@ class Course:
     """Robots in C MuJoCo, each in an episode of an environment."""
 
     def __init__(self, env: LeggedNavigation, keys: Key[Array, " robots"]):
-        """As many robots as keys, each at the start that `env.reset` gives for its key."""
+        """Place one robot per key, at the start that `env.reset` gives for its key."""
         self.env = env
         self.state, self.obs = _begin(env, keys)
         count = len(keys)
@@ -72,7 +72,7 @@ class Course:
 
     @property
     def outcomes(self) -> list[str]:
-        """Names of what an episode comes to."""
+        """Names of an episode's outcomes."""
         first = jax.tree.map(lambda leaf: leaf[0], self.state)
         return list(jax.eval_shape(self.env.ends, first)[0])
 
@@ -82,7 +82,7 @@ class Course:
         return np.asarray(_poses(self.state.body.qpos))
 
     def step(self, actions: jax.Array, each: Callable[[np.ndarray], None] | None = None) -> tuple[Any, Any, Any]:
-        """A step of navigation of each; `each` sees the configurations after every step of control.
+        """Take one navigation step with each robot; `each` is called with the configurations after every control step.
 
         Returns:
             outcome, terminated, truncated, as `Navigation.ends` does, each (robots,).

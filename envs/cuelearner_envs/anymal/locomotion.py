@@ -1,4 +1,4 @@
-"""Learning to walk: velocity commands are to be tracked, on uncertain ground, under noise and pushes (brax's `Env`).
+"""Learn to walk: track velocity commands on uncertain ground, under noise and pushes (brax's `Env`).
 
 The settings that make this learnable in minutes are those of a feasibility study on one accelerator: few but enough
 iterations of the solver, targets that can reach the torque limit, rewards clipped at 0 from below.
@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.physics import Body, Felt, Ground, control, standing
-from cuelearner_envs.anymal.policy import OBS, noisy, observe
+from cuelearner_envs.anymal.policy import OBS, add_noise, observe
 from cuelearner_jax.spaces.directions import from_angle
 
 Scalar = float | Float[Array, ""]
@@ -24,7 +24,7 @@ TOUCHING = 0.003  # lower than this a foot is on the floor [m]
 
 
 class Trial(struct.PyTreeNode):
-    """What a robot is put through. All of it is traced."""
+    """Conditions of a trial. All fields are traced."""
 
     speed: Scalar = 1.0  # largest commanded [m/s], in any direction
     turning: Scalar = 1.0  # largest commanded turning rate [rad/s]
@@ -51,7 +51,7 @@ class Walk(struct.PyTreeNode):
 
 
 def random_command(key: PRNGKeyArray, trial: Trial) -> Float[Array, "3"]:
-    """A velocity in a uniform direction and a turning rate, both uniform up to the trial's; or standing still."""
+    """Draw a velocity in a uniform direction and a turning rate, both uniform up to the trial's; or standing still."""
     k_angle, k_speed, k_turn, k_rest = jax.random.split(key, 4)
     velocity = from_angle(jax.random.uniform(k_angle, (), minval=-jnp.pi, maxval=jnp.pi))
     velocity = velocity * jax.random.uniform(k_speed) * trial.speed
@@ -61,15 +61,15 @@ def random_command(key: PRNGKeyArray, trial: Trial) -> Float[Array, "3"]:
 
 
 def random_ground(key: PRNGKeyArray, trial: Trial) -> Ground:
-    """Friction and payload, uniform within the trial's bounds."""
+    """Draw friction and payload, uniform within the trial's bounds."""
     k_friction, k_payload = jax.random.split(key)
     low, high = trial.friction
     friction = low + (high - low) * jax.random.uniform(k_friction)
     return Ground(jnp.asarray(friction), jax.random.uniform(k_payload) * trial.payload)
 
 
-def pushed(key: PRNGKeyArray, body: Body, trial: Trial) -> Body:
-    """Perhaps a push: the trunk's velocity changes at once."""
+def push_randomly(key: PRNGKeyArray, body: Body, trial: Trial) -> Body:
+    """Apply a random push with some probability: the trunk's velocity changes at once."""
     k_when, k_angle, k_speed = jax.random.split(key, 3)
     now = jax.random.bernoulli(k_when, robot.CONTROL_PERIOD / PUSH_EVERY)
     change = from_angle(jax.random.uniform(k_angle, (), minval=-jnp.pi, maxval=jnp.pi))
@@ -80,7 +80,7 @@ def pushed(key: PRNGKeyArray, body: Body, trial: Trial) -> Body:
 def reward(
     before: Walk, after: Body, felt: Felt, action: Float[Array, "12"], landed: Float[Array, "4"]
 ) -> dict[str, Any]:
-    """The terms of the reward, each with its weight in it; their sum counts where it is positive.
+    """Return the terms of the reward, already weighted; their sum counts where it is positive.
 
     Args:
         before: the robot before the step, with the command.
@@ -133,7 +133,7 @@ class Locomotion(envs.Env):
         return "mjx"
 
     def reset(self, rng: jax.Array) -> Any:
-        """Stands at the origin with its joints a little off; ground and command are random."""
+        """Stand at the origin with its joints a little off; ground and command are random."""
         k_body, k_yaw, k_command, k_ground, k_noise, k_next = jax.random.split(rng, 6)
         body = standing(jnp.zeros(2), jax.random.uniform(k_yaw, (), minval=-jnp.pi, maxval=jnp.pi))
         off = jax.random.uniform(k_body, (2, robot.JOINTS), minval=-1.0, maxval=1.0)
@@ -148,7 +148,7 @@ class Locomotion(envs.Env):
         zero = jnp.zeros(())
         return envs.State(
             pipeline_state=walk,
-            obs=noisy(k_noise, observe(body.qpos, body.qvel, walk.last_action, walk.command), self.trial.noise),
+            obs=add_noise(k_noise, observe(body.qpos, body.qvel, walk.last_action, walk.command), self.trial.noise),
             reward=zero,
             done=zero,
             metrics={"error": zero},
@@ -159,8 +159,8 @@ class Locomotion(envs.Env):
         """A step of control, perhaps a push, perhaps a new command. A fall ends the episode."""
         before: Walk = state.pipeline_state
         k_push, k_when, k_command, k_noise, k_next = jax.random.split(state.info["rng"], 5)
-        body, felt = control(pushed(k_push, before.body, self.trial), action, before.ground)
-        # A body whose numbers blew up has fallen; what is not a number must not reach the network.
+        body, felt = control(push_randomly(k_push, before.body, self.trial), action, before.ground)
+        # A body whose numbers diverged counts as fallen; NaN must not reach the network.
         body = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(body.qvel).all(), new, old), body, before.body)
         in_air, landed = _steps(before.in_air, felt.foot_heights < TOUCHING)
         terms = reward(before, body, felt, action, landed)
@@ -172,7 +172,7 @@ class Locomotion(envs.Env):
         error = jnp.linalg.norm(robot.planar_velocity(body.qpos, body.qvel)[:2] - before.command[:2])
         return state.replace(
             pipeline_state=walk,
-            obs=noisy(k_noise, observe(body.qpos, body.qvel, action, command), self.trial.noise),
+            obs=add_noise(k_noise, observe(body.qpos, body.qvel, action, command), self.trial.noise),
             reward=total,
             done=felt.fallen.astype(jnp.float32),
             metrics={**state.metrics, "error": error},
@@ -181,6 +181,6 @@ class Locomotion(envs.Env):
 
 
 def _steps(in_air: Float[Array, "4"], touching: Bool[Array, "4"]) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """How long each foot has been in the air [s], and how long those had been that have just landed (0: others)."""
+    """Return each foot's time in the air [s], and the time of feet that have just landed (0: others)."""
     landed = jnp.where(touching, in_air, 0.0)
     return jnp.where(touching, 0.0, in_air + robot.CONTROL_PERIOD), landed

@@ -29,7 +29,7 @@ STANDING_HEIGHT = 0.55  # of the trunk's middle, the legs at home, feet just abo
 
 
 def load(timestep: float | None = None, friction: float = FRICTION, payload: float = 0.0) -> mujoco.MjModel:
-    """The model.
+    """Load the model.
 
     Args:
         timestep: of the physics [s]; the file's 0.01 s unless given. With one, the solver runs to convergence, as a
@@ -41,7 +41,7 @@ def load(timestep: float | None = None, friction: float = FRICTION, payload: flo
 
 
 def changed(model: mujoco.MjModel, timestep: float | None, friction: float, payload: float) -> mujoco.MjModel:
-    """A model, changed in place as `load` says."""
+    """Change a model in place as `load` says; return it."""
     if timestep is not None:
         model.opt.timestep, model.opt.iterations, model.opt.ls_iterations = timestep, 100, 50
     feet = [model.geom(f"{leg}_FOOT").id for leg in ("LF", "RF", "LH", "RH")]
@@ -52,7 +52,7 @@ def changed(model: mujoco.MjModel, timestep: float | None, friction: float, payl
 
 
 def rotation(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """The matrix that turns the body's frame into the world's."""
+    """Return the matrix that rotates the body's frame into the world's."""
     w, x, y, z = quaternion
     return jnp.array(
         [
@@ -64,8 +64,8 @@ def rotation(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 
 def in_body(turn: Float[Array, "3 3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """A vector of the world's frame in the body's."""
-    # Sums, not a matrix product: an accelerator rounds the factors of those.
+    """Rotate a vector from the world's frame into the body's."""
+    # A sum, since accelerators round the factors of a matrix product.
     return jnp.sum(turn * vector[:, None], axis=0)
 
 

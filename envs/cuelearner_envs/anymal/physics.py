@@ -1,4 +1,4 @@
-"""The quadruped's physics in MJX: a step of control from the little that has to be carried between steps."""
+"""The quadruped's physics in MJX: one control step, from a minimal state."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's compiled module has no stubs)
@@ -16,16 +16,16 @@ from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.anymal import model as robot
 
-with contextlib.redirect_stdout(None):  # it tells of an optional engine that is not installed
+with contextlib.redirect_stdout(None):  # silences a note on an optional engine that is not installed
     from mujoco import mjx
 
 Scalar = float | Float[Array, ""]
-LOWEST_TRUNK, LOWEST_KNEE = 0.3, 0.05  # lower than this the robot has fallen [m]
+LOWEST_TRUNK, LOWEST_KNEE = 0.3, 0.05  # below these heights the robot counts as fallen [m]
 LEAST_UPRIGHT = 0.5  # cosine of the tilt beyond which it has fallen
 
 
 class Body(struct.PyTreeNode):
-    """All that is carried; `mjx.Data` (kilobytes) is rebuilt from it each step."""
+    """The state between control steps; `mjx.Data` (kilobytes) is rebuilt from it each step."""
 
     qpos: Float[Array, "19"]  # see `model`
     qvel: Float[Array, "18"]
@@ -33,14 +33,14 @@ class Body(struct.PyTreeNode):
 
 
 class Ground(struct.PyTreeNode):
-    """What may differ between robots."""
+    """Conditions that may differ between robots."""
 
     friction: Scalar = robot.FRICTION  # of feet on the floor
     payload: Scalar = 0.0  # carried at the trunk's centre of mass [kg]
 
 
 class Felt(struct.PyTreeNode):
-    """What a step of control tells beside the body's new state."""
+    """Measurements of a control step, beside the body's new state."""
 
     foot_heights: Float[Array, "4"]  # of the feet's lowest points above the floor [m]
     torques: Float[Array, "12"]  # of the drives, at the step's end [Nm]
@@ -49,7 +49,7 @@ class Felt(struct.PyTreeNode):
 
 @functools.cache
 def _compiled() -> tuple[Any, Any, Any]:
-    """MJX's model and an empty `mjx.Data`, and the numbers of what is looked at."""
+    """Return MJX's model, an empty `mjx.Data`, and the indices of the bodies read."""
     model = robot.load()
     legs = ("LF", "RF", "LH", "RH")
     places = {
@@ -61,13 +61,13 @@ def _compiled() -> tuple[Any, Any, Any]:
 
 
 def compiled() -> tuple[Any, Any, Any]:
-    """`_compiled`, whose arrays are real ones even where this is first called while something is traced."""
+    """Return `_compiled`, with concrete arrays even if first called while tracing."""
     with jax.ensure_compile_time_eval():
         return _compiled()
 
 
 def standing(place: Float[Array, "2"], yaw: Scalar) -> Body:
-    """The robot at rest on straight feet at a place [m], turned by `yaw` [rad]."""
+    """Return the robot at rest on straight feet at a position [m], turned by `yaw` [rad]."""
     half = jnp.asarray(yaw) / 2
     quaternion = jnp.stack([jnp.cos(half), jnp.zeros(()), jnp.zeros(()), jnp.sin(half)])
     height = jnp.full(1, robot.STANDING_HEIGHT)
@@ -76,7 +76,7 @@ def standing(place: Float[Array, "2"], yaw: Scalar) -> Body:
 
 
 def control(body: Body, action: Float[Array, "12"], ground: Ground) -> tuple[Body, Felt]:
-    """The body after a step of control (0.02 s) with an action in [-1, 1]: targets of the joints round home."""
+    """Return the body after a control step (0.02 s) with an action in [-1, 1]: joint targets relative to home."""
     model, data, places = compiled()
     trunk, feet = places["trunk"], places["feet"]
     model = model.replace(
@@ -99,7 +99,7 @@ def control(body: Body, action: Float[Array, "12"], ground: Ground) -> tuple[Bod
 
 
 def fallen(body: Body, knees: Float[Array, "4"]) -> Bool[Array, ""]:
-    """Does anything but the feet reach the floor, or is the robot on its side? True for numbers that blew up, too."""
+    """Whether the robot lies or touches the floor with more than its feet; true for diverged numbers too."""
     upright = robot.rotation(body.qpos[3:7])[2, 2]
     stands = (upright > LEAST_UPRIGHT) & (body.qpos[2] > LOWEST_TRUNK) & (knees > LOWEST_KNEE).all()
     return ~(stands & jnp.isfinite(body.qvel).all())

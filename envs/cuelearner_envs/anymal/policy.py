@@ -1,4 +1,4 @@
-"""The walking policy: what it perceives, its network as a plain function, and its file.
+"""The walking policy: its observation, its network as a plain function, and its file.
 
 policy/policy.npz    the network in half precision
 policy/policy.json   how it was trained and what it was measured to do
@@ -37,7 +37,7 @@ class WalkingPolicy(struct.PyTreeNode):
     layers: tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]  # kernel and bias of each
 
     def __call__(self, obs: Float[Array, "... 48"]) -> Float[Array, "... 12"]:
-        """Any leading axes."""
+        """Return joint targets for observations with any leading axes."""
 
         def for_each(vector: Float[Array, " n"]) -> Float[Array, "... n"]:
             return jnp.broadcast_to(vector, (*obs.shape[:-1], *vector.shape))
@@ -52,7 +52,7 @@ class WalkingPolicy(struct.PyTreeNode):
 def observe(
     qpos: Float[Array, "19"], qvel: Float[Array, "18"], last_action: Float[Array, "12"], command: Float[Array, "3"]
 ) -> Float[Array, "48"]:
-    """What the walking policy perceives, without errors.
+    """Return the walking policy's observation, without sensor errors.
 
     - 3: the trunk's velocity [m/s], 3: its angular velocity [rad/s], 3: which way is down; all in its own frame
     - 3: the command: velocity forward and to the left [m/s], turning rate [rad/s]
@@ -72,22 +72,22 @@ def observe(
     )
 
 
-def noisy(key: PRNGKeyArray, obs: Float[Array, "48"], level: float | Float[Array, ""]) -> Float[Array, "48"]:
-    """An observation with uniform errors, at `level` 1 up to `NOISE`."""
+def add_noise(key: PRNGKeyArray, obs: Float[Array, "48"], level: float | Float[Array, ""]) -> Float[Array, "48"]:
+    """Add uniform errors to an observation, at `level` 1 up to `NOISE`."""
     return obs + level * jnp.asarray(NOISE, jnp.float32) * jax.random.uniform(key, (OBS,), minval=-1.0, maxval=1.0)
 
 
 def from_brax(params: Any) -> WalkingPolicy:
-    """Of the parameters (normaliser, policy, ...) that brax's PPO trains: the network's mean, not its spread."""
+    """Make the policy from brax PPO's parameters (normaliser, policy, ...), using the network's mean action."""
     normaliser, dense = params[0], params[1]["params"]
     layers = [(dense[f"hidden_{number}"]["kernel"], dense[f"hidden_{number}"]["bias"]) for number in range(len(dense))]
     kernel, bias = layers[-1]
-    layers[-1] = kernel[:, : robot.JOINTS], bias[: robot.JOINTS]  # the rest is the logarithm of a spread
+    layers[-1] = kernel[:, : robot.JOINTS], bias[: robot.JOINTS]  # the rest is the logarithm of the standard deviation
     return WalkingPolicy(normaliser.mean, normaliser.std, tuple(layers))
 
 
 def save(folder: Path, policy: WalkingPolicy, about: dict[str, Any]) -> None:
-    """Writes a policy and what is to be known about it; replaces an earlier one in one step each."""
+    """Write a policy and what is to be known about it; replaces an earlier one in one step each."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {"mean": policy.mean, "std": policy.std}
     for number, (kernel, bias) in enumerate(policy.layers):
@@ -102,7 +102,7 @@ def save(folder: Path, policy: WalkingPolicy, about: dict[str, Any]) -> None:
 
 
 def load(folder: Path = SHIPPED) -> WalkingPolicy:
-    """A policy that `save` wrote, the shipped one by default. Raises UserError if there is none, or it is damaged."""
+    """Load a policy that `save` wrote (default: the shipped one). Raises UserError if missing or damaged."""
     file = folder / WEIGHTS
     if not file.is_file():
         command = f"python experiments/train_walking.py train --out {folder}"
@@ -115,13 +115,13 @@ def load(folder: Path = SHIPPED) -> WalkingPolicy:
         mean, std = arrays["mean"], arrays["std"]
     except PermissionError as error:
         raise UserError(f"{file} cannot be read ({error.strerror}): check its permissions") from error
-    except Exception as error:  # NumPy's and zipfile's readers raise whatever damaged bytes lead them to
+    except Exception as error:  # NumPy's and zipfile's readers raise many exception types for damaged bytes
         raise UserError(f"{file} is damaged: restore it, or train the policy anew") from error
     widths = [OBS, *(bias.size for _, bias in layers)]
     wanted = [((before, after), (after,)) for before, after in itertools.pairwise(widths)]
     shapes = [(kernel.shape, bias.shape) for kernel, bias in layers]
     if shapes != wanted or widths[-1] != robot.JOINTS or {mean.shape, std.shape} != {(OBS,)}:
-        raise UserError(f"{file} is no walking policy of this robot ({OBS} observations, {robot.JOINTS} joints)")
+        raise UserError(f"{file} is not a walking policy of this robot ({OBS} observations, {robot.JOINTS} joints)")
     if not all(np.isfinite(leaf).all() for leaf in arrays.values()) or not (std > 0).all():
-        raise UserError(f"{file} holds numbers that cannot be: train the policy anew")
+        raise UserError(f"{file} holds invalid numbers: train the policy anew")
     return WalkingPolicy(*jax.tree.map(jnp.asarray, (mean, std, layers)))

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.anymal.judged import Course
-from cuelearner_envs.anymal.scene import AZIMUTH, Picture, Studio, above, beside, furnished, unobstructed
+from cuelearner_envs.anymal.scene import AZIMUTH, Picture, Studio, above, beside, furnish, unobstructed
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import ENDS
 from cuelearner_envs.navigation.world import World
@@ -32,7 +32,7 @@ COLOURS = 200  # of a GIF
 
 
 class LeggedFrame(NamedTuple):
-    """One step of navigation, in arrays of numpy."""
+    """One navigation step, in NumPy arrays."""
 
     world: World  # the one walked in, no batch
     goal: Float[np.ndarray, "2"]  # [m]
@@ -83,7 +83,7 @@ def record(
 def still(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
     """The robot in its world at the last frame, from the side, with what its lidar perceives."""
     frame = frames[-1]
-    with Studio(furnished(frame.world, frame.goal, frame.goal_radius), *STILL) as studio:
+    with Studio(furnish(frame.world, frame.goal, frame.goal_radius), *STILL) as studio:
         studio.pose(frame.qpos[0])
         camera = unobstructed(studio.model, studio.data, distance=4.5)
         imageio.imwrite(Path(file), studio.picture(camera, frame.ends, frame.met))
@@ -106,7 +106,7 @@ def portrait(file: str | os.PathLike[str]) -> None:
 
 
 def _perceived(env: LeggedNavigation, state: Any) -> tuple[jax.Array, jax.Array, World]:
-    """Where the lidar's beams end in space, by what it reads (beams, 3) [m], which met something, and the world."""
+    """Return the perceived ends of the lidar's beams (beams, 3) [m], which beams hit something, and the world."""
     turn = robot.rotation(state.body.qpos[3:7])
     angles = BEAM_ANGLES + jnp.asarray(env.lidar.rotation)
     ahead = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
@@ -122,7 +122,7 @@ def _pictures(frames: Sequence[LeggedFrame], fps: float) -> Iterator[Picture]:
     for _, group in itertools.groupby(frames, key=lambda frame: frame.episode):
         episode = list(group)
         first = episode[0]
-        with Studio(furnished(first.world, first.goal, first.goal_radius), *VIEW) as studio:
+        with Studio(furnish(first.world, first.goal, first.goal_radius), *VIEW) as studio:
             high, near, picture = above(np.asarray(first.world.extent)), AZIMUTH, None
             moments = [(frame, qpos) for frame in episode for qpos in frame.qpos]
             for frame, qpos in moments[::stride]:

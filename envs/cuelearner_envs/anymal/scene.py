@@ -25,16 +25,16 @@ Picture = UInt8[np.ndarray, "height width 3"]
 LOW, TALL, GOAL = (0.79, 0.8, 0.82, 1), (0.36, 0.39, 0.42, 1), (0.0, 0.62, 0.45, 0.55)
 BEAM, HIT = (0.34, 0.71, 0.91, 0.16), (0.8, 0.47, 0.65, 1)
 LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
-AZIMUTH, SIDES_APART = 130, 30  # from where the robot is seen, and how far apart other sides are tried [deg]
-BEAMS_APART = 3  # of the beams every so many-th is drawn
+AZIMUTH, SIDES_APART = 130, 30  # side from which the robot is seen, and spacing of the other sides tried [deg]
+BEAMS_APART = 3  # every so many-th beam is drawn
 NO_OPENGL = (
     "MuJoCo can't render here ({}): install OpenGL for EGL (apt-get install libegl1 libgl1-mesa-dri), "
     "or OSMesa (libosmesa6) and set MUJOCO_GL=osmesa"
 )
 
 
-def furnished(world: World, goal: Float[np.ndarray, "2"], goal_radius: float) -> mujoco.MjModel:
-    """The robot's model with a world's solids and the goal, all of them to be looked at only."""
+def furnish(world: World, goal: Float[np.ndarray, "2"], goal_radius: float) -> mujoco.MjModel:
+    """Return the robot's model with a world's solids and the goal, for drawing only."""
     spec = mujoco.MjSpec.from_file(str(robot.FILE))
     look: dict[str, Any] = {"contype": 0, "conaffinity": 0}
     for (x, y, yaw, length, width), height in _used(world.boxes, world.box_heights):
@@ -55,14 +55,14 @@ class Studio:
     """Renders a model from several sides. Used as a context: the graphics memory is given back at its end."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int):
-        """Pictures of `width` by `height` dots. Raises UserError where there is no OpenGL."""
+        """Prepare pictures of `width` by `height` pixels. Raises UserError where OpenGL is missing."""
         self.model, self.data = model, mujoco.MjData(model)
         self.size = width, height
         try:
             self._gl = _gl_context()(width, height)
             self._gl.make_current()
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        except Exception as error:  # what is missing decides the kind: no library, no display, no driver
+        except Exception as error:  # the exception type depends on what is missing: library, display or driver
             raise UserError(NO_OPENGL.format(str(error).strip().split("\n")[0][:80] or type(error).__name__)) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=4000)
@@ -76,7 +76,7 @@ class Studio:
         self._gl.free()
 
     def pose(self, qpos: Float[np.ndarray, " qpos"]) -> None:
-        """Puts the model into a configuration."""
+        """Put the model into a configuration."""
         self.data.qpos[:] = qpos
         mujoco.mj_forward(self.model, self.data)
 
@@ -86,7 +86,7 @@ class Studio:
         ends: Float[np.ndarray, "beams 3"] | None = None,
         met: Bool[np.ndarray, " beams"] | None = None,
     ) -> Picture:
-        """What a camera sees; with the lidar's beams up to where they end [m] and dots where they met something."""
+        """Render a camera's view, with the lidar's beams up to their ends [m] and dots at their hits."""
         option, every = mujoco.MjvOption(), mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, self.data, option, None, camera, every, self._scene)
         if ends is not None and met is not None:
@@ -107,7 +107,7 @@ class Studio:
                 self._added(ball, HIT, end)
 
     def _added(self, kind: Any, colour: tuple, place: np.ndarray | None = None) -> Any:
-        """One more thing in the scene, of 25 mm if it has a size."""
+        """Add a shape to the scene, of 25 mm if it has a size."""
         geom = self._scene.geoms[self._scene.ngeom]
         at, size = np.zeros(3) if place is None else place, np.full(3, 0.025)
         mujoco.mjv_initGeom(geom, kind, size, at, np.eye(3).ravel(), np.asarray(colour, np.float32))
@@ -116,7 +116,7 @@ class Studio:
 
 
 def above(extent: Float[np.ndarray, "2"]) -> mujoco.MjvCamera:
-    """Looks down on the whole hall, x to the right."""
+    """Return a camera that looks down on the whole hall, x to the right."""
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.azimuth, camera.elevation = (0, 0, 0), 90, -90
     camera.distance = 1.3 * float(np.max(extent))
@@ -124,7 +124,7 @@ def above(extent: Float[np.ndarray, "2"]) -> mujoco.MjvCamera:
 
 
 def beside(qpos: Float[np.ndarray, "19"], azimuth: float = AZIMUTH, distance: float = 3.2) -> mujoco.MjvCamera:
-    """Looks at the robot from the side [deg, m], whatever stands in between."""
+    """Return a camera that looks at the robot from the side [deg, m], obstructed or not."""
     camera = mujoco.MjvCamera()
     camera.lookat[:] = qpos[0], qpos[1], 0.35
     camera.azimuth, camera.elevation, camera.distance = azimuth, -22, distance
@@ -134,14 +134,14 @@ def beside(qpos: Float[np.ndarray, "19"], azimuth: float = AZIMUTH, distance: fl
 def unobstructed(
     model: mujoco.MjModel, data: mujoco.MjData, azimuth: float = AZIMUTH, distance: float = 3.2
 ) -> mujoco.MjvCamera:
-    """Looks at the robot from the side nearest to `azimuth` where no solid stands in between [deg, m]."""
+    """Return a camera at the side nearest to `azimuth` without a solid in between [deg, m]."""
     turns = sorted(range(-180, 180, SIDES_APART), key=abs)
     cameras = [beside(data.qpos, azimuth + turn, distance) for turn in turns]
     return next((camera for camera in cameras if _sees(model, data, camera)), cameras[0])
 
 
 def _sees(model: mujoco.MjModel, data: mujoco.MjData, camera: mujoco.MjvCamera) -> bool:
-    """Is there no solid between a camera and what it looks at?"""
+    """Whether no solid lies between a camera and its target."""
     azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
     ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     hit = np.full(1, -1, np.int32)
@@ -150,7 +150,7 @@ def _sees(model: mujoco.MjModel, data: mujoco.MjData, camera: mujoco.MjvCamera) 
 
 
 def _gl_context() -> Any:
-    """MuJoCo's kind of OpenGL context: EGL, which needs no display, unless MUJOCO_GL names another."""
+    """Return MuJoCo's OpenGL context class: EGL, which needs no display, unless MUJOCO_GL names another."""
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     name = wanted if wanted in ("egl", "osmesa", "glfw") else "egl"
     if name != "glfw":
@@ -159,12 +159,12 @@ def _gl_context() -> Any:
 
 
 def _used(rows: Any, heights: Any) -> list[tuple[list[float], float]]:
-    """Solids that are there, and not far away to fill the arrays."""
+    """Return the solids in use; unused ones lie far away to fill the arrays."""
     pairs = zip(np.asarray(rows, float).tolist(), np.asarray(heights, float).tolist(), strict=True)
     return [(row, height) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
 
 
 def _shade(height: float) -> list[float]:
-    """The taller the darker."""
+    """Return a grey level, darker for taller solids."""
     share = np.clip((height - LOWEST) / (TALLEST - LOWEST), 0, 1)
     return [float((1 - share) * low + share * tall) for low, tall in zip(LOW, TALL, strict=True)]

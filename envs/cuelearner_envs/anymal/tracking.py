@@ -1,8 +1,8 @@
-"""How well a walking policy tracks random commands, in MJX and in C MuJoCo: one protocol, one way to count.
+"""Measure how well a walking policy tracks random commands, in MJX and in C MuJoCo, by one protocol.
 
-Commands change every 4 s. The last 2 s of each are settled. An error is a mean over all settled stretches of robots
-that stand: `error` of the stretch's mean velocity, `momentary_error` of the velocity at each moment, the sway of the
-gait included.
+Commands change every 4 s. The last 2 s of each count as settled. An error is a mean over all settled stretches of
+robots that stand: `error` is that of the stretch's mean velocity, `momentary_error` that of the velocity at each
+moment, which includes the gait's sway.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.judge import Judge
-from cuelearner_envs.anymal.locomotion import Trial, pushed, random_command, random_ground
+from cuelearner_envs.anymal.locomotion import Trial, push_randomly, random_command, random_ground
 from cuelearner_envs.anymal.physics import Body, Ground, control, standing
-from cuelearner_envs.anymal.policy import WalkingPolicy, noisy, observe
+from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe
 
-HELD, SETTLING = 200, 100  # steps of control that a command is held for, and of those that are no settled ones
+HELD, SETTLING = 200, 100  # control steps for which a command is held, and how many of them are not yet settled
 SECONDS = 20.0  # a robot walks for
 
 CLEAN = Trial()
@@ -48,11 +48,11 @@ def walk(
         body, last_action, down = state
         command = random_command(jax.random.fold_in(key, index // HELD), trial)
         k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
-        obs = noisy(k_noise, observe(body.qpos, body.qvel, last_action, command), trial.noise)
+        obs = add_noise(k_noise, observe(body.qpos, body.qvel, last_action, command), trial.noise)
         action = policy(obs)
-        after, felt = control(pushed(k_push, body, trial), action, ground)
+        after, felt = control(push_randomly(k_push, body, trial), action, ground)
         down = down | felt.fallen
-        body = jax.tree.map(partial(jnp.where, down), body, after)  # who has fallen stays there
+        body = jax.tree.map(partial(jnp.where, down), body, after)  # a fallen robot stays where it is
         return (body, action, down), (robot.planar_velocity(body.qpos, body.qvel), command, down)
 
     keys = jax.random.split(k_run, robots)
@@ -66,7 +66,7 @@ def walk(
     return jax.lax.scan(everyone, states, jnp.arange(steps))[1]
 
 
-def judged(
+def walk_in_mujoco(
     policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, robots: int, steps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`walk` in C MuJoCo at its finer step."""
@@ -82,8 +82,8 @@ def judged(
         def one(key: PRNGKeyArray, qpos: jax.Array, qvel: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
             command = random_command(jax.random.fold_in(key, index // HELD), trial)
             k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
-            action = policy(noisy(k_noise, observe(qpos, qvel, last, command), trial.noise))
-            after = pushed(k_push, Body(qpos, qvel, qvel), trial).qvel
+            action = policy(add_noise(k_noise, observe(qpos, qvel, last, command), trial.noise))
+            after = push_randomly(k_push, Body(qpos, qvel, qvel), trial).qvel
             return action, command, after[:2] - qvel[:2]
 
         return jax.vmap(one)(keys, qpos, qvel, last)
@@ -144,5 +144,5 @@ def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> Iterator[t
 
 def measure(policy: WalkingPolicy, engine: str, trial: Trial, key: PRNGKeyArray, robots: int) -> dict[str, float]:
     """Figures of 20 s of random commands in `mjx` or `mujoco`."""
-    play = {"mjx": walk, "mujoco": judged}[engine]
+    play = {"mjx": walk, "mujoco": walk_in_mujoco}[engine]
     return figures(*jax.device_get(play(policy, trial, key, robots=robots, steps=steps_of(SECONDS))))

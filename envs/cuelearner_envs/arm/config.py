@@ -1,4 +1,4 @@
-"""Configuration of the arm: which skill, which reward, which changes of the world and of the wish."""
+"""Configuration of the arm: its skill and reward, and changes of the world and of the preference."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ SIDES = {"none": 0.0, "left": 1.0, "right": -1.0}
 
 @dataclass(frozen=True)
 class ArmConfig:
-    """A skill of the arm and the world in which it is asked for."""
+    """A skill of the arm, and the world for it."""
 
     skill: Skill = "push"
     """reach: the gripper to a goal. push: a cube to a goal on the table. pick: a cube to one on or over the table."""
     reward: Reward = "shaped"
-    """sparse: -1 a step until success, then 0. dense: minus the distance from the goal. shaped: also half the distance
-    from gripper to cube."""
+    """sparse: -1 per step until success, then 0. dense: the negative distance from the goal. shaped: dense, less half
+    the distance from gripper to cube."""
     obstacle: bool = True
-    """Skill push: stands a post between cube and goal? Without it cube and goal lie as in FetchPush."""
+    """Skill push: place a post between cube and goal. Without the post, cube and goal lie as in FetchPush."""
     max_steps: int = 50
     """Steps of 0.04 s after which an episode is truncated."""
     within: float = 0.05
     """An episode is a success if it ends within this distance of the goal [m]."""
     camera_turn_deg: float = 0.0
-    """Changed world: the camera is turned by this about the robot's base, counterclockwise [deg]; the goal and the cube
-    seem turned."""
+    """Changed world: the camera is rotated counterclockwise about the robot's base by this angle [deg], so that goal
+    and cube seem rotated."""
     camera_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Changed world: added to where the goal and the cube are seen, x, y and z [m]."""
+    """Changed world: offset of the observed positions of goal and cube, x, y and z [m]."""
     friction: float = 1.0
     """Changed world: friction of the cube on table, fingers and post."""
     preferred_side: Literal["none", "left", "right"] = "none"
-    """Changed wish, where a post stands: the teacher pushes the cube past it on this side."""
+    """Changed preference, with a post: the teacher pushes the cube past the post on this side."""
 
     def __post_init__(self) -> None:
-        """Raises UserError with one line for the first value that cannot work."""
+        """Raise UserError with one line for the first value that cannot work."""
         check(self)
 
     @property
@@ -53,7 +53,7 @@ class ArmConfig:
 
 
 def check(config: ArmConfig) -> None:
-    """Raises UserError with one line for the first value that cannot work."""
+    """Raise UserError with one line for the first value that cannot work."""
     check_word("skill", config.skill, get_args(Skill))
     check_word("reward", config.reward, REWARDS)
     check_word("preferred_side", config.preferred_side, SIDES)

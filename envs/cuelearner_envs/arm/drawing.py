@@ -18,7 +18,7 @@ from cuelearner_envs.arm import model as arm
 Picture = UInt8[np.ndarray, "height width 3"]
 Faces = list[Float[np.ndarray, "corners 3"]]
 SIZE = (480, 360)  # width and height [pixels]
-FINER = 2  # pixels are averaged over so many squared
+FINER = 2  # the picture is drawn this many times larger and averaged down
 AZIMUTH, ELEVATION, DISTANCE = math.radians(28.0), math.radians(-45.0), 0.98  # [rad, rad, m]
 LOOK_AT = np.array([1.34, 0.75, 0.47])  # [m]
 FOCAL = 1.6  # of the picture's height
@@ -38,7 +38,7 @@ LIGHT = np.array([-0.35, 0.3, 0.88])
 
 
 class Scene(NamedTuple):
-    """What is drawn. Places in metres."""
+    """The positions to draw [m]."""
 
     gripper: Float[np.ndarray, "3"]
     fingers: Float[np.ndarray, "2"]  # how far each is open
@@ -72,7 +72,7 @@ def draw(scene: Scene) -> Picture:
 
 
 def _axes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The camera's directions: to the right, up, and along its sight."""
+    """Return the camera's axes: to the right, up, and along its view."""
     cos, sin = math.cos(ELEVATION), math.sin(ELEVATION)
     sight = np.array([cos * math.cos(AZIMUTH), cos * math.sin(AZIMUTH), sin])
     right = np.array([math.sin(AZIMUTH), -math.cos(AZIMUTH), 0.0])
@@ -84,7 +84,7 @@ _EYE = LOOK_AT - DISTANCE * _SIGHT
 
 
 def _flat(places: np.ndarray) -> list[tuple[float, float]]:
-    """Where places (n, 3) are in the picture [fine pixels]."""
+    """Return the picture positions of points (n, 3) [fine pixels]."""
     off = np.asarray(places, float) - _EYE
     scale = FOCAL * SIZE[1] * FINER / np.maximum(off @ _SIGHT, 0.05)
     x = SIZE[0] * FINER / 2 + scale * (off @ _RIGHT)
@@ -115,7 +115,7 @@ def _darker(colour: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 def _ground(scene: Scene) -> Iterator[tuple[np.ndarray, tuple[int, int, int]]]:
-    """The table, and shadows on it: below the goal, the gripper, the cube and the post."""
+    """Yield the table, and the shadows of goal, gripper, cube and post on it."""
     (x0, x1), (y0, y1) = TABLE_BOX
     low = [(x0, y1), (x0, y0), (x1, y0), (x1, y1)]
     yield np.array([(x0, y0, arm.TABLE), (x0, y0, 0.3), (x0, y1, 0.3), (x0, y1, arm.TABLE)]), EDGE
@@ -153,7 +153,7 @@ def _solids(scene: Scene) -> Iterator[tuple[Faces, tuple[int, int, int]]]:
 
 
 def _box(middle: np.ndarray, half: Sequence[float], turn: np.ndarray | None = None) -> Faces:
-    """The six faces of a box, corners counterclockwise as seen from outside."""
+    """Return the six faces of a box, corners counterclockwise as seen from outside."""
     faces, turn = [], np.eye(3) if turn is None else turn
     for axis in range(3):
         first, second = (axis + 1) % 3, (axis + 2) % 3
@@ -167,7 +167,7 @@ def _box(middle: np.ndarray, half: Sequence[float], turn: np.ndarray | None = No
 
 
 def _column(sides: int = 14) -> Faces:
-    """The post: a column of flat sides and its top."""
+    """Return the post: a column of flat sides, and its top."""
     turns = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     x, y = arm.POST_PLACE[0] + arm.POST_RADIUS * np.cos(turns), arm.POST_PLACE[1] + arm.POST_RADIUS * np.sin(turns)
     low, high = (np.stack([x, y, np.full(sides, z)], -1) for z in (arm.TABLE, arm.TABLE + arm.POST_HEIGHT))
@@ -187,7 +187,7 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _draw_goal(brush: ImageDraw.ImageDraw, goal: np.ndarray) -> None:
-    """A ring and a line down to the table, over all solids: the goal is never hidden."""
+    """Draw the goal as a ring with a line down to the table, over all solids, so that it is never hidden."""
     (x, y), (_, below) = _flat(np.array([goal, [goal[0], goal[1], arm.TABLE]]))
     radius = FOCAL * SIZE[1] * FINER * GOAL_RADIUS / float((goal - _EYE) @ _SIGHT)
     if below - y > radius:
@@ -196,7 +196,7 @@ def _draw_goal(brush: ImageDraw.ImageDraw, goal: np.ndarray) -> None:
 
 
 def _draw_action(brush: ImageDraw.ImageDraw, gripper: np.ndarray, action: np.ndarray) -> None:
-    """An arrow from the gripper, twice as long as the step that is asked for, and what the fingers are to do."""
+    """Draw an arrow from the gripper, twice as long as the action's step, and the fingers' motion."""
     action = np.asarray(action, float)
     start, end = (np.array(one) for one in _flat(np.stack([gripper, gripper + 0.1 * action[:3]])))
     way = end - start

@@ -1,4 +1,4 @@
-"""The arm as a task: what the gripper perceives, when an episode ends, what it earns. Laid out as Fetch's tasks are.
+"""The arm as a task: observation, episodes and rewards, laid out as Fetch's tasks.
 
 One step is one step of control, 0.04 s. An episode is 50 steps long and never ends before. Success: at the end the
 gripper, or the cube, is within 5 cm of the goal.
@@ -27,8 +27,8 @@ Scalar = float | Float[Array, ""]
 Skill = Literal["reach", "push", "pick"]
 Reward = Literal["shaped", "dense", "sparse"]
 REWARDS = get_args(Reward)
-PLACEMENTS = 16  # places tried for a cube that must not lie near the gripper
-WAY = 0.5  # of the way from gripper to cube in a shaped reward, to that from cube to goal
+PLACEMENTS = 16  # draws of a cube position that must not lie near the gripper
+WAY = 0.5  # weight of the distance gripper to cube in a shaped reward, relative to cube to goal
 ACTIONS = Box((-1.0,) * 4, (1.0,) * 4, cues_from(CUES, CUE_NAMES))
 
 
@@ -42,13 +42,13 @@ class Situation(struct.PyTreeNode):
 
 
 class Camera(struct.PyTreeNode):
-    """How what a camera tells is displaced: the goal and the cube, with all that derives from these."""
+    """Displacement of the positions that a camera measures: goal, cube and all that derives from them."""
 
     turn: Scalar = 0.0  # about the vertical through the robot's base, counterclockwise [rad]
     offset: Float[Array, "3"] | tuple[float, ...] = (0.0, 0.0, 0.0)  # added afterwards [m]
 
     def seen(self, place: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return where a place seems to be [m]."""
+        """Return the observed position of a point [m]."""
         cos, sin, base = jnp.cos(self.turn), jnp.sin(self.turn), jnp.asarray(BASE)
         x, y = place[:2] - base
         return jnp.stack([cos * x - sin * y + base[0], sin * x + cos * y + base[1], place[2]]) + jnp.asarray(

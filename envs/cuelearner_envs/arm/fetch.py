@@ -1,4 +1,4 @@
-"""The arm in Gymnasium-Robotics' Fetch: this camera and these rewards, the physics of what plays Fetch, no post."""
+"""The arm in Gymnasium-Robotics' Fetch: this camera and these rewards, Fetch's physics, no post."""
 
 from __future__ import annotations
 

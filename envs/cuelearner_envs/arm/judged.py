@@ -1,4 +1,4 @@
-"""Episodes of the arm in C MuJoCo: the same starts and policies; finer steps of physics, solved to convergence."""
+"""Episodes of the arm in C MuJoCo, with equal starts and policies, finer steps and a converged solver."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's compiled module has no stubs)
@@ -50,13 +50,13 @@ class Judge:
             self.data[number].ctrl[:] = targets[number]
             mujoco.mj_step(self.model, self.data[number], nstep=self.steps)
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:  # MuJoCo lets go of Python's lock
+        with ThreadPoolExecutor(os.cpu_count()) as pool:  # MuJoCo releases Python's lock
             list(pool.map(one, range(len(self.data)), chunksize=max(1, len(self.data) // 8)))
         return self.body
 
     @property
     def body(self) -> Body:
-        """Where they are."""
+        """The grippers' present configurations."""
         rows = [(data.qpos, data.qvel, data.qacc_warmstart) for data in self.data]
         return Body(*(jnp.asarray(np.stack(column), jnp.float32) for column in zip(*rows, strict=True)))
 

@@ -95,7 +95,7 @@ def _objects() -> tuple[str, str, str, str]:
 
 
 def _finger(side: str, way: int) -> str:
-    """One finger, which opens along y by `way`; Fetch's right one stands on the side of larger y."""
+    """Return the XML of one finger, which opens along y by `way`; Fetch's right finger has the larger y."""
     apart = FINGER_HALF_WIDTH - FINGER_RADIUS
     capsules = "".join(
         f'<geom name="{side}{number}" type="capsule" mass="0" size="{FINGER_RADIUS}" '

@@ -1,4 +1,4 @@
-"""The gripper's physics in MJX: a step of control from the little that has to be carried between steps."""
+"""The gripper's physics in MJX: one control step, from a minimal state."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's compiled module has no stubs)
@@ -26,7 +26,7 @@ CUBE_VELOCITY, CUBE_TURNING = slice(5, 8), slice(8, 11)  # of qvel
 
 
 class Body(struct.PyTreeNode):
-    """All that is carried; `mjx.Data` (kilobytes) is rebuilt from it each step.
+    """The state between control steps; `mjx.Data` (kilobytes) is rebuilt from it each step.
 
     Without an object there are no fingers and no cube: the gripper is three numbers.
     """
@@ -37,7 +37,7 @@ class Body(struct.PyTreeNode):
 
 
 class Ground(struct.PyTreeNode):
-    """What may differ between worlds."""
+    """Conditions that may differ between worlds."""
 
     friction: Scalar = arm.FRICTION  # of the cube on table, fingers and post
     post: Scalar = 1.0  # 1: there is a post; 0: there is none
@@ -55,7 +55,7 @@ class Command(NamedTuple):
 
 
 def _mjx() -> Any:
-    """MJX, which takes seconds to load and not every command needs."""
+    """Import MJX, which takes seconds and which not every command needs."""
     with contextlib.redirect_stdout(None):  # it tells of an optional engine that is not installed
         from mujoco import mjx
     return mjx
@@ -70,7 +70,7 @@ def _compiled(has_object: bool) -> tuple[Any, Any, int]:
 
 
 def compiled(has_object: bool) -> tuple[Any, Any, int]:
-    """`_compiled`, whose arrays are real ones even where this is first called while something is traced."""
+    """Return `_compiled`, with concrete arrays even if first called while tracing."""
     with jax.ensure_compile_time_eval():
         return _compiled(has_object)
 

@@ -1,4 +1,4 @@
-"""Where things are in the arm's world, beside what `model` says of its solids."""
+"""Positions in the arm's world, beside those of `model`'s solids."""
 
 SPREAD = 0.15  # of cubes and goals round where the gripper begins, along each axis [m]
 APART = 0.1  # of the cube from there, at least [m]

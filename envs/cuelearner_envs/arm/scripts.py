@@ -1,4 +1,4 @@
-"""Policies written by hand: they look at one observation and remember nothing.
+"""Scripted policies: memoryless functions of one observation.
 
 Observations are Fetch's, flattened: these scripts act in Fetch too, and Fetch's (`cuelearner_envs.fetch.scripts`) here.
 """
@@ -56,7 +56,7 @@ def past(obs: Observations, side: Amount = 0.0, friction: Amount = 1.0, post: Am
 
 
 def _aim(cube: Float[Array, "n 2"], goal: Float[Array, "n 2"], side: Amount) -> Float[Array, "n 2"]:
-    """Where to push the cube next: the goal, or along the tangent to a circle round the post."""
+    """Return the point to push the cube to next: the goal, or along the tangent to a circle around the post."""
     way, to_post = goal - cube, jnp.asarray(arm.POST_PLACE)[None] - cube
     length = jnp.maximum(jnp.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
     ahead = way / length

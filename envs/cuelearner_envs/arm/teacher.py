@@ -12,7 +12,7 @@ from cuelearner_jax.types import EnvState
 
 
 class ScriptTeacher(struct.PyTreeNode):
-    """Knows what the script of the skill would do where the gripper, the cube and the goal truly are."""
+    """Teacher that runs the skill's script on the true positions of gripper, cube and goal."""
 
     env: Arm
     side: Float[Array, ""] | float = 0.0  # of the post: +1 left, -1 right, 0 the shorter way

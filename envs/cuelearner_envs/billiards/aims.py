@@ -1,4 +1,4 @@
-"""The shots that a player thinks of: each ball on the table straight into each pocket.
+"""Candidate shots of a player: each ball on the table straight into each pocket.
 
 Geometry alone, from an observation; nothing is simulated. Where the cue ball must touch a target follows from how two
 discs with friction part (`impacts`): the target leaves along the line of centres, thrown a little the way of the cut.
@@ -17,12 +17,12 @@ from cuelearner_envs.billiards.table import Table, corner_gap, pockets
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.spaces.directions import difference, retract, rotate
 
-THROWS = 8  # fixed-point steps for the line of centres: the throw hangs on the cut, and the cut on the line
+THROWS = 8  # fixed-point steps for the line of centres: the throw depends on the cut, and the cut on the line
 THINNEST = 0.15  # cosine of the thinnest cut that is tried
-FARTHEST = 2.0  # clearances and misses beyond this count as this
+FARTHEST = 2.0  # clearances and misses are capped at this value
 INWARD = 0.25  # a corner pocket is aimed at this share of its gap before the corner: its jaws stand out
 GROWTH, CLEAR, SCRATCH = 4, 7, 13  # columns of an aim's features
-SURE = 3.0  # of aims whose sums by the rule differ by 1 the better is likelier by a factor of exp(3)
+SURE = 3.0  # an aim whose sum by the rule is larger by 1 is likelier by a factor of exp(3)
 EDGE = 20.0  # steepness of "there is room", per ball diameter or hole width
 
 
@@ -36,7 +36,7 @@ class Contact(NamedTuple):
 
 
 def aims_of(table: Table, obs: Float[Array, " obs"]) -> Aims:
-    """Every target into every pocket, targets first; see `Billiards.aims`."""
+    """Return the shot of every target into every pocket, targets first; see `Billiards.aims`."""
     balls = obs.reshape(-1, 3)
     targets, on_table = balls[1:, :2], balls[1:, 2] < 0
     mouths, openings = _mouths(table)
@@ -52,7 +52,7 @@ def aims_of(table: Table, obs: Float[Array, " obs"]) -> Aims:
 
 
 def rule_of(aims: Aims) -> Float[Array, " aims"]:
-    """log-weights of the aims by a rule of three numbers, all of which count alike. Chosen by hand on tuning episodes.
+    """Return log-weights of the aims by a hand-made sum of three numbers, chosen on tuning episodes.
 
     By what factor an error of the aim grows on its way to the mouth (its logarithm); by how many ball diameters another
     ball stands in the cue ball's way; whether the cue ball goes on into a pocket.
@@ -62,7 +62,7 @@ def rule_of(aims: Aims) -> Float[Array, " aims"]:
 
 
 def contact_for(table: Table, cue: Float[Array, "2"], target: Float[Array, "2"], way: Float[Array, "2"]) -> Contact:
-    """Where the cue ball must touch a target that is to leave along `way` (a direction).
+    """Return the contact at which the cue ball sends a target along `way` (a direction).
 
     Two discs with friction mu: the tangential impulse is the smaller of mu times the normal one and what ends the slip,
     so the target leaves along the normal turned toward the strike by atan(min(mu, tan(cut) / 6)).
@@ -80,13 +80,13 @@ def contact_for(table: Table, cue: Float[Array, "2"], target: Float[Array, "2"],
 
 
 def _throw(table: Table, cut: Float[Array, ""]) -> Float[Array, ""]:
-    """Angle between the line of centres and the way of the target [rad]."""
+    """Return the angle between the line of centres and the target's direction [rad]."""
     slip = jnp.tan(jnp.minimum(jnp.abs(cut), 1.5)) / (2.0 * TANGENT_PER_DISC)
     return jnp.arctan(jnp.minimum(table.friction, slip))
 
 
 def _mouths(table: Table) -> tuple[Float[Array, "pockets 2"], Float[Array, "pockets 2"]]:
-    """Where to send a ball for each pocket [m], and the direction in which one goes straight through."""
+    """Return each pocket's point to aim at [m], and the direction straight through it."""
     places = pockets(table)
     corner = jnp.abs(places[:, :1]) > 0.0
     outward = retract(jnp.where(corner, jnp.sign(places), places))
@@ -103,7 +103,7 @@ def _features(
     mouth: Float[Array, "2"],
     opening: Float[Array, "2"],
 ) -> Float[Array, "features"]:
-    """What makes the shot hard, of the order of one, the same for its mirror image."""
+    """Return features of a shot's difficulty, of the order of 1, equal for its mirror image."""
     radius, diameter = table.ball_radius, 2.0 * table.ball_radius
     way = mouth - targets[ball]
     far, near = jnp.linalg.norm(way), jnp.linalg.norm(contact.place - cue)
@@ -128,7 +128,7 @@ def _clearance(
     start: Float[Array, "2"],
     end: Float[Array, "2"],
 ) -> Float[Array, ""]:
-    """Distance of the closest of the other balls' centres from a ball's way [m]."""
+    """Return the distance of the closest other ball's centre from a ball's path [m]."""
     way = end - start
     share = jnp.clip(((targets - start[None]) @ way) / jnp.maximum((way * way).sum(), 1e-12), 0.0, 1.0)
     distance = jnp.linalg.norm(targets - start[None] - share[:, None] * way[None], axis=-1)
@@ -136,7 +136,7 @@ def _clearance(
 
 
 def _afterwards(table: Table, contact: Contact) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The cue ball after the contact: by how much it misses the nearest pocket ahead [hole widths], how far it rolls.
+    """Return the cue ball's miss of the nearest pocket ahead [hole widths] and its roll after the contact.
 
     All of its speed along the normal goes to the target (equal discs, elastic); it leaves along the tangent. What it
     rolls is given in table heights.

@@ -1,4 +1,4 @@
-"""Configuration of the billiards task: which table, which changes of the world, which teacher."""
+"""Configuration of the billiards task: table, changes of the world, teacher."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.table import Table
 from cuelearner_envs.bounds import check_number, check_vector, check_word
 
-MOST_DIRECTIONS = 100_000  # a shot is simulated for each, in every state that the teacher looks at
+MOST_DIRECTIONS = 100_000  # the teacher simulates a shot for each direction in every state
 SHOTS = {"one_ball": 1, "easy": 10, "regulation": 10}  # of an episode
 
 
@@ -22,30 +22,31 @@ class BilliardsConfig:
     table: Literal["one_ball", "easy", "regulation"] = "regulation"
     """one_ball: one large target, one shot. easy: three large targets. regulation: the paper's table."""
     mirrors: bool = False
-    """Multiply transitions by the mirror images of an unchanged table; labels stay as they were given."""
+    """Add the mirror images of transitions on an unchanged table to replay; labels are not mirrored."""
     action_turn_deg: float = 0.0
-    """Changed world: every strike is turned by this, counterclockwise [deg] (paper: 0.8)."""
+    """Changed world: every strike is rotated counterclockwise by this angle [deg] (paper: 0.8)."""
     observation_bias: tuple[float, float] = (0.0, 0.0)
-    """Changed world: added to the observed positions of balls on the table, x and y [m] (paper: 0.0071 0.0071)."""
+    """Changed world: offset of the observed positions of balls on the table, x and y [m] (paper: 0.0071 0.0071)."""
     acceleration: tuple[float, float] = (0.0, 0.0)
     """Changed world: constant acceleration of the balls on a tilted table, x and y [m/s^2] (paper: 0 0.005)."""
     teacher: str = "search"
-    """Who labels: search (every direction is tried), learned (shipped for easy and regulation), local_search (shots
-    near what the learned one proposes are tried), or a folder that `experiments/train_teacher.py` made."""
+    """Teacher: search (tries every direction), learned (shipped for easy and regulation), local_search (tries shots
+    near the learned teacher's proposals), or a folder made by `experiments/train_teacher.py`."""
     aim_error_deg: float = 0.5
-    """The teacher values directions for a player whose aim has this standard deviation [deg]."""
+    """Standard deviation of the aim of the player for whom the teacher evaluates directions [deg]."""
     habit: float = 0.2
-    """The teacher shrinks values by this share over a full turn counterclockwise from x: settles ties the same way."""
+    """Share by which the teacher reduces values over a full counterclockwise turn from x, which settles ties
+    consistently."""
     search_directions: int = 1440
-    """Search teacher: directions that it tries in every state."""
+    """Number of directions that the search teacher tries in every state."""
 
     def __post_init__(self) -> None:
-        """Raises UserError with one line for the first value that cannot work."""
+        """Raise UserError with one line for the first value that cannot work."""
         check(self)
 
 
 def check(config: BilliardsConfig) -> None:
-    """Raises UserError with one line for the first value that cannot work."""
+    """Raise UserError with one line for the first value that cannot work."""
     check_word("table", config.table, SHOTS)
     check_number("action_turn_deg", config.action_turn_deg, -360, 360, unit="degrees")
     check_vector("observation_bias", config.observation_bias, 2, -1, 1, "metres")
@@ -56,7 +57,7 @@ def check(config: BilliardsConfig) -> None:
 
 
 def make_environment(config: BilliardsConfig) -> Billiards:
-    """The world that a configuration describes."""
+    """Return the environment of a configuration."""
     table: Table = getattr(Table, config.table)()
     return Billiards(
         table=table.replace(acceleration=jnp.array(config.acceleration, jnp.float32)),

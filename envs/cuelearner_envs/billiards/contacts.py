@@ -1,4 +1,4 @@
-"""When discs in straight flight next touch something, and what they touch.
+"""Time and place of a disc's next contact in straight flight.
 
 Everything here is geometry of uniform motion: x(s) = x + u s. All quantities are components, so that the same
 lines serve one ball or an array of them. Times never come out negative: an overlap left by rounding counts as a
@@ -14,7 +14,7 @@ from cuelearner_envs.billiards.table import Scalar, Table, corner_gap
 
 
 class Flight(NamedTuple):
-    """What a single ball meets next, apart from other balls."""
+    """A ball's next contact, other balls apart."""
 
     time: Float[Array, "*any"]  # until then; infinite if nothing
     centre_x: Float[Array, "*any"]  # point of the cushion's centre line that it touches [m]
@@ -70,7 +70,7 @@ def next_on_edge(
     ux: Float[Array, "*any"],
     uy: Float[Array, "*any"],
 ) -> Flight:
-    """What a ball at (x, y) moving with (ux, uy) meets on the table's edge.
+    """Return the next contact on the table's edge of a ball at (x, y) moving with (ux, uy).
 
     A straight flight leaves the inner rectangle (the edge less ball and cushion radius) exactly once. Where it does, it
     touches a cushion's straight part or enters a pocket's mouth, where only that pocket's two jaws can be in the way. A

@@ -44,7 +44,7 @@ def draw_table(
     angle: float | None = None,
     path: Trajectory | None = None,
 ) -> None:
-    """Draws a table and its balls, filling the axes.
+    """Draw a table and its balls, filling the axes.
 
     Args:
         axes: matplotlib axes; their limits and aspect are set and their frame is hidden.
@@ -63,7 +63,7 @@ def draw_table(
 
 
 def still(table: Table, path: Trajectory, file: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Writes a picture of one shot: pale balls where it began, the way of each, solid balls where they came to rest.
+    """Write a picture of one shot: pale balls where it began, the way of each, solid balls where they came to rest.
 
     Args:
         table: one table (no batch).
@@ -87,7 +87,7 @@ def question(
     file: str | os.PathLike[str],
     dpi: int = 160,
 ) -> None:
-    """Writes a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it.
+    """Write a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it.
 
     Args:
         table: one table (no batch).
@@ -106,7 +106,7 @@ def question(
 def animate(
     table: Table, shots: Sequence[Trajectory], file: str | os.PathLike[str], fps: float = 30.0, speed: float = 1.0
 ) -> None:
-    """Writes an animation of shots, one after the other; before each, an arrow shows its direction.
+    """Write an animation of shots, one after the other; before each, an arrow shows its direction.
 
     Args:
         table: one table (no batch).
@@ -151,13 +151,13 @@ def _figure(table: Table, dpi: float) -> tuple[Figure, Axes]:
 
 
 def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
-    """Writes a picture with no date: the same drawing, the same bytes."""
+    """Write a picture with no date: the same drawing, the same bytes."""
     with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
         figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
 
 
 def _draw_room(axes: Axes, table: Table) -> None:
-    """Everything that does not move."""
+    """Draw everything that does not move."""
     w, h, r, rail = float(table.width), float(table.height), float(table.ball_radius), rail_width(table)
     left, right, bottom, top = _limits(table)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
@@ -189,7 +189,7 @@ def _draw_room(axes: Axes, table: Table) -> None:
 
 
 def _tray(table: Table) -> Float[np.ndarray, "balls 2"]:
-    """Where pocketed balls are drawn, below the table, the cue ball last [m]."""
+    """Return the drawn positions of pocketed balls, below the table, the cue ball last [m]."""
     left, _, bottom, _ = _limits(table)
     r = float(table.ball_radius)
     x = left + 0.008 + 1.3 * r + 2.4 * r * ((np.arange(table.balls) - 1) % table.balls)
@@ -217,7 +217,7 @@ class _Balls:
             self.numbers.append(axes.text(0, 0, number, fontsize=1.05 * points, animated=animated, **style))
 
     def place(self, positions: Float[np.ndarray, "balls 2"], pocketed: Bool[np.ndarray, "balls"]) -> None:
-        """Moves the balls; pocketed ones to the tray, or out of sight where they are the ghosts of a start."""
+        """Move the balls; pocketed ones to the tray, or out of sight where they are the ghosts of a start."""
         for ball, (disc, number) in enumerate(zip(self.discs, self.numbers, strict=True)):
             centre = self.tray[ball] if pocketed[ball] else positions[ball]
             disc.set_center(tuple(centre))
@@ -225,14 +225,14 @@ class _Balls:
             number.set_position(tuple(centre))
 
     def draw(self, renderer: Any) -> None:
-        """Draws them alone, over what is there."""
+        """Draw them alone, over what is there."""
         for disc, number in zip(self.discs, self.numbers, strict=True):
             disc.draw(renderer)
             number.draw(renderer)
 
 
 def ball_colour(ball: int) -> str:
-    """Of a ball, as a hexadecimal code."""
+    """Return a ball's colour as a hexadecimal code."""
     return CUE if ball == 0 else TARGETS[(ball - 1) % len(TARGETS)]
 
 
@@ -257,7 +257,7 @@ def _arrow_ends(table: Table, cue: np.ndarray, angle: float) -> tuple[tuple[floa
 
 
 def _draw_tracks(axes: Axes, table: Table, path: Trajectory) -> None:
-    """One line for each ball that moves, from its start to where it rests or falls."""
+    """Draw one line for each ball that moves, from its start to where it rests or falls."""
     times, positions, pocketed = np.asarray(path.times), np.asarray(path.positions), np.asarray(path.pocketed)
     for ball in range(table.balls):
         alive = int((~pocketed[:, ball]).sum())

@@ -60,7 +60,7 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         return 4 if self.mirrors else 1
 
     def reset(self, key: PRNGKeyArray) -> tuple[Balls, Float[Array, " obs"]]:
-        """Racks the balls: targets in a triangle, each displaced by a Gaussian of scale `table.rack_jitter`."""
+        """Rack the balls: targets in a triangle, each displaced by a Gaussian of scale `table.rack_jitter`."""
         balls = Balls(
             positions=_jittered_rack(key, self.table),
             pocketed=jnp.zeros(self.table.balls, bool),
@@ -69,7 +69,7 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         return balls, self.observe(balls)
 
     def step(self, key: PRNGKeyArray, state: Balls, action: Float[Array, "2"]) -> tuple[Balls, Step]:
-        """Plays one shot; a new rack follows the last one of an episode."""
+        """Play one shot; a new rack follows the last one of an episode."""
         k_place, k_reset = jax.random.split(key)
         shot = self.shot(state, to_angle(action) + self.action_turn)
         foul = shot.pocketed[0]
@@ -101,7 +101,7 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         return jax.tree.map(lambda new, old: jnp.where(ended, new, old), racked, after), step
 
     def shot(self, balls: Balls, angle: Float[Array, ""]) -> Shot:
-        """What striking the cue ball in the direction `angle` [rad] leads to."""
+        """Simulate striking the cue ball in the direction `angle` [rad]."""
         return simulate(self.table, balls.positions, balls.pocketed, angle)
 
     def observe(self, balls: Balls) -> Float[Array, " obs"]:

@@ -78,7 +78,7 @@ def drag(table: Table) -> Float[Array, ""]:
 
 
 def warp(rate: Float[Array, ""], time: Float[Array, "*any"]) -> Float[Array, "*any"]:
-    """Warped time at a time since the strike: what a unit of initial speed covers meanwhile."""
+    """Return the warped time at a time since the strike: the distance covered meanwhile per unit of initial speed."""
     return jnp.where(rate > 0.0, -jnp.expm1(-rate * time) / jnp.where(rate > 0.0, rate, 1.0), time)
 
 
@@ -123,7 +123,7 @@ def next_contact(table: Table, motion: Motion) -> Contact:
 
 
 def time_to_stop(table: Table, motion: Motion, unseen: Scalar) -> Float[Array, ""]:
-    """Warped time until every ball is slower than the stop speed; exact while no ball changes direction.
+    """Return the warped time until every ball is slower than the stop speed; exact if no ball changes direction.
 
     Along its direction a ball obeys dv/dt = a - lambda v, `unseen` being the kick due since the last one applied.
     """
@@ -306,7 +306,7 @@ def trace(
     pocketed: Bool[ArrayLike, "balls"],
     angle: Float[ArrayLike, ""],
 ) -> Trajectory:
-    """The same shot as `simulate` plays, with every event kept. For drawing: it always takes max_events steps."""
+    """Simulate a shot as `simulate` does and keep every event, for drawing; always takes max_events steps."""
     positions = jnp.asarray(positions)
     table = as_arrays(table, positions.dtype)
     start = strike(table, positions, jnp.asarray(pocketed, bool), jnp.asarray(angle, positions.dtype))
@@ -328,7 +328,7 @@ def trace(
 def positions_at(
     table: Table, path: Trajectory, times: Float[ArrayLike, "times"]
 ) -> tuple[Float[Array, "times balls 2"], Bool[Array, "times balls"]]:
-    """Where the balls are [m], and which are pocketed, at given times since the strike [s]; at rest after the shot."""
+    """Return positions [m] and pocketed balls at given times since the strike [s]; at rest after the shot."""
     table = as_arrays(table, path.positions.dtype)
     times = jnp.clip(times, 0.0, path.times[-1])
     knot = jnp.clip(jnp.searchsorted(path.times, times, side="right") - 1, 0)

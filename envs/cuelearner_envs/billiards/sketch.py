@@ -87,7 +87,7 @@ def _rolled(env: Billiards, state: Balls, actions: jax.Array) -> tuple[Array, Ar
 
 
 def trails(env: Billiards, state: Balls, actions: Float[Array, "n 2"]) -> list[str]:
-    """For each action, the ways of the cue ball and of the ball that it hits first, in the first `TOLD` seconds.
+    """Return for each action the paths of the cue ball and of the first ball it hits, for `TOLD` seconds.
 
     The cue ball's is a line, the other's is dashed; a ring is where a ball is then, a disc a target that fell, a cross
     the cue ball that did.
@@ -105,7 +105,7 @@ def _trail(radius: float, positions: np.ndarray, pocketed: np.ndarray) -> str:
 
 
 def _way(radius: float, number: int, places: np.ndarray, gone: np.ndarray) -> str:
-    """One ball's; it ends where the ball falls."""
+    """Return one ball's path, which ends where the ball falls."""
     places = places[: max(int(gone.argmax()), 1)] if gone.any() else places
     rows = _corners(np.asarray(places, float) * [1.0, -1.0])
     dashes = f";stroke-dasharray:{svg.number(0.7 * radius)} {svg.number(0.5 * radius)}" if number else ""
@@ -120,7 +120,7 @@ def _way(radius: float, number: int, places: np.ndarray, gone: np.ndarray) -> st
 
 
 def _stroke(width: float, fill: str = "fill:none;") -> str:
-    """Of a line [m], which a page may draw wider underneath, so that the line stands out."""
+    """Return the SVG stroke of a line [m]; a page may draw a wider one underneath to set it off."""
     return f"{fill}stroke-width:calc({width:.5f}px*var(--wider,1));stroke-linejoin:round"
 
 
@@ -141,7 +141,7 @@ def _ball(number: int, radius: float) -> str:
 
 
 def _table(table: Table) -> str:
-    """Everything that does not move."""
+    """Return the SVG of everything that does not move."""
     w, h, rail = float(table.width), float(table.height), drawing.rail_width(table)
     parts = [
         svg.rectangle(-w / 2 - rail, -h / 2 - rail, w + 2 * rail, h + 2 * rail, f"fill:{drawing.RAIL}", 0.6 * rail)

@@ -81,14 +81,14 @@ def pockets(table: Table) -> Float[Array, "pockets 2"]:
 
 
 def parking_place(table: Table, ball: Int[Array, "*any"]) -> tuple[Float[Array, "*any"], Float[Array, "*any"]]:
-    """Where a pocketed ball stands, x and y [m]: in a row beside the table, a place for each ball index."""
+    """Return the position of a pocketed ball [m]: in a row beside the table, by ball index."""
     return table.ball_radius * (
         1.0 + 3.0 * ball
     ) - table.width / 2, table.height / 2 + 3.0 * table.ball_radius + 0.0 * ball
 
 
 def parking(table: Table) -> Float[Array, "balls 2"]:
-    """Where the balls of a table stand once pocketed [m]."""
+    """Return the positions of a table's balls once pocketed [m]."""
     return jnp.stack(parking_place(table, jnp.arange(table.balls)), axis=-1)
 
 
@@ -104,5 +104,5 @@ def rack(table: Table) -> Float[Array, "balls 2"]:
 
 
 def as_arrays(table: Table, dtype: jnp.dtype) -> Table:
-    """The same table with every traced field an array of `dtype`."""
+    """Return the table with every traced field as an array of `dtype`."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), table)

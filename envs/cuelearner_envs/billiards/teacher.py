@@ -70,7 +70,7 @@ class Transferred(struct.PyTreeNode):
     env: Billiards  # where it is asked
 
     def best_action(self, state: Balls, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
-        """What leads to the shot that the teacher holds for best. Looks at the true state, not at the observation."""
+        """Return the action of the shot with the highest value; uses the true state, not the observation."""
         return self._here(self.teacher.best_action(state, self.own.observe(state)))
 
     def nearest_good(
@@ -86,7 +86,7 @@ class Transferred(struct.PyTreeNode):
         return self._here(self.teacher.nearest_good(state, self.own.observe(state), struck, spread, share))
 
     def _here(self, struck: Float[Array, "2"]) -> Float[Array, "2"]:
-        """What leads here to the shot that a strike leads to where the teacher learned."""
+        """Convert a strike of the teacher's own world into the strike with the same shot in this world."""
         return rotate(struck, self.own.action_turn - self.env.action_turn)
 
 
@@ -183,7 +183,7 @@ class NearbyTeacher(struct.PyTreeNode):
         return rotate(action, turns[jnp.argmin(jnp.where(good, jnp.abs(turns), jnp.inf))])
 
     def turns(self) -> Float[Array, " tried"]:
-        """By how much the directions that are tried are turned from their middle [rad]."""
+        """Return the offsets of the tried directions from their middle [rad]."""
         return jnp.linspace(-1.0, 1.0, self.tried) * self.reach
 
     def expected(

@@ -1,1 +1,1 @@
-"""Fetch of gymnasium_robotics: scripted policies, and a camera that stands elsewhere than the arm believes."""
+"""Fetch of gymnasium_robotics: scripted policies, and a camera displaced from where the arm believes."""

@@ -1,4 +1,4 @@
-"""The cues of Fetch's actions, and of the arm's: words for more and for less of each entry, and names."""
+"""The cues of Fetch's and the arm's actions: names, and words for more and less of each entry."""
 
 CUES = ("forward,backward", "left,right", "up,down", "open,close")
 CUE_NAMES = ("x", "y", "z", "fingers")

@@ -16,9 +16,9 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.fetch.scripts import SCRIPTS
 
-# Entries of a flattened observation that a camera tells: the goal; with an object also that, twice, and the way to it.
+# Slices that a camera measures: the goal and, with an object, its position (twice) and the vector to it.
 SEEN = {"FetchReach-v4": (3,), "FetchPush-v4": (0, 3, 9, 12)}
-REACH_WITHIN = 0.02  # [m]: Gymnasium's own 5 cm forgive an error of 3 cm
+REACH_WITHIN = 0.02  # [m]: Gymnasium's own 5 cm tolerate an error of 3 cm
 
 
 class HandEye(gymnasium.ObservationWrapper):
@@ -32,7 +32,7 @@ class HandEye(gymnasium.ObservationWrapper):
         self.offset, self.within = np.asarray(offset, float), within
 
     def observation(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return what is seen in place of an observation."""
+        """Return the observation that the displaced camera gives."""
         seen = {name: value.copy() for name, value in observation.items()}
         seen["desired_goal"] += self.offset
         if len(seen["observation"]) > 10:  # there is an object
@@ -41,7 +41,7 @@ class HandEye(gymnasium.ObservationWrapper):
         return seen
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Execute an action; success is told of true places."""
+        """Execute an action; success is judged by true positions."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         if self.within is not None:
             away = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"])
@@ -50,13 +50,13 @@ class HandEye(gymnasium.ObservationWrapper):
 
 
 class Onlooker(struct.PyTreeNode):
-    """A teacher who sees true places: in mind is what the script would do there."""
+    """Teacher that runs the script on true positions."""
 
     offset: Float[Array, "3"]  # of the camera [m]
     environment: str = struct.field(pytree_node=False)
 
     def best_action(self, state: Any, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
-        """The script's action, of true places."""
+        """Return the script's action for the true positions."""
         true = obs
         for start in SEEN[self.environment]:
             true = true.at[start : start + 3].add(-self.offset)

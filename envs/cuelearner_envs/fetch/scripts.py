@@ -1,4 +1,4 @@
-"""Policies for FetchReach and FetchPush, written by hand: they look at one observation and remember nothing.
+"""Scripted policies for FetchReach and FetchPush: memoryless functions of one observation.
 
 An observation is flattened as `cl.from_gymnasium` does: achieved goal, desired goal, then Fetch's own vector.
 """
@@ -17,16 +17,16 @@ Script = Callable[[Float[Array, "n obs"]], Float[Array, "n 4"]]
 Amount = float | Float[Array, ""]
 
 GOAL, GRIPPER, OBJECT = slice(3, 6), slice(6, 9), slice(9, 12)
-REACH_GAIN = 20.0  # of the way to the goal, per metre; an action of 1 is a step of some 3 cm
-GAIN = 20.0  # the same of the ways round the object
-HIGH, LIFTED = 0.085, 0.055  # over the object: where the gripper travels, and from where on it does [m]
-LOW = 0.03  # over the object's middle: below, the gripper can push [m]
-BEYOND = 0.16  # behind the object's middle: farthest from where it pushes [m]
-CLEAR, ROUND = 0.05, 0.12  # behind the object, or from it: as far, it may travel while it rises [m]
+REACH_GAIN = 20.0  # gain on the distance to the goal, per metre; an action of 1 moves about 3 cm
+GAIN = 20.0  # gain on the distances around the object
+HIGH, LIFTED = 0.085, 0.055  # height above the object at which the gripper travels, and from which on it does [m]
+LOW = 0.03  # below this height above the object's middle, the gripper can push [m]
+BEYOND = 0.16  # behind the object's middle: the farthest start of a push [m]
+CLEAR, ROUND = 0.05, 0.12  # distances from the object at which the gripper may travel while it rises [m]
 
 
 class Gains(NamedTuple):
-    """How `push` pushes. Lengths in metres."""
+    """Parameters of `push`. Lengths in metres."""
 
     along: Amount = 8.0  # per metre of the way along the line to the goal
     side: Amount = 14.0  # per metre that the gripper is off that line
@@ -77,7 +77,7 @@ def push(obs: Observations, gains: Gains = USUAL) -> Float[Array, "n 4"]:
 
 
 def _action(move: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
-    """A move with the fingers as they are."""
+    """Return a move that leaves the fingers unchanged."""
     return jnp.clip(jnp.concatenate([move, jnp.zeros_like(move[:, :1])], -1), -1.0, 1.0)
 
 

@@ -21,14 +21,14 @@ from cuelearner_jax.environment import Aims
 from cuelearner_jax.spaces.directions import from_angle, rotate, to_angle
 
 WAYS = 72  # every 5 degrees
-RADII = (0.28, 0.42, 0.55)  # of the discs: the body's own, nearly its reach, what a road map keeps clear [m]
-BESIDE = (0, 1, -1, 2, -2, 4, -4, 8, -8)  # neighbours that a way sees, in steps of 5 degrees
+RADII = (0.28, 0.42, 0.55)  # of the discs: the body's own, nearly its reach, and what a road map keeps clear [m]
+BESIDE = (0, 1, -1, 2, -2, 4, -4, 8, -8)  # neighbours that a way takes into account, in steps of 5 degrees
 # A way on which the first two discs are stopped sooner is not open [m]: the body's front is 0.2 m ahead, a step is
 # 0.2 m, and a body that turns needs more room than one that goes straight.
 ROOM = (0.6, 0.1)
 SCALE = 5.0  # of lengths among the features [m]
 CLOSE = 0.1  # of two ways by the rule, the one that leaves so much less is likelier by a factor of e [m]
-UNSEEN = -1.0  # nearness where the lidar does not look
+UNSEEN = -1.0  # nearness in directions that the lidar does not cover
 
 
 def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
@@ -56,7 +56,7 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
 
 
 def rule_of(aims: Aims) -> Float[Array, " ways"]:
-    """log-weights by a rule that somebody wrote down at once: least is left to the goal after two legs.
+    """Return log-weights by a simple hand-written rule: the shortest rest to the goal after two legs.
 
     `aims` with the features of a look ahead. Of ways that leave as much the shorter plan counts.
     """
@@ -65,7 +65,7 @@ def rule_of(aims: Aims) -> Float[Array, " ways"]:
 
 
 def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Array, "radii n"]:
-    """How far a disc of each radius could walk in directions before it touches what the lidar sees [m], to 10 m."""
+    """Return how far a disc of each radius can go in directions before it touches what the lidar sees [m], to 10 m."""
     points = points_of(obs)
     along = ways[:, :1] * points[None, :, 0] + ways[:, 1:] * points[None, :, 1]
     across = ways[:, :1] * points[None, :, 1] - ways[:, 1:] * points[None, :, 0]
@@ -73,7 +73,7 @@ def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Arr
 
 
 def points_of(obs: Float[Array, " obs"]) -> Float[Array, "271 2"]:
-    """What each beam hits, in the body's frame [m]; `FAR_AWAY` where it hits nothing."""
+    """Return each beam's hit in the body's frame [m]; `FAR_AWAY` without a hit."""
     ranges = -jnp.log(jnp.maximum(obs[:BEAMS], math.exp(-MAX_RANGE)))
     hit = ranges < MAX_RANGE - 0.01
     return jnp.where(hit[:, None], ranges[:, None] * from_angle(jnp.asarray(BEAM_ANGLES)), FAR_AWAY)
@@ -82,7 +82,7 @@ def points_of(obs: Float[Array, " obs"]) -> Float[Array, "271 2"]:
 def _lengths(
     ways: Float[Array, "ways 2"], free: Float[Array, " ways"], goal: Float[Array, "2"], away: Float[Array, ""]
 ) -> list[Float[Array, " ways"]]:
-    """What a way is worth as a detour: to its end, or past what stops its neighbours, and on straight to the goal."""
+    """Return each way's length as a detour: to its end or past its neighbours' obstacle, then straight to the goal."""
     end = jnp.minimum(free, away)
     corners = [jnp.minimum(jnp.minimum(jnp.roll(free, side), jnp.roll(free, 2 * side)), end) for side in (-1, 1)]
 
@@ -94,6 +94,6 @@ def _lengths(
 
 
 def _seen_from(ways: Float[Array, "ways 2"], vectors: Float[Array, "n 2"]) -> list[Float[Array, "n ways"]]:
-    """Vectors along and across the ways."""
+    """Rotate vectors into the frame of the ways: along and across."""
     x, y = vectors[:, :1], vectors[:, 1:]
     return [x * ways[None, :, 0] + y * ways[None, :, 1], y * ways[None, :, 0] - x * ways[None, :, 1]]

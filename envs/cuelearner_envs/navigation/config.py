@@ -1,4 +1,4 @@
-"""Configuration of the navigation task: which worlds, which sensor, which robot."""
+"""Configuration of the navigation task: worlds, sensor, robot."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SIDES = {"none": 0, "left": 1, "right": -1}
 
 MOST_WORLDS = 1 << 24  # replay keeps a world's number in single precision, which is exact up to here
 
-# Folded into the key of the worlds: what is trained in is never validated in.
+# Folded into the key of the worlds, so that no training world is used for validation.
 SPLITS = {"training": 0, "validation": 1, "tuning": 2}
 
 
@@ -32,37 +32,37 @@ class NavigationConfig:
     style: Style = "clutter"
     """clutter: a hall of boxes and columns. rooms: rooms, doorways, thin obstacles. corridor: pass left or right."""
     worlds: int = 1024
-    """Number of worlds, each with 16 routes; training and validation have different ones."""
+    """Number of worlds, each with 16 routes. Training and validation use different worlds."""
     world_seed: int = 0
-    """Decides the worlds."""
+    """Seed of the worlds."""
     max_steps: int = 200
-    """Steps of 0.2 s after which an episode is truncated."""
+    """Largest number of steps of 0.2 s in an episode, after which it is truncated."""
     goal_radius: float = 0.5
     """The goal is reached within this distance [m]."""
     max_range: float = 10.0
     """Range of the lidar [m]."""
     lidar_rotation_deg: float = 0.0
-    """Changed world: the lidar is mounted turned by this, counterclockwise [deg] (paper: 15)."""
+    """Changed world: the lidar is mounted rotated counterclockwise by this angle [deg] (paper: 15)."""
     lidar_noise: float = 0.0
     """Changed world: standard deviation of a beam's error [m]."""
     lidar_dropout: float = 0.0
     """Changed world: probability that a beam reads the full range."""
     goal_rotation_deg: float = 0.0
-    """Changed world: the direction to the goal is measured turned by this, counterclockwise [deg]."""
+    """Changed world: the measured direction to the goal is rotated counterclockwise by this angle [deg]."""
     mirrors: bool = False
-    """Multiply transitions by their mirror images, whatever the guidance; labels stay as they were given."""
+    """Add the mirror images of transitions to replay, whatever the guidance; labels are not mirrored."""
     look_ahead: bool = False
-    """Do ways, as guidance intent weighs them, tell where a second leg would lead? Observations stay as they are."""
+    """Add the length of a second leg to the ways that guidance intent compares. Observations do not change."""
     preferred_side: Literal["none", "left", "right"] = "none"
-    """Changed wish, in a corridor: the teacher passes every obstacle on this side."""
+    """Changed preference, in a corridor: the teacher passes every obstacle on this side."""
 
     def __post_init__(self) -> None:
-        """Raises UserError with one line for the first value that cannot work."""
+        """Raise UserError with one line for the first value that cannot work."""
         check(self)
 
 
 def check(config: NavigationConfig) -> None:
-    """Raises UserError with one line for the first value that cannot work."""
+    """Raise UserError with one line for the first value that cannot work."""
     check_word("style", config.style, STYLES)
     check_word("preferred_side", config.preferred_side, SIDES)
     if config.preferred_side != "none" and config.style != "corridor":

@@ -48,7 +48,7 @@ HOLD_AFTER = 1.2  # at the end of an animated episode [s]
 
 
 def draw_world(axes: Axes, world: World) -> None:
-    """Draws the floor and the solids of a world from above, the taller the darker, filling the axes.
+    """Draw the floor and the solids of a world from above, the taller the darker, filling the axes.
 
     Args:
         axes: matplotlib axes; their limits and aspect are set and their frame is hidden.
@@ -66,7 +66,7 @@ def draw_world(axes: Axes, world: World) -> None:
 
 
 def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Writes a picture of the first episode: its way, and halfway what the lidar saw and what was chosen.
+    """Write a picture of the first episode: its way, and halfway what the lidar saw and what was chosen.
 
     Args:
         robot: gives the outline of the body.
@@ -99,7 +99,7 @@ def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], d
 
 
 def question(robot: Robot, frame: Frame, file: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Writes a picture of one situation and of the direction in question as an arrow, for somebody to judge it.
+    """Write a picture of one situation and of the direction in question as an arrow, for somebody to judge it.
 
     Args:
         robot: gives the outline of the body.
@@ -120,7 +120,7 @@ def question(robot: Robot, frame: Frame, file: str | os.PathLike[str], dpi: int 
 
 
 def animate(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], fps: float = 10.0) -> None:
-    """Writes an animation of all episodes, one picture a step; the end of an episode stands for a moment.
+    """Write an animation of all episodes, one picture a step; the end of an episode stands for a moment.
 
     Args:
         robot: gives the outline of the body.
@@ -147,7 +147,7 @@ def overview(
     columns: int = 3,
     routes: int = 4,
 ) -> None:
-    """Writes worlds side by side from above, some routes of each as straight lines from start to goal.
+    """Write worlds side by side from above, some routes of each as straight lines from start to goal.
 
     Args:
         worlds: worlds (no batch), drawn from the left to the right and from the top to the bottom.
@@ -194,7 +194,7 @@ def outline(robot: Robot, pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "po
 
 
 def hits(frame: Frame) -> Float[np.ndarray, "271 2"]:
-    """Where the robot takes the lidar's beams to end [m]; a sensor mounted askew is mistaken."""
+    """Return the lidar's beam ends as the robot takes them [m], wrong for a sensor that is mounted rotated."""
     angles = np.asarray(BEAM_ANGLES, float)
     beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     return _to_world(frame.pose, np.asarray(frame.ranges)[:, None] * beams)
@@ -237,7 +237,7 @@ def _figure(extent: Float[np.ndarray, "2"], dpi: float) -> tuple[Figure, Axes, A
 
 
 def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
-    """Writes a picture with no date: the same drawing, the same bytes."""
+    """Write a picture with no date: the same drawing, the same bytes."""
     with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
         figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
 
@@ -249,7 +249,7 @@ def _draw_goal(axes: Axes, frame: Frame) -> None:
 
 
 def _draw_course(axes: Axes, frame: Frame) -> None:
-    """Everything that stays as it is in an episode: the world, the goal, and the start, which is the frame's pose."""
+    """Draw what stays constant in an episode: the world, the goal, and the start, which is the frame's pose."""
     draw_world(axes, frame.world)
     _draw_goal(axes, frame)
     axes.plot(*frame.pose[:2], marker="o", markersize=6, color="white", markeredgecolor=START, zorder=3)
@@ -300,14 +300,14 @@ class _Body:
         axes.add_patch(self.head)
 
     def place(self, pose: Float[np.ndarray, "3"]) -> None:
-        """Moves it to a pose [m, rad]."""
+        """Move it to a pose [m, rad]."""
         radius, tip = float(self.robot.disc_radius), float(self.robot.disc_offset) + 0.6 * float(self.robot.disc_radius)
         chevron = np.array([[tip, 0.0], [tip - 1.1 * radius, 0.6 * radius], [tip - 1.1 * radius, -0.6 * radius]])
         self.hull.set_xy(outline(self.robot, pose))
         self.head.set_xy(_to_world(pose, chevron))
 
     def draw(self, renderer: Any) -> None:
-        """Draws it alone, over what is there."""
+        """Draw it alone, over what is there."""
         self.hull.draw(renderer)
         self.head.draw(renderer)
 
@@ -323,14 +323,14 @@ class _Lidar:
         self.dots.set_animated(animated)
 
     def place(self, frame: Frame) -> None:
-        """Moves it to what a frame saw."""
+        """Move it to what a frame saw."""
         ends = hits(frame)
         met = np.asarray(frame.ranges) < 0.999 * frame.max_range
         self.free.set_xy(np.concatenate([[frame.pose[:2]], ends]))
         self.dots.set_data(*ends[met].T)
 
     def draw(self, renderer: Any) -> None:
-        """Draws it alone, over what is there."""
+        """Draw it alone, over what is there."""
         self.free.draw(renderer)
         self.dots.draw(renderer)
 
@@ -368,7 +368,7 @@ def _spread(way: Float[np.ndarray, "poses 3"], middle: Float[np.ndarray, "3"]) -
 
 
 class _Stage:
-    """One episode's figure. What stands still is drawn once; each picture draws only what moves over it."""
+    """One episode's figure. Constant parts are drawn once; each picture draws only what moves."""
 
     def __init__(self, robot: Robot, first: Frame, extent: Float[np.ndarray, "2"]) -> None:
         self.figure, axes, strip = _figure(extent, dpi=100)
@@ -383,14 +383,14 @@ class _Stage:
         self.empty = self.canvas.copy_from_bbox(self.figure.bbox)
 
     def step(self, frame: Frame, way: Float[np.ndarray, "poses 3"], words: str) -> UInt8[np.ndarray, "height width 3"]:
-        """What the robot sees and chooses before a step, and the way so far."""
+        """Draw what the robot sees and chooses before a step, and the path so far."""
         self.lidar.place(frame)
         self.body.place(frame.pose)
         self.arrow.set_positions(*_arrow_ends(frame))
         return self._picture(way, words, INK, self.lidar, self.trail, self.body, self.arrow)
 
     def end(self, last: Frame, way: Float[np.ndarray, "poses 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Where an episode ended, and how."""
+        """Draw where an episode ended, and how."""
         body = self.crashed if last.outcome in ("collision", "fall") else self.body
         body.place(last.next_pose)
         words = f"{WORDS[last.outcome]} {last.seconds:.1f} s"
@@ -406,12 +406,12 @@ class _Stage:
 
 
 def _extent(frames: Sequence[Frame]) -> Float[np.ndarray, "2"]:
-    """Of the largest world [m]."""
+    """Return the extent of the largest world [m]."""
     return np.max([np.asarray(frame.world.extent) for frame in frames], axis=0)
 
 
 def _pictures(robot: Robot, frames: Sequence[Frame], hold: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """One picture of each step, and `hold` of the end of each episode that ends."""
+    """Yield one picture per step, and the end of each finished episode for `hold`."""
     extent = _extent(frames)
     for number, group in itertools.groupby(frames, key=lambda frame: frame.episode):
         episode = list(group)

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from cuelearner_envs.navigation.aims import aims_of, rule_of
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
-from cuelearner_envs.navigation.sides import heading, passed
+from cuelearner_envs.navigation.sides import count_passed, heading
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.environment import Aims, Described, Features, Quantity
@@ -83,16 +83,16 @@ class Navigation(Described, struct.PyTreeNode):
         return self.replace(worlds=None)
 
     def world(self, index: Int[ArrayLike, "*n"]) -> World:
-        """One of the worlds, or as many as there are indices."""
+        """Return one world, or one for each index."""
         return jax.tree.map(lambda leaf: leaf[index], self.worlds)
 
     def reset(self, key: PRNGKeyArray) -> tuple[AnyWalker, Float[Array, " obs"]]:
-        """Stands still, turned at random, at the start of a random route of a random world."""
+        """Stand still, turned at random, at the start of a random route of a random world."""
         state = self._start(key)
         return state, self.observe(state)
 
     def step(self, key: PRNGKeyArray, state: AnyWalker, action: Float[Array, "2"]) -> tuple[AnyWalker, Step]:
-        """Walks for one period in the direction; a new episode follows an end."""
+        """Walk for one period in the direction; a new episode follows an end."""
         after = self.counted(state, self.moved(state, action))
         outcome, terminated, truncated = self.ends(after)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), self._start(key), after)
@@ -128,7 +128,7 @@ class Navigation(Described, struct.PyTreeNode):
         if not self.sides:
             return after
         world, ahead = self.world(before.world), heading(self.worlds.starts[before.world, before.route], before.goal)
-        return after.replace(passed=before.passed + passed(world, ahead, before.pose[:2], after.pose[:2]))
+        return after.replace(passed=before.passed + count_passed(world, ahead, before.pose[:2], after.pose[:2]))
 
     def sides_taken(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
         """Whether all obstacles passed so far were passed on one side, or some on either; none holds before the first.
@@ -151,15 +151,15 @@ class Navigation(Described, struct.PyTreeNode):
         )
 
     def arrived(self, state: AnyWalker) -> Bool[Array, ""]:
-        """Is the goal reached?"""
+        """Whether the goal is reached."""
         return jnp.linalg.norm(state.goal - state.pose[:2]) < self.goal_radius
 
     def failures(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
-        """What ends an episode in failure, by name; at most one holds."""
+        """Return the failures that end an episode, by name; at most one holds."""
         return {"collision": self.collided(state)}
 
     def place(self, state: AnyWalker) -> Float[Array, " place"]:
-        """Where the sensor is, with the body: what replay keeps of it."""
+        """Return the sensor's place on the body, which replay stores."""
         return state.pose
 
     def placed(
@@ -174,7 +174,7 @@ class Navigation(Described, struct.PyTreeNode):
         return Walker(place, jnp.zeros(2), goal, previous, world, route, jnp.zeros((), jnp.int32))
 
     def collided(self, state: AnyWalker) -> Bool[Array, ""]:
-        """Does the body touch anything?"""
+        """Whether the body touches anything."""
         return collides(self.robot, self.world(state.world), state.pose)
 
     def ranges(self, state: AnyWalker) -> Float[Array, "271"]:
@@ -182,7 +182,7 @@ class Navigation(Described, struct.PyTreeNode):
         return self.lidar.read(self.world(state.world), state.pose)
 
     def observe(self, state: AnyWalker) -> Float[Array, " obs"]:
-        """What the robot perceives; everything is of the order of one.
+        """Return the robot's observation; every entry is of the order of 1.
 
         - 271 entries: how near the lidar's beams end, from right behind to left behind, exp(-distance / 1 m) of
         - 2: direction to the goal in the body's frame; 1: distance to the goal over 15 m
@@ -199,7 +199,7 @@ class Navigation(Described, struct.PyTreeNode):
         return obs[BEAMS : BEAMS + 2]
 
     def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]) -> Features:
-        """What lies ahead, to the left and to the right of a robot that walks in the direction.
+        """Return features of what lies ahead, to the left and to the right of a robot that walks in the direction.
 
         - own, 1: the distance to the goal
         - turned, 370: nearness all round in steps of one degree; goal and previous actions along and across the

@@ -43,7 +43,7 @@ def line_clearance(world: World, start: Float[Array, "2"], end: Float[Array, "2"
 def free_path(
     along: Float[Array, "*n points"], across: Float[Array, "*n points"], radius: float, most: float
 ) -> Float[Array, "*n"]:
-    """How far a disc can walk straight on before it touches one of the points [m], from 0 to `most`.
+    """Return how far a disc can go straight on before it touches one of the points [m], from 0 to `most`.
 
     Args:
         along: how far ahead of its middle the points lie, in the direction that it walks [m].
@@ -98,7 +98,7 @@ def _box_to_line(half: Float[Array, "2"], start: Float[Array, "2"], end: Float[A
 
 
 def _meets(half: Float[Array, "2"], start: Float[Array, "2"], end: Float[Array, "2"]) -> Bool[Array, ""]:
-    """Does the line pass through the box? Separating axes: the box's two and the line's normal."""
+    """Whether the line passes through the box, by separating axes: the box's two and the line's normal."""
     middle, reach = (start + end) / 2, (end - start) / 2
     apart = (jnp.abs(middle) > half + jnp.abs(reach)).any()
     cross = jnp.abs(middle[0] * reach[1] - middle[1] * reach[0])

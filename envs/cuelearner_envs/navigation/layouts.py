@@ -1,4 +1,4 @@
-"""How the solids of each style of world are laid out. A layout may turn out impassable: `worlds` then draws another."""
+"""Lay out the solids of each style of world. A layout may be impassable; `worlds` then draws another."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def look_ahead(
     goal: Float[Array, "2"],
     radius: float,
 ) -> tuple[Float[Array, " ways"], Float[Array, " ways"], Float[Array, " ways"]]:
-    """What is left to the goal after the best two legs of which the first goes along each way.
+    """Return the remaining length to the goal after the best two legs, of which the first goes along each way.
 
     Args:
         points: what beams hit, in the body's frame; those that hit nothing lie far away [m].
@@ -73,7 +73,7 @@ def look_ahead(
 def _stations(
     ways: Float[Array, "ways 2"], free: Float[Array, " ways"], goal: Float[Array, "2"]
 ) -> Float[Array, "stations ways"]:
-    """How far along the ways stations lie [m]: evenly, past the corners that stop the neighbours, nearest the goal."""
+    """Return the positions of stations along the ways [m]: even, past neighbours' obstacles, nearest the goal."""
     end = jnp.maximum(free - SHORT, 0.0)
     beside = [jnp.minimum(jnp.roll(free, side), jnp.roll(free, 2 * side)) + BEYOND for side in (-1, 1)]
     least = jnp.minimum(LEAST, jnp.linalg.norm(goal))

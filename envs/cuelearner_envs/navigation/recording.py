@@ -17,7 +17,7 @@ ENDS = ("success", "collision", "fall", "timeout")
 
 
 class Frame(NamedTuple):
-    """One step of an episode, in arrays of numpy."""
+    """One step of an episode, in NumPy arrays."""
 
     world: World  # the one walked in, no batch
     goal: Float[np.ndarray, "2"]  # [m]
@@ -33,7 +33,7 @@ class Frame(NamedTuple):
 
 
 def situation(env: Navigation, state: Any, action: Float[ArrayLike, "2"]) -> Frame:
-    """What a picture needs of a state that has not been left yet, with an action in question."""
+    """Return a state's frame for a picture, with the asked action."""
     seen = jax.device_get(_seen(env, state))
     return Frame(
         world=seen["world"],

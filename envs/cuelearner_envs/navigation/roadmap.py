@@ -24,16 +24,16 @@ from cuelearner_envs.navigation.world import World
 from cuelearner_jax.spaces.directions import from_angle, retract, rotate
 
 NODES = 160
-UNIFORM = 64  # candidates drawn anywhere
-ROUND = 6  # candidates round a circle
+UNIFORM = 64  # candidates drawn uniformly
+ROUND = 6  # candidates around a circle
 NODE_MARGIN = 0.13  # a node keeps this much more than the body's reach from every solid [m]
 LINE_MARGIN = 0.08  # and a line this much
-YIELD = 0.001  # a line may be this much closer to a solid than the place it begins at already is [m]
-BLOCKED = 1e4  # added to the length of a way that begins with a blocked line [m]
+YIELD = 0.001  # a line may come this much closer to a solid than its own start [m]
+BLOCKED = 1e4  # added to the length of a way whose first line is blocked [m]
 
 
 class RoadMap(struct.PyTreeNode):
-    """One world's graph."""
+    """The road map of one world, as a graph."""
 
     nodes: Float[Array, "nodes 2"]  # [m]
     lengths: Float[Array, "nodes nodes"]  # of the line between two nodes [m]; infinite where it is blocked
@@ -76,7 +76,7 @@ def way(
     position: Float[Array, "2"],
     goal: Float[Array, "2"],
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Where to walk next from a place, and how long the whole way is.
+    """Return the next point to walk to from a place, and the length of the whole way.
 
     Args:
         to_goal: `distances` of the same goal.

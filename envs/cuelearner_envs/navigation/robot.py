@@ -1,4 +1,4 @@
-"""How the quadruped moves when told a direction, and the room that its body takes.
+"""The simple robot: a model of the quadruped's motion, and the room that its body takes.
 
 A stand-in for a legged robot with its walking controller, which MuJoCo simulates elsewhere. ANYmal's body (0.93 m by
 0.53 m) is three discs along its axis. Its velocity follows the command with a first-order lag, and the body turns
@@ -35,14 +35,14 @@ class Robot(struct.PyTreeNode):
 
 
 class Motion(struct.PyTreeNode):
-    """Where a robot is and how it moves."""
+    """Pose and velocity of a robot."""
 
     pose: Float[Array, "3"]  # x, y, yaw [m, rad]
     velocity: Float[Array, "2"]  # in the world's frame [m/s]
 
 
 def walk(robot: Robot, motion: Motion, direction: Float[Array, "2"], duration: Scalar) -> Motion:
-    """The motion after `duration` [s] of being told to walk in `direction` (unit vector in the body's frame).
+    """Return the motion after `duration` [s] of the command to walk in `direction` (unit vector in the body's frame).
 
     The command is held in the world's frame meanwhile: the body turns under it.
     """
@@ -63,7 +63,7 @@ def discs(robot: Robot, pose: Float[Array, "3"]) -> Float[Array, "3 2"]:
 
 
 def collides(robot: Robot, world: World, pose: Float[Array, "3"]) -> Bool[Array, ""]:
-    """Does the body touch a solid, or stand outside the walls?"""
+    """Whether the body touches a solid, or stands outside the walls."""
     centres = discs(robot, pose)
     touching = jax.vmap(lambda centre: clearance(world, centre))(centres) < robot.disc_radius
     return touching.any() | (jnp.abs(pose[:2]) > world.extent / 2).any()

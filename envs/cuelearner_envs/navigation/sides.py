@@ -1,4 +1,4 @@
-"""On which side obstacles are passed: counted step by step, and worlds in which one side is closed.
+"""Count the side on which obstacles are passed, and make worlds with one side closed.
 
 Left and right are those of a robot on its way along x from its start to its goal: who passes an obstacle on the left
 keeps it on their right.
@@ -26,10 +26,10 @@ def obstacles(world: World) -> tuple[Float[Array, "obstacles 2"], Bool[Array, " 
     return middles, (jnp.abs(middles) < world.extent[None] / 2).all(-1)
 
 
-def passed(
+def count_passed(
     world: World, ahead: Float[Array, ""], before: Float[Array, "2"], after: Float[Array, "2"]
 ) -> Float[Array, "2"]:
-    """How many obstacles a straight step passes, on the left and on the right.
+    """Return how many obstacles a straight step passes, on the left and on the right.
 
     One is passed by a step that crosses the line through its middle across the corridor, forward; which side that is
     says where on this line.

@@ -21,16 +21,16 @@ from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Reel, Sketch
 
-AHEAD, BEHIND, ASIDE = 9.0, 4.0, 6.5  # that is shown at least [m]
-AROUND = 2 * (AHEAD + BEHIND)  # that is drawn: a page wider or higher than the sketch shows more of it [m]
-INSET = 0.5  # of a goal that lies farther away, from the edge [m]
+AHEAD, BEHIND, ASIDE = 9.0, 4.0, 6.5  # extent that is shown at least [m]
+AROUND = 2 * (AHEAD + BEHIND)  # extent that is drawn; a page of another shape than the sketch shows more of it [m]
+INSET = 0.5  # distance of a far goal's mark from the edge [m]
 STEPS = 15  # of a film
 DOT = 0.05  # radius of a beam's end [m]
 WORDS = {"success": "the goal is reached", "collision": "collision", "fall": "it falls", "timeout": "out of time"}
 
 
 def sketch(env: Navigation, state: Any) -> Sketch:
-    """What lies round the robot, from above."""
+    """Return the robot's surroundings as a sketch, from above."""
     world, goal, pose, ranges = jax.device_get(_seen(env, state))
     parts = [svg.rectangle(-AROUND, -AROUND, 2 * AROUND, 2 * AROUND, "fill:var(--floor)")]
     boxes = zip(world.boxes, world.box_heights.tolist(), strict=True)
@@ -104,7 +104,7 @@ def _placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def _shown(points: np.ndarray, beyond: float = 0.0) -> bool:
-    """May something of what lies between these points be seen, on a page of any width?"""
+    """Whether anything between these points may be visible on a page of any width."""
     low, high = points.min(axis=0) - beyond, points.max(axis=0) + beyond
     return bool((low < AROUND).all() and (high > -AROUND).all())
 

@@ -12,7 +12,7 @@ FAR_AWAY = 1000.0  # where unused rows lie [m]: a solid there is out of reach of
 
 
 class World(struct.PyTreeNode):
-    """One world. All worlds have arrays of one size, whatever their style, so that they can be stacked and swapped.
+    """A world. The arrays of all worlds have equal sizes, whatever the style, so that worlds can be stacked.
 
     Unused rows hold a tiny solid `FAR_AWAY`. Solids stand on the floor and may overlap; the outer walls are boxes too.
     """

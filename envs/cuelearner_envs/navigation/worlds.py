@@ -1,4 +1,4 @@
-"""Procedurally generated worlds: a layout, and routes that the robot is sure to be able to walk.
+"""Generate worlds: a layout, and routes that the robot is proved to be able to walk.
 
 Reachability is proved on a grid. A cell is passable if its middle keeps the body's reach and half a cell from every
 solid. Then the straight line between the middles of two passable neighbours keeps the body's reach too, however the
@@ -23,7 +23,7 @@ CELLS = 100  # along either side: the largest world is 20 m
 NEAREST, FARTHEST = 5.0, 15.0  # from start to goal [m]
 JITTER = 0.1  # starts and goals lie this far from a cell's middle at most, along x and y [m]
 ROUTES = 16
-WORLDS_AT_ONCE = 64  # generated together on an accelerator: bounds the memory of their grids
+WORLDS_AT_ONCE = 64  # worlds generated together on an accelerator, which bounds the memory of their grids
 
 
 def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) -> World:
@@ -60,7 +60,7 @@ def generate_many(key: PRNGKeyArray, count: int, style: str = "clutter", routes:
 
 
 def together() -> int | None:
-    """Worlds generated together; None on a CPU, where all would wait for the one that is tried most often."""
+    """Return how many worlds are generated together; None on a CPU, where all would wait for the slowest."""
     return None if jax.default_backend() == "cpu" else WORLDS_AT_ONCE
 
 
@@ -114,7 +114,7 @@ def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[World,
     seed = any_of(k_seed, roomy.ravel())
     reached = flood(passable, jnp.zeros(roomy.size, bool).at[seed].set(True).reshape(roomy.shape))
     usable = (roomy & reached).ravel()
-    # A seed in a corner that is cut off from the rest makes no world.
+    # A world whose seed cell is cut off from the rest is rejected.
     connected = (passable & reached).sum() >= 0.8 * passable.sum()
     starts, goals, found = jax.vmap(partial(_route, usable))(jax.random.split(k_routes, routes))
     return world.replace(starts=starts, goals=goals), connected & found.all()

@@ -25,7 +25,7 @@ STRIKE_SPEED = 0.7
 
 
 class PooltoolBilliards(Billiards, kw_only=True):
-    """The environment (`cuelearner_jax.environment.Environment`), to agents the same as `Billiards`.
+    """The environment (`cuelearner_jax.environment.Environment`), with the interface of `Billiards`.
 
     A shot leaves the compiled program (`jax.pure_callback`) and is played in other processes. Of the table's constants
     sizes alone count; friction, restitution and drag are pooltool's.
@@ -35,7 +35,7 @@ class PooltoolBilliards(Billiards, kw_only=True):
     processes: int = struct.field(pytree_node=False, default=0)  # that play; 0: one for each processor
 
     def shot(self, balls: Balls, angle: Float[Array, ""]) -> Shot:
-        """Plays one shot; batches are shared out."""
+        """Play one shot; batches are distributed among processes."""
         count = self.table.balls
         shapes = (
             jax.ShapeDtypeStruct((count, 2), jnp.float32),

@@ -41,7 +41,7 @@ SIDE_POCKET = 0.1  # radius of the circle that stands for the straight edge betw
 
 @lru_cache(maxsize=1)
 def engine() -> PhysicsEngine:
-    """Its models by name: what a user's configuration of pooltool says does not count."""
+    """Return pooltool's physics engine with models by name, independent of the user's pooltool configuration."""
     return PhysicsEngine(
         Resolver.from_config(
             ResolverConfig(
@@ -97,12 +97,12 @@ def table(outline: Outline) -> Table:
 
 
 def _corner_reach(outline: Outline) -> float:
-    """How far from a corner a ball's centre can be when it leaves the table there [m]."""
+    """Return the largest distance from a corner at which a ball's centre can leave the table there [m]."""
     along = outline.corner_gap - outline.ball_radius - outline.cushion_radius
     return math.hypot(along, outline.pocket_margin)
 
 
-def apart(outline: Outline, positions: np.ndarray, pocketed: np.ndarray) -> np.ndarray:
+def separate(outline: Outline, positions: np.ndarray, pocketed: np.ndarray) -> np.ndarray:
     """Places (balls, 2) at which no ball touches another or a cushion: those that do are moved by `CLEAR`, no more.
 
     Positions are kept in single precision; pooltool lets balls that overlap by a rounding error pass.
@@ -134,7 +134,7 @@ def struck(outline: Outline, positions: np.ndarray, pocketed: np.ndarray, angle:
         angle: of the strike, counterclockwise from x [rad].
     """
     params, balls = ball_params(outline.ball_radius), {}
-    for number, (place, out) in enumerate(zip(apart(outline, positions, pocketed), pocketed, strict=True)):
+    for number, (place, out) in enumerate(zip(separate(outline, positions, pocketed), pocketed, strict=True)):
         motion = np.zeros((3, 3))  # place, velocity, spin
         motion[0] = *place, outline.ball_radius
         state = POCKETED if out else RESTING

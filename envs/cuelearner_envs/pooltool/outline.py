@@ -1,4 +1,4 @@
-"""What goes into shots in pooltool and what comes out, in plain numbers."""
+"""Inputs and outputs of shots in pooltool, in plain numbers."""
 
 from __future__ import annotations
 

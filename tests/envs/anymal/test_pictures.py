@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.anymal.scene import AZIMUTH, SIDES_APART, furnished, unobstructed
+from cuelearner_envs.anymal.scene import AZIMUTH, SIDES_APART, furnish, unobstructed
 from cuelearner_envs.navigation import World
 
 STANDING = [0, 0, robot.STANDING_HEIGHT, 1, 0, 0, 0, *robot.HOME]
@@ -18,7 +18,7 @@ def looked_at(*circles):
     rows, heights = np.array([*circles, (9.0, 9.0, 0.1)]), np.full(len(circles) + 1, 1.5)
     nothing = np.zeros((0, 5)), np.zeros(0)
     world = World(*nothing, rows, heights, np.full(2, 20.0), np.zeros((1, 2)), np.zeros((1, 2)))
-    model = furnished(world, np.array([0.0, 0.0]), 0.5)
+    model = furnish(world, np.array([0.0, 0.0]), 0.5)
     data = mujoco.MjData(model)
     data.qpos[:] = STANDING
     mujoco.mj_forward(model, data)

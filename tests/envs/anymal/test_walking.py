@@ -78,8 +78,8 @@ def test_a_damaged_policy_is_the_same_or_refused_in_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("name", "values", "told"),
     [
-        ("std", np.zeros(policy.OBS), "numbers that cannot be"),
-        ("bias_1", np.full(robot.JOINTS, np.nan), "numbers that cannot be"),
+        ("std", np.zeros(policy.OBS), "invalid numbers"),
+        ("bias_1", np.full(robot.JOINTS, np.nan), "invalid numbers"),
         ("mean", np.zeros(3), "no walking policy of this robot"),
         ("kernel_1", np.zeros((5, robot.JOINTS)), "no walking policy of this robot"),
         ("bias_0", np.zeros(()), "no walking policy of this robot"),
@@ -109,7 +109,9 @@ def test_what_is_no_policy_is_refused(tmp_path):
 
 
 def test_noise_stays_within_its_bounds_and_spares_command_and_last_action():
-    many = jax.vmap(policy.noisy, (0, None, None))(jax.random.split(jax.random.key(0), 500), jnp.zeros(policy.OBS), 1.0)
+    many = jax.vmap(policy.add_noise, (0, None, None))(
+        jax.random.split(jax.random.key(0), 500), jnp.zeros(policy.OBS), 1.0
+    )
     largest = np.abs(np.asarray(many)).max(0)
     assert (largest <= policy.NOISE).all()
     assert (largest[policy.NOISE > 0] > 0.95 * policy.NOISE[policy.NOISE > 0]).all()

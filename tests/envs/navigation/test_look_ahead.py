@@ -190,7 +190,7 @@ def test_who_weighs_ways_is_refused_where_they_tell_something_else(policy):
     for before in (False, True):
         source = kept("intent", before)
         source.check(policy, world(look_ahead=before))
-        with pytest.raises(UserError, match=f"weighs aims of {PLAINLY + 3 * before} features"):
+        with pytest.raises(UserError, match=f"uses aims of {PLAINLY + 3 * before} features"):
             source.check(policy, world(look_ahead=not before))
     kept("relative", False).check(policy, world(look_ahead=True))  # who asks nothing of ways does not mind
 

@@ -12,7 +12,7 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.geometry import line_clearance
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
 from cuelearner_envs.navigation.roadmap import RoadMapTeacher, SidedTeacher, make_sided_teacher
-from cuelearner_envs.navigation.sides import closed, heading, passed
+from cuelearner_envs.navigation.sides import closed, count_passed, heading
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
@@ -22,7 +22,7 @@ from cuelearner_jax.tasks.navigation import make_teacher
 BOX, CIRCLE, SIZE = [0, 0.1, 0.3, 0.4, 0.3], [5.0, 0.0, 0.4], (20.0, 4.6)
 STARTS, GOALS = [[-6.0, 0.0]] * 16, [[8.0, 0.0]] * 16
 WORLD = rooms.world([*rooms.walls(*SIZE), BOX], [CIRCLE], SIZE, STARTS, GOALS, rows=(BOXES, CIRCLES))
-passes = jax.jit(passed)
+passes = jax.jit(count_passed)
 
 STEPS = [  # ahead, before, after, (passed on the left, on the right)
     (1, (-0.1, 1.0), (0.1, 1.0), (1, 0)),  # toward larger x and above the box: it stays on the right
