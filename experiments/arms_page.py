@@ -3,7 +3,8 @@
     python experiments/arms_page.py [--data docs/data/arms] [--page docs/results/arms.md]
 
 The data are `training_WORLD.json` of `arms.py`, what `cuelearner evaluate --out` wrote of one agent in MJX and in
-Fetch, and `reach_settings.json`. Three sections go between the lines `<!-- NAME -->` and `<!-- end of NAME -->` of the page.
+Fetch, and `reach_settings.json`. Three sections go between the lines `<!-- NAME -->` and `<!-- end of NAME -->`
+of the page.
 """
 
 from __future__ import annotations
