@@ -181,7 +181,7 @@ def arms() -> list[list[str]]:
         for end in ("_calibrated", "")
     ]
     steps = {(row["run"], row["labels"]): row["median"] for row in arms_page.studied(DATA / "arms", "reach")["steps"]}
-    title = "MJX `reach`, 100 relative labels: steps to 80% success, slower"
+    title = "MJX `reach`, 100 relative labels: steps to 80% success (no gain)"
     rows.append([title, f"{steps['by_value', 100]:,.0f}", f"{steps['alone', 0]:,.0f}", MORE["arms"]])
     title = "An MJX agent in Fetch, camera turned by 10 degrees, 200 labels: success"
     rows.append([title, *(f"{100 * value:.0f}%" for value in turned), MORE["arms"]])
