@@ -42,6 +42,7 @@ class Film:
     period: int = 80  # from one picture to the next in the renderings [ms]
     slower: float = 1.0  # by this factor the film is played
     most: int = 120  # pictures
+    ends: int = 120  # pictures of the rendering before labels, which then stands still: the end of its first episode
     box: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)  # what is shown of each: left, top, right, low
 
 
@@ -74,6 +75,7 @@ FILMS = (
         width=330,
         period=200,
         slower=0.5,
+        ends=5,
     ),
     Film(
         "anymal",
@@ -111,7 +113,15 @@ FILMS = (
         width=320,
         slower=1.5,
     ),
-    Film("fetch", program="fetch_film.py", words=CAMERA, width=320, slower=1.5),
+    Film(
+        "fetch",
+        program="fetch_film.py",
+        words=CAMERA,
+        width=300,
+        period=160,
+        slower=1.5,
+        box=(0.1, 0.3, 0.9, 0.95),
+    ),
 )
 
 
@@ -169,7 +179,7 @@ def join(files: Sequence[Path], film: Film, to: Path) -> int:
     pairs = _pictures(files, film)
     for scale in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5):
         frames = [_beside(pair, film.words, round(film.width * scale)) for pair in pairs]
-        palette = frames[0].quantize(96)
+        palette = frames[0].quantize(128, method=Image.Quantize.MAXCOVERAGE)
         small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
         durations = [round(film.slower * film.period)] * (len(small) - 1) + [1500]
         small[0].save(to, save_all=True, append_images=small[1:], duration=durations, loop=0, optimize=True)
@@ -181,13 +191,13 @@ def join(files: Sequence[Path], film: Film, to: Path) -> int:
 def _pictures(files: Sequence[Path], film: Film) -> list[tuple[Image.Image, ...]]:
     """Return pairs of pictures, `film.period` milliseconds apart; a film that has ended stands still."""
     reels = []
-    for file in files:
+    for file, ends in zip(files, (film.ends, film.most), strict=True):
         reel, time = [], 0
         with Image.open(file) as opened:
             for frame in ImageSequence.Iterator(opened):
                 time += frame.info["duration"]
                 reel += [_cut(frame.convert("RGB"), film.box)] * max(0, -(-time // film.period) - len(reel))
-        reels.append(reel)
+        reels.append(reel[:ends])
     length = min(max(map(len, reels)), film.most)
     return list(zip(*((reel + [reel[-1]] * length)[:length] for reel in reels), strict=True))
 
