@@ -13,7 +13,7 @@ import many_devices
 import numpy as np
 import pytest
 
-from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, each_lane_in_place, lane_mesh, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, each_lane_in_place, lane_mesh, over_lanes, place, settled
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import PolicySource
@@ -131,3 +131,11 @@ def test_a_checkpoint_of_fewer_lanes_is_refused(shared):
     grid = many_devices.Grid(("relative",), tuple(range(9)), (30,))
     with pytest.raises(UserError, match="holds 8 lanes, the run has 9"):
         PolicySource(task, config, grid, shared[0]).load(("relative",))
+
+
+def test_arrays_of_one_device_are_alike_to_a_program_wherever_they_came_from():
+    one = lane_mesh(jax.local_devices()[:1])
+    program = jax.jit(chex.assert_max_traces(lambda values, key: values + jax.random.uniform(key), n=1))
+    for values in (jnp.ones(3), place(one, jnp.ones(3), SHARED), program(*settled((jnp.ones(3), jax.random.key(0))))):
+        program(*settled((values, jax.random.key(0))))
+    assert program._cache_size() == 1
