@@ -217,27 +217,17 @@ def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path
 HELPED = [name.split() for command in dispatch.COMMANDS for name in dispatch.summaries(command)]
 
 
-@pytest.mark.parametrize("command", HELPED, ids=" ".join)
-def test_the_first_page_of_help_tells_what_one_needs_and_the_whole_page_the_rest(command, capsys):
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(name, marks=() if name == ["train"] else pytest.mark.long) for name in HELPED],
+    ids=" ".join,
+)
+def test_the_whole_page_of_help_tells_everything(command, capsys):
     task = [] if command[0] in ("report", "labels") else ["billiards"]
-    pages = []
-    for option in ("--help", "--help-all"):
-        with pytest.raises(SystemExit) as stopped:
-            main([*command, *task, option])
-        assert not stopped.value.code
-        pages.append(capsys.readouterr())
-    first, whole = pages
-    lines = first.out.splitlines()
-    assert len(lines) <= 40
-    assert max(map(len, lines)) <= 118
-    assert f"{' '.join([*command, *task])} --help-all" in " ".join(first.out.split())
-    assert {"--out"} <= set(re.findall(r"^  (--[\w-]+)", first.out, re.MULTILINE)) or command == ["labels", "inspect"]
-    assert "--sizes." not in first.out
-    explained(command[0], *whole)
-    if task and command[0] != "bench":
-        with pytest.raises(SystemExit):
-            main([*command, "--help"])
-        assert len(capsys.readouterr().out.splitlines()) <= 40
+    with pytest.raises(SystemExit) as stopped:
+        main([*command, *task, "--help-all"])
+    assert not stopped.value.code
+    explained(command[0], *capsys.readouterr())
 
 
 @pytest.mark.long

@@ -76,7 +76,9 @@ def test_figures_show_something_and_repeat_byte_for_byte(runs, tmp_path):
     for out in ("one", "two"):
         report(runs, tmp_path / out)
     names = {"curves.png", "curves.svg", "label_efficiency.png", "label_efficiency.svg"}
-    assert {path.name for path in (tmp_path / "one").iterdir()} == names | {"report.md", "summary.csv", "curves.csv"}
+    assert {path.name for path in (tmp_path / "one").iterdir()} == names | {
+        *("report.md", "report.html", "summary.csv", "curves.csv")
+    }
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
         if path.suffix == ".svg":

@@ -13,7 +13,15 @@ from probes import long_but
 
 from cuelearner_envs.navigation.environment import Navigation, Walker
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
-from cuelearner_envs.navigation.roadmap import BLOCKED, LINE_MARGIN, NODE_MARGIN, RoadMapTeacher, make_teacher, way
+from cuelearner_envs.navigation.roadmap import (
+    BLOCKED,
+    LINE_MARGIN,
+    NODE_MARGIN,
+    RoadMapTeacher,
+    make_brief_teacher,
+    make_teacher,
+    way,
+)
 from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import evaluate
 from cuelearner_jax.config import Scalars, Sizes
@@ -275,6 +283,19 @@ def test_the_teacher_points_at_the_next_place_in_the_bodys_frame(teacher, index)
     assert sees.any()
     toward = jax.vmap(teacher.env.heuristic)(observe(teacher.env, states))
     np.testing.assert_allclose(answers[sees], np.asarray(toward)[sees], atol=1e-4)
+
+
+@pytest.mark.long
+def test_a_map_that_is_made_when_asked_answers_as_one_that_is_kept(teacher):
+    """Up to rounding, by which another of two ways that are as long may be the shortest."""
+    brief, found = make_brief_teacher(teacher.env), []
+    answers = jax.jit(lambda states: jax.lax.map(lambda state: brief.best_action(state, None), states))
+    for index in range(3):
+        states = walkers(
+            one(teacher.env.worlds, index), index, 0, free_places(one(teacher.env.worlds, index), index), 0.3
+        )
+        found.append(np.abs(np.asarray(answers(states)) - np.asarray(best(teacher, states))).max(-1))
+    assert np.mean(np.concatenate(found) < 1e-3) > 0.98
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ from scipy import ndimage
 from cuelearner_envs.navigation import generate
 from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import FAR_AWAY
-from cuelearner_envs.navigation.worlds import generate_many
+from cuelearner_envs.navigation.worlds import any_of, generate_many
 
 KEYS = 100
 STYLES = ("clutter", "rooms", "corridor")
@@ -311,3 +311,10 @@ def test_worlds_of_all_styles_have_arrays_of_one_size():
     assert jax.eval_shape(lambda: generate(jax.random.key(0), routes=5)).starts == jax.ShapeDtypeStruct(
         (5, 2), jnp.float32
     )
+
+
+def test_a_usable_cell_is_drawn_as_a_categorical_draws_it():
+    keys, usable = jax.random.split(jax.random.key(0), 200), jax.random.bernoulli(jax.random.key(1), 0.3, (200, 1000))
+    usable = usable.at[0].set(False)
+    weights = jnp.where(usable, 0.0, -jnp.inf)
+    np.testing.assert_array_equal(jax.vmap(any_of)(keys, usable), jax.vmap(jax.random.categorical)(keys, weights))
