@@ -92,7 +92,11 @@ def correct(
             "policy is None: give the policy whose actions the labels are about; of the answers alone, without a base, "
             "cl.fit_feedback makes a model"
         )
-    policy = load_policy(policy) if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX) else policy
+    policy = (
+        load_policy(os.fspath(policy))
+        if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX)
+        else policy
+    )
     before = _recording_of(policy)
     if (
         before is not None
