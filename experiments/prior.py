@@ -69,12 +69,12 @@ PRIOR_OF_WAYS: Options = {
     "arbiter.beta": 1.0,
     "arbiter.trust-after": 20_000,
     "arbiter.near-deg": 5.0,
-    "arbiter.judge-steps": 20_000,
 }
 CAGE: Options = {"arbiter.own-share": 0.0, "arbiter.near-share": 0.0}
 # Chosen on seeds 0 to 3: of 100 labels one model in long fits forgets the rule (0.634 a shot; so: 0.651).
 RULED: Options = {"intent.from-rule": True, "sizes.ensemble": 5, "sizes.fit-steps": 200}
 SHUFFLED: Options = {"scalars.answer": "shuffled"}
+BRIEF = 0.15  # share of the steps with shaped episodes in `brief`: by then the agent's own choice is the better one
 
 
 def variants(
@@ -83,6 +83,7 @@ def variants(
     """Labels as a prior in one world, its controls, its ablation, and the other arbiters."""
     shaped, by_value, paced = {**options, **prior}, {**options, "arbiter": "by_value"}, {**options, "arbiter": "paced"}
     budgets, most = (*few, many), few[-1:]
+    brief = int(BRIEF * int(str(options["schedule.total-steps"])))
     rows: list[tuple[str, str, tuple[int, ...], Options, str]] = [
         ("alone", "none", (), {**options, "arbiter": "episodes"}, "the agent alone"),
         ("prior", "intent", budgets, shaped, "labels about aims"),
@@ -92,6 +93,7 @@ def variants(
         *(("prior", kind, most, shaped, f"labels of the form {kind}") for kind in FORMS),
         ("ruled", "intent", budgets, {**shaped, **RULED}, "labels correct the rule"),
         ("ruled_shuffled", "intent", budgets[:2], {**shaped, **RULED, **SHUFFLED}, "control: shuffled answers"),
+        ("brief", "intent", most, {**shaped, "schedule.guidance-until": brief}, "labels about aims, for a while"),
         ("cage", "intent", most, {**shaped, **CAGE}, "aims alone"),
         ("cage", "any_aim", (), {**shaped, **CAGE}, "aims alone, without labels"),
         ("by_value", "intent", most, by_value, "a second critic compares"),
