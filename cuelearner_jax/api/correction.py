@@ -92,7 +92,11 @@ def correct(
             "policy is None: give the policy whose actions the labels are about; without a base policy, "
             "cl.fit_feedback fits a model to the answers"
         )
-    policy = load_policy(policy) if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX) else policy
+    policy = (
+        load_policy(os.fspath(policy))
+        if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX)
+        else policy
+    )
     before = _recording_of(policy)
     if (
         before is not None

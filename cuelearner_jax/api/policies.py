@@ -94,7 +94,7 @@ def as_policy(given: Any, name: str = "policy") -> Policy:
     """
     if isinstance(given, str | os.PathLike) and not str(given).endswith(ONNX):
         try:
-            given = load_policy(given)
+            given = load_policy(os.fspath(given))
         except UserError as error:
             raise UserError(f"{name}: {error}") from error
     return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)

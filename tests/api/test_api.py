@@ -177,13 +177,13 @@ def rows_of(rows, columns):
 
 
 def test_training_from_python_gives_what_the_command_gives(tmp_path):
-    kinds = ["none", "relative"]
-    run = cl.train(WORLD, TEACHER, probes.CONFIG, guidance=kinds, labels=[10], seeds=[3, 5], progress=False)
-    grid = Grid(("none", "relative"), (3, 5), (10,))
+    how = {"guidance": ["relative"], "labels": [10], "seeds": [3, 5], "progress": False}
+    run = cl.train(WORLD, TEACHER, probes.CONFIG, **how)
+    grid = Grid(("relative",), (3, 5), (10,))
     train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
     columns = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
     assert rows_of(run.results.to_pylist(), columns) == rows_of(results.read(tmp_path / "run").to_pylist(), columns)
-    assert run.policy(guidance="none", seed=5)(SEEN).shape == (200, 2)
+    assert run.policy(guidance="relative", seed=5)(SEEN).shape == (200, 2)
     with pytest.raises(cl.UserError, match="no lane with seed 9"):
         run.policy(seed=9)
 
@@ -222,6 +222,7 @@ def test_a_label_file_answers_in_place_of_a_teacher(tmp_path):
     assert rows_of(run.results.to_pylist(), columns) == rows_of(results.read(tmp_path / "given").to_pylist(), columns)
 
 
+@pytest.mark.long
 def test_chance_is_a_policy_too():
     model = cl.ask(Uniform(), WORLD, TEACHER, labels=10, bound_deg=180.0, sizes=SIZES, scalars=SCALARS)
     assert cl.refine(Uniform(), model)(SEEN).shape == (200, 2)
