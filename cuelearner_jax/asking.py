@@ -19,7 +19,7 @@ from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.refining import bounded_scalars
+from cuelearner_jax.guides.refining import bound_scalars
 from cuelearner_jax.policies import Policy, best_actions, call_policy, policy_name
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
 
@@ -129,7 +129,7 @@ def question(
         states = jax.tree.map(lambda leaf: leaf[None], guide.env)
         first = call_policy(of.base, keys.base, states, guide.obs[None], space)[0]
     if of.bound is not None:
-        scalars = bounded_scalars(space, scalars, of.bound)
+        scalars = bound_scalars(space, scalars, of.bound)
 
     def one(key: PRNGKeyArray, obs: Array, first: Array) -> Array:
         asked = of.guidance.question(key, guide.model, of.env, obs, first, scalars)

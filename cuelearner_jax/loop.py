@@ -29,7 +29,7 @@ from cuelearner_jax.arbiters.protocol import (
     ArbiterOptions,
     Chooses,
     HasCritic,
-    Known,
+    LaneParts,
     Outcome,
     make_arbiter,
     offer_of,
@@ -336,7 +336,7 @@ class Lane(NamedTuple):
         """Return what an arbiter chooses in place of the agent's own actions, until the cut-off."""
         agent, schedule, model = state.agent, settings.schedule, state.guide.model
         steps = jnp.asarray(schedule.learned_from(clock.step), jnp.float32)
-        known = Known(env, self.learner, agent.params, self.guidance, model, settings.scalars, steps)
+        known = LaneParts(env, self.learner, agent.params, self.guidance, model, settings.scalars, steps)
         learns, own = clock.step >= schedule.random_steps, jax.random.fold_in(key, APART)
         return jax.lax.cond(
             clock.step < schedule.guidance_until,

@@ -40,7 +40,7 @@ class Shape:
     directions: int
 
 
-def initial_params(layers: tuple[int, ...], env: Any, key: PRNGKeyArray) -> Params:
+def init_params(layers: tuple[int, ...], env: Any, key: PRNGKeyArray) -> Params:
     """Return random weights of a teacher's network."""
     return q_network(layers).init(key, *network_inputs("action", env, jnp.zeros(env.obs_size), jnp.array([1.0, 0.0])))
 
@@ -119,7 +119,7 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     told = f"{folder / ABOUT} has {shape.directions:,} directions"
     # the same remedy as for a run (`grid.load`)
     check_room(told, 8 * max(shape.layers) * shape.directions, "restore the file")
-    template = jax.eval_shape(lambda key: initial_params(shape.layers, env, key), jax.random.key(0))
+    template = jax.eval_shape(lambda key: init_params(shape.layers, env, key), jax.random.key(0))
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:
         params = saved.restore({"params": halves})["params"]

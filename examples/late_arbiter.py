@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
-from cuelearner_jax.arbiters.episodes import redrawn
+from cuelearner_jax.arbiters.episodes import redraw
 from cuelearner_jax.arbiters.protocol import Outcome
 from cuelearner_jax.config import SHARE, Bounds, Scalars, part
 
@@ -57,5 +57,5 @@ class Late(NamedTuple):
 
     def follow(self, state: Running, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray) -> Running:
         """Count a step, and draw for the episodes that begin."""
-        chosen = redrawn(key, state.chosen, outcome.done, options.probability)
+        chosen = redraw(key, state.chosen, outcome.done, options.probability)
         return Running(chosen, jnp.where(outcome.done, 0, state.steps + 1))

@@ -24,7 +24,7 @@ from cuelearner_jax.config import LARGEST, MOST_LAYERS
 from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import directions as geometry
-from cuelearner_jax.teachers import LearnedTeacher, expected_reward, initial_params
+from cuelearner_jax.teachers import LearnedTeacher, expected_reward, init_params
 from cuelearner_jax.types import Params
 
 SHARPNESS = 0.05  # values that differ by this are told apart when promising directions are drawn
@@ -143,7 +143,7 @@ class Trainer(NamedTuple):
         c = self.config
         k_params, k_env, key = jax.random.split(key, 3)
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, c.tables))
-        params = initial_params(c.layers, env, k_params)
+        params = init_params(c.layers, env, k_params)
         return TeacherState(
             params=params,
             average=jax.tree.map(jnp.copy, params),

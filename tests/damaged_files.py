@@ -41,7 +41,7 @@ from cuelearner_jax.runs import lane_checkpoints
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files, results
 from cuelearner_jax.storage import table as tables
-from cuelearner_jax.teachers import LearnedTeacher, initial_params
+from cuelearner_jax.teachers import LearnedTeacher, init_params
 
 ANGLES = np.linspace(0.0, 6.0, 12)
 SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
@@ -97,7 +97,7 @@ def _labels_read(folder: Path) -> Any:
 
 
 def _teacher(folder: Path) -> None:
-    params = initial_params((8,), small_policies.ENV, jax.random.key(0))
+    params = init_params((8,), small_policies.ENV, jax.random.key(0))
     made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), (8,), 8)
     about = {"config": {"layers": [8], "directions": 8}, "task": {"name": "window", "half_width_deg": 28.0}}
     teachers.save(folder, made, about)

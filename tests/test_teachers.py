@@ -12,7 +12,7 @@ from cuelearner_jax import teachers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.storage import formats
-from cuelearner_jax.teachers import LearnedTeacher, initial_params
+from cuelearner_jax.teachers import LearnedTeacher, init_params
 
 ENV = probes.Window(mirrors=True)
 ABOUT = {"config": {"layers": [32, 32], "directions": 72}}
@@ -21,7 +21,7 @@ OBS = directions.evenly_spaced(4)
 
 @pytest.fixture(scope="module")
 def made():
-    return LearnedTeacher(ENV, initial_params((32, 32), ENV, jax.random.key(0)), 0.0, 0.0, (32, 32), 72)
+    return LearnedTeacher(ENV, init_params((32, 32), ENV, jax.random.key(0)), 0.0, 0.0, (32, 32), 72)
 
 
 def test_it_comes_back_from_disk_in_half_precision(made, tmp_path):

@@ -76,7 +76,7 @@ def check_acts(family: Family, env: Environment) -> None:
                 )
 
 
-def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
+def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
     """Return the distortions of a policy that was read from a file.
 
     Args:

@@ -156,7 +156,7 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
         return Guided(base, arrays["model"], view_of(env), scalars, _guidance(values, env), arrays.get("bound"), sizes)
     if kind == "calibrated":
         base = from_json(values["base"], arrays["base"], env, code, changes)
-        return Calibrated(base, arrays["theta"], own_changes.rebuilt(values, env, changes), values["code"])
+        return Calibrated(base, arrays["theta"], own_changes.rebuild_family(values, env, changes), values["code"])
     if kind != "code":
         raise ValueError(f"{kind!r} is no policy")
     if code is None:

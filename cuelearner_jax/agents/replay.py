@@ -44,7 +44,7 @@ class Transition(struct.PyTreeNode):
     next_obs: Float[Array, " obs_or_0"]
 
 
-class Following(NamedTuple):
+class LaterSteps(NamedTuple):
     """A stored step and those that came after it in the same environment, some of them perhaps of a later episode."""
 
     rewards: Float[Array, "batch n"]
@@ -62,7 +62,7 @@ class RingBuffer(NamedTuple):
     draw: Callable[[PRNGKeyArray, Array, Array, int], Array]  # (key, rows, step, batch_size) -> rows' numbers
     read: Callable[[Array, Array], StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
     follow: Callable[
-        [Array, Array, Array, int, int], Following
+        [Array, Array, Array, int, int], LaterSteps
     ]  # (rows, step, numbers (batch,), n, num_envs) -> Following
 
 
@@ -114,14 +114,14 @@ def ring_buffer(example: StoredStep) -> RingBuffer:
 
     def follow(
         rows: Float[Array, "capacity width"], step: Int[Array, ""], numbers: Int[Array, " batch"], n: int, num_envs: int
-    ) -> Following:
+    ) -> LaterSteps:
         capacity = rows.shape[0]
         further = jnp.arange(n) * num_envs
         newer = jnp.mod(step - 1 - numbers, capacity)  # rows written after each
         places = jnp.mod(numbers[:, None] + further[None], capacity)
         # Three neighbouring numbers of each row, not the row.
         found = rows[places[..., None], reward_column + jnp.arange(3)[None, None]]
-        return Following(*jnp.moveaxis(found, -1, 0), known=further[None] <= newer[:, None])
+        return LaterSteps(*jnp.moveaxis(found, -1, 0), known=further[None] <= newer[:, None])
 
     return RingBuffer(width, empty, add, draw, read, follow)
 

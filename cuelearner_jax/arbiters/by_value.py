@@ -26,8 +26,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.agents.protocol import AgentOptions, has_actor
-from cuelearner_jax.arbiters.episodes import redrawn
-from cuelearner_jax.arbiters.protocol import Arbiter, Known, Outcome
+from cuelearner_jax.arbiters.episodes import redraw
+from cuelearner_jax.arbiters.protocol import Arbiter, LaneParts, Outcome
 from cuelearner_jax.config import POSITIVE, SHARE, Scalars, part
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import Params
@@ -64,7 +64,7 @@ class Config:
         return Finishing(in_targets, self.judge_steps) if self.in_policy else ByOwnValues(in_targets)
 
 
-class Compared(struct.PyTreeNode):
+class ComparingState(struct.PyTreeNode):
     """The arbitrated episodes, with the second critic, or with the arm of the finished policy."""
 
     arbitrated: Bool[Array, " num_envs"]
@@ -74,7 +74,7 @@ class Compared(struct.PyTreeNode):
 
 
 def agent_values_higher(
-    known: Known,
+    known: LaneParts,
     critics: Params,
     obs: Float[Array, "n obs"],
     own: Float[Array, "n action"],
@@ -90,7 +90,7 @@ def agent_values_higher(
 
 
 def choose_by_value(
-    known: Known,
+    known: LaneParts,
     critics: Params,
     obs: Float[Array, "n obs"],
     own: Float[Array, "n action"],
@@ -105,29 +105,29 @@ def choose_by_value(
 class Comparing:
     """Base class of the arbiters that compare values (`protocol.Chooses`)."""
 
-    def init(self, num_envs: int) -> Compared:
+    def init(self, num_envs: int) -> ComparingState:
         """Return the state of the start. First episodes begin with uniform actions and belong to the agent."""
-        return Compared(jnp.zeros(num_envs, bool))
+        return ComparingState(jnp.zeros(num_envs, bool))
 
-    def guided(self, state: Compared) -> Bool[Array, " num_envs"]:
+    def guided(self, state: ComparingState) -> Bool[Array, " num_envs"]:
         """Return which episodes are arbitrated."""
         return state.arbitrated
 
     def follow(
-        self, state: Compared, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
-    ) -> Compared:
+        self, state: ComparingState, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
+    ) -> ComparingState:
         """Draw whether to arbitrate each episode that begins."""
-        return state.replace(arbitrated=redrawn(key, state.arbitrated, outcome.done, options.probability))
+        return state.replace(arbitrated=redraw(key, state.arbitrated, outcome.done, options.probability))
 
-    def compares(self, state: Compared, known: Known) -> Params:
+    def compares(self, state: ComparingState, known: LaneParts) -> Params:
         """Return the parameters of the critics that compare."""
         raise NotImplementedError(f"{type(self).__name__} does not say which critics compare: write `compares`")
 
     def choose(
         self,
-        state: Compared,
+        state: ComparingState,
         options: Config,
-        known: Known,
+        known: LaneParts,
         obs: Float[Array, "num_envs obs"],
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
@@ -141,15 +141,15 @@ class Comparing:
 class ByValue(Comparing):
     """The arbiter beside an agent that takes the argmax of its values (`protocol.HasCritic`)."""
 
-    def compares(self, state: Compared, known: Known) -> Params:
+    def compares(self, state: ComparingState, known: LaneParts) -> Params:
         """Return the parameters of the second critic."""
         return state.params
 
-    def critic(self, state: Compared) -> tuple[Params, Any]:
+    def critic(self, state: ComparingState) -> tuple[Params, Any]:
         """Return the second critic."""
         return state.params, state.training
 
-    def with_critic(self, state: Compared, critic: tuple[Params, Any]) -> Compared:
+    def with_critic(self, state: ComparingState, critic: tuple[Params, Any]) -> ComparingState:
         """Return the state with another second critic."""
         return state.replace(params=critic[0], training=critic[1])
 
@@ -160,7 +160,7 @@ class ByOwnValues(Comparing):
 
     in_targets: bool
 
-    def compares(self, state: Compared, known: Known) -> Params:
+    def compares(self, state: ComparingState, known: LaneParts) -> Params:
         """Return the parameters of the agent's own critics."""
         return known.params
 
@@ -176,20 +176,20 @@ class Finishing(ByOwnValues):
         """Names of the arms: the agent alone, and the better of both actions."""
         return ARMS
 
-    def init(self, num_envs: int) -> Compared:
+    def init(self, num_envs: int) -> ComparingState:
         """Return the state of the start: the agent alone acts until another arm validates better."""
         return super().init(num_envs).replace(best=jnp.array(OWN, jnp.int32))
 
-    def arm(self, state: Compared) -> Any:
+    def arm(self, state: ComparingState) -> Any:
         """Return the number of the arm that validated best."""
         return state.best
 
-    def with_arm(self, state: Compared, arm: Int[Array, "*lanes"]) -> Compared:
+    def with_arm(self, state: ComparingState, arm: Int[Array, "*lanes"]) -> ComparingState:
         """Return the state with another best arm."""
         return state.replace(best=arm)
 
     def act(
-        self, arm: Int[Array, ""], options: Config, known: Known, obs: Float[Array, "n obs"], key: PRNGKeyArray
+        self, arm: Int[Array, ""], options: Config, known: LaneParts, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return the actor's actions, or the better of these and the guide's, as the arm says."""
         own, every = known.agent.act(known.env, known.params, obs, key), jnp.ones(len(obs), bool)

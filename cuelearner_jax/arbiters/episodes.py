@@ -42,10 +42,10 @@ class Episodes(NamedTuple):
         self, state: Bool[Array, " num_envs"], options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
     ) -> Bool[Array, " num_envs"]:
         """Draw whether to guide each episode that begins."""
-        return redrawn(key, state, outcome.done, options.probability)
+        return redraw(key, state, outcome.done, options.probability)
 
 
-def redrawn(
+def redraw(
     key: PRNGKeyArray,
     guided: Bool[Array, " num_envs"],
     done: Bool[Array, " num_envs"],

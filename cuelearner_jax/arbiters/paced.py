@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.arbiters.episodes import redrawn
+from cuelearner_jax.arbiters.episodes import redraw
 from cuelearner_jax.arbiters.protocol import Outcome
 from cuelearner_jax.config import SHARE, Bounds, Scalars, part
 
@@ -114,7 +114,7 @@ class Paced(NamedTuple):
         fade = (1 - 1 / jnp.float32(WINDOW)) ** finished.sum()
         sums = jax.tree.map(lambda old, added: fade * old + added, state.sums, new)
         return Pace(
-            guided=redrawn(key, state.guided, done, probability(sums, options)),
+            guided=redraw(key, state.guided, done, probability(sums, options)),
             gain=jnp.where(done, 0, gain),
             steps=jnp.where(done, 0, steps),
             whole=whole | done,

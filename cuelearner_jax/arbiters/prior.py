@@ -30,7 +30,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.agents.choice import each_in_portions
-from cuelearner_jax.arbiters.protocol import Known, Outcome
+from cuelearner_jax.arbiters.protocol import LaneParts, Outcome
 from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Scalars, part
 from cuelearner_jax.guides.base import Candidates
 from cuelearner_jax.guides.refining import Refinement
@@ -117,7 +117,7 @@ class Prior(NamedTuple):
         self,
         state: Arms,
         options: Config,
-        known: Known,
+        known: LaneParts,
         obs: Float[Array, "num_envs obs"],
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
@@ -141,7 +141,7 @@ class Prior(NamedTuple):
         return state.replace(best=arm)
 
     def act(
-        self, arm: Int[Array, ""], options: Config, known: Known, obs: Float[Array, "n obs"], key: PRNGKeyArray
+        self, arm: Int[Array, ""], options: Config, known: LaneParts, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return the actions of one arm, for the finished policy."""
         own = known.agent.act(known.env, known.params, obs, key)
@@ -151,7 +151,7 @@ class Prior(NamedTuple):
             lambda: _of_arm(jnp.broadcast_to(arm, len(obs)), self._best(options, known, obs), own).actions,
         )
 
-    def _candidates(self, known: Known, obs: Float[Array, " obs"]) -> Candidates:
+    def _candidates(self, known: LaneParts, obs: Float[Array, " obs"]) -> Candidates:
         """Return the guide's candidates, or evenly spaced actions of the whole space."""
         found = known.guide.candidates(known.env, obs)
         if found is not None:
@@ -159,7 +159,7 @@ class Prior(NamedTuple):
         actions = known.guide.spaces.actions.spread(self.directions)
         return Candidates(actions, jnp.ones(len(actions), bool))
 
-    def _best(self, options: Config, known: Known, obs: Float[Array, "n obs"]) -> Choices:
+    def _best(self, options: Config, known: LaneParts, obs: Float[Array, "n obs"]) -> Choices:
         """Return the action with the largest Q + beta log p, among the candidates and then near the best candidate.
 
         The sum is taken times n / (n + trust_after): finite before the first step of learning, where log p decides.
@@ -188,7 +188,7 @@ class Prior(NamedTuple):
         changes = jnp.concatenate([jnp.zeros((1, len(space.cues))), along.reshape(-1, len(space.cues))])
         return space.exp(jnp.broadcast_to(action, (len(changes), *action.shape)), reach * changes)
 
-    def _drawn(self, options: Config, known: Known, obs: Float[Array, " obs"], key: PRNGKeyArray) -> Choices:
+    def _drawn(self, options: Config, known: LaneParts, obs: Float[Array, " obs"], key: PRNGKeyArray) -> Choices:
         """Return a candidate drawn from p, and an action drawn uniformly near it."""
         k_draw, k_near = jax.random.split(key)
         space, (actions, possible) = known.guide.spaces.actions, self._candidates(known, obs)

@@ -52,7 +52,7 @@ class Arbiter(Protocol):
         ...
 
 
-class Known(NamedTuple):
+class LaneParts(NamedTuple):
     """A lane's parts and what they have learned, for arbiters that choose by agent and guide."""
 
     env: Any  # or its view
@@ -72,7 +72,7 @@ class Chooses(Arbiter, Protocol):
         self,
         state: Any,
         options: Any,
-        known: Known,
+        known: LaneParts,
         obs: Float[Array, "num_envs obs"],
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
@@ -144,7 +144,7 @@ class Finishes(Arbiter, Protocol):
         ...
 
     def act(
-        self, arm: Int[Array, ""], options: Any, known: Known, obs: Float[Array, "n obs"], key: PRNGKeyArray
+        self, arm: Int[Array, ""], options: Any, known: LaneParts, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return the finished policy's actions by one of the arms."""
         ...

@@ -18,7 +18,7 @@ from brax.envs.wrappers import training
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.bridges.jax_environment import Given, JaxEnvironment, layout_of, space_of
+from cuelearner_jax.bridges.jax_environment import FixedSimulator, JaxEnvironment, layout_of, space_of
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space
@@ -252,7 +252,7 @@ def from_brax(
     layout = layout_of(env, name)
     return JaxEnvironment(
         max_steps=jnp.array(max_steps, jnp.int32),
-        simulator=Given(env),
+        simulator=FixedSimulator(env),
         observation=layout.observation,
         actions=space_of(name, layout, to_action, cues),
         to_action=to_action,

@@ -81,7 +81,7 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
 
 
 @dataclass(frozen=True)
-class Given:
+class FixedSimulator:
     """A maker that returns the caller's simulator; two makers of one simulator are equal."""
 
     simulator: Any

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cuelearner_jax.bridges.jax_environment import Given, JaxEnvironment, layout_of, space_of
+from cuelearner_jax.bridges.jax_environment import FixedSimulator, JaxEnvironment, layout_of, space_of
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.spaces import Cue
 
@@ -71,7 +71,7 @@ def from_playground(
     layout = layout_of(env, name)
     return JaxEnvironment(
         max_steps=jnp.array(max_steps, jnp.int32),
-        simulator=Given(env),
+        simulator=FixedSimulator(env),
         observation=layout.observation,
         actions=space_of(name, layout, to_action, cues),
         to_action=to_action,

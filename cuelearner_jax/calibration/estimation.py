@@ -133,7 +133,7 @@ class Calibration:
         fits = list(self.fits.values()) or [self._new(names) for names in self._singles()]
         draws = draw_hypotheses(fits, self._odds(fits), self.random)
         places = np.concatenate([fit.places(thetas) for fit, thetas in draws])
-        response = self.responses.of(obs, self.responses.covering(places, LOOKS))
+        response = self.responses.respond(obs, self.responses.covering(places, LOOKS))
         chosen = choose(draws, response, count, self.random)
         best = self.best
         theta = np.zeros(0) if best is None else best.interval()[0][: best.changes]
@@ -200,8 +200,8 @@ class Calibration:
             fits = list(self.fits.values())
             draws = draw_hypotheses(fits, self._odds(fits), self.random)
             places = np.concatenate([fit.places(thetas) for fit, thetas in draws])
-            self.responses.drawn(places, FRESH, self.random)
-        self.response = self.responses.of(self.answers.obs)
+            self.responses.add_nodes(places, FRESH, self.random)
+        self.response = self.responses.respond(self.answers.obs)
         self._fit(())
         for names in self._singles():
             self._fit(names)

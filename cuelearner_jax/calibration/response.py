@@ -73,7 +73,7 @@ class Responses:
         self.smooth = (LENGTHS[1], NUGGETS[1])
         self.known: dict[tuple[bytes, bytes], Floats] = {}
 
-    def drawn(self, draws: Float[Floats, "draws unknowns"], fresh: int, random: np.random.Generator) -> None:
+    def add_nodes(self, draws: Float[Floats, "draws unknowns"], fresh: int, random: np.random.Generator) -> None:
         """Take draws of the posterior, in prior scales: add nodes there, and drop the nodes farthest away."""
         if not self.names:
             return
@@ -97,7 +97,7 @@ class Responses:
             chosen.append(int(left[apart[farthest, left].argmin()]))
         return np.array(chosen)
 
-    def of(
+    def respond(
         self, obs: Float[Floats, "n obs"], among: Int[Floats, " nodes"] | None = None, learn: bool = True
     ) -> Response:
         """Return the policy's response in these situations; `learn`: also fit length and nugget to them."""

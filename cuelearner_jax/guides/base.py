@@ -22,7 +22,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refinement, bounded_scalars, refine
+from cuelearner_jax.guides.refining import Refinement, bound_scalars, refine
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 # pattern of names of kinds, also in files: neither a path nor a reference to code
@@ -253,7 +253,7 @@ class Guide:
     ) -> Refinement:
         """Return `act`, limited to within `bound` of the given actions for every kind."""
         space = self.spaces.actions
-        moved = self.act(model, env, obs, actions, active, bounded_scalars(space, scalars, bound))
+        moved = self.act(model, env, obs, actions, active, bound_scalars(space, scalars, bound))
         return moved._replace(actions=space.clip(moved.actions, actions, bound))
 
     def refined(

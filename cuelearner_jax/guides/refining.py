@@ -32,7 +32,7 @@ def no_refinement(actions: Float[Array, "n action"]) -> Refinement:
     return Refinement(actions, jnp.zeros(actions.shape[0], jnp.int32))
 
 
-def bounded_scalars(space: Space, scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
+def bound_scalars(space: Space, scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
     """Return scalars that bound refinement to `bound` of the first action, or less where they did before."""
     return dataclasses.replace(scalars, tau_max_deg=jnp.minimum(scalars.tau_max_deg, space.to_unit(bound)))
 

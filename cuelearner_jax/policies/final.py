@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.arbiters.protocol import Arbiter, Finishes, Known, make_arbiter
+from cuelearner_jax.arbiters.protocol import Arbiter, Finishes, LaneParts, make_arbiter
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies.layers import Agent, plain_part
@@ -34,7 +34,7 @@ class Arbitrated(PolicyNode):
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the arm's choice of actions."""
         agent = self.base
-        known = Known(agent.view, agent.functions, agent.params, self.guide, self.model, self.scalars, self.steps)
+        known = LaneParts(agent.view, agent.functions, agent.params, self.guide, self.model, self.scalars, self.steps)
         return self.arbiter.act(self.arm, self.options, known, obs, key)
 
     @property

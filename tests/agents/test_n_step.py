@@ -12,7 +12,7 @@ import pytest
 
 from cuelearner_jax import loop
 from cuelearner_jax.agents.networks import MLP, Joined, as_function, q_network
-from cuelearner_jax.agents.replay import Following, Memory, StoredStep, Transition, buffer_for, n_step_return
+from cuelearner_jax.agents.replay import LaterSteps, Memory, StoredStep, Transition, buffer_for, n_step_return
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -27,7 +27,7 @@ summed = jax.jit(n_step_return)
 def window(rewards=(1.0, 2.0, 4.0), discounts=(1, 1, 1), ended=(0, 0, 0), known=(True, True, True)):
     """One window of three steps."""
     rewards, discounts, ended = (jnp.array(values, jnp.float32) for values in (rewards, discounts, ended))
-    return Following(rewards, discounts, ended, jnp.array(known))
+    return LaterSteps(rewards, discounts, ended, jnp.array(known))
 
 
 def returned(following, discount=HALF):

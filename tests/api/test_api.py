@@ -158,7 +158,7 @@ def changed(**parts):
 
 NONSENSE = [  # that test_nonsense_calls.py does not have
     (lambda: cl.fit_feedback(changed(answer=np.ones(7))), r"give observations \(n, obs\)"),
-    (lambda: cl.fit_feedback(cl.Labels(SEEN[:1], SEEN[:1], np.ones(1))), "1 labels teach nothing"),
+    (lambda: cl.fit_feedback(cl.Labels(SEEN[:1], SEEN[:1], np.ones(1))), "1 labels are too few"),
     (lambda: cl.fit_feedback(own_labels(), sizes=SIZES, scalars=WILD), "the fit of the feedback model diverged"),
     (lambda: cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], seeds=1), "asks a teacher: give one"),
     (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, guidance=["telepathy"]), "unknown guidance 'telepathy'"),

@@ -134,7 +134,7 @@ def test_no_more_bounds_are_tried_than_anyone_can_wait_for():
 
 def test_a_policy_of_another_world_is_refused():
     for policy, says in (
-        (OF_BILLIARDS, "this world's 2: keep"),
+        (OF_BILLIARDS, "this world's 2: give a world"),
         (Heuristic(TABLE.env), "^policy cannot act in this wo"),
     ):
         for call in (

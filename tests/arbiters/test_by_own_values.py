@@ -11,7 +11,7 @@ import walk_task
 from walk_task import BOX, SMALL, Walk
 
 from cuelearner_jax.arbiters import by_value
-from cuelearner_jax.arbiters.protocol import Chooses, Finishes, HasCritic, InTargets, Known, make_arbiter, offer_of
+from cuelearner_jax.arbiters.protocol import Chooses, Finishes, HasCritic, InTargets, LaneParts, make_arbiter, offer_of
 from cuelearner_jax.guides import registry
 
 ENV = Walk()
@@ -38,13 +38,13 @@ def made(options=OPTIONS, agent=SMALL, bootstraps=True):
 
 def known(taste=1.0, guide=HEURISTIC):
     model = guide.init(jax.random.key(0))
-    return Known(ENV, Fond(), jnp.float32(taste), guide, model, probes.SCALARS, jnp.float32(0))
+    return LaneParts(ENV, Fond(), jnp.float32(taste), guide, model, probes.SCALARS, jnp.float32(0))
 
 
 @pytest.mark.parametrize("taste", [1.0, -1.0])
 def test_the_guides_action_is_executed_where_the_agents_own_critics_prefer_it(taste):
     arbiter = made()
-    state = by_value.Compared(jnp.ones(9, bool), best=jnp.int32(0))
+    state = by_value.ComparingState(jnp.ones(9, bool), best=jnp.int32(0))
     found = arbiter.choose(state, OPTIONS, known(taste), OBS, BASE, jnp.array(True), jax.random.key(0))
     prefers = taste * (GUIDED[:, 0] - np.asarray(BASE)[:, 0]) > 0
     assert 0 < prefers.sum() < 9

@@ -7,7 +7,7 @@ import probes
 
 from cuelearner_jax import loop
 from cuelearner_jax.arbiters import by_value
-from cuelearner_jax.arbiters.protocol import Chooses, Finishes, HasCritic, Known
+from cuelearner_jax.arbiters.protocol import Chooses, Finishes, HasCritic, LaneParts
 from cuelearner_jax.guides import registry
 from cuelearner_jax.spaces import directions
 
@@ -25,8 +25,8 @@ class Fond:
 def executed(critic, arbitrated, learns=True):
     env = probes.Window()
     guide = registry.make("heuristic", probes.SIZES, env)  # a turn by -1 rad
-    state = by_value.Compared(jnp.asarray(arbitrated), critic)
-    known = Known(env, Fond(), -critic, guide, guide.init(jax.random.key(0)), probes.SCALARS, jnp.float32(0))
+    state = by_value.ComparingState(jnp.asarray(arbitrated), critic)
+    known = LaneParts(env, Fond(), -critic, guide, guide.init(jax.random.key(0)), probes.SCALARS, jnp.float32(0))
     return ARBITER.choose(state, by_value.Config(), known, OBS, OBS, jnp.array(learns), jax.random.key(0))
 
 

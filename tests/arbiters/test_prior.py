@@ -11,7 +11,7 @@ import pytest
 
 from cuelearner_jax import evaluate, loop
 from cuelearner_jax.arbiters import prior
-from cuelearner_jax.arbiters.protocol import Chooses, Finishes, Known, Outcome
+from cuelearner_jax.arbiters.protocol import Chooses, Finishes, LaneParts, Outcome
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.base import Candidates
@@ -52,7 +52,7 @@ VALUES, LOG_P = jnp.array([0.0, 0.3, 0.0]), jnp.array([0.0, -2.0, -9.0])
 
 
 def known(steps, guide=GUIDE):
-    return Known(ENV, Valued(), VALUES, guide, LOG_P, probes.SCALARS, jnp.float32(steps))
+    return LaneParts(ENV, Valued(), VALUES, guide, LOG_P, probes.SCALARS, jnp.float32(steps))
 
 
 def chosen(arm, steps, options=OPTIONS, guide=GUIDE):

@@ -113,5 +113,5 @@ def test_an_answer_that_says_nothing_is_no_answer():
     obs = np.asarray(situations(jax.random.key(0), None, 5)[1])
     calibration.learn(obs, np.asarray(space.sample(jax.random.key(0), (5,))), np.full((5, 3), UNSAID))
     assert calibration.asked == 0
-    with pytest.raises(UserError, match="0 answers tell too little"):
+    with pytest.raises(UserError, match="0 answers are too few"):
         calibration.result()

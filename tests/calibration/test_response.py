@@ -32,7 +32,7 @@ def test_a_linear_policy_is_known_between_nodes():
     known = responses(lambda obs: 0.3 * obs[:, 0] - 0.2 * obs[:, 1])
     obs = np.random.default_rng(0).uniform(-1, 1, (5, 2)).astype(np.float32)
     theta = np.array([[0.2, 0.7], [-0.9, 0.4]])
-    mean, spread = known.of(obs).at(theta)
+    mean, spread = known.respond(obs).at(theta)
     true = -(0.3 * theta[:, 0] - 0.2 * theta[:, 1]) * 0.5 / EPS  # [eps], of every row alike
     np.testing.assert_allclose(mean[..., 0], np.tile(true[:, None], (1, 5)), atol=0.05)
     assert spread.max() < 0.1
@@ -41,7 +41,7 @@ def test_a_linear_policy_is_known_between_nodes():
 def test_where_the_policy_jumps_the_spread_tells():
     known = responses(lambda obs: np.where(obs[:, 0] > 0.2, 0.0, 1.0))
     obs = np.array([[0.3, 0.0], [3.0, 0.0]], np.float32)  # one near the jump, one far from it
-    _, spread = known.of(obs).at(np.array([[0.4, 0.0]]))
+    _, spread = known.respond(obs).at(np.array([[0.4, 0.0]]))
     assert spread[0, 0, 0] > 1
     assert spread[0, 1, 0] < 0.1
 
@@ -50,13 +50,13 @@ def test_no_row_is_asked_twice_and_nodes_follow_what_is_likely():
     count = []
     known = responses(lambda obs: obs[:, 0], count)
     random, obs = np.random.default_rng(0), np.zeros((4, 2), np.float32)
-    known.of(obs)
+    known.respond(obs)
     asked = len(count)
-    known.of(obs)
+    known.respond(obs)
     assert len(count) == asked
     draws = np.array([0.6, -0.3]) + 0.05 * random.standard_normal((50, 2))
     for _ in range(MOST):
-        known.drawn(draws, 3, random)
+        known.add_nodes(draws, 3, random)
     assert len(known.nodes) == MOST
     np.testing.assert_array_equal(known.nodes[0], 0)  # no change stays
     assert (np.abs(known.nodes[1:] - [0.6, -0.3]).max(1) < 0.5).mean() > 0.8

@@ -27,7 +27,7 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.tasks import registry as tasks
-from cuelearner_jax.teachers import LearnedTeacher, initial_params
+from cuelearner_jax.teachers import LearnedTeacher, init_params
 
 HOSTILE = "hostile:KIND"
 CODE = """
@@ -167,7 +167,7 @@ def test_no_string_of_a_policy_folder_is_imported(tmp_path):
 
 
 def test_no_string_of_a_teacher_is_imported(tmp_path):
-    params = initial_params((8,), small_policies.ENV, jax.random.key(0))
+    params = init_params((8,), small_policies.ENV, jax.random.key(0))
     made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), (8,), 8)
     about = {"config": {"layers": [8], "directions": 8}, "task": {"name": "window", "half_width_deg": 28.0}, "by": "me"}
     teachers.save(tmp_path / "teacher", made, about)

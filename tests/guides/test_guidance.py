@@ -176,7 +176,7 @@ def test_a_kind_can_be_registered_again_but_not_another_of_its_name(registered):
     assert guidance.make("calm", probes.SIZES, ENV).name == "calm"
     with pytest.raises(UserError, match="another guidance is already called 'calm': give yours another name"):
         guidance.register(kind_of("calm", about="another"))
-    with pytest.raises(UserError, match="another guidance called 'none'"):
+    with pytest.raises(UserError, match="another guidance is already called 'none'"):
         guidance.register(kind_of("none"))
     assert guidance.find("calm") is one
     assert guidance.find("none") is NONE

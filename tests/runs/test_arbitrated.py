@@ -126,7 +126,7 @@ def test_each_arm_is_exported_as_it_acts(whole, tmp_path, format, arm):
 
 
 def test_a_policy_folder_refuses_it_in_one_line(whole):
-    with pytest.raises(UserError, match="a policy of kind arbitrated cannot be kept in a folder") as told:
+    with pytest.raises(UserError, match="a policy of kind arbitrated cannot be stored in a folder") as told:
         serialization.to_json(agent_of(whole))
     assert "\n" not in str(told.value)
 

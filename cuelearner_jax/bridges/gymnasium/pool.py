@@ -76,7 +76,7 @@ class Process:
             self.child.wait()
 
 
-class Here:
+class LocalInstances:
     """Instances in this process."""
 
     def __init__(self, instances: Instances) -> None:
@@ -126,7 +126,7 @@ class Pool:
     slots: list[Slot] = field(default_factory=list)
     calls: int = 0
     lock: Any = field(default_factory=threading.RLock)
-    hosts: dict[int, Process | Here] = field(default_factory=dict)
+    hosts: dict[int, Process | LocalInstances] = field(default_factory=dict)
     replays: int = 0  # number of replayed steps
     _standing: dict[bytes, list[Slot]] = field(default_factory=dict)
 
@@ -201,11 +201,11 @@ class Pool:
         if place:
             self._standing.setdefault(place, []).append(slot)
 
-    def _host(self, number: int) -> Process | Here:
+    def _host(self, number: int) -> Process | LocalInstances:
         if number not in self.hosts:
             arguments = self.source.arguments_of_instances()
             if self.source.plays_here:
-                self.hosts[number] = Here(Instances(*arguments))
+                self.hosts[number] = LocalInstances(Instances(*arguments))
             else:
                 drawing = _without_screen() if self.source.drawn else {}
                 self.hosts[number] = Process(self.source.pickled(arguments), drawing)
