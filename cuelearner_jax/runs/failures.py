@@ -50,7 +50,7 @@ def without_failed(loaded: Sequence[Any]) -> list[Any]:
         for budget in sorted({budget for budget, _ in pairs}):
             seeds = [str(seed) for own, seed in pairs if own == budget]
             name = variant_name(lanes.guidance.name, budget)
-            console.print(f"{name}: {_listed(seeds)} failed (no longer finite) and are left out")
+            console.print(f"{name}: {_listed(seeds)} failed, no longer finite: left out")
         if not failed.all():
             kept = jax.tree.map(lambda leaf, failed=failed: leaf[~failed], lanes.policies)
             left.append(replace(lanes, seeds=lanes.seeds[~failed], budgets=lanes.budgets[~failed], policies=kept))

@@ -128,8 +128,7 @@ class Runner:
         for lane in found[:LISTED]:
             variant = variant_name(self.name, int(group.budgets[lane]))
             console.print(
-                f"{variant}: the lane of seed {group.seeds[lane]} is no longer finite {when}: it is "
-                f"kept at its last finite "
+                f"{variant}: the lane of seed {group.seeds[lane]} is no longer finite {when}: kept at its last finite "
                 "state and marked as failed"
             )
         if len(found) > LISTED:

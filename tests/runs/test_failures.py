@@ -105,7 +105,7 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policies["params"]))
     assert [row.seeds.tolist() for row in found] == [[3, 8], [3, 5, 8]]
     np.testing.assert_array_equal(found[0].metrics["reward"], found[1].metrics["reward"][[0, 2]])
-    assert "none: seed 5 failed (no longer finite) and are left out" in capsys.readouterr().err
+    assert "none: seed 5 failed, no longer finite: left out" in capsys.readouterr().err
     source = trained.PolicySource(TASK, CONFIG, GRID, sick)
     for seed, says in ((3, ""), (5, "seed 5 failed, no longer finite: this is its last finite state\n")):
         trained.one_policy(source, CONFIG.task, "agent", "none", None, seed)

@@ -80,9 +80,9 @@ def test_a_damaged_policy_is_the_same_or_refused_in_one_line(tmp_path):
     [
         ("std", np.zeros(policy.OBS), "invalid numbers"),
         ("bias_1", np.full(robot.JOINTS, np.nan), "invalid numbers"),
-        ("mean", np.zeros(3), "no walking policy of this robot"),
-        ("kernel_1", np.zeros((5, robot.JOINTS)), "no walking policy of this robot"),
-        ("bias_0", np.zeros(()), "no walking policy of this robot"),
+        ("mean", np.zeros(3), "not a walking policy of this robot"),
+        ("kernel_1", np.zeros((5, robot.JOINTS)), "not a walking policy of this robot"),
+        ("bias_0", np.zeros(()), "not a walking policy of this robot"),
         ("kernel_0", np.array(["a"]), "is damaged"),
     ],
 )
@@ -104,7 +104,7 @@ def test_what_is_no_policy_is_refused(tmp_path):
     with pytest.raises(UserError, match="is damaged"):
         policy.load(tmp_path)
     np.savez(tmp_path / policy.WEIGHTS, mean=np.zeros(3), std=np.ones(3), kernel_0=np.zeros((3, 2)), bias_0=np.zeros(2))
-    with pytest.raises(UserError, match="no walking policy of this robot"):
+    with pytest.raises(UserError, match="not a walking policy of this robot"):
         policy.load(tmp_path)
 
 
