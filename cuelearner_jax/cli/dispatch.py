@@ -1,8 +1,14 @@
 """Dispatch of `cuelearner`: call a command's file, and turn errors into one line and an exit status.
 
-Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, everything
-saved; 1 the disk is full, everything up to the last checkpoint saved, or a training is not finite, everything else
-saved; 141 the reader of standard output has gone (standard error needs no reader).
+Exit status:
+
+    0     done
+    1     the disk is full, everything up to the last checkpoint is saved; or a training is not finite, all else is saved
+    2     bad input, nothing changed
+    129   stopped by SIGHUP, everything saved
+    130   stopped by Ctrl-C, everything saved
+    141   the reader of standard output has gone (standard error needs no reader)
+    143   stopped by SIGTERM, everything saved
 """
 
 from __future__ import annotations

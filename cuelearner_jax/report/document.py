@@ -1,10 +1,9 @@
 """Write the folder of `cuelearner report`: figures and tables from recorded results.
 
-A report is a folder: `report.html` (one file: figures that tell their values under the pointer, the table, what is
-missing, where the numbers come from), `report.md` (the same for other documents), `summary.csv` (the table),
-`curves.csv` (what the curves show), `curves.png/.svg` and, where there are several label budgets,
-`label_efficiency.png/.svg`. A study may add tables, figures and a section (`experiments/label_efficiency.py`). The same
-results always give the same bytes.
+A report is a folder. `report.html` is one file: figures with values under the pointer, the table, what is missing, and
+the provenance. `report.md` holds the same for other documents. Beside them are `summary.csv` (the table), `curves.csv`
+(the curves' values) and `curves.png/.svg`; for several label budgets also `label_efficiency.png/.svg`. A study may add
+tables, figures and a section (`experiments/label_efficiency.py`). Equal results always give equal bytes.
 """
 
 from __future__ import annotations

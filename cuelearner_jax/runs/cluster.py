@@ -1,9 +1,9 @@
 """Run a sweep's shards as jobs of a Slurm cluster; the only module that uses submitit.
 
 A job is submitit's process with `cuelearner sweep ... --shard i/n` as its child, a command that can also be given by
-hand. The outer process never waits inside compiled code, so it always receives the scheduler's signals: near its time
-limit it makes the command save and stop, as Ctrl-C does, and then asks to be requeued. submitit's files lie in `jobs`
-below the sweep's folder, one folder per submission.
+hand. The outer process never waits inside compiled code, so it always receives the scheduler's signals. Near its time
+limit it makes the command save and stop, as Ctrl-C does, and then asks to be requeued. The files of submitit lie in
+`jobs` below the sweep's folder, one folder per submission.
 """
 
 from __future__ import annotations

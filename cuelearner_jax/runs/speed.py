@@ -78,10 +78,10 @@ def measure(
         watch: called with a note before each stretch.
 
     Returns:
-        `steps_a_second` (environment steps of all seeds), `ms_a_step` (one step of every seed), `mb_a_seed` (at rest),
-        `peak_gb` (of the first device in this process so far; None where unknown), `first_step_s` (environment,
-        compilation and first step, without imports), `seeds`, `devices`, `stretches`, `spread` (slowest less fastest
-        stretch, over their median).
+        `steps_a_second` (environment steps of all seeds), `ms_a_step` (one step of every seed), `mb_a_seed` (at rest)
+        and `peak_gb` (of the first device in this process so far; None where unknown). Further `first_step_s`
+        (environment, compilation and first step, without imports), `seeds`, `devices`, `stretches` and `spread`
+        (slowest less fastest stretch, over their median).
     """
     watch("compiling")
     began, mesh = time.perf_counter(), mesh or lane_mesh()
