@@ -20,10 +20,11 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 # What loads JAX, and takes seconds, is imported where a command needs it: `--version` and `--help` wait for nothing.
 from cuelearner_jax import __version__
+from cuelearner_jax.cli import pages
+from cuelearner_jax.cli.pages import HELP
 from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
 from cuelearner_jax.signals import Interrupted
 
-HELP, HELP_ALL = ("-h", "--help", "--help-all"), "--help-all"
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, the options of what it does by its full name.
 COMMANDS = (
     *("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export"),
@@ -114,7 +115,6 @@ def summaries(command: str) -> dict[str, str]:
 
 
 def _overview() -> None:
-    from cuelearner_jax.cli import pages
     from cuelearner_jax.tasks import registry
 
     print("usage: cuelearner COMMAND ...\n\nLearning from relative feedback with off-policy deep RL.\n\ncommands:")
