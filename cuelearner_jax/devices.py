@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import compress
 from pathlib import Path
@@ -71,27 +69,6 @@ def compiler_options(lanes: int) -> dict[str, Any]:
         "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
         "xla_gpu_enable_triton_gemm": lanes < LIBRARY_LANES,
     }
-
-
-_written_out = ContextVar("written out", default=False)
-
-
-@contextmanager
-def written_out() -> Iterator[None]:
-    """Trace without loops over data: for exporters, whose formats have none."""
-    token = _written_out.set(True)
-    try:
-        yield
-    finally:
-        _written_out.reset(token)
-
-
-def goes_through() -> bool:
-    """Return whether a minimum over few data for many places is best taken datum by datum.
-
-    On a CPU: all places are then worked on side by side in vector registers, which XLA's reductions leave unused.
-    """
-    return jax.default_backend() == "cpu" and not _written_out.get()
 
 
 def lane_mesh(devices: Sequence[Any] | None = None) -> Mesh:

@@ -3,7 +3,7 @@
 Exit status:
 
     0     done
-    1     the disk is full, everything up to the last checkpoint is saved; or a training is not finite, all else is saved
+    1     the disk is full, everything up to the last checkpoint saved; or a training is not finite, all else saved
     2     bad input, nothing changed
     129   stopped by SIGHUP, everything saved
     130   stopped by Ctrl-C, everything saved
@@ -26,10 +26,11 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 # JAX takes seconds to load, so a command imports it only when needed, never for `--version` and `--help`.
 from cuelearner_jax import __version__
+from cuelearner_jax.cli import pages
+from cuelearner_jax.cli.pages import HELP
 from cuelearner_jax.errors import NotFinite, UserError, file_system_message, suggestion
 from cuelearner_jax.signals import Interrupted
 
-HELP, HELP_ALL = ("-h", "--help", "--help-all"), "--help-all"
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, its option classes by command name.
 COMMANDS = (
     *("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export"),
@@ -120,7 +121,6 @@ def summaries(command: str) -> dict[str, str]:
 
 
 def _overview() -> None:
-    from cuelearner_jax.cli import pages
     from cuelearner_jax.tasks import registry
 
     print("usage: cuelearner COMMAND ...\n\nLearning from relative feedback with off-policy deep RL.\n\ncommands:")

@@ -13,7 +13,7 @@ import tyro
 from rich.table import Table
 
 from cuelearner_jax.cli import pages
-from cuelearner_jax.cli.dispatch import HELP
+from cuelearner_jax.cli.pages import HELP
 from cuelearner_jax.cli.parsing import out, parse, summary
 from cuelearner_jax.cli.shared_options import Flag
 from cuelearner_jax.config import Scalars

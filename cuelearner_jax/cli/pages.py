@@ -11,8 +11,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from cuelearner_jax.cli.dispatch import HELP_ALL
-
+HELP, HELP_ALL = ("-h", "--help", "--help-all"), "--help-all"
 LINES, COLUMNS = 40, 100  # of a first page
 INDENT = 24  # of texts
 

@@ -21,8 +21,7 @@ from rich.console import Console
 from cuelearner_jax import plugins
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli import pages
-from cuelearner_jax.cli.dispatch import HELP, HELP_ALL
-from cuelearner_jax.cli.pages import Subject
+from cuelearner_jax.cli.pages import HELP, HELP_ALL, Subject
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, no_space, suggestion
