@@ -1,6 +1,6 @@
 """The gallery: its films are small and on their page, and two renderings are joined frame by frame."""
 
-import importlib.util
+import importlib
 from pathlib import Path
 
 import pytest
@@ -9,13 +9,11 @@ from PIL import Image, ImageSequence
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def gallery():
+@pytest.fixture
+def gallery(monkeypatch):
     """The experiment as a module."""
-    spec = importlib.util.spec_from_file_location("gallery", ROOT / "experiments" / "gallery.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
+    return importlib.import_module("gallery")
 
 
 def test_every_film_is_small_and_on_the_page(gallery):
