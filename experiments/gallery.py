@@ -179,13 +179,22 @@ def join(files: Sequence[Path], film: Film, to: Path) -> int:
     pairs = _pictures(files, film)
     for scale in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5):
         frames = [_beside(pair, film.words, round(film.width * scale)) for pair in pairs]
-        palette = frames[0].quantize(128, method=Image.Quantize.MAXCOVERAGE)
+        palette = _below(frames[:: max(1, len(frames) // 6)]).quantize(128, method=Image.Quantize.MAXCOVERAGE)
         small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
         durations = [round(film.slower * film.period)] * (len(small) - 1) + [1500]
         small[0].save(to, save_all=True, append_images=small[1:], duration=durations, loop=0, optimize=True)
         if to.stat().st_size <= MOST_BYTES:
             break
     return to.stat().st_size
+
+
+def _below(frames: Sequence[Image.Image]) -> Image.Image:
+    """Return pictures one below the other: of all their colours a palette is made."""
+    height = frames[0].height
+    whole = Image.new("RGB", (frames[0].width, height * len(frames)))
+    for number, frame in enumerate(frames):
+        whole.paste(frame, (0, number * height))
+    return whole
 
 
 def _pictures(files: Sequence[Path], film: Film) -> list[tuple[Image.Image, ...]]:
