@@ -157,7 +157,7 @@ def load_policy(
     Raises:
         UserError: no such folder, lane or policy.
     """
-    path = shipped.folder_of(folder) if shipped.is_shipped(folder) else arguments.path("folder", folder)
+    path = shipped.folder_of(str(arguments.path("folder", folder)))
     arguments.optional(arguments.text, "policy", policy, trained.POLICIES)
     arguments.optional(arguments.text, "guidance", guidance)
     labels = arguments.optional(arguments.budget, "labels", labels, 0)

@@ -332,6 +332,7 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
         return Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0)
 
     with Opening(make, stopping.set, tell) as opening:
+        opening.wait_for_files()
         return server.serve(opening, f"label {plan.task.name}", port, stopping, open_page, commands)
 
 

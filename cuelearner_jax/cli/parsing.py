@@ -191,7 +191,7 @@ def check_out(place: Path, folder: bool = True) -> None:
         except OSError as error:
             raise UserError(f"{place}: {error.strerror}: give another --out") from None
         if (folder or there != place) and not stat.S_ISDIR(kept.st_mode):
-            raise UserError(f"{there} is no folder: give another --out")
+            raise UserError(f"{there} is not a folder: give another --out")
         if there == place and not os.access(there, os.W_OK):
             raise UserError(f"{there} may not be written to: give another --out, or have its permissions changed")
         if there != place:

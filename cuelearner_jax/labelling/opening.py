@@ -1,4 +1,4 @@
-"""A session that a thread of its own prepares, while its page is open already and says how far that is."""
+"""A session that its own thread prepares, while the session's page is open already and shows the progress."""
 
 from __future__ import annotations
 
@@ -9,26 +9,27 @@ from nicegui import ui
 
 from cuelearner_jax.labelling.session import Session
 
-LOOK_EVERY = 0.3  # for which a page waits before it asks again whether the session is there [s]
+LOOK_EVERY = 0.3  # between two looks of a waiting page for the session [s]
 
 
 class Opening:
-    """Prepares a session in the background; a context, at whose end the session is closed."""
+    """A session being prepared in the background; a context, which closes the session at its end."""
 
     def __init__(
         self, make: Callable[[Callable[[str], None]], Session], failed: Callable[[], None], tell: Callable[[str], None]
     ) -> None:
-        """Begin.
+        """Start the thread.
 
         Args:
-            make: opens the session; is given who is told what is being prepared.
-            failed: is called by the thread if that raises.
-            tell: is told the same.
+            make: opens the session. Its argument is to be called with progress lines, first when files are checked.
+            failed: called by the thread if `make` raises.
+            tell: called with each progress line.
         """
         self.session: Session | None = None
         self.doing = "preparing"
         self._make, self._failed, self._told = make, failed, tell
         self._error: BaseException | None = None
+        self._checked = threading.Event()
         self._thread = threading.Thread(target=self._open, name="opening")
         self._thread.start()
 
@@ -38,10 +39,18 @@ class Opening:
         except BaseException as error:
             self._error = error
             self._failed()
+        finally:
+            self._checked.set()
 
     def _tell(self, words: str) -> None:
+        self._checked.set()
         self.doing = words
         self._told(words)
+
+    def wait_for_files(self) -> None:
+        """Wait until the session's files are checked. Raises what `make` raised until then, before a page is shown."""
+        self._checked.wait()
+        self.check()
 
     def check(self) -> None:
         """Raise what opening the session raised, if anything."""

@@ -119,9 +119,9 @@ class _Last:
         self._waited_for = 0
 
     async def finish(self) -> None:
-        """Raises UserError if the work cannot be finished; the page then goes on."""
+        """Finish the session. Raises UserError if its labels cannot be saved; the session then continues."""
         session = self.session
-        assert session is not None  # its page has the button
+        assert session is not None  # the button is on the session's page
         file = await run.io_bound(session.finish)
         if file is None or self.told is not None:  # the program ends, or another page was first
             return
@@ -159,9 +159,17 @@ def serve(
     tell: Callable[[str], None],
     commands: Commands,
 ) -> Ending | None:
-    """Serves the page on a socket of `bound`, at once; `tell` is given its address, whose token nobody else knows.
+    """Serve the page on a socket of `bind` until the session ends; show the progress until the session is opened.
 
-    Returns how a person finished; None: `stopping` was set before. Raises what opening the session raised.
+    Args:
+        opening: the session being prepared.
+        title: of the page.
+        taken: the socket to listen on.
+        stopping: set it to stop the server.
+        tell: called with the page's address, which contains a secret token.
+        commands: what the last page shows for copying.
+
+    Returns how a person finished the session; None if `stopping` was set before. Raises what opening the session raised.
     """
     token, port = secrets.token_urlsafe(18), taken.getsockname()[1]
     pages: set[Page] = set()

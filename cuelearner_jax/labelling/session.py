@@ -80,12 +80,12 @@ class Session:
     def __init__(
         self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None, practice: int = 0
     ) -> None:
-        """Opens the file and prepares the first questions: afterwards nothing is compiled, but by the thread that fits.
+        """Open the label file and prepare the first questions; only the thread that fits may still compile then.
 
         Args:
             plan: the session's settings.
             folder: the folder of `labels.jsonl`. Keep the folder claimed (`storage.folders.claimed`).
-            tell: called with progress lines.
+            tell: called with progress lines, first when the folder's files are checked.
             practice: number of practice questions before the first one; their answers are not saved. None are asked
                 where the file holds answers already.
 
@@ -124,7 +124,7 @@ class Session:
         self._items: dict[int, Item] = {}
         self._trouble = ""
         self._finished: Path | None = None
-        self._lived(start, tell)
+        self._replay(start, tell)
         self.practice = 0 if self._rows else practice
         self._prepare_practice(start)
         tell("preparing questions")
@@ -135,7 +135,7 @@ class Session:
         self._next: Future[None] = self._ahead.submit(self._ensure, self.number + 1)
         self._since = time.monotonic()
 
-    def _lived(self, start: GuideState, tell: Callable[[str], None]) -> None:
+    def _replay(self, start: GuideState, tell: Callable[[str], None]) -> None:
         """Replay the file's items, fit a model to its answers, and make the question that comes next."""
         for row in label_files.history(self._writer.path):
             if row.get("item") is None:

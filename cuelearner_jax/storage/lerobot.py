@@ -91,7 +91,7 @@ def _info(path: Path) -> dict[str, Any]:
         raise UserError(f"{file} is damaged: restore it from where the dataset came from") from error
     if version != VERSION:
         raise UserError(
-            f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is wanted: convert it by "
+            f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is needed: convert it by "
             "LeRobot's own script first"
         )
     if not sound:

@@ -15,7 +15,8 @@ from cuelearner_jax.arbiters.protocol import Chooses, Finishes, LaneParts, Outco
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.base import Candidates
-from cuelearner_jax.policies import Agent, describe, final
+from cuelearner_jax.policies import Agent, describe
+from cuelearner_jax.policies.final import final_policy
 from cuelearner_jax.runs import judging
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import LaneGroup
@@ -213,7 +214,9 @@ def test_of_arms_that_validate_alike_the_agent_acts():
 def test_another_arbiter_leaves_the_agent_alone():
     group = group_of("rule", probes.CONFIG)
     lane = group.start()[0]
-    policy = final(probes.CONFIG, group.guidance, ENV, 0, {"params": lane.agent.params, "guidance": lane.guide.model})
+    policy = final_policy(
+        probes.CONFIG, group.guidance, ENV, 0, {"params": lane.agent.params, "guidance": lane.guide.model}
+    )
     assert isinstance(policy, Agent)
     assert judging.judges_world(probes.CONFIG, lambda split: pytest.fail("made")) is None
 

@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 from small_runs import SWEEP, listing
 
+from cuelearner_jax import terminal
 from cuelearner_jax.cli import main
+
+
+@pytest.fixture(autouse=True)
+def _no_progress_lines(monkeypatch):
+    """Standard error holds messages alone, however slow the machine is; tests/test_terminal.py has progress lines."""
+    monkeypatch.setattr(terminal, "FIRST", 600.0)
 
 
 @pytest.fixture(scope="session")

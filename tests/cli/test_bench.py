@@ -30,7 +30,7 @@ BAD = [
     ([*SMALL, "--seeds", "0"], "different positive numbers"),
     ([*SMALL, "--seeds", "2", "2"], "different positive numbers"),
     ([*SMALL, "--seconds", "0"], "--seconds is 0.0"),
-    ([*SMALL, "--devices", "9"], "--devices is 9: there are"),
+    ([*SMALL, "--devices", "9"], "--devices is 9: give at most"),
     ([*SMALL, "--agent.replay-capacity", "1000000000000"], "counted in 32 bits"),
     (["bench", "billards"], "did you mean 'billiards'"),
     (["bench", "--seedz", "1"], "--seeds"),

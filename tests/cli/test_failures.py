@@ -44,10 +44,10 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--steps", "150"], "multiple of envs"),
     (["evaluate", "billiards", "--scenario", "tilted_tabel"], "did you mean 'tilted_table'"),
     (["evaluate", "billiards", "--scenario"], "choose one of turned_strike, shifted_balls, tilted_table"),
-    (["evaluate", "billiards", "--guidance", "none"], "--guidance chooses nothing here"),
-    (["render", "billiards", "--seed", "3"], "--seed chooses nothing here"),
-    (["render", "billiards", "--labels", "0"], "--labels chooses nothing here"),
-    (["render", "billiards", "--guidance", "none"], "--guidance chooses nothing here"),
+    (["evaluate", "billiards", "--guidance", "none"], "--guidance has no effect"),
+    (["render", "billiards", "--seed", "3"], "--seed has no effect"),
+    (["render", "billiards", "--labels", "0"], "--labels has no effect"),
+    (["render", "billiards", "--guidance", "none"], "--guidance has no effect"),
     (["render", "billiards", "--film", "avi"], "gif or mp4"),
     (["render", "billiards", "--steps", "0"], "--steps is 0: give a number from 1 to 100,000"),
     (["render", "billiards", "--episode", "-1"], "--episode is -1: give a number from 0 to 4,294,967,295"),
@@ -119,7 +119,7 @@ def test_a_folder_in_use_is_left_alone(refused, run_folder, tmp_path):
 
 def test_resume_with_other_options_names_them(refused, run_folder):
     changed = [*SWEEP, "--scalars.eps-deg", "3", "--out", run_folder, "--resume"]
-    refused(changed, "another scalars.eps_deg", run_folder)
+    refused(changed, "other values of scalars.eps_deg", run_folder)
 
 
 @pytest.mark.long
@@ -159,7 +159,7 @@ def test_what_is_no_run_is_refused(refused, copy, tmp_path, command):
     out = ["--out", tmp_path / "new"]
     refused([command, empty, *out], "no config.json", tmp_path)
     refused([command, copy, "--policy", "expert", *out], "unknown policy", tmp_path)
-    refused([command, copy, "--task.table", "easy", *out], "keep its structure", tmp_path)
+    refused([command, copy, "--task.table", "easy", *out], "keep the options that set the observation's size", tmp_path)
     refused([command, copy, "--guidance", "scalar", *out], "choose among none, relative", tmp_path)
     (copy / "config.json").write_text("{")
     refused([command, copy, *out], "damaged", tmp_path)

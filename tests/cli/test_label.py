@@ -149,7 +149,7 @@ def test_what_is_labelled_by_default_trains_in_minutes(monkeypatch, tmp_path, ca
 
 def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp_path):
     pytest.importorskip("nicegui")
-    monkeypatch.setattr(label, "planned", lambda *told: None)  # worlds take long to make
+    monkeypatch.setattr(label, "make_plan", lambda *told: None)  # worlds take long to make
     options = ["--scenario", "corridor_left", "--sizes.frame", "action", "--scalars.eps-deg", "10"]
     _, _, commands = asked_for(monkeypatch, "navigation", "--out", str(tmp_path), *options)
     words = shlex.split(commands.following(7))

@@ -66,7 +66,7 @@ def test_a_run_says_where_its_task_is_from(run):
 
 def test_a_file_does_not_have_code_loaded(run, refused, tmp_path):
     for command in ("evaluate", "render"):
-        says = "not loaded because a file names it: add --task own_window:TASK if you trust that code"
+        says = "not loaded just because a file names it: add --task own_window:TASK if you trust that code"
         refused([command, run, *(["--out", tmp_path / "new"] if command == "render" else [])], says, run)
     assert "own_window" not in sys.modules
     assert main(["evaluate", str(run), "--task", "own_window:TASK", *EVALUATE]) == 0

@@ -215,12 +215,14 @@ def test_a_gain_is_made_where_lines_between_points_say(modules, recorded):
     labels, values = points["relative", ""]
     assert labels == [0, 100, 200]
     reference = values[..., [0, -1]]
-    made = found.reached(values, labels, reference, own=True)
+    made = found.first_reaching(values, labels, reference, own=True)
     assert made.estimate == pytest.approx(100 + 100 * 0.28 / 0.3)
     assert (made.lower, made.upper) == pytest.approx((made.estimate, made.estimate))  # all agents are alike
     steps, values = points["finetuning", ""]
-    assert found.reached(values, steps, reference, own=False).estimate == pytest.approx(2_000 + 2_000 * 0.08 / 0.2)
-    never = found.reached(values * 0.5, steps, reference, own=False)
+    assert found.first_reaching(values, steps, reference, own=False).estimate == pytest.approx(
+        2_000 + 2_000 * 0.08 / 0.2
+    )
+    never = found.first_reaching(values * 0.5, steps, reference, own=False)
     assert never.in_words(4_000) == "above 4,000 [above 4,000, above 4,000]"
 
 
@@ -317,7 +319,7 @@ def test_ceilings_are_those_after_the_most_actions(modules, tmp_path):
 
 def test_a_piece_is_finished_resumed_and_refused(modules, tmp_path, capsys, monkeypatch):
     data, known = modules["adaptation_billiards"], modules["_adaptation"]
-    monkeypatch.setattr(known, "opened", lambda *_: None)  # what `make smoke` runs
+    monkeypatch.setattr(known, "open_bench", lambda *_: None)  # what `make smoke` runs
     monkeypatch.setitem(known.METHODS, "none", lambda bench: [{"base": [7, 8], "labels": 0, "steps": 0, "reward": 0.5}])
     asked = ["--bases", "run", "--out", str(tmp_path), "--pieces", "turned_strike/none"]
     assert data.main(asked) == 0

@@ -39,7 +39,7 @@ def test_the_estimate_narrows_the_page_shows_it_the_policy_follows_and_a_restart
     async def acts(user, pages):
         await user.should_see("estimate 2, of 20 labels")
         await user.should_see("direction: turn: ")
-        await user.should_see("the policy as corrected so far")
+        await user.should_see("the corrected policy")
 
     session = opened(**SETTINGS)
     assert session.status().newest.told == ()

@@ -448,7 +448,7 @@ def test_a_finished_kind_is_looked_at_before_it_is_called_finished(whole, tmp_pa
     refused(out, "not a label file of cuelearner, or it is damaged")
 
 
-@pytest.mark.parametrize(("resume", "says"), [(False, "not empty"), (True, "another scalars.eps_deg")])
+@pytest.mark.parametrize(("resume", "says"), [(False, "not empty"), (True, "other values of scalars.eps_deg")])
 def test_a_folder_that_another_process_used_in_the_meantime_is_left_alone(stopped, tmp_path, resume, says):
     out, other = copied(stopped, tmp_path), tmp_path / "other"
     if resume:

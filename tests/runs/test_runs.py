@@ -220,7 +220,7 @@ def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
     [
         (probes.CONFIG, GRID, {}, "not empty"),
         (probes.CONFIG, GRID, {"resume": True, "overwrite": True}, "give one of them"),
-        (probes.config(scalars={"k_max": 3}), GRID, {"resume": True}, r"another scalars\.k_max"),
+        (probes.config(scalars={"k_max": 3}), GRID, {"resume": True}, r"other values of scalars\.k_max"),
         (probes.config(agent={"batch_size": 0}), GRID, {"overwrite": True}, r"agent\.batch_size is 0"),
         (probes.CONFIG, Grid(("none",), (), ()), {"overwrite": True}, "seeds must be"),
         (probes.config(agent={"replay_capacity": 2 * 10**9}), GRID, {"overwrite": True}, "are free"),
