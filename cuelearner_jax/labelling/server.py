@@ -169,7 +169,7 @@ def serve(
         tell: called with the page's address, which contains a secret token.
         commands: what the last page shows for copying.
 
-    Returns how a person finished the session; None if `stopping` was set before. Raises what opening the session raised.
+    Returns how a person finished the session; None if `stopping` was set before. Raises what `opening` raised.
     """
     token, port = secrets.token_urlsafe(18), taken.getsockname()[1]
     pages: set[Page] = set()

@@ -57,7 +57,8 @@ class PictureFiles:
             inside(self._folder, name, "picture")
             if Path(name).suffix.lower() not in KINDS:
                 raise UserError(
-                    f"picture {format_value(name)} has a type that the page does not show: give one of {', '.join(KINDS)}"
+                    f"picture {format_value(name)} has a type that the page does not show: give one of "
+                    f"{', '.join(KINDS)}"
                 )
         self._names: list[str | None] = names
 
