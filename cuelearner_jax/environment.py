@@ -214,22 +214,15 @@ class Spaces(NamedTuple):
 def spaces_of(env: Any) -> Spaces:
     """Return an environment's spaces; shapes in place of its arrays will do."""
     spaces = Spaces(env.obs_size, actions_of(env))
+    # New functions for each call, which share no trace: JAX 0.10 and 0.12 take dataclasses of different classes with
+    # equal fields for the same tree, and now and then give one class the trace of another.
     obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
     if offers(env, "features"):
-        seen = jax.eval_shape(_features, env, obs, action)
+        seen = jax.eval_shape(lambda env, obs, action: env.features(obs, action), env, obs, action)
         spaces = spaces._replace(features=(seen.own.shape[-1], seen.turned.shape[-1]))
     if offers(env, "aims"):
-        spaces = spaces._replace(aims=jax.eval_shape(_aims, env, obs).features.shape[-1])
+        spaces = spaces._replace(aims=jax.eval_shape(lambda env, obs: env.aims(obs), env, obs).features.shape[-1])
     return spaces
-
-
-# Named functions, since JAX caches traces by function.
-def _features(env: Any, obs: Float[Array, " obs"], action: Float[Array, " action"]) -> Features:
-    return env.features(obs, action)
-
-
-def _aims(env: Any, obs: Float[Array, " obs"]) -> Aims:
-    return env.aims(obs)
 
 
 def symmetries_of(env: Any) -> int:

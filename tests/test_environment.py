@@ -10,6 +10,7 @@ import pytest
 
 from cuelearner_jax.bridges.brax import from_brax, to_brax
 from cuelearner_jax.environment import (
+    Features,
     actions_of,
     offers,
     random_symmetries,
@@ -128,3 +129,19 @@ def test_a_key_always_draws_the_same_symmetries_and_another_key_others():
     )
     np.testing.assert_array_equal(one, same)
     assert (np.abs(one - other).max(-1) > 0.5).mean() > 0.5
+
+
+def test_environments_of_equal_fields_have_spaces_of_their_own():
+    """JAX takes such classes for the same tree; with a shared trace a tenth of them got the sizes of another."""
+
+    def turned(size):
+        class Turned(probes.Window):
+            def features(self, obs, action):
+                return Features(jnp.zeros(size), action)
+
+        return Turned()
+
+    assert jax.tree.structure(turned(1)) == jax.tree.structure(turned(2))
+    for size in range(1, 61):
+        assert spaces_of(turned(size)).features == (size, 2)
+        assert spaces_of(probes.Window()).features == (2, 4)
