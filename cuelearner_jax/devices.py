@@ -169,11 +169,11 @@ def _lane(blocks: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.lax.dynamic_index_in_dim(leaf, index, keepdims=False), blocks)
 
 
-def settled(tree: Any) -> Any:
-    """Return a tree whose arrays of one device are all committed to it alike.
+def commit_arrays(tree: Any) -> Any:
+    """Return a tree in which every array of a single device is committed to that device.
 
-    Arrays that lie on the same device as part of a mesh, as its own, or uncommitted, are of three kinds to `jax.jit`,
-    which compiles once for each. Arrays of several devices stay as they are.
+    For `jax.jit` an array is part of a mesh, committed to a device, or uncommitted. It compiles once for each of these
+    three kinds, also where the device is the same. Arrays of several devices stay as they are.
     """
 
     def put(leaf: Any) -> Any:

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions, settled
+from cuelearner_jax.devices import BY_LANE, SHARED, commit_arrays, over_lanes, portions
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.policies import Policy, PolicyBlock, call_policy, lanes_in, policy_name
 
@@ -240,7 +240,7 @@ def _in_stretches(
 ) -> Rollout:
     """Roll out one policy (`each` is None), or the lanes of `each` side by side; a lane that fails is NaN."""
     count, lanes = _stretches(steps // num_envs), 0 if each is None else len(jax.tree.leaves(each)[0])
-    env, each, shared, key = settled((env, each, shared, key))
+    env, each, shared, key = commit_arrays((env, each, shared, key))
     walk = _begin(env, key, num_envs=num_envs)
     walk = _repeat(walk, lanes=lanes) if lanes else walk
     for number, indices in enumerate(np.arange(steps // num_envs).reshape(count, -1)):
@@ -266,7 +266,7 @@ def _begin(env: Any, key: PRNGKeyArray, *, num_envs: int) -> _Walk:
 
 @partial(jax.jit, static_argnames="lanes")
 def _repeat(walk: _Walk, *, lanes: int) -> _Walk:
-    """The same beginning for each lane: apart, so that lanes and single policies share the program that begins."""
+    """Repeat a beginning for each lane. Lanes and single policies thus share the program that makes the beginning."""
     return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], lanes, axis=0), walk)
 
 

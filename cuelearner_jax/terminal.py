@@ -61,9 +61,9 @@ console = Console(file=cast(IO[str], _StandardError()), **PLAIN)
 
 @contextmanager
 def progress_bars(shown: bool = True, counted: bool = True) -> Iterator[Progress]:
-    """Progress on standard error: bars on a terminal, lines elsewhere; not `shown`: none.
+    """Show progress on standard error: bars on a terminal, lines elsewhere, nothing unless `shown`.
 
-    `counted`: bars show numbers of what is done.
+    `counted`: bars also show how much of how much is done.
     """
     if shown and not console.is_terminal:
         with ProgressLines() as lines:
@@ -94,11 +94,11 @@ class ProgressLines(Progress):
         self._thread = threading.Thread(target=self._tell_on, name="progress", daemon=True)
 
     def start(self) -> None:
-        """Begin to tell."""
+        """Start the thread that prints lines."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End."""
+        """End the thread that prints lines."""
         self._ended.set()
         self._thread.join()
 
@@ -108,22 +108,22 @@ class ProgressLines(Progress):
         return self._newest
 
     def remove_task(self, task_id: TaskID) -> None:
-        """Drop a piece of work."""
+        """Remove a piece of work."""
         self._newest = None if self._newest == task_id else self._newest
         super().remove_task(task_id)
 
     def update(self, task_id: TaskID, **options: Any) -> None:
-        """Note how far a piece of work is."""
+        """Set the progress of a piece of work."""
         super().update(task_id, **options)
         self._newest = task_id
 
     def advance(self, task_id: TaskID, advance: float = 1) -> None:
-        """Note that a piece of work is farther."""
+        """Add to the progress of a piece of work."""
         super().advance(task_id, advance)
         self._newest = task_id
 
     def tell(self) -> None:
-        """Print a line if there is something new to tell, or nothing was told for long."""
+        """Print a line about the piece of work that moved last, if the line is new or none was printed for long."""
         task = self._tasks.get(self._newest) if self._newest is not None else None
         if task is None:
             return

@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-import scipy.optimize
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from cuelearner_jax.report.figures import STYLE
+from cuelearner_jax.report.figures import STYLE, separate_heights
 from cuelearner_jax.report.statistics import Interval
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -190,11 +189,8 @@ def name_ends(axes: Axes, ends: Sequence[tuple[float, str, str]], size: float = 
     lowest = axes.transData.transform((1.0, low))[1]
     places = (heights - lowest) / room
     gap = 1.35 * size * figure.dpi / 72 / room
-    order, rank = np.argsort(places, kind="stable"), gap * np.arange(len(ends))
-    moved = scipy.optimize.isotonic_regression(places[order] - rank).x
-    moved = np.clip(moved, 0.0, max(0.0, 1.0 - rank[-1])) + rank
-    for at, place in zip(order, moved, strict=True):
-        _, name, colour = ends[at]
+    top = max(1.0, gap * (len(ends) - 1))
+    for (_, name, colour), place in zip(ends, separate_heights(places, gap, 0.0, top), strict=True):
         dark = tuple(0.75 * channel for channel in to_rgb(colour))
         axes.text(1.02, place, name, transform=axes.transAxes, color=dark, fontsize=size, va="center")
     axes.set_ylim(low, high)

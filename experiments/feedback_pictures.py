@@ -90,8 +90,8 @@ def teacher(obs: np.ndarray) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class Drawn:
-    """What a picture shows: answers (labels, ...), and actions after them (situations,)."""
+class Content:
+    """The content of a picture: answers (labels, ...), and actions after these answers (situations,)."""
 
     form: str  # of the answers; empty: there are none
     labels: Any
@@ -103,7 +103,7 @@ SITUATIONS, ROWS = np.linspace(-1, 1, 161, dtype=np.float32)[:, None], np.linspa
 
 
 def corrected(kind: str) -> tuple[Any, Any]:
-    """Return the policy that `cl.adapt` makes of `LABELS` answers, and these."""
+    """Return the policy that `cl.adapt` makes of `LABELS` answers, and the answers."""
     scalars = dataclasses.replace(plain_scalars(HEIGHTS), **TEACHERS.get(kind, {}))
     # Of uniform actions few are good, so good/bad needs more answers than the others do.
     count = 4 * LABELS if kind == "scalar" else LABELS
@@ -114,19 +114,19 @@ def corrected(kind: str) -> tuple[Any, Any]:
     return better, jax.tree.map(lambda leaf: np.asarray(leaf[0]), better.outcome.found.labels)
 
 
-def drawn(kind: str) -> Drawn:
-    """What the picture of a kind, or of an arbiter, shows."""
+def content_of(kind: str) -> Content:
+    """Return the content of the picture of a kind or of an arbiter."""
     if kind == "heuristic":
-        return Drawn("", None, np.full(len(SITUATIONS), 0.1))
+        return Content("", None, np.full(len(SITUATIONS), 0.1))
     if kind in ARBITERS:
         return prior()
     better, labels = corrected(kind)
     form = registry.find(kind).form
     assert form is not None
-    return Drawn(form.name, labels, np.asarray(better(SITUATIONS))[:, 0])
+    return Content(form.name, labels, np.asarray(better(SITUATIONS))[:, 0])
 
 
-def prior() -> Drawn:
+def prior() -> Content:
     """Values that like two heights equally, and labels that choose among them."""
     _, labels = corrected("relative")
     keep = np.asarray(labels.valid, bool)
@@ -136,10 +136,10 @@ def prior() -> Drawn:
     likely = jax.vmap(lambda obs: guide.log_p(fitted.model, Line(), obs, heights, fitted.scalars))(SITUATIONS)
     two = jnp.minimum(jnp.abs(ROWS - right(SITUATIONS)), jnp.abs(ROWS - right(SITUATIONS) + 0.75))
     values = -two + 0.1 * np.asarray(likely)
-    return Drawn("relative", labels, ROWS[np.argmax(np.asarray(values), 1)], np.asarray(-two).T)
+    return Content("relative", labels, ROWS[np.argmax(np.asarray(values), 1)], np.asarray(-two).T)
 
 
-def plot(what: Drawn, kind: str) -> Figure:
+def plot(what: Content, kind: str) -> Figure:
     """Draw the one picture that all kinds share; readable on white and on black."""
     found = registry.find_or_none(kind)
     colour = found.colour if found else "#0072B2"
@@ -165,7 +165,7 @@ def plot(what: Drawn, kind: str) -> Figure:
     return figure
 
 
-def answers(axes: Any, what: Drawn) -> None:
+def answers(axes: Any, what: Content) -> None:
     """Draw each answer where its question lies."""
     if what.labels is None:
         return
@@ -187,7 +187,7 @@ def answers(axes: Any, what: Drawn) -> None:
 
 
 def main() -> None:
-    """Draws the pictures."""
+    """Draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kinds", nargs="*", default=SHOWN, choices=SHOWN)
     parser.add_argument("--out", type=Path, default=Path("docs/figures/feedback"))
@@ -197,7 +197,7 @@ def main() -> None:
     file = asked.out / "pictures.json"
     told = json.loads(file.read_text()) if file.exists() else {}
     for kind in asked.kinds:
-        what = drawn(kind)
+        what = content_of(kind)
         plot(what, kind).savefig(asked.out / f"{kind}.svg", metadata={"Date": None}, transparent=True)
         wrong = float(np.abs(what.after - np.asarray(right(SITUATIONS))[:, 0]).mean() / OFFSET)
         count = 0 if what.labels is None else int(np.asarray(what.labels.valid).sum())

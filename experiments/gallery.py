@@ -4,7 +4,7 @@
 
 Run in the folder above this one. The commands of a film are those that a user types (`FILMS` below); what lies in the
 folder of `--work` already is not made again. Each film shows the same episodes of both policies, in a GIF of at most
-600 kB. All films take about ten minutes of processor time.
+600 kB.
 """
 
 from __future__ import annotations
@@ -47,11 +47,24 @@ class Film:
 
 
 SCRIPTS = "cuelearner_envs.arm.scripts"
-REACH = (
-    "reach",
-    f"adapt {SCRIPTS}:reach --task arm --task.skill reach --scenario turned_camera --labels 100",
-)
 CAMERA = ("camera moved, no labels", "the same camera, 100 labels")
+
+
+def _of_arm(skill: str, script: str, scenario: str) -> Film:
+    """Return the film of the arm's script in a changed world, before 100 labels and after."""
+    base = f"{SCRIPTS}:{script}"
+    adapt = f"adapt {base} --task arm --task.skill {skill} --scenario {scenario} --labels 100"
+    shown = f"WORK/{skill} --base {base}"
+    return Film(
+        skill,
+        make=((skill, adapt),),
+        before=f"{shown} --policy base --steps 150",
+        after=f"{shown} --steps 150",
+        words=CAMERA,
+        width=320,
+        slower=1.5,
+    )
+
 
 FILMS = (
     Film(
@@ -86,33 +99,9 @@ FILMS = (
         period=200,
         slower=0.5,
     ),
-    Film(
-        "reach",
-        make=(REACH,),
-        before=f"WORK/reach --base {SCRIPTS}:reach --policy base --steps 150",
-        after=f"WORK/reach --base {SCRIPTS}:reach --steps 150",
-        words=CAMERA,
-        width=320,
-        slower=1.5,
-    ),
-    Film(
-        "push",
-        make=(("push", f"adapt {SCRIPTS}:past --task arm --task.skill push --scenario hand_eye --labels 100"),),
-        before=f"WORK/push --base {SCRIPTS}:past --policy base --steps 150",
-        after=f"WORK/push --base {SCRIPTS}:past --steps 150",
-        words=CAMERA,
-        width=320,
-        slower=1.5,
-    ),
-    Film(
-        "pick",
-        make=(("pick", f"adapt {SCRIPTS}:pick --task arm --task.skill pick --scenario hand_eye --labels 100"),),
-        before=f"WORK/pick --base {SCRIPTS}:pick --policy base --steps 150",
-        after=f"WORK/pick --base {SCRIPTS}:pick --steps 150",
-        words=CAMERA,
-        width=320,
-        slower=1.5,
-    ),
+    _of_arm("reach", "reach", "turned_camera"),
+    _of_arm("push", "past", "hand_eye"),
+    _of_arm("pick", "pick", "hand_eye"),
     Film(
         "fetch",
         program="fetch_film.py",
@@ -137,13 +126,13 @@ def main() -> int:
     asked.out.mkdir(parents=True, exist_ok=True)
     for film in FILMS:
         if asked.only is None or film.name in asked.only:
-            status = made(film, asked.work, asked.out / f"{film.name}.gif")
+            status = make_film(film, asked.work, asked.out / f"{film.name}.gif")
             if status:
                 return status
     return 0
 
 
-def made(film: Film, work: Path, to: Path) -> int:
+def make_film(film: Film, work: Path, to: Path) -> int:
     """Run the commands of one film and join its two renderings; return the first exit status that is not 0."""
     place = work / "films" / film.name
     sides = [place / side for side in ("before", "after")]

@@ -83,7 +83,8 @@ def variants(
     """Labels as a prior in one world, its controls, its ablation, and the other arbiters."""
     shaped, by_value, paced = {**options, **prior}, {**options, "arbiter": "by_value"}, {**options, "arbiter": "paced"}
     budgets, most = (*few, many), few[-1:]
-    brief = int(BRIEF * int(str(options["schedule.total-steps"])))
+    steps: Any = options["schedule.total-steps"]
+    brief = round(BRIEF * steps)
     rows: list[tuple[str, str, tuple[int, ...], Options, str]] = [
         ("alone", "none", (), {**options, "arbiter": "episodes"}, "the agent alone"),
         ("prior", "intent", budgets, shaped, "labels about aims"),

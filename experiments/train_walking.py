@@ -37,7 +37,7 @@ VALUE_LAYERS = (256, 256, 256, 256)
 
 
 class Walker(NamedTuple):
-    """What training needs to know about a robot that learns to walk. Figures are numbers by name."""
+    """A robot that learns to walk, as training uses it. Figures are numbers by name."""
 
     environment: Any  # brax.envs.Env: velocity commands are to be tracked
     policy: Callable[[Any], Any]  # brax's parameters -> a policy

@@ -45,7 +45,7 @@ assert cl.__file__.startswith(sys.prefix) and cuelearner_envs.__file__.startswit
 
 
 def main() -> int:
-    """Builds, then checks every Python. Returns 1 if a check failed."""
+    """Build, then check every Python; return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pythons", nargs="+", default=["3.11", "3.12", "3.13"], help="versions, or interpreters")
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder of the sdist and the wheel")
@@ -106,12 +106,12 @@ def call(command: list[str], folder: Path, environment: dict[str, str]) -> None:
 
 
 def output(command: list[str], folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    """Return what a command did, printed and ended with."""
+    """Run a command; return its output and exit status."""
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
 def open_page(folder: Path, environment: dict[str, str]) -> None:
-    """Start the labelling page, open its address, and end it by Ctrl-C. Raises SystemExit if one of these fails."""
+    """Start the labelling page, open its first question, stop by Ctrl-C. Raises SystemExit if one of these fails."""
     command = ["cuelearner", "label", "navigation", "--out", "labels/mine"]
     began = time.perf_counter()
     with subprocess.Popen(
@@ -128,8 +128,11 @@ def open_page(folder: Path, environment: dict[str, str]) -> None:
                 break
         if address is None:
             raise SystemExit(f"{' '.join(command)} opened no page:\n{told}")
-        with urllib.request.urlopen(address, timeout=60) as answer:
-            page = answer.read().decode()
+        page = ""
+        while "Which way" not in page and process.poll() is None:  # until then the page says what is being prepared
+            time.sleep(1)
+            with urllib.request.urlopen(address, timeout=60) as answer:
+                page = answer.read().decode()
         process.send_signal(signal.SIGINT)
         told += process.stdout.read()
         status = process.wait()

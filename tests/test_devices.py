@@ -16,13 +16,13 @@ import pytest
 from cuelearner_jax.devices import (
     BY_LANE,
     SHARED,
+    commit_arrays,
     each_lane,
     each_lane_in_place,
     lane_mesh,
     over_lanes,
     place,
     release_programs,
-    settled,
 )
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.grid import load
@@ -165,6 +165,10 @@ def test_programs_are_forgotten_above_half_of_the_allowed_maps_and_compiled_agai
 def test_arrays_of_one_device_are_alike_to_a_program_wherever_they_came_from():
     one = lane_mesh(jax.local_devices()[:1])
     program = jax.jit(chex.assert_max_traces(lambda values, key: values + jax.random.uniform(key), n=1))
-    for values in (jnp.ones(3), place(one, jnp.ones(3), SHARED), program(*settled((jnp.ones(3), jax.random.key(0))))):
-        program(*settled((values, jax.random.key(0))))
+    for values in (
+        jnp.ones(3),
+        place(one, jnp.ones(3), SHARED),
+        program(*commit_arrays((jnp.ones(3), jax.random.key(0)))),
+    ):
+        program(*commit_arrays((values, jax.random.key(0))))
     assert program._cache_size() == 1

@@ -101,7 +101,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _named_first(arguments: list[str]) -> list[str]:
-    """Arguments in which `--compare A B`, with nothing named before, is `A --compare B`."""
+    """Return the arguments with `--compare A B` as `A --compare B` where nothing is named before."""
     if COMPARE not in arguments or not arguments[0].startswith("-"):
         return arguments
     place = arguments.index(COMPARE) + 1

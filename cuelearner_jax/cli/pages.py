@@ -24,7 +24,7 @@ class Example(NamedTuple):
 
 
 class Page(NamedTuple):
-    """What a command's first page shows."""
+    """The content of a command's first page."""
 
     options: tuple[str, ...]  # without the dashes, in the order of the page
     examples: tuple[Example, ...]  # where nothing is named yet
@@ -32,7 +32,7 @@ class Page(NamedTuple):
 
 
 CHANCE = "uniform"
-WALKER = "docs/data/navigation_agent"
+WALKER = "shipped:navigation"
 TRAINED = (
     Example("the smallest preset", "{command} {subject} --preset {preset} --out runs/{name}"),
     Example(
@@ -217,17 +217,17 @@ PAGES: dict[str, Page] = {
 
 
 class Subject(NamedTuple):
-    """What is named after the command, as examples need it."""
+    """The task or folder named after the command, with the words that examples need."""
 
     typed: str  # as the user named it
-    name: str  # of folders that are made of it
-    preset: str = ""  # the smallest
+    name: str  # base name for folders in examples
+    preset: str = ""  # the smallest preset
     scenario: str = ""  # the first changed world; empty: there is none
-    policy: str = ""  # that acts, where the usual one cannot be had
+    policy: str = ""  # the acting policy, where the usual one is not available
 
 
 def examples_of(command: str, subject: Subject | None = None) -> list[Example]:
-    """Three command lines for a first page, with the named task or folder in them."""
+    """Return three command lines for a first page, with the named task or folder in them."""
     page = PAGES[command]
     if subject is None or not page.of_subject:
         return list(page.examples)
@@ -247,25 +247,25 @@ def examples_of(command: str, subject: Subject | None = None) -> list[Example]:
 
 
 class Choice(NamedTuple):
-    """Names that an option takes."""
+    """The names that an option accepts."""
 
     title: str
     names: tuple[str, ...]
 
 
 class Option(NamedTuple):
-    """An option of tyro's page."""
+    """An option with its text, as tyro prints it."""
 
     name: str  # with its metavar
     about: str
 
 
 def read(text: str) -> tuple[str, str, list[Choice], dict[str, Option], dict[str, int]]:
-    """The parts of tyro's page as it prints it where output goes nowhere: boxes of plain characters.
+    """Parse the help that tyro prints without a terminal: boxes of plain characters.
 
     Returns:
-        Usage; what the command does; the groups of names; the command's own options by their names; how many options
-        each other group has.
+        Usage; the command's purpose; the groups of names; the command's own options by name; the number of options in
+        each other group.
     """
     head, *boxes = re.split(r"^ (\S.*?) *\n -{9,} *\n", text, flags=re.MULTILINE)
     usage, about, *groups = head.strip().split("\n\n")
@@ -289,13 +289,13 @@ def read(text: str) -> tuple[str, str, list[Choice], dict[str, Option], dict[str
 
 
 def _key(name: str) -> str:
-    """An option's long name without its dashes; of a positional argument, its first word."""
+    """Return an option's long name without its dashes, or a positional argument's first word."""
     long = re.findall(r"--(?:no-)?([\w-]+)", name)
     return long[-1] if long else name.split(maxsplit=1)[0]
 
 
 def _plain(text: str) -> str:
-    """Text without defaults that say nothing, and lists as they are typed."""
+    """Return text without defaults that say nothing, and with lists as they are typed."""
     text = re.sub(r"\((?:default: (?:None|False|True)?|required)\)", "", " ".join(text.split()))
     text = text.replace("{None}|", "")
     text = re.sub(r"\[+(\w+) \[\1 \.\.\.\]\]+", r"\1 ...", text)
@@ -303,19 +303,19 @@ def _plain(text: str) -> str:
 
 
 def command_of(program: str) -> str:
-    """The command's name at the beginning of a command line without `cuelearner`."""
+    """Return the command's name at the beginning of a command line without `cuelearner`."""
     return next(name for name in PAGES if f"{program} ".startswith(f"{name} "))
 
 
 def first_page(text: str, command: str, program: str, subject: Subject | None = None, tasks: Sequence[str] = ()) -> str:
-    """The first page of a command, from the whole page that tyro printed.
+    """Return the first page of a command, made from the whole page that tyro printed.
 
     Args:
         text: tyro's page.
         command: the command's full name.
         program: the command line so far, for the last line.
-        subject: the task or folder that is named.
-        tasks: that can be named, where nothing is.
+        subject: the named task or folder.
+        tasks: names of the tasks to choose from, where nothing is named yet.
     """
     usage, about, choices, own, others = read(text)
     usage = re.sub(r"( \[-h\]|(?<= \[OPTIONS\]) \[OPTIONS\])", "", usage)
@@ -343,7 +343,7 @@ def first_page(text: str, command: str, program: str, subject: Subject | None = 
 
 
 def lines_of(examples: Sequence[Example]) -> Iterator[str]:
-    """Each example as a comment and a command line, which is cut where it is too long for a page."""
+    """Yield each example as a comment and a command line, which continues on the next line if it is too long."""
     for about, command in examples:
         yield f"  # {about}"
         lines = textwrap.wrap(f"cuelearner {command}", COLUMNS - 4, break_on_hyphens=False, break_long_words=False)
@@ -352,14 +352,14 @@ def lines_of(examples: Sequence[Example]) -> Iterator[str]:
 
 
 def _chosen(choice: Choice, most: int) -> list[str]:
-    """A group of names in at most so many lines."""
+    """Return a group of names in at most so many lines."""
     title = re.sub(r" \((--[\w-]+)(?: of [^;)]*)?", r" (\1", choice.title)
     text = f"{title}: {', '.join(choice.names)}"
     return _cut(textwrap.wrap(text, COLUMNS, subsequent_indent="  ", break_on_hyphens=False), most)
 
 
 def _described(option: Option, most: int) -> list[str]:
-    """An option and its text in at most so many lines: of a longer text the first sentence."""
+    """Return an option and its text in at most so many lines: of a longer text only the first sentence."""
     name = f"  {option.name}"
     first = f"{name:<{INDENT - 2}}  "
     for text in (option.about, re.split(r"[.;:,]? \(|(?<=[.;:]) ", option.about)[0]):
@@ -385,7 +385,10 @@ def _footer(program: str, more: int, others: dict[str, int]) -> list[str]:
 
 
 def subject_of(typed: str, name: str, task: Any, has_usual: bool = True) -> Subject:
-    """A task, or a folder with policies of a task, as examples name it; `has_usual`: the usual policy."""
+    """Return a task, or a folder with policies of a task, as examples name it.
+
+    `has_usual`: whether the policy that acts by default is available.
+    """
     preset = "quickstart" if "quickstart" in task.presets else next(iter(task.presets), "")
     policy = "" if has_usual else CHANCE if task.teacher is None else "teacher"
     return Subject(typed, name, preset, next(iter(task.scenarios), ""), policy)

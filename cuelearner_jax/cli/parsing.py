@@ -120,7 +120,7 @@ NARROW = 99  # columns within which tyro's help is one column of options
 
 
 def _whole(tell: Callable[[], Any]) -> str:
-    """The page of tyro's that `tell` prints, as `pages.read` takes it."""
+    """Return the help that `tell` prints by tyro, in the form that `pages.read` parses."""
     page, before = io.StringIO(), os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = str(NARROW)
     try:
@@ -137,13 +137,13 @@ class _Unnamed:
 
 
 def explain(command: str, kind: Any, takes: str, whole: bool) -> None:
-    """Prints the help of a command after which nothing is named yet.
+    """Print the help of a command after which nothing is named yet.
 
     Args:
         command: its name.
-        kind: its options, generic in what a task decides.
-        takes: what is to be named, as `TASK`.
-        whole: every task with what there is to choose from, in place of a first page.
+        kind: its options class, generic in the types that a task decides.
+        takes: the word for what is named next, such as `TASK`.
+        whole: print every task with its choices instead of a first page.
     """
     usage = f"cuelearner {command} {takes} [OPTIONS]"
     if whole:
@@ -380,7 +380,7 @@ def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> Pol
 
 
 def _tasks() -> str:
-    """Every task with what there is to choose from."""
+    """Return every task with its choices."""
     told = []
     for name in registry.names():
         try:

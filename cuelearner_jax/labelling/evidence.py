@@ -32,7 +32,7 @@ def _act(policy: Any, obs: Array) -> Array:
 
 
 class Theory:
-    """What calibration has inferred from the answers so far; chooses questions and predicts right actions."""
+    """Calibration's inference from the answers so far; chooses questions and predicts right actions."""
 
     def __init__(self, known: Calibration, family: Family, beside: Float[np.ndarray, "n obs"]) -> None:
         self.known, self.beside = known, beside

@@ -185,6 +185,19 @@ def _extremes(rows: Sequence[np.ndarray]) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
+def separate_heights(heights: np.ndarray, gap: float, low: float, high: float) -> np.ndarray:
+    """Return heights (n,) at least a gap apart, in the order of the given ones and as near to them as possible.
+
+    They are an isotonic regression of the heights less the gaps below them. All lie between `low` and `high`, which
+    must leave room for n - 1 gaps.
+    """
+    order, rank = np.argsort(heights, kind="stable"), gap * np.arange(len(heights))
+    moved = scipy.optimize.isotonic_regression(heights[order] - rank).x
+    found = np.empty(len(heights))
+    found[order] = np.clip(moved, low, high - rank[-1]) + rank
+    return found
+
+
 def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
     """Write each curve's name to the right of the axes, ordered by the curves' ends and without overlap."""
     low, high = axes.get_ylim()
@@ -193,11 +206,7 @@ def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[
     ends = np.array([variant.curve.estimate[-1] for variant in variants])
     height = 0.055 * (high - low)  # height of a line of text with its spacing
     gap = min((high - low) / len(variants), height)
-    # The heights that keep the order and a gap and move least are an isotonic regression of the ends less the gaps.
-    order, rank = np.argsort(ends, kind="stable"), gap * np.arange(len(variants))
-    heights = scipy.optimize.isotonic_regression(ends[order] - rank).x
-    heights = np.clip(heights, low, high - rank[-1]) + rank
-    for place, height_of_name in zip(order, heights, strict=True):
+    for place, height_of_name in enumerate(separate_heights(ends, gap, low, high)):
         variant, colour = variants[place], colours[place]
         last = float(variant.curve.steps[-1])
         # The leader is dotted, since it shows no data. It is level within the axes, so that the leaders keep the

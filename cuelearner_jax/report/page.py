@@ -34,12 +34,12 @@ def page(
     """Return the page.
 
     Args:
-        title: the report's.
-        variants: what figures show.
-        rows: the summary's.
-        metric: the column that is reported.
-        missing: what a reader would otherwise take to be there, a line each.
-        provenance: where the numbers come from: what, and its value.
+        title: title of the report.
+        variants: the curves of the figures.
+        rows: the rows of the summary.
+        metric: the reported column.
+        missing: one line for each part of the runs that has no results.
+        provenance: name and value of each entry of the provenance.
     """
     figures = [_curves(variants, metric)]
     if len({variant.labels for variant in variants if variant.labels}) > 1:
@@ -90,7 +90,7 @@ def _curves(variants: Sequence[Variant], metric: str) -> dict[str, Any]:
 
 
 def _budgets(variants: Sequence[Variant], metric: str) -> dict[str, Any]:
-    """Means over the curve against the label budget, as data of a figure; what takes no labels is a level."""
+    """Means over the curve against the label budget, as data of a figure; a kind without labels is a level."""
     budgets = sorted({variant.labels for variant in variants if variant.labels})
     series = []
     for kind in dict.fromkeys((variant.run, variant.guidance) for variant in variants):

@@ -18,7 +18,7 @@ STEPS = "steps"
 
 @dataclass(frozen=True)
 class Choices(Space):
-    """One of `count` choices; an action is a vector (count,), 1 at the choice and 0 elsewhere.
+    """A space of `count` choices; an action is a vector (count,), 1 at the choice and 0 elsewhere.
 
     With `order` the choices stand in a row, and `log` counts the steps from one to another. Without `order` there is no
     cue, no answer can ask for "more", and bounds have no effect.

@@ -26,12 +26,12 @@ class Leaf(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of entries of the vector that it fills."""
+        """Number of entries that the leaf fills in the vector."""
         return sum(self.choices) if self.kind == "one of" else int(np.prod(self.shape, dtype=int))
 
     @property
     def name(self) -> str:
-        """Its keys as a name for people."""
+        """The leaf's keys, joined by dots, as a name in messages."""
         return ".".join(map(str, self.path)) or "observation"
 
 

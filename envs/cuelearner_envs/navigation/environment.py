@@ -109,10 +109,10 @@ class Navigation(Described, struct.PyTreeNode):
         return following, step
 
     def ends(self, after: AnyWalker) -> tuple[dict[str, Float[Array, ""]], Bool[Array, ""], Bool[Array, ""]]:
-        """Outcome of a step that led to a state (1 or 0 each, and the time since the start [s]); is it over, and how?
+        """Return how a step that led to a state ends its episode, if it does.
 
         Returns:
-            outcome, terminated, truncated.
+            outcome (1 or 0 each, and the time since the start [s]), terminated, truncated.
         """
         failures = self.failures(after)
         failed = jnp.stack(list(failures.values())).any()

@@ -213,7 +213,7 @@ def _mapped(env: Navigation, key: PRNGKeyArray, world: World) -> tuple[RoadMap, 
 
 
 def _each(env: Navigation, mapped: Callable[[PRNGKeyArray, World], Any]) -> Any:
-    """What `mapped` gives of each world (leading axis: worlds)."""
+    """Return the result of `mapped` for each world (leading axis: worlds)."""
     keys = _keys(env)
     return jax.lax.map(lambda pair: mapped(*pair), (keys, env.worlds), batch_size=min(len(keys), 16))
 
