@@ -101,11 +101,16 @@ def run(arguments: list[str]) -> None:
 
 
 def _named_first(arguments: list[str]) -> list[str]:
-    """Return the arguments with `--compare A B` as `A --compare B` where nothing is named before."""
+    """Return the arguments with `--compare A B` as `A --compare B` where nothing is named before.
+
+    Raises UserError for a single policy after a --compare that comes first.
+    """
     if COMPARE not in arguments or not arguments[0].startswith("-"):
         return arguments
     place = arguments.index(COMPARE) + 1
     both = list(takewhile(lambda word: not word.startswith("-"), arguments[place:]))
+    if place == 1 and len(both) == 1:
+        raise UserError(f"--compare {both[0]} compares with nothing: give two, as --compare {both[0]} uniform")
     if len(both) != 2:
         return arguments
     first, second = both

@@ -44,6 +44,7 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--steps", "150"], "multiple of envs"),
     (["evaluate", "billiards", "--scenario", "tilted_tabel"], "did you mean 'tilted_table'"),
     (["evaluate", "billiards", "--scenario"], "choose one of turned_strike, shifted_balls, tilted_table"),
+    (["evaluate", "--compare", "billiards"], "--compare billiards compares with nothing: give two"),
     (["evaluate", "billiards", "--guidance", "none"], "--guidance has no effect"),
     (["render", "billiards", "--seed", "3"], "--seed has no effect"),
     (["render", "billiards", "--labels", "0"], "--labels has no effect"),
