@@ -26,6 +26,7 @@ class Portions(NamedTuple):
     actions: int  # state-action pairs of one agent in one forward pass of an argmax
     agents: int  # agents evaluated side by side
     states: int  # situations in one call of a teacher
+    passes: int  # of refinement between two looks whether all actions are done
 
 
 def release_programs(share: float = 0.5, process: Path = Path("/proc/self"), system: Path = Path("/proc/sys")) -> bool:
@@ -54,7 +55,7 @@ def release_programs(share: float = 0.5, process: Path = Path("/proc/self"), sys
 
 def portions() -> Portions:
     """Return the portions for the default device."""
-    return Portions(8192, 1, 16) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256)
+    return Portions(8192, 1, 16, 1) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256, 10)
 
 
 def compiler_options(lanes: int) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """The refinement loop (paper, Eqs. 3-5): a <- a + phi(s, a) until a settles, within a ball around the first action.
 
 Batch-native: a mask says which rows are done, so one `lax.while_loop` serves any number of actions, compiles with
-everything round it and exports. No randomness.
+everything round it and exports. No randomness. An accelerator waits for the host at each look whether all rows are
+done, so it makes several passes between two looks (`devices.Portions.passes`); rows that are done stay as they are.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.devices import portions
 from cuelearner_jax.spaces import Space
 
 GuideScalarsT = TypeVar("GuideScalarsT", bound=GuideScalars)
@@ -67,12 +69,18 @@ def refine(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         current, done, passes, k = carry
+        done = done | (k >= k_max)
         proposal = space.retract(current + residual(current))
         proposal = space.clip(proposal, first, tau_max)
         settled = space.distance(current, proposal) < tau
         moved = jnp.where(done[:, None], current, proposal)
         return moved, done | settled, passes + ~done, k + 1
 
+    def some_passes(
+        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        return jax.lax.fori_loop(0, portions().passes, lambda _, carry: one_pass(carry), carry)
+
     start = (first, ~active, jnp.zeros(first.shape[0], jnp.int32), jnp.zeros((), jnp.int32))
-    refined, _, passes, _ = jax.lax.while_loop(unfinished, one_pass, start)
+    refined, _, passes, _ = jax.lax.while_loop(unfinished, one_pass if portions().passes == 1 else some_passes, start)
     return Refinement(refined, passes)

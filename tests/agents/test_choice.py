@@ -88,7 +88,7 @@ def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
 def test_actions_do_not_depend_on_how_many_states_are_searched_at_once(monkeypatch):
     obs = jax.random.normal(jax.random.key(2), (7, 5))
     together = chosen(FULL, agent(), obs)
-    monkeypatch.setattr(search, "portions", lambda: Portions(actions=360, agents=1, states=1))
+    monkeypatch.setattr(search, "portions", lambda: Portions(actions=360, agents=1, states=1, passes=1))
     np.testing.assert_allclose(chosen(FULL, agent(), obs), together, atol=1e-6)
 
 

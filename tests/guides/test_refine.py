@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cuelearner_jax.devices import portions
+from cuelearner_jax.guides import refining
 from cuelearner_jax.guides.refining import no_refinement, refine
 from cuelearner_jax.spaces import DIRECTIONS, directions
 
@@ -81,6 +83,18 @@ def test_the_cases_above_stop_by_tau_and_by_the_number_of_passes():
     assert np.asarray(settled.passes).max() < 50
     assert np.asarray(settled.passes).min() < np.asarray(settled.passes).max()
     assert (np.asarray(limited.passes) == 4).mean() > 0.5
+
+
+@pytest.mark.parametrize("k_max", [0, 4, 7, 50])
+def test_passes_between_two_looks_change_nothing(monkeypatch, k_max):
+    weights, first, some = network(20, 0.2), starts(1), np.arange(ROWS) % 3 > 0
+    given = (weights, first, some, 0.5 * DEG, math.pi, k_max)
+    each = refined_by_network(*given)
+    monkeypatch.setattr(refining, "portions", lambda: portions()._replace(passes=7))
+    several = jax.jit(refined_by_network.__wrapped__)(*given)
+    np.testing.assert_array_equal(several.passes, each.passes)
+    np.testing.assert_allclose(several.actions, each.actions, atol=1e-6)
+    assert k_max <= 7 or each.passes.max() > 7
 
 
 @pytest.mark.parametrize("seed", range(12))
