@@ -4,12 +4,13 @@
 
 Run in the folder above this one. The commands of a film are those that a user types (`FILMS` below); what lies in the
 folder of `--work` already is not made again. Each film shows the same episodes of both policies, in a GIF of at most
-600 kB.
+600 kB. The film `fetch` needs a screen, or MUJOCO_GL=egl or osmesa, by which MuJoCo draws without one.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import subprocess
 import sys
@@ -123,12 +124,15 @@ def main() -> int:
     )
     parser.add_argument("--only", nargs="+", choices=[film.name for film in FILMS], help="films (default: all)")
     asked = parser.parse_args()
+    films = [film for film in FILMS if asked.only is None or film.name in asked.only]
+    screenless = sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "MUJOCO_GL")))
+    if screenless and any(film.program for film in films):
+        parser.error("the film 'fetch' needs a screen: set MUJOCO_GL=egl or MUJOCO_GL=osmesa, or name others by --only")
     asked.out.mkdir(parents=True, exist_ok=True)
-    for film in FILMS:
-        if asked.only is None or film.name in asked.only:
-            status = make_film(film, asked.work, asked.out / f"{film.name}.gif")
-            if status:
-                return status
+    for film in films:
+        status = make_film(film, asked.work, asked.out / f"{film.name}.gif")
+        if status:
+            return status
     return 0
 
 

@@ -44,3 +44,14 @@ def test_two_films_are_joined_and_the_shorter_stands_still(gallery, tmp_path):
         low = frame.height - 5
         assert near(frame.getpixel((10, low)), left)
         assert near(frame.getpixel((38, low)), right)
+
+
+def test_without_a_screen_nothing_is_made_and_the_renderer_is_named(gallery, monkeypatch, capsys, tmp_path):
+    for name in ("DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("sys.argv", ["gallery.py", "--out", str(tmp_path / "films"), "--work", str(tmp_path / "work")])
+    with pytest.raises(SystemExit, match="2"):
+        gallery.main()
+    assert "MUJOCO_GL=egl or MUJOCO_GL=osmesa" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
