@@ -9,7 +9,7 @@ UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 .PHONY: help setup quickstart gallery smoke test test-all test-quick test-foreign durations fuzz lint format docs bench release constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
-	@echo "make gallery      the films of docs/gallery.md (without a screen: MUJOCO_GL=osmesa make gallery)"
+	@echo "make gallery      the films of docs/gallery.md"
 	@echo "make test         run the tests (about 8 minutes on 2 cores)"
 	@echo "make test-all     these, and what checks the same at length"
 	@echo "make test-quick   those in files that take little of that (under 3 minutes)"

@@ -4,7 +4,7 @@
 
 Run in the folder above this one. The commands of a film are those that a user types (`FILMS` below); what lies in the
 folder of `--work` already is not made again. Each film shows the same episodes of both policies, in a GIF of at most
-600 kB. The film `fetch` needs a screen, or MUJOCO_GL=egl or osmesa, by which MuJoCo draws without one.
+600 kB.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
+from cuelearner_jax.bridges.gymnasium.pool import drawing_variables
 from cuelearner_jax.cli import main as cuelearner
 
 HERE = Path(__file__).resolve().parent
@@ -124,15 +125,12 @@ def main() -> int:
     )
     parser.add_argument("--only", nargs="+", choices=[film.name for film in FILMS], help="films (default: all)")
     asked = parser.parse_args()
-    films = [film for film in FILMS if asked.only is None or film.name in asked.only]
-    screenless = sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "MUJOCO_GL")))
-    if screenless and any(film.program for film in films):
-        parser.error("the film 'fetch' needs a screen: set MUJOCO_GL=egl or MUJOCO_GL=osmesa, or name others by --only")
     asked.out.mkdir(parents=True, exist_ok=True)
-    for film in films:
-        status = make_film(film, asked.work, asked.out / f"{film.name}.gif")
-        if status:
-            return status
+    for film in FILMS:
+        if asked.only is None or film.name in asked.only:
+            status = make_film(film, asked.work, asked.out / f"{film.name}.gif")
+            if status:
+                return status
     return 0
 
 
@@ -161,7 +159,9 @@ def _run(words: list[str]) -> int:
     """Run a command in this process if it is `cuelearner`, in one of its own if it is `python`; return its status."""
     if words[0] == "cuelearner":
         return cuelearner(words[1:])
-    return subprocess.run([sys.executable, *words[1:]], check=False).returncode
+    return subprocess.run(
+        [sys.executable, *words[1:]], env={**os.environ, **drawing_variables()}, check=False
+    ).returncode
 
 
 def join(files: Sequence[Path], film: Film, to: Path) -> int:

@@ -69,18 +69,17 @@ def refine(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         current, done, passes, k = carry
-        done = done | (k >= k_max)
+        done = done | (k >= k_max)  # reached between two looks
         proposal = space.retract(current + residual(current))
         proposal = space.clip(proposal, first, tau_max)
         settled = space.distance(current, proposal) < tau
         moved = jnp.where(done[:, None], current, proposal)
         return moved, done | settled, passes + ~done, k + 1
 
-    def some_passes(
-        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        return jax.lax.fori_loop(0, portions().passes, lambda _, carry: one_pass(carry), carry)
-
+    at_once = portions().passes
+    body = (
+        one_pass if at_once == 1 else lambda carry: jax.lax.fori_loop(0, at_once, lambda _, one: one_pass(one), carry)
+    )
     start = (first, ~active, jnp.zeros(first.shape[0], jnp.int32), jnp.zeros((), jnp.int32))
-    refined, _, passes, _ = jax.lax.while_loop(unfinished, one_pass if portions().passes == 1 else some_passes, start)
+    refined, _, passes, _ = jax.lax.while_loop(unfinished, body, start)
     return Refinement(refined, passes)

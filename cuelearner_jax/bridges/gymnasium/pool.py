@@ -207,7 +207,7 @@ class Pool:
             if self.source.plays_here:
                 self.hosts[number] = LocalInstances(Instances(*arguments))
             else:
-                drawing = _without_screen() if self.source.drawn else {}
+                drawing = drawing_variables() if self.source.drawn else {}
                 self.hosts[number] = Process(self.source.pickled(arguments), drawing)
         return self.hosts[number]
 
@@ -242,8 +242,8 @@ class Pool:
             self.hosts, self.slots, self._standing = {}, [], {}
 
 
-def _without_screen() -> dict[str, str]:
-    """Return the environment variables that let MuJoCo draw without a screen, unless the user set them."""
+def drawing_variables() -> dict[str, str]:
+    """Return the environment variables by which MuJoCo draws without a screen; none where a user set them."""
     if "MUJOCO_GL" in os.environ or "DISPLAY" in os.environ or sys.platform != "linux":
         return {}
     return {"MUJOCO_GL": "osmesa" if find_library("OSMesa") else "egl"}
