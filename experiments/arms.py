@@ -5,10 +5,11 @@
     python experiments/arms.py --out FOLDER --pieces push --minutes 9      # on an accelerator; again to go on
 
 A piece of training is a sweep with a folder of its own, resumed where it stands. Every method trains the same `sac`.
-`by_value` has critics choose between the agent's action and the guide's. Its controls are `shuffled` (labels with each
-other's answers), the script as a guide without labels, and `alone`. `rlpd` fits a policy to as many demonstrations;
-half of all episodes are that policy's, and so is half of every minibatch (RLPD: Ball et al., 2023). In `corrections`
-the agent never learns: what counts is the guide of uniform actions.
+`by_value` has critics choose between the agent's action and the guide's; in `acting` they do not in their own targets,
+where refinement takes most of the time. Controls are `shuffled` (labels with each other's answers), the script as a
+guide without labels, and `alone`. `rlpd` fits a policy to as many demonstrations; half of all episodes are that
+policy's, and so is half of every minibatch (RLPD: Ball et al., 2023). In `corrections` the agent never learns: what
+counts is the guide of uniform actions.
 
 A piece of adaptation corrects a script, or in Fetch a trained agent, by labels. Held-out labels judge: no step is
 rewarded. Demonstrations and good/bad labels cannot judge: 20 tuning episodes do, and their steps are counted. A piece
@@ -73,6 +74,7 @@ WORLDS: dict[str, Options] = {
     "pick": {**steps(480_000, 24_000), "task.skill": "pick"},
 }
 BY_VALUE: Options = {"arbiter": "by_value"}
+ACTING: Options = {"arbiter.in-targets": False}
 OWN_POLICY: Options = {"arbiter.in-policy": False}  # the finished policy is the agent's, which a folder can keep
 EPISODES: Options = {"arbiter": "episodes"}
 SHUFFLED: Options = {"scalars.answer": "shuffled"}
@@ -99,13 +101,8 @@ def variants(world: str, options: Options) -> list[Piece]:
         ("alone", "none", (), plain, "SAC alone"),
         ("alone_10", "none", (), {**plain, **ENSEMBLE}, "SAC alone, ten critics"),
         ("by_value", "relative", BUDGETS, valued, "labels, compared by value"),
-        (
-            "own_policy",
-            "relative",
-            (500,),
-            {**valued, **OWN_POLICY},
-            "labels in training alone, for Fetch",
-        ),
+        ("acting", "relative", BUDGETS, {**valued, **ACTING}, "labels, compared by value where the agent acts"),
+        ("own_policy", "relative", (500,), {**valued, **OWN_POLICY}, "labels in training alone, for Fetch"),
         ("by_value", "demonstration", BUDGETS, valued, "demonstrations, compared by value"),
         ("by_value", "heuristic", (), valued, "control: the script without labels"),
         ("shuffled", "relative", BUDGETS, {**valued, **SHUFFLED}, "control: shuffled answers"),
