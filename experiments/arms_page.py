@@ -27,7 +27,12 @@ WORLDS = {
 STEPS = (3_200, 6_400, 9_600, 12_800)
 
 
-RUNS = {"alone": "SAC alone", "by_value": "{labels} relative labels", "rlpd": "{labels} demonstrations, RLPD"}
+RUNS = {
+    "alone": "SAC alone",
+    "by_value": "{labels} relative labels",
+    "acting": "{labels} relative labels, while acting",
+    "rlpd": "{labels} demonstrations, RLPD",
+}
 SHOWN_STEPS = 16_000  # of reach; all curves are level by then
 
 
@@ -58,7 +63,7 @@ def training(data: Path) -> str:
 
 
 def draw_training(data: Path, stem: Path) -> None:
-    """Draw success over steps: reach with labels and without, push without."""
+    """Draw success over steps, with labels and without."""
     with matplotlib.rc_context(STYLE):
         figure = new_figure(11, 3.8)
         for axes, world in zip(figure.subplots(1, 2), ("reach", "push"), strict=True):
