@@ -63,6 +63,13 @@ class Meaning:
         found = in_portions(partial(_offset, self.space, family), CHEAP, theta, meant, action)
         return found.reshape(number, count, len(self.space.cues))
 
+    def moved(
+        self, action: Float[Floats, "n action"], offset: Float[Floats, "k n cues"]
+    ) -> Float[Floats, "k n action"]:
+        """Return actions moved by offsets (`space.exp`)."""
+        rows = np.tile(action, (len(offset), 1)), offset.reshape(-1, len(self.space.cues))
+        return in_portions(partial(_moved, self.space), CHEAP, *rows).reshape(*offset.shape[:2], self.space.size)
+
     def right(
         self, family: Family, thetas: Float[Floats, "thetas unknowns"], meant: Float[Floats, "thetas n action"]
     ) -> Float[Floats, "thetas n action"]:
@@ -113,6 +120,11 @@ def _right(family: Family, theta: Any, meant: Any) -> Any:
         if family
         else meant
     )
+
+
+@partial(jax.jit, static_argnums=0)
+def _moved(space: Space, action: Any, offset: Any) -> Any:
+    return space.exp(jnp.asarray(action), offset)
 
 
 @partial(jax.jit, static_argnums=(0, 1))

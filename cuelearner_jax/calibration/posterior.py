@@ -166,9 +166,7 @@ class Fit:
     def right(self, theta: Floats, response: Response) -> tuple[Floats, Floats]:
         """Return the actions (samples, n, action) that the teacher would call right, and their spread [eps]."""
         meaning, (mean, spread) = self.responses.meaning, response.at(self.places(theta))
-        meant = np.asarray(
-            meaning.space.exp(response.centre[None], jnp.asarray(mean * self.responses.eps, jnp.float32))
-        )
+        meant = meaning.moved(response.centre, mean * self.responses.eps)
         return meaning.right(self.family, theta, meant), spread
 
     def _offsets(self, theta: Floats) -> tuple[Floats, Floats]:

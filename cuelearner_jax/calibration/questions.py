@@ -89,7 +89,7 @@ def choose(
     shares = np.array_split(np.arange(right.shape[1]), count)
     index, turn, worth = _told_most(np.stack([np.asarray(one) for one in of_cues]), shares, random)
     turned = np.stack([turns[turn[:, cue], index, cue] for cue in range(turns.shape[-1])], -1)
-    action = np.asarray(meaning.space.exp(middle[index], jnp.asarray(turned * eps, jnp.float32)))
+    action = meaning.moved(middle[index], turned[None] * eps)[0]
     return Questions(index, action, np.zeros(count), worth)
 
 
