@@ -218,6 +218,9 @@ def asked_of(
     except ValueError as error:
         parser.error(str(error))
     if asked.labels:
+        known = sorted({one for piece in meant for one in piece.labels})
+        if missing := sorted(set(asked.labels) - set(known)):
+            parser.error(f"--labels {missing[0]}: these pieces have {', '.join(map(str, known)) or 'no labels'}")
         kept = [piece._replace(labels=tuple(one for one in piece.labels if one in asked.labels)) for piece in meant]
         meant = [new for old, new in zip(meant, kept, strict=True) if new.labels or not old.labels]
     return asked, meant

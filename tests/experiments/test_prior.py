@@ -45,6 +45,17 @@ def test_every_piece_is_a_sweep_that_would_begin(study, scale, monkeypatch, tmp_
             assert left.options["arbiter"] == orders[-1].config.arbiter.NAME
 
 
+def test_budgets_that_no_piece_has_are_refused_and_known_ones_select(study, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        study.main(["--pieces", "regulation/prior", "--labels", "25", "7", "--list"])
+    assert "--labels 7: these pieces have 25, 100, 500" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        study.main(["--pieces", "easy/alone", "--labels", "25"])
+    assert "these pieces have no labels" in capsys.readouterr().err
+    assert study.main(["--pieces", "regulation/prior/intent", "--labels", "25", "--list"]) == 0
+    assert "    8 lanes" in capsys.readouterr().out
+
+
 def row(step, mean):
     return {"step": step, "mean": mean}
 
