@@ -5,8 +5,8 @@
     python experiments/arms.py --out FOLDER --pieces push --minutes 9      # on an accelerator; again to go on
 
 A piece of training is a sweep with a folder of its own, resumed where it stands. Every method trains the same `sac`.
-`by_value` has critics choose between the agent's action and the guide's; in `acting` they do not in their own targets,
-where refinement takes most of the time. Controls are `shuffled` (labels with each other's answers), the script as a
+`by_value` has critics choose between the agent's action and the guide's, while acting and in the targets of learning;
+`acting` while acting alone. Controls are `shuffled` (labels with each other's answers), the script as a
 guide without labels, and `alone`. `rlpd` fits a policy to as many demonstrations; half of all episodes are that
 policy's, and so is half of every minibatch (RLPD: Ball et al., 2023). In `corrections` the agent never learns: what
 counts is the guide of uniform actions.

@@ -39,6 +39,7 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import policy_of
+from cuelearner_jax.report.statistics import drawn
 from cuelearner_jax.runs.trained import PolicySource, several
 from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.storage.provenance import provenance
@@ -267,12 +268,26 @@ def main() -> None:
     table(rows)
 
 
+def mean_worth(rows: list[dict[str, Any]]) -> str:
+    """Return the mean worth with its 95% bootstrap interval over bases and their label seeds, and the least worth."""
+    groups = [
+        [row["worth"] for row in rows if row["base"] == base] for base in dict.fromkeys(row["base"] for row in rows)
+    ]
+    values = np.full((len(groups), max(map(len, groups))), np.nan)  # NaN: not played
+    for own, group in zip(values, groups, strict=True):
+        own[: len(group)] = group
+    means = np.nanmean(values[drawn(*values.shape)], (1, 2))
+    low, high = np.quantile(means[1:], (0.025, 0.975))
+    shown = f"{means[0]:.3f}" + (f" [{low:.3f}, {high:.3f}]" if values.size > 1 else "")
+    return f"{shown} (least {np.nanmin(values):.3f})"
+
+
 def table(rows: list[dict[str, Any]]) -> None:
     """Print the mean worth, and how often each verdict was found, by world and number of labels."""
     for world, labels in dict.fromkeys((row["world"], row["labels"]) for row in rows):
         own = [row for row in rows if (row["world"], row["labels"]) == (world, labels)]
-        worths = [row["worth"] for row in own if "worth" in row]
-        shown = f"{np.mean(worths):.3f} (least {np.min(worths):.3f})" if worths else "-"
+        played = [row for row in own if "worth" in row]
+        shown = mean_worth(played) if played else "-"
         found = [" + ".join(row["changes"]) or row["verdict"] for row in own if "verdict" in row]
         counts = ", ".join(f"{found.count(one)} x {one}" for one in dict.fromkeys(found))
         print(f"{world:<16}{labels:>4} labels  {shown}  {counts}")

@@ -124,7 +124,7 @@ def _right(family: Family, theta: Any, meant: Any) -> Any:
 
 @partial(jax.jit, static_argnums=0)
 def _moved(space: Space, action: Any, offset: Any) -> Any:
-    return space.exp(jnp.asarray(action), offset)
+    return space.exp(action, offset)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
