@@ -6,6 +6,7 @@ adaptation gives another base policy than uniform actions.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,7 +22,7 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import bound_scalars
 from cuelearner_jax.policies import Policy, best_actions, call_policy, policy_name
-from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
+from cuelearner_jax.types import EnvState, GuidanceModel, Label, Step, Teacher
 
 LaneT = TypeVar("LaneT", bound=Any)
 
@@ -37,6 +38,7 @@ class GuideState(struct.PyTreeNode):
     asked: Int[Array, ""]  # questions so far that count within it, answered or not
     env: EnvState  # leading axis: candidates, where each question is chosen among several situations
     obs: Float[Array, "*candidates obs"]
+    stored: Float[Array, "slots width"] | None = None  # labelled steps as rows of replay; None: they are not kept
 
 
 class Stream(IntEnum):
@@ -59,6 +61,8 @@ class Inquiry(struct.PyTreeNode):
     base: Policy  # its actions are asked about, after refinement by the guide so far
     # Questions stay within it of what the base policy does, as `log` of the space counts; None: wherever guidance leads
     bound: Float[Array, ""] | None = None
+    # rows of replay of steps (n, ...) with the observations and actions before; None: asked actions are executed
+    pack: Callable[[Array, Array, Step], Array] | None = struct.field(pytree_node=False, default=None)
 
 
 class QuestionKeys(NamedTuple):
@@ -236,7 +240,29 @@ def ask(
         told = answer(keys.answer, state, there[0], there[1])
         obs, about, first, answers, answered = (row[None] for row in (*there, *told))
     recorded = record(guide, position, obs, about, answers, answered, first if of.guidance.kind.sees_base else None)
-    return proceed(of.env, recorded, actions, keys)
+    if of.pack is None:
+        return proceed(of.env, recorded, actions, keys)
+    assert form.correct is not None  # see `Lane.label_round`
+    space = actions_of(of.env)
+    corrected = form.correct(space, about[0], answers[0], space.from_unit(of.scalars.eps_deg))
+    return _proceed_corrected(of, recorded, position, jnp.where(answered[0], corrected, about[0]), keys)
+
+
+def _proceed_corrected(
+    of: Inquiry,
+    guide: GuideState,
+    position: Int[Array, ""],
+    action: Float[Array, " action"],
+    keys: QuestionKeys,
+) -> GuideState:
+    """Return the guide after the step of a corrected action, which is kept at its label's place."""
+    assert of.pack is not None
+    assert guide.stored is not None
+    before = of.env.remember(guide.env, guide.obs)
+    state, step = of.env.step(keys.env, guide.env, action)
+    rows = of.pack(before[None], action[None], jax.tree.map(lambda leaf: leaf[None], step))
+    stored = jax.lax.dynamic_update_slice_in_dim(guide.stored, rows, position, 0)
+    return guide.replace(env=state, obs=step.obs, stored=stored)
 
 
 def _chosen(

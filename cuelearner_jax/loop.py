@@ -48,7 +48,7 @@ from cuelearner_jax.devices import (
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import Refinement, no_refinement
-from cuelearner_jax.policies import uniform_in
+from cuelearner_jax.policies import asked_from
 from cuelearner_jax.run_config import RunConfig, Settings
 from cuelearner_jax.types import EnvState, Label, Params, Step, Teacher
 
@@ -233,7 +233,12 @@ class Lane(NamedTuple):
     @property
     def counts_guided(self) -> bool:
         """Whether replay counts guided steps: for an agent that draws them separately, under a guide that acts."""
-        return draws_sorts(self.learner.options) and self.guidance.moves
+        return draws_sorts(self.learner.options) and self.guidance.moves and not self.stores
+
+    @property
+    def stores(self) -> bool:
+        """Whether labelled steps are kept for the agent to learn from."""
+        return self.sizes.store_labelled and self.guidance.asks
 
     def init(self, env: Environment, key: PRNGKeyArray, budget: Int[Array, ""] | int) -> TrainState:
         """Return a new lane. Budgets do not affect the random numbers: lanes of one seed start alike."""
@@ -246,21 +251,24 @@ class Lane(NamedTuple):
         arbiter = self.arbiter.init(self.sizes.num_envs)
         if isinstance(self.arbiter, HasCritic):
             arbiter = self.arbiter.with_critic(arbiter, self.learner.init(jax.random.fold_in(k_agent, APART)))
+        guide = asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes)
         return TrainState(
             agent=AgentState(params, training, self.buffer.empty(capacity), env_state, obs, guided),
-            guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes),
+            guide=guide.replace(stored=self.buffer.empty(slots)) if self.stores else guide,
             arbiter=arbiter,
             key=key,
             failed=jnp.array(False),
         )
 
     def label_round(self, env: Environment, teacher: Teacher, scalars: Scalars, state: TrainState) -> TrainState:
-        """Ask a simulated teacher one round of questions about uniform actions (see `asking.label_round`).
-
-        `state` may lack its agent.
-        """
-        of = asking.Inquiry(self.guidance, env, scalars, uniform_in(env))
+        """Ask a simulated teacher one round of questions (see `asking.label_round`); `state` may lack its agent."""
+        base = asked_from(env, self.sizes)
+        of = asking.Inquiry(self.guidance, env, scalars, base, pack=self._pack if self.stores else None)
         return asking.with_guide(state, asking.label_round(of, self.sizes, teacher, state.guide, state.key))
+
+    def _pack(self, remembered: Array, actions: Array, step: Step) -> Float[Array, "n width"]:
+        """Return steps (n, ...) as rows of replay."""
+        return self.buffer.pack(jax.vmap(partial(stored_step, bootstraps=self.bootstraps))(remembered, actions, step))
 
     def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
         """Return the lane with given labels in place of questions, and a model fitted to them."""
@@ -372,6 +380,9 @@ class Lane(NamedTuple):
         """Make as many gradient steps as environment steps, once replay holds enough."""
         filled, agent, schedule = clock.step + self.sizes.num_envs, state.agent, settings.schedule
         memory = Memory(env, self.buffer, agent.replay, filled, self.sizes.num_envs, self.bootstraps, agent.guided)
+        if (stored := state.guide.stored) is not None:
+            labelled = Memory(env, self.buffer, stored, state.guide.asked, 1, self.bootstraps)
+            memory = memory._replace(labelled=labelled)
         offer = offer_of(self.arbiter, self.guidance, state.guide.model, env, settings.scalars, guides(clock, schedule))
         offered = {} if offer is None else {"other": offer}
 

@@ -20,6 +20,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.plugins import PartRegistry
+from cuelearner_jax.spaces import Box
 
 TaskT = TypeVar("TaskT")
 AgentT = TypeVar("AgentT", bound=AgentOptions)
@@ -64,8 +65,19 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
         return self.agent.make(self.sizes.frame, spaces_of(env))
 
     def guide_in(self, env: Any, kind: str) -> Guide:
-        """Return the guide of a kind for an environment. Raises UserError as `guides.registry.make`."""
-        return guidances.make(kind, self.sizes, env, self.options_of(kind))
+        """Return the guide of a kind for an environment.
+
+        Raises UserError as `guides.registry.make`, and for sizes that do not suit the guide's answers or the space.
+        """
+        guide, space = guidances.make(kind, self.sizes, env, self.options_of(kind)), spaces_of(env).actions
+        if self.sizes.ask_from == "middle" and not isinstance(space, Box):
+            raise UserError(f"sizes.ask_from is middle, but only a box has one, not {space.name}: leave it out")
+        if self.sizes.store_labelled and guide.form is not None and guide.form.correct is None:
+            raise UserError(
+                f"sizes.store_labelled executes what answers ask for, but {guide.form.name} answers name no action: "
+                f"leave it out, or leave out guidance {kind}"
+            )
+        return guide
 
     def options_of(self, kind: str) -> Any:
         """Return the options of a kind of guidance; None: its defaults.
@@ -93,6 +105,8 @@ def check(config: RunConfig) -> None:
     sizes, schedule = config.sizes, config.schedule
     check_part(schedule, "schedule")
     check_guide(sizes, config.scalars)
+    if sizes.store_labelled and (sizes.candidates > 1 or sizes.question_every > 1):
+        raise UserError("sizes.store_labelled keeps every step: leave out sizes.candidates and sizes.question_every")
     check_part(config.agent, "agent")
     check_part(config.arbiter, "arbiter")
     for name in config.kinds:

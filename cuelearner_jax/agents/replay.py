@@ -58,6 +58,7 @@ class RingBuffer(NamedTuple):
 
     width: int
     empty: Callable[[int], Float[Array, "capacity width"]]
+    pack: Callable[[StoredStep], Array]  # steps (n, ...) -> rows (n, width)
     add: Callable[[Array, Array, StoredStep], Array]  # (rows, step, steps (n, ...)) -> rows
     draw: Callable[[PRNGKeyArray, Array, Array, int], Array]  # (key, rows, step, batch_size) -> rows' numbers
     read: Callable[[Array, Array], StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
@@ -96,13 +97,16 @@ def ring_buffer(example: StoredStep) -> RingBuffer:
     def empty(capacity: int) -> Float[Array, "capacity width"]:
         return jnp.zeros((capacity, width), jnp.float32)
 
+    def pack(steps: StoredStep) -> Float[Array, "n width"]:
+        return jax.vmap(lambda item: ravel_pytree(item)[0])(steps).astype(jnp.float32)
+
     def add(
         rows: Float[Array, "capacity width"], step: Int[Array, ""], steps: StoredStep
     ) -> Float[Array, "capacity width"]:
-        packed = jax.vmap(lambda item: ravel_pytree(item)[0])(steps)
+        packed = pack(steps)
         if rows.shape[0] % packed.shape[0]:
             raise ValueError(f"capacity {rows.shape[0]} is no multiple of the {packed.shape[0]} steps added")
-        return _write(rows, packed.astype(rows.dtype), jnp.mod(step, rows.shape[0]))
+        return _write(rows, packed, jnp.mod(step, rows.shape[0]))
 
     def draw(
         key: PRNGKeyArray, rows: Float[Array, "capacity width"], step: Int[Array, ""], batch_size: int
@@ -123,7 +127,7 @@ def ring_buffer(example: StoredStep) -> RingBuffer:
         found = rows[places[..., None], reward_column + jnp.arange(3)[None, None]]
         return LaterSteps(*jnp.moveaxis(found, -1, 0), known=further[None] <= newer[:, None])
 
-    return RingBuffer(width, empty, add, draw, read, follow)
+    return RingBuffer(width, empty, pack, add, draw, read, follow)
 
 
 class Memory(NamedTuple):
@@ -136,6 +140,7 @@ class Memory(NamedTuple):
     num_envs: int
     bootstraps: bool  # whether transitions have a next observation
     guided: Int[Array, "capacity 1"] | None = None  # counts of `count_guided`; None: guided steps are not counted
+    labelled: Memory | None = None  # labelled steps, one environment's; None: none are kept
 
     def batches(
         self,
@@ -148,19 +153,39 @@ class Memory(NamedTuple):
         """Draw transitions (size,), each under a random symmetry of the environment.
 
         With `n_step` above 1 a second batch follows: from the same steps on, up to so many of one episode as one.
-        All stored steps are as likely; with a `guided_share` the first of a batch, up to that share, are guided steps
-        and the others own steps, each sort as likely. A sort without steps leaves its place to the other.
+        All stored steps are as likely; with a `guided_share` the first of a batch, up to that share, are labelled
+        steps or else guided steps, and the others own steps, each sort as likely. A sort without steps leaves its place
+        to the other.
         """
         k_sample, k_mirror = jax.random.split(key)
+        found = self._drawn(k_sample, size, n_step, discount, guided_share)
+        if self.labelled is not None:
+            k_labelled, k_choice = jax.random.split(jax.random.fold_in(k_sample, 1))
+            labelled = self.labelled._drawn(k_labelled, size, n_step, discount, None)
+            chosen = self._labelled_places(k_choice, size, guided_share)
+            found = [_replaced(chosen, *both) for both in zip(labelled, found, strict=True)]
+        return [apply_symmetries(k_mirror, self.env, batch) for batch in found]
+
+    def _drawn(self, key: PRNGKeyArray, size: int, n_step: int, discount: Any, guided_share: Any) -> list[Transition]:
+        """Return the batches of `batches`, of this memory's own rows and without symmetries."""
         if guided_share is None or self.guided is None:
-            numbers = self.buffer.draw(k_sample, self.rows, self.filled, size)
+            numbers = self.buffer.draw(key, self.rows, self.filled, size)
         else:
             wanted = jnp.arange(size) < jnp.round(guided_share * size)
-            numbers = draw_sorts(k_sample, self.guided[:, 0], self.filled, wanted)
+            numbers = draw_sorts(key, self.guided[:, 0], self.filled, wanted)
         found = [self.one_step(self.buffer.read(self.rows, numbers))]
         if n_step > 1:
             found.append(self.n_step(numbers, n_step, discount))
-        return [apply_symmetries(k_mirror, self.env, batch) for batch in found]
+        return found
+
+    def _labelled_places(self, key: PRNGKeyArray, size: int, guided_share: Any) -> Bool[Array, " batch"]:
+        """Return the places of a batch for labelled steps: a share in front, or at random, as often as other steps."""
+        assert self.labelled is not None
+        there = self.labelled.filled
+        if guided_share is not None:
+            return (jnp.arange(size) < jnp.round(guided_share * size)) & (there > 0)
+        own = jnp.clip(self.filled, 1, self.rows.shape[0])
+        return jax.random.uniform(key, (size,)) * (there + own) < there
 
     def one_step(self, stored: StoredStep) -> Transition:
         """Return stored steps (batch, ...) as transitions, with their observations rebuilt."""
@@ -180,6 +205,12 @@ class Memory(NamedTuple):
         end = self.buffer.read(self.rows, jnp.mod(numbers + last * self.num_envs, self.rows.shape[0]))
         next_obs = jax.vmap(self.env.recall_next)(end.obs, end.action, end.aftermath)
         return Transition(jax.vmap(self.env.recall)(first.obs), first.action, reward, factor, next_obs)
+
+
+def _replaced(chosen: Bool[Array, " n"], new: Transition, old: Transition) -> Transition:
+    """Return transitions (n, ...) with new ones in the chosen places."""
+    pick = lambda one, other: jnp.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, other)  # noqa: E731
+    return jax.tree.map(pick, new, old)
 
 
 def count_guided(

@@ -55,6 +55,11 @@ class Sizes(GuideSizes):
     """Environments of one seed that step together before as many gradient steps follow."""
     lanes_per_block: Annotated[int, Bounds(0)] = 0
     """Seeds trained in one block, side by side (0: all) on an accelerator, one by one (0: a block a core) on a CPU."""
+    ask_from: Literal["uniform", "middle"] = "uniform"
+    """Actions that questions begin with, before the guide refines them: uniform, or the middle of a box."""
+    store_labelled: bool = False
+    """Execute each asked action as its answer corrects it, and keep these rewarded steps for the agent to learn
+    from."""
 
 
 @dataclass(frozen=True)

@@ -199,6 +199,7 @@ RELATIVE = AnswerForm(
     answer=relative_answer,
     values=lambda space: (-1.0, 0.0, 1.0) if len(space.cues) == 1 else (-1.0, 0.0, 1.0, UNSAID),
     by_eps=True,
+    correct=lambda space, action, answer, eps: space.toward(action, answer, eps),
 )
 DEMONSTRATION = AnswerForm(
     name="demonstration",
@@ -206,6 +207,7 @@ DEMONSTRATION = AnswerForm(
     meaning=lambda space: f"what to do instead, an action ({space.name})",
     answer=demonstrate,
     is_action=True,
+    correct=lambda space, action, answer, eps: answer,
 )
 SCALAR = AnswerForm(
     name="scalar",

@@ -40,3 +40,5 @@ class AnswerForm(NamedTuple):
     values: Callable[[Space], tuple[float, ...]] | None = None  # allowed values of an entry; None: any finite number
     is_action: bool = False  # True if an answer is itself an action
     by_eps: bool = False  # True if an answer means a change by eps, which label files then record
+    # (space, action, answer, eps) -> the action that the answer asks for; None: an answer names none
+    correct: Callable[[Space, Array, Array, Array], Array] | None = None

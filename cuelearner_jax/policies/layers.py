@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.agents.protocol import AgentFunctions
-from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, to_json
+from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, Sizes, to_json
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.feedback.answers import intended_action, relative_feedback
@@ -22,7 +22,7 @@ from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyNode, describe
 from cuelearner_jax.policies.opaque import in_space, policy_of
 from cuelearner_jax.run_config import kind_to_json, part_to_json
-from cuelearner_jax.spaces import DIRECTIONS, Space
+from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
 
 
@@ -60,6 +60,20 @@ class Uniform(PolicyNode):
     def describe(self) -> dict[str, Any]:
         """Return {"policy": "uniform"}."""
         return {"policy": "uniform"}
+
+
+class Middle(PolicyNode):
+    """A policy of the action halfway between the bounds of a box."""
+
+    box: Box = struct.field(pytree_node=False)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Return the same action in every situation."""
+        return jnp.broadcast_to(self.box.middle(), (len(obs), self.box.size))
+
+    def describe(self) -> dict[str, Any]:
+        """Return {"policy": "middle"}."""
+        return {"policy": "middle"}
 
 
 class NearAims(PolicyNode):
@@ -271,3 +285,12 @@ def wanted_actions(
 def uniform_in(env: Any) -> Uniform:
     """Return the policy of uniform actions of an environment's space."""
     return Uniform(actions_of(env))
+
+
+def asked_from(env: Any, sizes: Sizes) -> Uniform | Middle:
+    """Return the policy that questions begin with while training (`Sizes.ask_from`)."""
+    space = actions_of(env)
+    if sizes.ask_from == "uniform":
+        return Uniform(space)
+    assert isinstance(space, Box)  # see `RunConfig.guide_in`
+    return Middle(space)

@@ -78,6 +78,8 @@ def labels_of(request: TrainRequest) -> label_files.LabelFile | None:
     if request.labels_from is None:
         return None
     config = request.config
+    if config.sizes.store_labelled:
+        raise UserError("sizes.store_labelled keeps steps, but a label file has none: leave out one of the two")
     return read_labels(request.labels_from, request.task, config.task, config.sizes, config.scalars, request.grid)
 
 

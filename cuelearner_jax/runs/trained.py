@@ -14,7 +14,17 @@ from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Corrected, Guided, Heuristic, Policy, Taught, arbiter_of, final_policy, uniform_in
+from cuelearner_jax.policies import (
+    Corrected,
+    Guided,
+    Heuristic,
+    Policy,
+    Taught,
+    arbiter_of,
+    asked_from,
+    final_policy,
+    uniform_in,
+)
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
@@ -87,7 +97,7 @@ def make(
     if name == "corrected":
         assert teacher is not None
         return Corrected(agent, teacher, config.scalars, actions_of(view))
-    base = uniform_in(view) if name == "guide" else agent
+    base = asked_from(view, config.sizes) if name == "guide" else agent
     return Guided(base, lanes.policies["guidance"], view, config.scalars, lanes.guidance)
 
 

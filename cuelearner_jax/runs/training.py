@@ -16,7 +16,7 @@ from cuelearner_jax.devices import BY_LANE, SHARED, place
 from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.evaluate import Tell, episodes, ignore_progress
 from cuelearner_jax.loop import Clock, TrainState, start_clock
-from cuelearner_jax.policies import Guided, PolicyBlock, acting_state, final_policy, uniform_in
+from cuelearner_jax.policies import Guided, PolicyBlock, acting_state, asked_from, final_policy
 from cuelearner_jax.runs.judging import Returns, judges_envs, judges_episodes, scores
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
@@ -198,7 +198,7 @@ class Training:
         return self._of_finite({"arm": best.astype(float), **judged})
 
     def guide_alone(self) -> dict[str, np.ndarray]:
-        """Return metrics (lanes,) of uniform actions under guidance; without guidance that is chance.
+        """Return metrics (lanes,) of the actions that questions begin with, under guidance; without it that is chance.
 
         Guides change only in label rounds, so one evaluation per round is enough.
         """
@@ -207,7 +207,7 @@ class Training:
         return self._guides[1]
 
     def _of_guides(self) -> dict[str, np.ndarray]:
-        group, base = self.group, uniform_in(self.group.env)
+        group, base = self.group, asked_from(self.group.env, self.group.config.sizes)
 
         def guide(lane: TrainState) -> PolicyBlock:
             return Guided(base, lane.guide.model, view_of(self.examined), group.config.scalars, group.guidance)

@@ -125,7 +125,7 @@ def test_tries_come_first_from_the_best_and_last_from_anywhere():
 @pytest.mark.long
 def test_a_stopped_training_goes_on_to_the_same_teacher_and_mixes_with_nothing(begun, tmp_path):
     refused(begun, "--resume to go on")
-    refused(begun, "another seed", resume=True, seed=1)
+    refused(begun, "other values of seed", resume=True, seed=1)
     other = dataclasses.replace(CONFIG, rounds=300)
     refused(begun, r"another config\.rounds", resume=True, teacher=other)
     refused(tmp_path, "nothing to resume", resume=True)
