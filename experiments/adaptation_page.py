@@ -322,6 +322,19 @@ def settings(rows: Sequence[Row], metric: str, scale: str) -> list[list[str]]:
     return cells
 
 
+def with_look_ahead(data: Path, out: Output) -> str:
+    """Return the section of four agents trained anew, at full size: rooms and sides, with look-ahead."""
+    rows = read(data / "anew" / "navigation")
+    return tables(
+        out,
+        [
+            ("rooms_anew", "Rooms, four agents trained anew", outcomes(rows, "rooms", None)),
+            ("sides_left_anew", "Pass on the left, the same four", side_table(rows, "corridor_left", "left")),
+            ("sides_right_anew", "Pass on the right, the same four", side_table(rows, "corridor_right", "right")),
+        ],
+    )
+
+
 def on_two_cores(data: Path, out: Output) -> str:
     """Return the section of smaller runs: the lidar, rooms with look-ahead, sides, the quadruped."""
     small, again = read(data / "cpu" / "navigation"), read(data / "retrained" / "navigation")
@@ -333,15 +346,19 @@ def on_two_cores(data: Path, out: Output) -> str:
         ("quadruped", "The quadruped in halls", outcomes(small, "anymal", None)),
         ("quadruped_sides", "The quadruped, pass on the left", side_table(small, "corridor_left_anymal", "left")),
     ]
+    text = tables(out, parts)
+    return fold("Tables of the runs on two cores", text) if text else ""
+
+
+def tables(out: Output, parts: Sequence[tuple[str, str, Table | None]]) -> str:
+    """Return short tables of parts (name, title, whole table), with links to the whole ones."""
     shown, links = [], []
     for name, title, table in parts:
         if table and table.cells:
             columns = SHORT_SIDES if table.header == SIDES_HEADER else [*AMOUNTS, "success [%]", "models used"]
             shown.append(f"**{title}**\n\n{table.short(columns)}")
             links.append(out.link(name, title, table.header, table.cells))
-    if not shown:
-        return ""
-    return fold("Tables of the runs on two cores", "\n\n".join([*shown, out.links(*links)]))
+    return "\n\n".join([*shown, out.links(*links)]) if shown else ""
 
 
 def sections(data: Path, page: Path) -> dict[str, str]:
@@ -359,6 +376,7 @@ def sections(data: Path, page: Path) -> dict[str, str]:
             found[name] = part(rows, data / task, out)
         compared += settings(rows, "reward" if task == "billiards" else "success", "paper")
     compared += settings(read(data / "cpu" / "navigation"), "success", "cpu")
+    found["look-ahead"] = with_look_ahead(data, out)
     found["two-cores"] = on_two_cores(data, out)
     if compared:
         link = out.link("settings", "settings compared on tuning episodes", SETTINGS_HEADER, compared)

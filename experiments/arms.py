@@ -8,9 +8,9 @@ A piece of training is a sweep with a folder of its own, resumed where it stands
 `by_value` has critics choose between the agent's action and the guide's, while acting and in the targets of learning;
 `acting` while acting alone. Controls are `shuffled` (labels with each other's answers), the script as a
 guide without labels, and `alone`. `rlpd` fits a policy to as many demonstrations; half of all episodes are that
-policy's, and so is half of every minibatch (RLPD: Ball et al., 2023). In `stored` each label corrects the step that is
-executed, and these steps are half of every minibatch: with demonstrations this is RLPD as published. In `corrections`
-the agent never learns: what counts is the guide of uniform actions.
+policy's, and so is half of every minibatch. In `stored` each label corrects the step that is executed, and these steps
+are half of every minibatch; with demonstrations this is RLPD (Ball et al., 2023). In `corrections` the agent never
+learns: what counts is the guide of uniform actions.
 
 A piece of adaptation corrects a script, or in Fetch a trained agent, by labels. Held-out labels judge: no step is
 rewarded. Demonstrations and good/bad labels cannot judge: 20 tuning episodes do, and their steps are counted. A piece
@@ -80,15 +80,7 @@ OWN_POLICY: Options = {"arbiter.in-policy": False}  # the finished policy is the
 EPISODES: Options = {"arbiter": "episodes"}
 SHUFFLED: Options = {"scalars.answer": "shuffled"}
 ENSEMBLE: Options = {"agent.critics": 10}
-# Labels are asked for in whole episodes, each about the middle action. The corrected steps are half of every minibatch.
-STORED: Options = {
-    **EPISODES,
-    "arbiter.probability": 0.0,
-    "sizes.store-labelled": True,
-    "sizes.ask-from": "middle",
-    "scalars.eps-deg": 0.25,  # of a range: the strength at which such episodes succeed most often
-    "scalars.refined-fraction": 0.0,
-}
+STORED: Options = {"preset": "corrected"}
 # The agent only ever acts at random. Half of the episodes are guided, as questions are then asked there too.
 UNLEARNED: Options = {
     "arbiter": "episodes",
@@ -118,7 +110,7 @@ def variants(world: str, options: Options) -> list[Piece]:
         ("by_value", "demonstration", BUDGETS, valued, "demonstrations, compared by value"),
         ("by_value", "heuristic", (), valued, "control: the script without labels"),
         ("shuffled", "relative", BUDGETS, {**valued, **SHUFFLED}, "control: shuffled answers"),
-        ("rlpd", "demonstration", BUDGETS, {**plain, **ENSEMBLE}, "demonstrations in the replay"),
+        ("rlpd", "demonstration", BUDGETS, {**plain, **ENSEMBLE}, "a policy of them in the replay"),
         *(("stored", kind, BUDGETS, stored, "corrected steps in the replay") for kind in ("relative", "demonstration")),
         ("stored_random", "relative", (500,), {**stored, **RANDOM}, "control: answers at random in the replay"),
         *(("corrections", kind, (500,), alone, "labels alone") for kind in (*FORMS, *PEERS)),
@@ -185,7 +177,7 @@ def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
     found = []
     for piece, arbiter, row, own in evaluations(out, pieces):
         judged = len(by_value.ARMS) * arbiter.get("judge_steps", 0) if piece.kinds != ("none",) else 0
-        paid = row["step"] + judged + (row["labels"] if piece.options.get("sizes.store-labelled") else 0)
+        paid = row["step"] + judged + (row["labels"] if piece.options["preset"] == "corrected" else 0)
         told = {**row, **spread([one["success"] for one in own]), "rewarded_steps": paid}
         found.append({**told, "each": {one["seed"]: one["success"] for one in own}})
     return found

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import argparse
 import json
+from operator import itemgetter
 from pathlib import Path
 
 import matplotlib
 from _pages import GREY, image, markdown, name_ends, new_figure, rendered
+from _pieces import grouped
 from matplotlib.ticker import EngFormatter
 
 from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
@@ -29,10 +31,17 @@ STEPS = (3_200, 6_400, 9_600, 12_800)
 
 RUNS = {
     "alone": "SAC alone",
-    "by_value": "{labels} relative labels",
-    "acting": "{labels} relative labels, while acting",
-    "rlpd": "{labels} demonstrations, RLPD",
+    "alone_10": "SAC alone, ten critics",
+    "by_value": "{labels} {labelled}, compared by value",
+    "acting": "{labels} {labelled}, compared while acting",
+    "own_policy": "{labels} {labelled}, compared in training",
+    "rlpd": "{labels} {labelled}, a policy of them",
+    "stored": "{labels} {labelled}, corrected steps",
+    "stored_random": "control: {labels} answers at random, corrected steps",
 }
+LABELLED = {"relative": "relative labels", "demonstration": "demonstrations"}
+HEURISTIC = "control: the script compared by value, no label"
+DRAWN = {"alone": "-", "stored": "-", "by_value": "--", "acting": "--"}  # runs that are drawn, with 500 labels
 SHOWN_STEPS = 16_000  # of reach; all curves are level by then
 
 
@@ -43,7 +52,9 @@ def studied(data: Path, world: str) -> dict[str, list[dict]]:
 
 def run_name(row: dict) -> str:
     """Return the name of a run of the study."""
-    return RUNS[row["run"]].format(labels=row["labels"])
+    if row["guidance"] == "heuristic":
+        return HEURISTIC
+    return RUNS[row["run"]].format(labels=row["labels"], labelled=LABELLED.get(row["guidance"], ""))
 
 
 def training(data: Path) -> str:
@@ -51,10 +62,11 @@ def training(data: Path) -> str:
     cells = []
     for world in ("reach", "push"):
         found = studied(data, world)
-        guides = {(row["run"], row["labels"]): row["mean"] for row in found["guides"]}
+        named = itemgetter("run", "guidance", "labels")
+        guides = {named(row): row["mean"] for row in found["guides"]}
         for row in found["steps"]:
             ratio = "{:.2f} [{:.2f}, {:.2f}]".format(*row["ratio"]) if "ratio" in row else ""
-            guide = guides.get((row["run"], row["labels"]))
+            guide = guides.get(named(row))
             alone = "" if guide is None else f"{100 * guide:.0f}%"
             end = f"{100 * row['end']['mean']:.0f}%"
             cells.append([f"`{world}`, {run_name(row)}", alone, f"{row['median']:,.0f}", ratio, end])
@@ -69,16 +81,16 @@ def draw_training(data: Path, stem: Path) -> None:
         for axes, world in zip(figure.subplots(1, 2), ("reach", "push"), strict=True):
             rows = studied(data, world)["training"]
             ends = []
-            for run, guidance, labels in dict.fromkeys((row["run"], row["guidance"], row["labels"]) for row in rows):
-                own = [row for row in rows if (row["run"], row["labels"]) == (run, labels)]
-                own = [row for row in own if world == "push" or row["step"] <= SHOWN_STEPS]
+            rows = [row for row in rows if world == "push" or row["step"] <= SHOWN_STEPS]
+            for (run, guidance, labels), own in grouped(rows, "run", "guidance", "labels"):
+                if run not in DRAWN or labels == 100 or guidance == "heuristic":
+                    continue
                 steps, means = [row["step"] for row in own], [row["mean"] for row in own]
                 colour = GREY if run == "alone" else colour_of(guidance)
-                style = ":" if labels == 100 else "-"
                 low, high = [row["low"] for row in own], [row["high"] for row in own]
                 axes.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
-                axes.plot(steps, means, color=colour, linewidth=1.8, linestyle=style)
-                ends.append((means[-1], run_name(own[0]) + (" (dotted)" if style == ":" else ""), colour))
+                axes.plot(steps, means, color=colour, linewidth=1.8, linestyle=DRAWN[run])
+                ends.append((means[-1], run_name(own[0]), colour))
             axes.set(xlim=(0, steps[-1]), ylim=(0, 1.03), xlabel="environment steps of a seed", ylabel="success")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.set_title(world, fontweight="bold", fontsize=11)

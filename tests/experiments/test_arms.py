@@ -50,7 +50,8 @@ def test_every_training_is_a_sweep_that_would_begin(study, scale, monkeypatch, t
     for piece in (piece for piece in study.TRAINED if piece.world in worlds):
         left = study.scaled(piece, study.SCALES[scale])
         assert main(study.sweep_command("arm", left, tmp_path, resume=False)) == 0, piece.path
-        assert left.options["arbiter"] == orders[-1].config.arbiter.NAME
+        assert left.options.get("arbiter", "episodes") == orders[-1].config.arbiter.NAME
+        assert orders[-1].config.sizes.store_labelled == piece.run.startswith("stored")
         assert orders[-1].config.agent.NAME == "sac"
 
 
