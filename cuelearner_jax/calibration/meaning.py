@@ -31,6 +31,7 @@ class Meaning:
 
     def __init__(self, policy: Any, space: Space) -> None:
         self.policy, self.space = policy, space
+        self.known: dict[bytes, Floats] = {}  # actions by observation, where no change is of what the policy sees
 
     def actions(
         self, family: Family, thetas: Float[Floats, "thetas unknowns"], obs: Float[Floats, "n obs"]
@@ -38,7 +39,9 @@ class Meaning:
         """Return the policy's actions in each situation, seen as it was before the changes of each theta."""
         number, count = len(thetas), len(obs)
         theta, rows = np.repeat(thetas, count, 0), np.tile(obs, (number, 1))
-        if is_python(self.policy):
+        if family and not any(one.sees for one in family):
+            found = in_portions(partial(_planned, family), CHEAP, theta, rows, np.tile(self._acts(obs), (number, 1)))
+        elif is_python(self.policy):
             before = in_portions(partial(_seen, family), CHEAP, theta, rows)
             act = partial(self.policy.act, jax.random.key(0), None)
             found = in_portions(lambda seen: act(jnp.asarray(seen)), ROWS_PYTHON, before)
@@ -48,6 +51,14 @@ class Meaning:
             found = in_portions(partial(_meant, family, self.policy), portion, theta, rows)
         user_code.check_actions(found, policy_name(self.policy))
         return found.reshape(number, count, self.space.size)
+
+    def _acts(self, obs: Float[Floats, "n obs"]) -> Float[Floats, "n action"]:
+        """Return the policy's actions; ask only for observations that were never asked about."""
+        keys = [row.tobytes() for row in obs]
+        if missing := [row for row, key in enumerate(keys) if key not in self.known]:
+            asked = self.actions((), np.zeros((1, 0)), obs[missing])[0]
+            self.known.update({keys[row]: action for row, action in zip(missing, asked, strict=True)})
+        return np.array([self.known[key] for key in keys])
 
     def offsets(
         self,

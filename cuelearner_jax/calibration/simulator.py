@@ -2,7 +2,8 @@
 
 A tilted table changes neither the observation nor the executed action, but the action's effect. A simulator of the
 world can play actions near the meant one, before and after the change. The compensating action is the one around which
-rewards after the change match the rewards around the meant action before the change.
+rewards after the change match the rewards around the meant action before the change. Where the change also decides how
+wide the window of good actions is, its rewards match nowhere: `aim` compares the best actions instead.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Space
 
 NARROW = 0.5  # standard deviation of the window in which rewards are compared, in reaches
+GOOD = 0.95  # share of the largest expected reward with which an action is as good as the best
 
 
 def simulator_distortion(
@@ -29,6 +31,7 @@ def simulator_distortion(
     space: Space,
     reach: float,
     tried: int = 13,
+    aim: float | None = None,
 ) -> Distortion:
     """Return a distortion of the physics, as a simulator predicts it.
 
@@ -40,6 +43,8 @@ def simulator_distortion(
         space: space of the actions, with one cue.
         reach: how far an action may have to change, in the space's unit.
         tried: actions within the reach of another one; odd.
+        aim: an action changes as much as the best one within the reach does, for a player who errs by this standard
+            deviation, in the space's unit. None: rewards are matched.
 
     Raises:
         UserError: actions with several cues, or a number of tries that has no middle.
@@ -68,4 +73,20 @@ def simulator_distortion(
         best = jnp.where(before.any(), jnp.argmin(unlike + nearest), half)
         return space.exp(action, away[half + best][None])
 
-    return Distortion(name, unknowns, plans=plans)
+    if aim is None:
+        return Distortion(name, unknowns, plans=plans)
+    near = away[half : half + tried]
+    errs = jnp.exp(-0.5 * jnp.square((near[:, None] - near[None]) / space.from_unit(aim)))
+    errs = errs / errs[half].sum()
+
+    def best(env: Any, state: Any, action: Array) -> Array:
+        expected = jnp.einsum("ij,j->i", errs, rewards(env, state, action, near), precision=jax.lax.Precision.HIGHEST)
+        good = expected >= GOOD * expected.max() - 1e-6
+        return near[jnp.argmin(jnp.where(good, jnp.abs(near), jnp.inf))]
+
+    def follows(theta: Array, obs: Array, action: Array) -> Array:
+        state = state_of(obs)
+        before = best(env_of(jnp.zeros_like(theta)), state, action)
+        return space.exp(action, (best(env_of(theta), state, action) - before)[None])
+
+    return Distortion(name, unknowns, plans=follows)

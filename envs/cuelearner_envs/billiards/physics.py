@@ -159,15 +159,30 @@ def impact(table: Table, motion: Motion, contact: Contact, unseen: Scalar) -> Mo
     # A kick that is due acts on both balls of a pair alike, so only a cushion feels it.
     late_x = jnp.where(paired, 0.0, table.acceleration[0] * unseen)
     late_y = jnp.where(paired, 0.0, table.acceleration[1] * unseen)
-    jn = normal_impulse(-(vx * nx + vy * ny), -(late_x * nx + late_y * ny), table.restitution, discs)
+    restitution, friction, roll = _surfaces(table, paired)
+    jn = normal_impulse(-(vx * nx + vy * ny), -(late_x * nx + late_y * ny), restitution, discs)
     slip = (vy + late_y) * nx - (vx + late_x) * ny - of(motion.rim, a) - of(motion.rim, b)
-    jt = tangential_impulse(slip, jn, table.friction, discs)
+    jt = tangential_impulse(slip, jn, friction, discs)
 
     sign = a.astype(vx.dtype) - b.astype(vx.dtype)
+    if table.cloth is not None:  # the impulse acts on the velocity; what rolls on adds its share of the one before
+        sign = sign * (1.0 - roll)
     return motion._replace(
         ux=motion.ux + sign * (jn * nx - jt * ny),
         uy=motion.uy + sign * (jn * ny + jt * nx),
         rim=motion.rim + jnp.where(a | b, RIM_PER_IMPULSE * jt, 0.0),
+    )
+
+
+def _surfaces(table: Table, paired: Bool[Array, ""]) -> tuple[Scalar, Scalar, Scalar]:
+    """Return restitution, friction and the share that rolls on, of an impact between two balls or with a cushion."""
+    if table.cloth is None:
+        return table.restitution, table.friction, 0.0
+    cloth = table.cloth
+    return (
+        jnp.where(paired, table.restitution, cloth.rebound),
+        jnp.where(paired, cloth.throw, table.friction),
+        jnp.where(paired, cloth.roll, 0.0),
     )
 
 
