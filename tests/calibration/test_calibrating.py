@@ -117,6 +117,39 @@ def test_questions_of_a_batch_tell_different_things():
     assert questions.information[0] > 2 * questions.information[-1]
 
 
+@pytest.fixture(scope="module")
+def turned():
+    """A calibration that 30 answers have told of a turn, and situations for more."""
+    calibration, answers = Calibration(POLICY, TURN, DIRECTIONS, EPS_DEG), person(DIRECTIONS, EPS, TURNED)
+    _, obs = situations(jax.random.key(0), None, 100)
+    for start in (0, 15):
+        asked = calibration.questions(obs[start : start + 15], 15)
+        rows = obs[start + asked.index], asked.action
+        calibration.learn(*rows, answers(jax.random.key(start), None, *rows))
+    return calibration, obs[30:]
+
+
+def test_confirmations_are_halfway_and_answers_count_by_their_side(turned):
+    calibration, obs = turned[0].copy(np.random.default_rng(0)), turned[1]
+    asked = calibration.confirmations(obs, 10)
+    halfway = np.rad2deg(DIRECTIONS.log(aims(obs)[asked.index], asked.action))
+    assert np.allclose(halfway, -15, atol=2)  # the right actions are 30 degrees to the right
+    told = np.array([-1, -1, -1, -1, -1, -1, 1, 1, 1, 0.0])[:, None]
+    calibration.confirm(obs[asked.index], asked.action, told)
+    assert calibration.asked == 40
+    assert calibration._confirmed(calibration.fits["direction: change",]) == (6, 3)
+    assert calibration._confirmed(calibration.fits[()]) is None
+
+
+@pytest.mark.parametrize(("confirmed", "named"), [(None, True), ((6, 3), True), ((5, 3), False), ((0, 0), False)])
+def test_a_change_is_refused_without_two_answers_for_it_to_each_one_against_it(turned, confirmed, named, monkeypatch):
+    monkeypatch.setattr(Calibration, "_confirmed", lambda calibration, fit: confirmed)
+    found = turned[0].copy(np.random.default_rng(0)).result()
+    assert (found.verdict, found.refused) == ((CHANGED, ()) if named else (UNEXPLAINED, ("direction: change",)))
+    assert (found.policy is turned[0].base) is not named
+    assert named or "did not confirm" in found.words()[0]
+
+
 def test_too_few_answers_and_spaces_without_cues_are_refused():
     with pytest.raises(UserError, match="give at least 5"):
         Calibration(POLICY, FAMILY, DIRECTIONS, EPS_DEG).result()
