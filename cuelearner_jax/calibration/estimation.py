@@ -125,7 +125,7 @@ class Calibration:
         self.scales: dict[str, float] = {}
         self.fits: dict[tuple[str, ...], Fit] = {}
         self.ready: list[Responses] = []  # none before the first situations
-        self.confirming: Answers | None = None  # answers to `confirmations`
+        self.confirmed: tuple[int, int] | None = None  # see `Result`
 
     def copy(self, random: np.random.Generator) -> Calibration:
         """Return a copy for choosing questions while the original goes on; `random`: for these questions."""
@@ -187,10 +187,9 @@ class Calibration:
         asked about before.
         """
         obs = np.asarray(obs, np.float32)
-        sets = [names for names in self._current() if self.fits[names].corrects] if self.asked else []
-        if not sets:
+        if (fit := self._candidate()) is None:
             return self.questions(obs, count)
-        before, offset = self._correction(self.fits[max(sets, key=lambda names: self._score(self.fits[names]))], obs)
+        before, offset = self._correction(fit, obs)
         apart = np.abs(offset).max(-1) / self.eps
         differs = np.where(apart <= MOVED[1], np.minimum(apart, MOVED[0]), 0) + 1e-3 * self.random.random(len(obs))
         index = np.array([own[differs[own].argmax()] for own in np.array_split(np.arange(len(obs)), count)])
@@ -204,20 +203,22 @@ class Calibration:
         answer: Float[Given, "n cues"],
         doubt: Float[Given, " n"] | None = None,
     ) -> None:
-        """Add answers to `confirmations`. Without enough of them for the changes, `result` refuses these."""
-        asked = self.asked
-        self.learn(obs, action, answer, doubt)
-        if self.answers is not None:
-            self.confirming = Answers._make(rows[asked:] for rows in self.answers)
+        """Count the answers to `confirmations` that are for the corrected policy, then learn from them too.
 
-    def _confirmed(self, fit: Fit) -> tuple[int, int] | None:
-        """Return how many answers to `confirmations` are for the fit's changes, and how many against them."""
-        if self.confirming is None or not fit.corrects:
-            return None
-        if not len(self.confirming.obs):
-            return 0, 0
-        toward = (self.confirming.answer * self.confirming.told * self._correction(fit, self.confirming.obs)[1]).sum(-1)
-        return int((toward > 0).sum()), int((toward < 0).sum())
+        The count is out of sample: the answers have not been learned. Without enough of them, `result` refuses.
+        """
+        if (fit := self._candidate()) is not None:
+            self.confirmed = 0, 0
+            if len(obs):
+                said = np.where(np.asarray(is_answered(jnp.asarray(answer))) & np.isfinite(answer), answer, 0)
+                toward = (said * self._correction(fit, np.asarray(obs, np.float32))[1]).sum(-1)
+                self.confirmed = int((toward > 0).sum()), int((toward < 0).sum())
+        self.learn(obs, action, answer, doubt)
+
+    def _candidate(self) -> Fit | None:
+        """Return the most likely fit that corrects the policy."""
+        fits = [self.fits[names] for names in self._current() if self.fits[names].corrects]
+        return max(fits, key=self._score, default=None)
 
     def _correction(self, fit: Fit, obs: Floats) -> tuple[Floats, Floats]:
         """Return the actions that the teacher would call right without changes, and the vectors to those with them."""
@@ -327,8 +328,8 @@ class Calibration:
         gain = after - before
         holds = bool(best.family) and gain.mean() > 0
         refused: tuple[str, ...] = ()
-        confirmed = self._confirmed(best) if holds else None
-        if confirmed and (not confirmed[0] or confirmed[0] < AGREE * confirmed[1]):
+        confirmed = self.confirmed
+        if holds and confirmed and (not confirmed[0] or confirmed[0] < AGREE * confirmed[1]):
             refused = tuple(one.name for one in best.family if not one.of_teacher)
             holds = not refused
         if not holds:

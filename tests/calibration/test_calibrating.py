@@ -137,14 +137,14 @@ def test_confirmations_are_halfway_and_answers_count_by_their_side(turned):
     told = np.array([-1, -1, -1, -1, -1, -1, 1, 1, 1, 0.0])[:, None]
     calibration.confirm(obs[asked.index], asked.action, told)
     assert calibration.asked == 40
-    assert calibration._confirmed(calibration.fits["direction: change",]) == (6, 3)
-    assert calibration._confirmed(calibration.fits[()]) is None
+    assert calibration.confirmed == (6, 3)
 
 
 @pytest.mark.parametrize(("confirmed", "named"), [(None, True), ((6, 3), True), ((5, 3), False), ((0, 0), False)])
-def test_a_change_is_refused_without_two_answers_for_it_to_each_one_against_it(turned, confirmed, named, monkeypatch):
-    monkeypatch.setattr(Calibration, "_confirmed", lambda calibration, fit: confirmed)
-    found = turned[0].copy(np.random.default_rng(0)).result()
+def test_a_change_is_refused_without_two_answers_for_it_to_each_one_against_it(turned, confirmed, named):
+    calibration = turned[0].copy(np.random.default_rng(0))
+    calibration.confirmed = confirmed
+    found = calibration.result()
     assert (found.verdict, found.refused) == ((CHANGED, ()) if named else (UNEXPLAINED, ("direction: change",)))
     assert (found.policy is turned[0].base) is not named
     assert named or "did not confirm" in found.words()[0]
