@@ -51,7 +51,7 @@ APART = 2.5  # [eps]: larger typical distance between teacher and policy gives t
 CONFIRMING = 5  # every fifth label asks whether the corrected policy is nearer
 MET = 240  # situations from which these questions are chosen
 MOVED = (3.0, 20.0)  # [eps]: distance between both policies in such a question, so that neither is right halfway
-AGREE = 2.0  # least answers for the corrected policy, for each one against it
+AGREE = 1.5  # more answers than this must be for the corrected policy, for each one against it
 
 CHANGED, UNCHANGED, UNEXPLAINED = "changed", "nothing changed", "none of these"
 
@@ -205,7 +205,8 @@ class Calibration:
     ) -> None:
         """Count the answers to `confirmations` that are for the corrected policy, then learn from them too.
 
-        The count is out of sample: the answers have not been learned. Without enough of them, `result` refuses.
+        The paired counts of a sign test (Dixon and Mood, 1946), out of sample: the answers have not been learned.
+        Without enough answers for the corrected policy, `result` refuses the changes.
         """
         if (fit := self._candidate()) is not None:
             self.confirmed = 0, 0
@@ -329,7 +330,7 @@ class Calibration:
         holds = bool(best.family) and gain.mean() > 0
         refused: tuple[str, ...] = ()
         confirmed = self.confirmed
-        if holds and confirmed and (not confirmed[0] or confirmed[0] < AGREE * confirmed[1]):
+        if holds and confirmed and confirmed[0] <= AGREE * confirmed[1]:
             refused = tuple(one.name for one in best.family if not one.of_teacher)
             holds = not refused
         if not holds:

@@ -140,8 +140,8 @@ def test_confirmations_are_halfway_and_answers_count_by_their_side(turned):
     assert calibration.confirmed == (6, 3)
 
 
-@pytest.mark.parametrize(("confirmed", "named"), [(None, True), ((6, 3), True), ((5, 3), False), ((0, 0), False)])
-def test_a_change_is_refused_without_two_answers_for_it_to_each_one_against_it(turned, confirmed, named):
+@pytest.mark.parametrize(("confirmed", "named"), [(None, True), ((5, 3), True), ((6, 4), False), ((0, 0), False)])
+def test_a_change_is_refused_without_more_than_three_answers_for_it_to_two_against_it(turned, confirmed, named):
     calibration = turned[0].copy(np.random.default_rng(0))
     calibration.confirmed = confirmed
     found = calibration.result()
