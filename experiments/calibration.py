@@ -141,7 +141,8 @@ def to_row(found: Result) -> dict[str, Any]:
     if isinstance(found.policy, Calibrated):
         plain |= {"theta": np.asarray(found.policy.theta, float).tolist()}
         plain |= {"family": [one.name for one in found.policy.family]}
-    return {**plain, "held_out": found.held_out, "wrong": found.wrong, "apart": found.apart, "more": found.more}
+    numbers = {name: getattr(found, name) for name in ("held_out", "confirmed", "refused", "wrong", "apart", "more")}
+    return plain | numbers
 
 
 def found_policy(row: dict[str, Any], base: Any, family: tuple[Distortion, ...]) -> Any:

@@ -250,7 +250,7 @@ def sentences(found: AdaptationResult) -> list[str]:
 
 def to_json(results: tuple[Result, ...]) -> list[dict[str, Any]]:
     """Return the results as JSON values, without their policies."""
-    kept = ("verdict", "changes", "held_out", "wrong", "apart", "more")
+    kept = ("verdict", "changes", "held_out", "confirmed", "refused", "wrong", "apart", "more")
     return [
         {name: getattr(one, name) for name in kept} | {"estimates": [estimate._asdict() for estimate in one.estimates]}
         for one in results

@@ -4,6 +4,9 @@ calibration = Calibration(policy, declared_distortions(env), actions_of(env), ep
 while calibration.asked < 100:
     questions = calibration.questions(obs, 10)
     calibration.learn(obs[questions.index], questions.action, answers, doubt=questions.doubt)
+if calibration.is_far:    # then ask in other situations: is the corrected policy nearer?
+    questions = calibration.confirmations(obs, 20)
+    calibration.confirm(obs[questions.index], questions.action, answers, doubt=questions.doubt)
 found = calibration.result()    # found.words(), found.estimates, found.policy
 """
 
@@ -46,6 +49,12 @@ SETTLED, SETTLING = 10.0, 6  # effective samples for each unknown and one in the
 MOSTLY = 0.75  # share of answers about something else, above which the verdict is UNEXPLAINED
 APART = 2.5  # [eps]: larger typical distance between teacher and policy gives the verdict UNEXPLAINED
 
+FAR = 2.0  # [eps]: larger typical distance, after most labels, calls for answers that confirm
+CONFIRMING = 5  # every fifth label then asks whether the corrected policy is nearer
+MET = 240  # situations from which these questions are chosen
+MOVED = (3.0, 20.0)  # [eps]: distance between both policies in such a question, so that neither is right halfway
+AGREE = 1.5  # more answers than this must be for the corrected policy, for each one against it
+
 CHANGED, UNCHANGED, UNEXPLAINED = "changed", "nothing changed", "none of these"
 
 
@@ -72,6 +81,8 @@ class Result(NamedTuple):
     estimates: tuple[Estimate, ...]  # estimates of all unknowns
     evidence: dict[tuple[str, ...], float]  # evidence of each set of changes, less that of no change [nats]
     held_out: tuple[float, float]  # mean log probability of a held-out answer without and with the changes [nats]
+    confirmed: tuple[int, int] | None  # answers for the corrected policy and against it; None: not asked
+    refused: tuple[str, ...]  # names of the distortions that were not confirmed
     wrong: float  # share of answers about something else
     apart: float  # typical distance between teacher and corrected policy, in the space's unit
     more: int | None  # expected number of labels still needed; None: not known
@@ -79,6 +90,9 @@ class Result(NamedTuple):
 
     def words(self) -> list[str]:
         """Describe the result, line by line."""
+        if self.refused:
+            named = f"The answers named {' and '.join(self.refused)}, but the last answers did not confirm this."
+            return [f"{named} The policy stays as it was."]
         if self.verdict == UNEXPLAINED:
             return ["None of these changes explains the answers. The policy stays as it was."]
         if self.verdict == UNCHANGED:
@@ -113,6 +127,7 @@ class Calibration:
         self.scales: dict[str, float] = {}
         self.fits: dict[tuple[str, ...], Fit] = {}
         self.ready: list[Responses] = []  # none before the first situations
+        self.confirmed: tuple[int, int] | None = None  # see `Result`
 
     def copy(self, random: np.random.Generator) -> Calibration:
         """Return a copy for choosing questions while the original goes on; `random`: for these questions."""
@@ -165,6 +180,65 @@ class Calibration:
         old = self.answers
         self.answers = new if old is None else Answers._make(map(np.concatenate, zip(old, new, strict=True)))
         self._compare()
+
+    def confirmations(self, obs: Float[Given, "n obs"], count: int) -> Questions:
+        """Return questions about actions halfway between the policy and the corrected one, where these differ.
+
+        The policy is corrected by the most likely changes, however little evidence there is. An answer tells which of
+        both is nearer to what the teacher means, whatever else is wrong with the policy. Give situations that were not
+        asked about before.
+        """
+        obs = np.asarray(obs, np.float32)
+        if (fit := self._candidate()) is None:
+            return self.questions(obs, count)
+        before, offset = self._correction(fit, obs)
+        apart = np.abs(offset).max(-1) / self.eps
+        differs = np.where(apart <= MOVED[1], np.minimum(apart, MOVED[0]), 0) + 1e-3 * self.random.random(len(obs))
+        index = np.array([own[differs[own].argmax()] for own in np.array_split(np.arange(len(obs)), count)])
+        action = self.meaning.moved(before[index], offset[None, index] / 2)[0]
+        return Questions(index, action, ties(self.meaning, (), np.zeros(0), obs[index], self.eps), np.zeros(count))
+
+    def confirm(
+        self,
+        obs: Float[Given, "n obs"],
+        action: Float[Given, "n action"],
+        answer: Float[Given, "n cues"],
+        doubt: Float[Given, " n"] | None = None,
+    ) -> None:
+        """Count the answers to `confirmations` that are for the corrected policy, then learn from them too.
+
+        The paired counts of a sign test (Dixon and Mood, 1946), out of sample: the answers have not been learned.
+        Without enough answers for the corrected policy, `result` refuses the changes.
+        """
+        if (fit := self._candidate()) is not None:
+            self.confirmed = 0, 0
+            if len(obs):
+                said = np.where(np.asarray(is_answered(jnp.asarray(answer))) & np.isfinite(answer), answer, 0)
+                toward = (said * self._correction(fit, np.asarray(obs, np.float32))[1]).sum(-1)
+                self.confirmed = int((toward > 0).sum()), int((toward < 0).sum())
+        self.learn(obs, action, answer, doubt)
+
+    @property
+    def is_far(self) -> bool:
+        """Whether teacher and corrected policy still differ so widely that answers should confirm a change.
+
+        The model of answers is then wrong, and its evidence too certain.
+        """
+        fit = self._candidate()
+        return fit is not None and bool((fit.nuisance @ GRID)[1] > FAR)
+
+    def _candidate(self) -> Fit | None:
+        """Return the most likely fit that corrects the policy."""
+        fits = [self.fits[names] for names in self._current() if self.fits[names].corrects]
+        return max(fits, key=self._score, default=None)
+
+    def _correction(self, fit: Fit, obs: Floats) -> tuple[Floats, Floats]:
+        """Return the actions that the teacher would call right without changes, and the vectors to those with them."""
+        theta = fit.interval()[0]
+        of_teacher = np.concatenate([np.full(len(one.unknowns), one.of_teacher) for one in fit.family])
+        thetas = np.stack([np.where(of_teacher, theta, 0), theta])
+        right = self.meaning.right(fit.family, thetas, self.meaning.actions(fit.asks, thetas[:, : fit.changes], obs))
+        return right[0], self.meaning.offsets((), np.zeros((1, 0)), right[1:], right[0])[0]
 
     def _scaled(self, obs: Floats) -> None:
         self.scales = self.scales or scales_of(self.meaning, self.family, obs, self.eps)
@@ -252,7 +326,7 @@ class Calibration:
     def policy(self) -> Any:
         """The policy corrected by the most likely changes so far."""
         best = self.best
-        if best is None or not [one for one in best.family if not one.of_teacher]:
+        if best is None or not best.corrects:
             return self.base
         return Calibrated(self.base, jnp.asarray(best.interval()[0], jnp.float32), best.family)
 
@@ -265,17 +339,24 @@ class Calibration:
         before, after = none.predict_held_out(), best.predict_held_out()
         gain = after - before
         holds = bool(best.family) and gain.mean() > 0
+        refused: tuple[str, ...] = ()
+        confirmed = self.confirmed
+        if holds and confirmed and confirmed[0] <= AGREE * confirmed[1]:
+            refused = tuple(one.name for one in best.family if not one.of_teacher)
+            holds = not refused
         if not holds:
             self.chosen, best, after = (), none, before
         rho, width = (best.nuisance @ GRID)[:2]
         corrected = [one.name for one in best.family if not one.of_teacher]
-        verdict = CHANGED if corrected else (UNCHANGED if best.family or _explains(best) else UNEXPLAINED)
+        explained = best.family or (_explains(best) and not refused)
+        verdict = CHANGED if corrected else (UNCHANGED if explained else UNEXPLAINED)
         evidence = {names: self.fits[names].evidence - none.evidence for names in self._current()}
         apart = float(self.space.to_unit(width * self.eps * np.log(3), np))
         more = self._more(best) if corrected else None
         estimates = tuple(estimate for one in self.family for estimate in self._estimates(one))
         held = (float(before.mean()), float(after.mean()))
-        return Result(verdict, tuple(corrected), estimates, evidence, held, float(rho), apart, more, self.policy())
+        judged = evidence, held, confirmed, refused
+        return Result(verdict, tuple(corrected), estimates, *judged, float(rho), apart, more, self.policy())
 
     def _estimates(self, distortion: Distortion) -> list[Estimate]:
         names = self._named({*self.chosen, distortion.name})
@@ -319,7 +400,11 @@ def calibrate(
     space: Space,
     eps_deg: float,
 ) -> Result:
-    """Ask a teacher in batches and estimate the changes. Held-out answers judge; no reward is used.
+    """Ask a teacher in batches and estimate the changes. No reward is used.
+
+    Held-out answers judge. Where teacher and policy differ widely, the last fifth of the labels asks whether the
+    corrected policy is nearer to what the teacher means: model-free, so that it holds where no change of the family
+    describes the answers.
 
     Args:
         policy: a policy, or any function of a batch of observations.
@@ -336,14 +421,20 @@ def calibrate(
     """
     k_seed, key = jax.random.split(key)
     calibration = Calibration(policy, family, space, eps_deg, int(jax.random.randint(k_seed, (), 0, 1 << 20)))
-    for start in range(0, labels, BATCH):
+    left, last = labels, labels // CONFIRMING
+    while left:
         k_where, k_answer, key = jax.random.split(key, 3)
-        count = min(BATCH, labels - start)
-        states, obs = situations(k_where, calibration.policy(), CHOICE * count)
-        asked = calibration.questions(np.asarray(obs), count)
+        confirms = left == last and calibration.is_far
+        count = last if confirms else min(BATCH, left - last if left > last else left)
+        ask, learn, met = calibration.questions, calibration.learn, CHOICE * count
+        if confirms:  # another number of situations makes a `Walk` start new environments
+            ask, learn, met = calibration.confirmations, calibration.confirm, max(MET, CHOICE * count)
+        states, obs = situations(k_where, calibration.policy(), met)
+        asked = ask(np.asarray(obs), count)
         states = jax.tree.map(lambda leaf, index=asked.index: leaf[index], states)
         obs = np.asarray(obs)[asked.index]
         answers = np.asarray(teacher(k_answer, states, jnp.asarray(obs), jnp.asarray(asked.action)))
         there = np.isfinite(answers).any(-1)
-        calibration.learn(obs[there], asked.action[there], answers[there], asked.doubt[there])
+        learn(obs[there], asked.action[there], answers[there], asked.doubt[there])
+        left -= count
     return calibration.result()

@@ -134,6 +134,11 @@ class Fit:
         """Number of unknowns."""
         return len(unknowns_of(self.family))
 
+    @property
+    def corrects(self) -> bool:
+        """Return whether a change of the family is corrected."""
+        return any(not one.of_teacher for one in self.family)
+
     def learn(self, answers: Answers, response: Response, rounds: int = 1) -> None:
         """Take all answers so far and the policy's responses in their situations; add rounds of samples."""
         self.answers, self.response = answers, response

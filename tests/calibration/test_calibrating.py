@@ -71,6 +71,7 @@ def test_one_answer_in_five_may_be_wrong():
 def test_no_change_is_told_and_nothing_is_corrected():
     found = asked(aims, family=FAMILY[1:])
     assert (found.verdict, found.changes) == (UNCHANGED, ())
+    assert found.confirmed is None  # policy and teacher agree: no label was spent on confirming
     for one in found.estimates:  # 95% of intervals hold zero, and here all that are half as wide again
         more = 0.25 * (one.high - one.low)
         assert one.low - more < 0 < one.high + more
@@ -81,6 +82,7 @@ def test_a_change_outside_the_family_is_told_and_nothing_is_corrected():
     side = lambda obs: rotate(aims(obs), jnp.where(jnp.sin(40 * obs[:, 1]) > 0, 0.5, -0.5))  # noqa: E731
     found = asked(side, family=FAMILY[1:])
     assert (found.verdict, found.changes) == (UNEXPLAINED, ())
+    assert found.confirmed is not None
     assert missed(found, aims) < 1e-4
     assert "None of these" in found.words()[0]
 
@@ -115,6 +117,39 @@ def test_questions_of_a_batch_tell_different_things():
     turns = np.rad2deg(np.asarray(DIRECTIONS.log(np.asarray(aims(obs))[questions.index], questions.action))[:, 0])
     assert np.ptp(turns) > 10  # the turn is not known: asked are actions turned by more and by less
     assert questions.information[0] > 2 * questions.information[-1]
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """A calibration that 30 answers have told of a turn, and situations for more."""
+    calibration, answers = Calibration(POLICY, TURN, DIRECTIONS, EPS_DEG), person(DIRECTIONS, EPS, TURNED)
+    _, obs = situations(jax.random.key(0), None, 100)
+    for start in (0, 15):
+        asked = calibration.questions(obs[start : start + 15], 15)
+        rows = obs[start + asked.index], asked.action
+        calibration.learn(*rows, answers(jax.random.key(start), None, *rows))
+    return calibration, obs[30:]
+
+
+def test_confirmations_are_halfway_and_answers_count_by_their_side(turned):
+    calibration, obs = turned[0].copy(np.random.default_rng(0)), turned[1]
+    asked = calibration.confirmations(obs, 10)
+    halfway = np.rad2deg(DIRECTIONS.log(aims(obs)[asked.index], asked.action))
+    assert np.allclose(halfway, -15, atol=2)  # the right actions are 30 degrees to the right
+    told = np.array([-1, -1, -1, -1, -1, -1, 1, 1, 1, 0.0])[:, None]
+    calibration.confirm(obs[asked.index], asked.action, told)
+    assert calibration.asked == 40
+    assert calibration.confirmed == (6, 3)
+
+
+@pytest.mark.parametrize(("confirmed", "named"), [(None, True), ((5, 3), True), ((6, 4), False), ((0, 0), False)])
+def test_a_change_is_refused_without_more_than_three_answers_for_it_to_two_against_it(turned, confirmed, named):
+    calibration = turned[0].copy(np.random.default_rng(0))
+    calibration.confirmed = confirmed
+    found = calibration.result()
+    assert (found.verdict, found.refused) == ((CHANGED, ()) if named else (UNEXPLAINED, ("direction: change",)))
+    assert (found.policy is turned[0].base) is not named
+    assert named or "did not confirm" in found.words()[0]
 
 
 def test_too_few_answers_and_spaces_without_cues_are_refused():
