@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 from cuelearner_jax.config import Sizes
+from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import Corrected, asked_from
 from cuelearner_jax.storage.provenance import provenance
@@ -39,7 +40,7 @@ def main() -> None:
             base = asked_from(env, Sizes(ask_from=first))
             for eps in STRENGTHS:
                 scalars = dataclasses.replace(CORRECTED.scalars, eps_deg=eps, k_max=1)
-                policy = Corrected(base, teacher, scalars, env.actions)
+                policy = Corrected(base, teacher, scalars, actions_of(env))
                 steps = asked.episodes * config.max_steps
                 found = float(evaluate_policy(env, policy, episodes(SPLIT), asked.episodes, steps)["success"])
                 rows.append({"skill": skill, "first": first, "strength": eps, "success": found})
