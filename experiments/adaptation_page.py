@@ -325,7 +325,7 @@ def settings(rows: Sequence[Row], metric: str, scale: str) -> list[list[str]]:
 def with_look_ahead(data: Path, out: Output) -> str:
     """Return the section of four agents trained anew, at full size: rooms and sides, with look-ahead."""
     rows = read(data / "anew" / "navigation")
-    return tables(
+    text = tables(
         out,
         [
             ("rooms_anew", "Rooms, four agents trained anew", outcomes(rows, "rooms", None)),
@@ -333,6 +333,7 @@ def with_look_ahead(data: Path, out: Output) -> str:
             ("sides_right_anew", "Pass on the right, the same four", side_table(rows, "corridor_right", "right")),
         ],
     )
+    return fold("Tables of rooms and sides with look-ahead", text) if text else ""
 
 
 def on_two_cores(data: Path, out: Output) -> str:

@@ -187,6 +187,7 @@ def test_every_preset_is_paced_but_the_papers_and_the_one_that_labels_shape():
     offered = map(registry.find, ("arm", "billiards", "navigation"))
     found = {(task.name, name): preset.config.arbiter.NAME for task in offered for name, preset in task.presets.items()}
     others = {("billiards", "paper"): "episodes", ("navigation", "paper"): "episodes", ("billiards", "shaped"): "prior"}
+    others[("arm", "corrected")] = "episodes"  # labels correct steps there, and guide no episode
     assert found == {named: others.get(named, "paced") for named in found}
 
 
