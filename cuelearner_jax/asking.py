@@ -242,7 +242,7 @@ def ask(
     recorded = record(guide, position, obs, about, answers, answered, first if of.guidance.kind.sees_base else None)
     if of.pack is None:
         return proceed(of.env, recorded, actions, keys)
-    assert form.correct is not None  # see `Lane.label_round`
+    assert form.correct is not None  # see `RunConfig.guide_in`
     space = actions_of(of.env)
     corrected = form.correct(space, about[0], answers[0], space.from_unit(of.scalars.eps_deg))
     return _proceed_corrected(of, recorded, position, jnp.where(answered[0], corrected, about[0]), keys)

@@ -109,7 +109,7 @@ def planned(own: Billiards, theta: Any) -> Taught:
 
 @jax.jit
 def _near(env: Any, states: Any, actions: Array) -> Array:
-    """Rewards (n, shots) of shots near actions."""
+    """Return rewards (n, shots) of shots near actions (n, 2)."""
     turns = jnp.deg2rad(jnp.linspace(-FITTED_DEG, FITTED_DEG, round(20 * FITTED_DEG) + 1))
     shoot = lambda state, action: env.step(jax.random.key(0), state, action)[1].reward  # noqa: E731
     return jax.vmap(lambda state, action: jax.vmap(lambda turn: shoot(state, rotate(action, turn)))(turns))(
@@ -118,7 +118,7 @@ def _near(env: Any, states: Any, actions: Array) -> Array:
 
 
 def fitted(base: Any, own: Billiards, env: Any) -> Row:
-    """The unknowns with which our simulator pays most like pooltool near the network's shots on tuning racks.
+    """Return the unknowns with which our simulator pays most like pooltool near the network's shots on tuning racks.
 
     `likeness` is the correlation of rewards: as our table is, with each of the found unknowns alone, and with all.
     """
@@ -146,7 +146,7 @@ def fitted(base: Any, own: Billiards, env: Any) -> Row:
 
 
 def calibrated(base: Any, own: Billiards, env: Any, seed: int) -> tuple[Row, Any]:
-    """What 250 questions tell, and the policy whose shots are turned."""
+    """Return what 250 questions tell, and the policy whose shots are turned."""
     teacher = FrankTeacher(Teaching(base), env, jnp.deg2rad(AIM_DEG), jnp.deg2rad(REACH_DEG), TRIED)
     walk, answers = Walk(env, teacher, Scalars(eps_deg=EPS_DEG)), []
 
@@ -195,7 +195,7 @@ def measure(seeds: int, racks: int, processes: int) -> Iterator[Row]:
 
 
 def shares(rows: Sequence[Row]) -> str:
-    """The share of the loss that each policy wins back, a line each; with the spread over label seeds."""
+    """Return the share of the loss that each policy wins back, a line each; with the spread over label seeds."""
     means = [(row["what"], float(np.mean(row["rewards"]))) for row in rows]
     own, before = (dict(means).get(name, np.nan) for name in ("own table", "not adapted"))
     lines = []
@@ -206,7 +206,7 @@ def shares(rows: Sequence[Row]) -> str:
 
 
 def main() -> None:
-    """Measures, writes after each measurement, and prints the tables."""
+    """Measure, write after each measurement, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=8, help="of labels")
     parser.add_argument("--racks", type=int, default=200, help="of a measurement")

@@ -59,7 +59,7 @@ def _at_rest(block: TrainState, layers: Footprint) -> dict[str, int]:
     agent, guide = block.agent, block.guide
     parts = {
         "--agent.replay-capacity": (agent.replay, agent.guided),
-        "--labels": guide.labels,
+        "--labels": (guide.labels, guide.stored),
         "--sizes.num-envs": (agent.env, agent.obs, block.arbiter),
         "--sizes.candidates": (guide.env, guide.obs),
         layers.option: guide.model,
