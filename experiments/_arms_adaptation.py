@@ -42,6 +42,7 @@ VARIED = {"wrong": (EVIDENCE, "relative"), "one_cue": (EVIDENCE, "relative"), "s
 LABELS, FETCH_LABELS, SEEDS, EPISODES = 100, 200, 8, 200
 JUDGED = 20  # episodes that judge where held-out answers cannot
 FETCH_BUDGET = 500  # of the agents that act in Fetch
+FETCHED = {"reach": "own_policy", "push_free": "stored"}  # runs whose finished policies are the agents alone
 
 
 NOWHERE: Options = {}
@@ -100,7 +101,7 @@ def _in_fetch(trained: str) -> list[Corrected]:
     plain: Options = {"task.skill": skill, "task.obstacle": False}
     fetch: Options = {**plain, "robot": "fetch"}
     turned: Options = {**fetch, "scenario": "turned_camera"}
-    source, world, labels = f"{trained}/own_policy/relative", f"{trained}_fetch", (FETCH_LABELS,)
+    source, world, labels = f"{trained}/{FETCHED[trained]}/relative", f"{trained}_fetch", (FETCH_LABELS,)
     rows = [
         Corrected(world, "agent", "mjx", (), SEEDS, {}, 1, "agents of 500 labels in MJX", where=plain),
         Corrected(world, "agent", "fetch", (), SEEDS, {}, 3, "the agents in Fetch", where=fetch),
@@ -116,7 +117,7 @@ def _in_fetch(trained: str) -> list[Corrected]:
 
 CORRECTED = (
     *(row for world in CHANGED for row in _in_world(world)),
-    *(row for trained in ("reach", "push_free") for row in _in_fetch(trained)),
+    *(row for trained in FETCHED for row in _in_fetch(trained)),
 )
 
 ADAPTED_SCALES: Mapping[str, Scale] = {

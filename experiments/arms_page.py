@@ -2,30 +2,34 @@
 
     python experiments/arms_page.py [--data docs/data/arms] [--page docs/results/arms.md]
 
-The data are `training_WORLD.json` of `arms.py`, what `cuelearner evaluate --out` wrote of one agent in MJX and in
-Fetch, and `reach_settings.json`. Three sections go between the page's lines `<!-- NAME -->` and `<!-- end of NAME -->`.
+The data are `training_WORLD.json` of `arms.py`, what `cuelearner evaluate --out` wrote of agents in MJX and in Fetch,
+and `reach_settings.json`. Three sections go between the page's lines `<!-- NAME -->` and `<!-- end of NAME -->`.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from operator import itemgetter
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 from _pages import GREY, image, markdown, name_ends, new_figure, rendered
 from _pieces import grouped
 from matplotlib.ticker import EngFormatter
 
+from cuelearner_jax.evaluate import mean_interval
 from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
 
-WORLDS = {
-    "reach_mjx": "in MJX",
-    "reach_fetch": "in FetchReach, unchanged",
-    "reach_fetch_turned": "in FetchReach, camera turned by 10 degrees",
-    "reach_fetch_turned_calibrated": "the same world, after 200 labels",
+PLACES = {
+    "mjx": "in MJX",
+    "fetch": "in Fetch, unchanged",
+    "fetch_turned": "in Fetch, camera turned by 10 degrees",
+    "fetch_turned_calibrated": "the same world, after 200 labels",
 }
+AGENTS = {"reach": "`reach`, one agent", "push_free": "`push` without a post, 8 agents"}
 STEPS = (3_200, 6_400, 9_600, 12_800)
 
 
@@ -60,7 +64,7 @@ def run_name(row: dict) -> str:
 def training(data: Path) -> str:
     """Return the table of steps to 80% success, with the ratio to the agent alone."""
     cells = []
-    for world in ("reach", "push"):
+    for world in ("reach", "push", "push_free"):
         found = studied(data, world)
         named = itemgetter("run", "guidance", "labels")
         guides = {named(row): row["mean"] for row in found["guides"]}
@@ -98,16 +102,25 @@ def draw_training(data: Path, stem: Path) -> None:
         save_figure(figure, stem)
 
 
-def measured(data: Path) -> dict[str, tuple[float, float]]:
-    """Return success and the distance to the goal [cm] of each recorded evaluation, in the order of `WORLDS`."""
-    rows = {name: json.loads((data / f"{name}.json").read_text())["rows"][0] for name in WORLDS}
-    return {name: (row["success"][0], 100 * row["distance"][0]) for name, row in rows.items()}
+def measured(data: Path) -> dict[str, dict[str, list[float]]]:
+    """Return the success of each skill's agents in each place: mean, and ends of the interval over agents."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for skill, place in itertools.product(AGENTS, PLACES):
+        each = json.loads((data / f"{skill}_{place}.json").read_text())["rows"][0]["success"]
+        interval = mean_interval(np.array(each, float)).tolist() if len(each) > 1 else [each[0]] * 3
+        found.setdefault(skill, {})[place] = interval
+    return found
 
 
-def transfer(found: dict[str, tuple[float, float]]) -> str:
-    """Return the table of one agent in MJX and in Fetch."""
-    cells = [[WORLDS[name], f"{100 * success:.0f}%", f"{distance:.1f}"] for name, (success, distance) in found.items()]
-    return markdown(["an agent of 32,000 steps, trained without labels", "success", "distance to the goal [cm]"], cells)
+def transfer(found: dict[str, dict[str, list[float]]]) -> str:
+    """Return the table of agents in MJX and in Fetch."""
+    cells = [[told, *(_percent(found[skill][place]) for skill in AGENTS)] for place, told in PLACES.items()]
+    return markdown(["success [%]", *AGENTS.values()], cells)
+
+
+def _percent(interval: list[float]) -> str:
+    mean, low, high = (100 * value for value in interval)
+    return f"{mean:.1f} [{low:.1f}, {high:.1f}]" if high > low else f"{mean:.0f}"
 
 
 def settings(data: Path) -> str:
@@ -122,28 +135,29 @@ def settings(data: Path) -> str:
     return markdown(["guidance", *(f"{step:,} steps" for step in STEPS)], cells)
 
 
-def draw(found: dict[str, tuple[float, float]], stem: Path) -> None:
-    """Draw success of the agent in every world, with its distance to the goal."""
+def draw(found: dict[str, dict[str, list[float]]], stem: Path) -> None:
+    """Draw the success of both skills' agents in every place."""
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(8, 2.4)
-        axes = figure.subplots()
-        for place, (name, (success, distance)) in enumerate(found.items()):
-            colour = colour_of("calibration") if name.endswith("calibrated") else GREY
-            axes.barh(place, 100 * success, color=colour)
-            told = f"{100 * success:.0f}%, {distance:.1f} cm off"
-            axes.text(100 * success + 1.5, place, told, va="center", fontsize=9)
-        axes.set_yticks(range(len(found)), [WORLDS[name] for name in found])
+        figure = new_figure(11, 2.4)
+        for axes, (skill, told) in zip(figure.subplots(1, len(AGENTS), sharey=True), AGENTS.items(), strict=True):
+            for row, place in enumerate(PLACES):
+                mean, low, high = (100 * value for value in found[skill][place])
+                colour = colour_of("calibration") if place.endswith("calibrated") else GREY
+                axes.barh(row, mean, color=colour, xerr=[[mean - low], [high - mean]], ecolor="0.25")
+                axes.text(max(mean, high) + 2, row, f"{mean:.0f}%", va="center", fontsize=9)
+            axes.set_yticks(range(len(PLACES)), list(PLACES.values()))
+            axes.set_title(told.replace("`", ""), fontweight="bold", fontsize=11)
+            axes.set(xlim=(0, 115), xlabel="success [%]")
+            axes.set_xticks(range(0, 101, 20))
+            axes.grid(visible=False, axis="y")
+            axes.tick_params(axis="y", length=0)
         axes.invert_yaxis()
-        axes.set(xlim=(0, 150), xlabel="success [%], 200 episodes")
-        axes.set_xticks(range(0, 101, 20))
-        axes.grid(visible=False, axis="y")
-        axes.tick_params(axis="y", length=0)
         save_figure(figure, stem)
 
 
 def sections(data: Path, page: Path) -> dict[str, str]:
     """Return the sections of the page."""
-    picture = image("success of one agent in MJX and in Fetch", data / "transfer", page)
+    picture = image("success of agents in MJX and in Fetch", data / "transfer", page)
     curves = image("success of an arm over steps, with labels and without", data / "training", page)
     study = f"{curves}\n\n{training(data)}"
     return {"training": study, "transfer": f"{picture}\n\n{transfer(measured(data))}", "settings": settings(data)}

@@ -57,6 +57,8 @@ RUNS = {
     "flipped-10": "10% wrong",
     "flipped-20": "20% wrong",
     "random": "random answers",
+    "shuffled": "shuffled answers",
+    "paced-shuffled": "shuffled answers, paced",
     "silent-20": "20% unanswered",
     "indifferent": "indifferent within 20 degrees",
     "biased": "biased by 10 degrees",
@@ -66,7 +68,7 @@ RUNS = {
     "page": "labelling page, 10% wrong",
 }
 PERFECT = "perfect"  # kinds whose names begin so take the shipped teacher's shots
-CONTROLS = ("random", "paced-random")
+CONTROLS = ("random", "paced-random", "shuffled", "paced-shuffled")
 TABLES = {
     "efficiency": "all budgets",
     "labels_to_level": "labels to the level",
@@ -297,7 +299,8 @@ def findings(data: Path) -> str:
     return markdown(["guidance", "measured", "with guidance", "without"], rows)
 
 
-PRIOR_STUDIES = ("start", "ruled", "regulation", "easy", "halls")  # docs/data/prior_NAME.json
+# Names of docs/data/prior_NAME.json.
+PRIOR_STUDIES = ("start", "ruled", "regulation", "regulation_controls", "easy", "easy_brief", "halls")
 PRIOR = {"any_aim": "all aims alike, no labels", "rule": "a rule by hand, no labels", "intent": "100 `intent` labels"}
 
 

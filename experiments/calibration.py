@@ -30,7 +30,7 @@ import numpy as np
 from cuelearner_envs.billiards.environment import Balls
 from cuelearner_jax.adaptation.by_model import settling
 from cuelearner_jax.agents.choice import best_near_peaks
-from cuelearner_jax.calibration.estimation import Result, calibrate
+from cuelearner_jax.calibration import Result, calibrate
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
 from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.simulator import simulator_distortion

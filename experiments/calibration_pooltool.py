@@ -33,7 +33,7 @@ from cuelearner_envs.billiards.table import Cloth
 from cuelearner_envs.billiards.teacher import NearbyTeacher, SearchTeacher
 from cuelearner_jax import teachers
 from cuelearner_jax.agents.choice import best_near_peaks
-from cuelearner_jax.calibration.estimation import calibrate
+from cuelearner_jax.calibration import calibrate
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
 from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.simulator import simulator_distortion

@@ -23,7 +23,7 @@ THIRD: Options = {
     "agent.replay-capacity": 3_000_000,
     "schedule.total-steps": 3_000_000,
     "schedule.eval-every": 100_000,
-    "schedule.checkpoint-every": 500_000,
+    "schedule.checkpoint-every": 3_000_000,
 }
 # 800 of 1,000 labels train: 16,000 batches of 500 are 10,000 epochs. A round is 100 labels, so that there are ten fits.
 EPOCHS: Options = {

@@ -22,8 +22,8 @@ from cuelearner_jax.config import Scalars, Schedule, Sizes, digest
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
 from cuelearner_jax.export import runner
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.loop import make_program
 from cuelearner_jax.run_config import RunConfig
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces.directions import difference, evenly_spaced, from_angle, inward, rotate
 from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Label, Step

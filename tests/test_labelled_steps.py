@@ -13,8 +13,9 @@ from box_task import SMALL, Reach
 from cuelearner_jax.agents.replay import Memory, buffer_for
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.loop import make_program, start_clock
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import asked_from
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces.directions import difference, rotate
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())

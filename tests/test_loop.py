@@ -18,6 +18,7 @@ from cuelearner_jax.arbiters import episodes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Uniform
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.types import Step
 
@@ -87,7 +88,7 @@ CHAIN = probes.config(
 @cache
 def chain_program():
     env = probes.Chain(jnp.array(False))
-    return loop.make_program(CHAIN, guidances.make("heuristic", CHAIN.sizes, env), env, 0)
+    return make_program(CHAIN, guidances.make("heuristic", CHAIN.sizes, env), env, 0)
 
 
 def chain_values(truncates, polyak=CHAIN.agent.polyak):
@@ -398,7 +399,7 @@ def test_a_lane_alone_is_the_lane_beside_others(grid):
 def test_the_smaller_budget_is_the_sweep_of_that_budget_alone(grid):
     state, _ = grid
     guide = guidances.make("relative", probes.SIZES, ENV)
-    small, _ = trained(loop.make_program(probes.CONFIG, guide, ENV, 15), [2], [15])
+    small, _ = trained(make_program(probes.CONFIG, guide, ENV, 15), [2], [15])
     assert small.guide.labels.obs.shape[1] == 20
     assert_same_lane(state, 1, small)
 

@@ -11,7 +11,8 @@ from flax import struct
 from cuelearner_jax.agents import sac
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.guides import registry
-from cuelearner_jax.loop import make_program, start_clock
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Step

@@ -1,16 +1,10 @@
 """Calibration: estimate from relative answers what changed in the world."""
 
-from cuelearner_jax.calibration.estimation import (
-    CHANGED,
-    UNCHANGED,
-    UNEXPLAINED,
-    Calibration,
-    Estimate,
-    Result,
-    calibrate,
-)
+from cuelearner_jax.calibration.asking import calibrate
+from cuelearner_jax.calibration.estimation import Calibration
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
 from cuelearner_jax.calibration.policy import Calibrated
+from cuelearner_jax.calibration.result import CHANGED, UNCHANGED, UNEXPLAINED, Estimate, Result
 from cuelearner_jax.calibration.simulator import simulator_distortion
 from cuelearner_jax.calibration.walk import Walk
 

@@ -12,22 +12,22 @@ found = calibration.result()    # found.words(), found.estimates, found.policy
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
+from cuelearner_jax.calibration import confirmation
 from cuelearner_jax.calibration.families import Distortion, check_family, unknowns_of
-from cuelearner_jax.calibration.likelihood import GRID
 from cuelearner_jax.calibration.meaning import Meaning
 from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.posterior import HELD_OUT, Answers, Fit
 from cuelearner_jax.calibration.questions import Questions, choose, draw_hypotheses, ties
 from cuelearner_jax.calibration.response import Responses
+from cuelearner_jax.calibration.result import CHANGED, UNCHANGED, UNEXPLAINED, Estimate, Result
 from cuelearner_jax.calibration.scales import scales_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import in_space, policy_of
@@ -36,7 +36,6 @@ from cuelearner_jax.spaces import Space, is_answered
 Floats = np.ndarray
 Given = Array | np.ndarray  # accepted arrays
 BATCH = 10  # questions between two fits
-CHOICE = 6  # situations from which one question is chosen
 LOOKS = 6  # nodes at which the policy is asked in each situation to choose from
 FRESH = 3  # nodes after each batch
 ROUNDS = 4  # rounds of samples for a set without samples
@@ -48,57 +47,6 @@ LARGEST = 3  # most changes at once
 SETTLED, SETTLING = 10.0, 6  # effective samples for each unknown and one in the end; most rounds for these
 MOSTLY = 0.75  # share of answers about something else, above which the verdict is UNEXPLAINED
 APART = 2.5  # [eps]: larger typical distance between teacher and policy gives the verdict UNEXPLAINED
-
-FAR = 2.0  # [eps]: larger typical distance, after most labels, calls for answers that confirm
-CONFIRMING = 5  # every fifth label then asks whether the corrected policy is nearer
-MET = 240  # situations from which these questions are chosen
-MOVED = (3.0, 20.0)  # [eps]: distance between both policies in such a question, so that neither is right halfway
-AGREE = 1.5  # more answers than this must be for the corrected policy, for each one against it
-
-CHANGED, UNCHANGED, UNEXPLAINED = "changed", "nothing changed", "none of these"
-
-
-class Estimate(NamedTuple):
-    """The estimate of one unknown after all answers, in the unknown's unit."""
-
-    name: str
-    unit: str
-    mean: float
-    low: float  # ends of the 95% interval
-    high: float
-    changed: bool  # True if the unknown is corrected; else the interval is for this unknown added alone
-
-    def words(self) -> str:
-        """Describe the estimate in one line."""
-        return f"{self.name}: {self.mean:.4g} [{self.low:.4g}, {self.high:.4g}] {self.unit}"
-
-
-class Result(NamedTuple):
-    """The verdict of calibration, the estimates and the corrected policy."""
-
-    verdict: str  # CHANGED, UNCHANGED or UNEXPLAINED
-    changes: tuple[str, ...]  # names of the distortions that are corrected
-    estimates: tuple[Estimate, ...]  # estimates of all unknowns
-    evidence: dict[tuple[str, ...], float]  # evidence of each set of changes, less that of no change [nats]
-    held_out: tuple[float, float]  # mean log probability of a held-out answer without and with the changes [nats]
-    confirmed: tuple[int, int] | None  # answers for the corrected policy and against it; None: not asked
-    refused: tuple[str, ...]  # names of the distortions that were not confirmed
-    wrong: float  # share of answers about something else
-    apart: float  # typical distance between teacher and corrected policy, in the space's unit
-    more: int | None  # expected number of labels still needed; None: not known
-    policy: Any  # the corrected policy, or its base where nothing changed
-
-    def words(self) -> list[str]:
-        """Describe the result, line by line."""
-        if self.refused:
-            named = f"The answers named {' and '.join(self.refused)}, but the last answers did not confirm this."
-            return [f"{named} The policy stays as it was."]
-        if self.verdict == UNEXPLAINED:
-            return ["None of these changes explains the answers. The policy stays as it was."]
-        if self.verdict == UNCHANGED:
-            return ["The answers ask for no change. The policy stays as it was."]
-        lines = [one.words() for one in self.estimates if one.changed]
-        return [*lines, f"About {self.more} more labels are needed." if self.more else "No more labels are needed."]
 
 
 class Calibration:
@@ -182,21 +130,16 @@ class Calibration:
         self._compare()
 
     def confirmations(self, obs: Float[Given, "n obs"], count: int) -> Questions:
-        """Return questions about actions halfway between the policy and the corrected one, where these differ.
+        """Return questions whose answers tell whether the corrected policy is nearer to what the teacher means.
 
-        The policy is corrected by the most likely changes, however little evidence there is. An answer tells which of
-        both is nearer to what the teacher means, whatever else is wrong with the policy. Give situations that were not
-        asked about before.
+        The policy is corrected by the most likely changes, however little evidence there is. Give situations that were
+        not asked about before.
         """
         obs = np.asarray(obs, np.float32)
         if (fit := self._candidate()) is None:
             return self.questions(obs, count)
-        before, offset = self._correction(fit, obs)
-        apart = np.abs(offset).max(-1) / self.eps
-        differs = np.where(apart <= MOVED[1], np.minimum(apart, MOVED[0]), 0) + 1e-3 * self.random.random(len(obs))
-        index = np.array([own[differs[own].argmax()] for own in np.array_split(np.arange(len(obs)), count)])
-        action = self.meaning.moved(before[index], offset[None, index] / 2)[0]
-        return Questions(index, action, ties(self.meaning, (), np.zeros(0), obs[index], self.eps), np.zeros(count))
+        chosen = confirmation.halfway(self.meaning, fit, obs, count, self.eps, self.random)
+        return chosen._replace(doubt=ties(self.meaning, (), np.zeros(0), obs[chosen.index], self.eps))
 
     def confirm(
         self,
@@ -207,38 +150,22 @@ class Calibration:
     ) -> None:
         """Count the answers to `confirmations` that are for the corrected policy, then learn from them too.
 
-        The paired counts of a sign test (Dixon and Mood, 1946), out of sample: the answers have not been learned.
         Without enough answers for the corrected policy, `result` refuses the changes.
         """
         if (fit := self._candidate()) is not None:
-            self.confirmed = 0, 0
-            if len(obs):
-                said = np.where(np.asarray(is_answered(jnp.asarray(answer))) & np.isfinite(answer), answer, 0)
-                toward = (said * self._correction(fit, np.asarray(obs, np.float32))[1]).sum(-1)
-                self.confirmed = int((toward > 0).sum()), int((toward < 0).sum())
+            self.confirmed = confirmation.counts(self.meaning, fit, np.asarray(obs, np.float32), answer)
         self.learn(obs, action, answer, doubt)
 
     @property
     def is_far(self) -> bool:
-        """Whether teacher and corrected policy still differ so widely that answers should confirm a change.
-
-        The model of answers is then wrong, and its evidence too certain.
-        """
+        """Whether teacher and corrected policy still differ so widely that answers should confirm a change."""
         fit = self._candidate()
-        return fit is not None and bool((fit.nuisance @ GRID)[1] > FAR)
+        return fit is not None and confirmation.is_far(fit)
 
     def _candidate(self) -> Fit | None:
         """Return the most likely fit that corrects the policy."""
         fits = [self.fits[names] for names in self._current() if self.fits[names].corrects]
         return max(fits, key=self._score, default=None)
-
-    def _correction(self, fit: Fit, obs: Floats) -> tuple[Floats, Floats]:
-        """Return the actions that the teacher would call right without changes, and the vectors to those with them."""
-        theta = fit.interval()[0]
-        of_teacher = np.concatenate([np.full(len(one.unknowns), one.of_teacher) for one in fit.family])
-        thetas = np.stack([np.where(of_teacher, theta, 0), theta])
-        right = self.meaning.right(fit.family, thetas, self.meaning.actions(fit.asks, thetas[:, : fit.changes], obs))
-        return right[0], self.meaning.offsets((), np.zeros((1, 0)), right[1:], right[0])[0]
 
     def _scaled(self, obs: Floats) -> None:
         self.scales = self.scales or scales_of(self.meaning, self.family, obs, self.eps)
@@ -341,12 +268,12 @@ class Calibration:
         holds = bool(best.family) and gain.mean() > 0
         refused: tuple[str, ...] = ()
         confirmed = self.confirmed
-        if holds and confirmed and confirmed[0] <= AGREE * confirmed[1]:
+        if holds and confirmed and confirmation.refuses(confirmed):
             refused = tuple(one.name for one in best.family if not one.of_teacher)
             holds = not refused
         if not holds:
             self.chosen, best, after = (), none, before
-        rho, width = (best.nuisance @ GRID)[:2]
+        rho, width = best.noise
         corrected = [one.name for one in best.family if not one.of_teacher]
         explained = best.family or (_explains(best) and not refused)
         verdict = CHANGED if corrected else (UNCHANGED if explained else UNEXPLAINED)
@@ -356,7 +283,7 @@ class Calibration:
         estimates = tuple(estimate for one in self.family for estimate in self._estimates(one))
         held = (float(before.mean()), float(after.mean()))
         judged = evidence, held, confirmed, refused
-        return Result(verdict, tuple(corrected), estimates, *judged, float(rho), apart, more, self.policy())
+        return Result(verdict, tuple(corrected), estimates, *judged, rho, apart, more, self.policy())
 
     def _estimates(self, distortion: Distortion) -> list[Estimate]:
         names = self._named({*self.chosen, distortion.name})
@@ -381,60 +308,5 @@ class Calibration:
 
 def _explains(fit: Fit) -> bool:
     """Return whether most answers are about the fit's actions, and near them."""
-    rho, width = (fit.nuisance @ GRID)[:2]
-    return bool(rho <= MOSTLY and width <= APART)
-
-
-Situations = Callable[[PRNGKeyArray, Any, int], tuple[Any, Any]]  # (key, policy, count) -> states, observations
-Asked = Callable[[PRNGKeyArray, Any, Any, Any], Any]  # (key, states, observations, actions) -> answers (n, cues)
-
-
-def calibrate(
-    policy: Any,
-    family: Sequence[Distortion],
-    situations: Situations,
-    teacher: Asked,
-    labels: int,
-    key: PRNGKeyArray,
-    *,
-    space: Space,
-    eps_deg: float,
-) -> Result:
-    """Ask a teacher in batches and estimate the changes. No reward is used.
-
-    Held-out answers judge. Where teacher and policy differ widely, the last fifth of the labels asks whether the
-    corrected policy is nearer to what the teacher means: model-free, so that it holds where no change of the family
-    describes the answers.
-
-    Args:
-        policy: a policy, or any function of a batch of observations.
-        family: the possible changes.
-        situations: gives states and observations (count, obs) that a policy meets.
-        teacher: gives answers (n, cues), -1, 0, 1 or `UNSAID`; NaN where it did not answer.
-        labels: number of questions.
-        key: key of all random numbers.
-        space: space of the actions.
-        eps_deg: strength of an answer, in the space's unit.
-
-    Raises:
-        UserError: settings that make no sense, or too few labels.
-    """
-    k_seed, key = jax.random.split(key)
-    calibration = Calibration(policy, family, space, eps_deg, int(jax.random.randint(k_seed, (), 0, 1 << 20)))
-    left, last = labels, labels // CONFIRMING
-    while left:
-        k_where, k_answer, key = jax.random.split(key, 3)
-        confirms = left == last and calibration.is_far
-        count = last if confirms else min(BATCH, left - last if left > last else left)
-        ask, learn, met = calibration.questions, calibration.learn, CHOICE * count
-        if confirms:  # another number of situations makes a `Walk` start new environments
-            ask, learn, met = calibration.confirmations, calibration.confirm, max(MET, CHOICE * count)
-        states, obs = situations(k_where, calibration.policy(), met)
-        asked = ask(np.asarray(obs), count)
-        states = jax.tree.map(lambda leaf, index=asked.index: leaf[index], states)
-        obs = np.asarray(obs)[asked.index]
-        answers = np.asarray(teacher(k_answer, states, jnp.asarray(obs), jnp.asarray(asked.action)))
-        there = np.isfinite(answers).any(-1)
-        learn(obs[there], asked.action[there], answers[there], asked.doubt[there])
-        left -= count
-    return calibration.result()
+    rho, width = fit.noise
+    return rho <= MOSTLY and width <= APART

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from scipy.special import gammaln, logsumexp, stdtrit
 
 from cuelearner_jax.calibration.families import Family, unknowns_of
-from cuelearner_jax.calibration.likelihood import LOG_PRIOR, log_chances
+from cuelearner_jax.calibration.likelihood import GRID, LOG_PRIOR, log_chances
 from cuelearner_jax.calibration.meaning import in_portions
 from cuelearner_jax.calibration.response import Response, Responses
 
@@ -258,6 +258,12 @@ class Fit:
             return np.exp(LOG_PRIOR)
         joint = self.log_likelihood + self.log_origin[:, None]
         return np.exp(logsumexp(joint, axis=0) - logsumexp(joint))
+
+    @property
+    def noise(self) -> tuple[float, float]:
+        """Share of answers about something else, and typical distance between teacher and policy [eps]; both means."""
+        rho, width = (self.nuisance @ GRID)[:2]
+        return float(rho), float(width)
 
     def predict_held_out(self) -> Float[Floats, " n"]:
         """Return the log probability of each answer, given the other four fifths of the answers."""

@@ -8,8 +8,9 @@ from typing import Annotated, Any, Generic
 
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.api import correction
-from cuelearner_jax.cli.parsing import TASK_OPTIONS, about, code_of, is_code, out, parse, source_of, taken
+from cuelearner_jax.cli.parsing import about, out, parse, taken
 from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, subject_of, unprefixed
+from cuelearner_jax.cli.sources import TASK_OPTIONS, code_of, is_code, source_of
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders

@@ -15,8 +15,9 @@ import tyro
 from jax.sharding import Mesh
 
 from cuelearner_jax.cli import pages
-from cuelearner_jax.cli.parsing import out, parse, preset_of, task_of
+from cuelearner_jax.cli.parsing import out, parse
 from cuelearner_jax.cli.shared_options import RunT, as_kept, parts_of, typed_name
+from cuelearner_jax.cli.sources import preset_of, task_of
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig, check

@@ -11,8 +11,9 @@ import numpy as np
 from rich.table import Table
 
 from cuelearner_jax.api import correction
-from cuelearner_jax.cli.parsing import code_of, is_code, out, taken
+from cuelearner_jax.cli.parsing import out, taken
 from cuelearner_jax.cli.shared_options import TaskT, asked_of_source
+from cuelearner_jax.cli.sources import code_of, is_code
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.measurements import Difference

@@ -12,7 +12,8 @@ import tyro
 
 from cuelearner_jax.cli import pages
 from cuelearner_jax.cli.pages import Subject
-from cuelearner_jax.cli.parsing import about, parse, preset_of, source_of, taken, task_of, world_of
+from cuelearner_jax.cli.parsing import about, parse, taken
+from cuelearner_jax.cli.sources import preset_of, source_of, task_of, world_of
 from cuelearner_jax.environment import offers
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import PARTS, RunConfig

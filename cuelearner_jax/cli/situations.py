@@ -7,7 +7,8 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-from cuelearner_jax.cli.parsing import taken, task_of
+from cuelearner_jax.cli.parsing import taken
+from cuelearner_jax.cli.sources import task_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import cues_from
 from cuelearner_jax.task import Task, shape_of

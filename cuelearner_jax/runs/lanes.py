@@ -19,10 +19,11 @@ from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import Tell, ignore_progress, rollout_lanes
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.loop import Clock, Program, TrainState, make_program
+from cuelearner_jax.loop import Clock, TrainState
 from cuelearner_jax.policies import PolicyBlock, arbiter_of
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.program import Program, make_program
 from cuelearner_jax.types import Label, Teacher
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

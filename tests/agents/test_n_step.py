@@ -17,6 +17,7 @@ from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import check
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces.directions import evenly_spaced
 
 HALF = 0.5  # the discount factor of everything worked out by hand
@@ -178,7 +179,7 @@ LOOP = probes.config(
 
 @cache
 def program():
-    return loop.make_program(LOOP, guidances.make("none", LOOP.sizes, CHAIN), CHAIN, 0)
+    return make_program(LOOP, guidances.make("none", LOOP.sizes, CHAIN), CHAIN, 0)
 
 
 def learned(truncates, weight, polyak=LOOP.agent.polyak):

@@ -11,11 +11,11 @@ import probes
 import pytest
 
 import cuelearner_jax as cl
-from cuelearner_jax import loop
 from cuelearner_jax.api import training
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent, Uniform
+from cuelearner_jax.runs import lanes
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.spaces import DIRECTIONS
@@ -114,7 +114,7 @@ def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(tmp_path):
 
 def test_the_shipped_agent_is_loaded_without_worlds_and_without_a_training_program(monkeypatch):
     monkeypatch.setattr(Task, "environment", lambda *_: pytest.fail("an environment was made"))
-    monkeypatch.setattr(loop, "make_program", lambda *_: pytest.fail("a training program was made"))
+    monkeypatch.setattr(lanes, "make_program", lambda *_: pytest.fail("a training program was made"))
     loaded = cl.load_policy("shipped:navigation")
     assert sum(np.size(leaf) for leaf in jax.tree.leaves(loaded.policy.view)) < 20
     size = sum(quantity.size for quantity in loaded.observation)

@@ -9,6 +9,7 @@ from cuelearner_jax import loop
 from cuelearner_jax.arbiters import by_value
 from cuelearner_jax.arbiters.protocol import Chooses, Finishes, HasCritic, LaneParts
 from cuelearner_jax.guides import registry
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import directions
 
 OBS = directions.evenly_spaced(6)
@@ -53,7 +54,7 @@ def test_it_is_what_the_protocols_ask_and_leaves_the_finished_policy_to_the_agen
 def test_the_second_critic_learns_the_same_values_from_other_parameters_and_batches():
     config = probes.config(arbiter=by_value.Config(), schedule={"random_steps": 400, "guidance_until": 10**6})
     env = probes.Window()
-    program = loop.make_program(config, registry.make("heuristic", config.sizes, env), env, 0)
+    program = make_program(config, registry.make("heuristic", config.sizes, env), env, 0)
     state = probes.start(program, [0], [0])
     before = probes.lane((state.agent.params, state.arbiter.params), 0)
     assert not all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, before), strict=True))

@@ -15,6 +15,7 @@ from cuelearner_jax.arbiters import paced as pace
 from cuelearner_jax.arbiters.protocol import Outcome
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.tasks import registry
 
 HALF = pace.Config(lead=0.0)  # any lead will do
@@ -201,7 +202,7 @@ STRETCH = 100
 @pytest.fixture(scope="module")
 def program():
     env = probes.Window()
-    return loop.make_program(PACED, guidances.make("heuristic", PACED.sizes, env), env, 0)
+    return make_program(PACED, guidances.make("heuristic", PACED.sizes, env), env, 0)
 
 
 def run(program, env, seeds, stretches, schedule=SCHEDULE, clock=None, state=None):

@@ -20,6 +20,7 @@ from cuelearner_jax.policies.final import final_policy
 from cuelearner_jax.runs import judging
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.runs.training import Training
 from cuelearner_jax.spaces import DIRECTIONS, directions
 
@@ -166,7 +167,7 @@ def test_it_is_what_the_protocols_ask():
 
 
 def test_a_lane_acts_among_the_aims_until_the_cut_off():
-    program = loop.make_program(CONFIG, registry.make("rule", CONFIG.sizes, ENV), ENV, 0)
+    program = make_program(CONFIG, registry.make("rule", CONFIG.sizes, ENV), ENV, 0)
     state = probes.start(program, [0, 1], [0, 0], ENV)
     _, state, metrics = program.train(ENV, CONFIG.settings, loop.start_clock(), state, 12)
     met = probes.stored(state, 0, 48)

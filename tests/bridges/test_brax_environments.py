@@ -16,6 +16,7 @@ from cuelearner_jax.bridges.jax_environment import cues_of
 from cuelearner_jax.environment import Environment, actions_of, offers, symmetries_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import DIRECTIONS, Box, Cue
 from cuelearner_jax.spaces.directions import evenly_spaced
 
@@ -188,7 +189,7 @@ BOOTSTRAPPING = probes.config(scalars={"discount": 0.9}, agent={"target_every": 
 )
 def test_our_loop_learns_on_an_environment_of_brax(make):
     env = from_brax(make(), max_steps=5)
-    program = loop.make_program(BOOTSTRAPPING, guidances.make("none", probes.SIZES, env), env, 0)
+    program = make_program(BOOTSTRAPPING, guidances.make("none", probes.SIZES, env), env, 0)
     state = probes.start(program, [0], [0], env)
     fresh = probes.lane(state.agent.params, 0)
     clock, state, metrics = program.train(env, BOOTSTRAPPING.settings, loop.start_clock(), state, 12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from known_worlds import BOX, Yard, aims, changed, grips, person, situations
 
-from cuelearner_jax.calibration.estimation import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, calibrate
+from cuelearner_jax.calibration import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, calibrate
 from cuelearner_jax.calibration.families import declared_distortions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of

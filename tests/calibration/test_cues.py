@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.calibration.estimation import CHANGED, Calibration, calibrate
+from cuelearner_jax.calibration import CHANGED, Calibration, calibrate
 from cuelearner_jax.calibration.families import declared_distortions
 from cuelearner_jax.calibration.likelihood import log_chances
 from cuelearner_jax.config import Scalars

@@ -143,7 +143,7 @@ def test_one_cue_a_press_on_a_folder_of_pictures(folder, tmp_path):
     config = task.presets["paper"].config
     asked = label.Label(
         task.plain(),
-        label._part(label.GuideSizes, label.adapting.SIZES),
+        label._part(label.GuideSizes, label.by_model.SIZES),
         label._part(label.GuideScalars, config.scalars),
         tmp_path / "labels",
         guidance="relative",

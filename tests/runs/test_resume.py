@@ -16,11 +16,12 @@ from cuelearner_jax.arbiters import paced
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.loop import make_program, start_clock
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lane_checkpoints, lanes, runner, training
 from cuelearner_jax.runs.grid import Grid, config_hash
 from cuelearner_jax.runs.lane_checkpoints import items
 from cuelearner_jax.runs.order import Order
+from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files, lines, results
 from cuelearner_jax.storage import table as tables

@@ -1,0 +1,74 @@
+"""Calibration by a teacher who is asked: questions in batches, and the last of them to confirm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from cuelearner_jax.calibration import confirmation
+from cuelearner_jax.calibration.estimation import BATCH, Calibration
+from cuelearner_jax.calibration.families import Distortion
+from cuelearner_jax.calibration.result import Result
+from cuelearner_jax.spaces import Space
+
+CHOICE = 6  # situations from which one question is chosen
+
+Situations = Callable[[PRNGKeyArray, Any, int], tuple[Any, Any]]  # (key, policy, count) -> states, observations
+Asked = Callable[[PRNGKeyArray, Any, Any, Any], Any]  # (key, states, observations, actions) -> answers (n, cues)
+
+
+def calibrate(
+    policy: Any,
+    family: Sequence[Distortion],
+    situations: Situations,
+    teacher: Asked,
+    labels: int,
+    key: PRNGKeyArray,
+    *,
+    space: Space,
+    eps_deg: float,
+) -> Result:
+    """Ask a teacher in batches and estimate the changes. No reward is used.
+
+    Held-out answers judge. Where teacher and policy differ widely, the last fifth of the labels asks whether the
+    corrected policy is nearer to what the teacher means: model-free, so that it holds where no change of the family
+    describes the answers.
+
+    Args:
+        policy: a policy, or any function of a batch of observations.
+        family: the possible changes.
+        situations: gives states and observations (count, obs) that a policy meets.
+        teacher: gives answers (n, cues), -1, 0, 1 or `UNSAID`; NaN where it did not answer.
+        labels: number of questions.
+        key: key of all random numbers.
+        space: space of the actions.
+        eps_deg: strength of an answer, in the space's unit.
+
+    Raises:
+        UserError: settings that make no sense, or too few labels.
+    """
+    k_seed, key = jax.random.split(key)
+    calibration = Calibration(policy, family, space, eps_deg, int(jax.random.randint(k_seed, (), 0, 1 << 20)))
+    left, last = labels, labels // confirmation.EVERY
+    while left:
+        k_where, k_answer, key = jax.random.split(key, 3)
+        confirms = left == last and calibration.is_far
+        count = last if confirms else min(BATCH, left - last if left > last else left)
+        ask, learn, met = calibration.questions, calibration.learn, CHOICE * count
+        if confirms:  # another number of situations makes a `Walk` start new environments
+            ask, learn = calibration.confirmations, calibration.confirm
+            met = max(confirmation.SITUATIONS, met)
+        states, obs = situations(k_where, calibration.policy(), met)
+        asked = ask(np.asarray(obs), count)
+        states = jax.tree.map(lambda leaf, index=asked.index: leaf[index], states)
+        obs = np.asarray(obs)[asked.index]
+        answers = np.asarray(teacher(k_answer, states, jnp.asarray(obs), jnp.asarray(asked.action)))
+        there = np.isfinite(answers).any(-1)
+        learn(obs[there], asked.action[there], answers[there], asked.doubt[there])
+        left -= count
+    return calibration.result()
