@@ -20,9 +20,10 @@ from cuelearner_jax.adaptation import by_calibration, by_model, changes
 from cuelearner_jax.calibration import declared_distortions
 from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.cli import pages
-from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, is_code, out, parse, preset_of, taken
+from cuelearner_jax.cli.parsing import about, check_numbers, out, parse, taken
 from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind, typed_name
 from cuelearner_jax.cli.situations import WORDS, task_named, with_cues
+from cuelearner_jax.cli.sources import code_of, is_code, preset_of
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
@@ -37,7 +38,7 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.train import preset_kinds
-from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.task import PAPER, Task, shape_of
 from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
@@ -182,6 +183,8 @@ def make_plan(
         raise UserError("--who is empty: give a name, or leave it out")
     if merged.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but the page takes situations as they come: leave it out")
+    if merged.sizes.store_labelled:
+        raise UserError("this preset keeps labelled steps, but the page executes none: give another --preset")
     robot, task = _robot(task, asked.robot), task.on(asked.robot)
     if task.pictures(UNDRAWN).sketch is None:
         raise UserError(f"{task.name} has no sketch of a situation: {UNDRAWN}")

@@ -94,6 +94,12 @@ def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypat
     refused(["label", OWN, "--out", "labels", *more], says, tmp_path)
 
 
+def test_a_preset_whose_labels_are_executed_is_refused(refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    says = "keeps labelled steps, but the page executes none: give another --preset"
+    refused(["label", "arm", "--preset", "corrected", "--out", "labels"], says, tmp_path)
+
+
 def test_a_task_that_nobody_draws_is_refused_before_anything_is_made(refused, tmp_path, monkeypatch):
     pytest.importorskip("nicegui")
     code, work = tmp_path / "code", tmp_path / "work"  # Python may write the module's bytecode beside it
