@@ -32,7 +32,7 @@ def labelled(arguments, ask):
 
             async def acts(user, pages):
                 (page,) = pages
-                while (item := session.item) is not None:
+                while (item := await drawn(page, session)) is not None:
                     given = np.asarray(item.guide.obs), item.action, *([page] if looks else [])
                     await answer(user, page, session, ask(*given))
                 user.find(marker="finish").click()
@@ -48,6 +48,15 @@ def labelled(arguments, ask):
     with mock.patch.object(label, "_served", served):
         label.run([*map(str, arguments)])
     return places[0]
+
+
+async def drawn(page, session):
+    """The question of the session, once the page shows it: an answer moves the session on before the page."""
+    for _ in range(4000):
+        if page._drawn is (item := session.item):
+            return item
+        await asyncio.sleep(0.002)
+    raise AssertionError("the page does not show the question")
 
 
 async def answer(user, page, session, said):

@@ -1,4 +1,9 @@
-"""A session that its own thread prepares, while the session's page is open already and shows the progress."""
+"""A session that its own thread prepares, while the session's page is open already and shows the progress.
+
+The thread waits while the server starts. NiceGUI then lists every object that Python's garbage collector knows, also
+tuples that another thread is just building, and CPython refuses to finish these (`SystemError: bad argument to internal
+function`, see the documentation of `gc.get_referrers`).
+"""
 
 from __future__ import annotations
 
@@ -29,7 +34,7 @@ class Opening:
         self.doing = "preparing"
         self._make, self._failed, self._told = make, failed, tell
         self._error: BaseException | None = None
-        self._checked = threading.Event()
+        self._checked, self._proceeds = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._open, name="opening")
         self._thread.start()
 
@@ -44,6 +49,7 @@ class Opening:
 
     def _tell(self, words: str) -> None:
         self._checked.set()
+        self._proceeds.wait()
         self.doing = words
         self._told(words)
 
@@ -51,6 +57,10 @@ class Opening:
         """Wait until the session's files are checked. Raises what `make` raised until then, before a page is shown."""
         self._checked.wait()
         self.check()
+
+    def proceed(self) -> None:
+        """Let the thread go on after its check of files: the server has started."""
+        self._proceeds.set()
 
     def check(self) -> None:
         """Raise what opening the session raised, if anything."""
@@ -61,6 +71,7 @@ class Opening:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.proceed()
         self._thread.join()
         if self.session is not None:
             self.session.close()

@@ -96,11 +96,17 @@ class _Server(uvicorn.Server):
     """A server that stops when an event is set and leaves signals to the command."""
 
     ends: threading.Event
+    after_startup: Callable[[], None]
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Install no signal handlers."""
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, then call `after_startup`."""
+        await super().startup(sockets)
+        self.after_startup()
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether the server should stop."""
@@ -196,7 +202,7 @@ def serve(
     how = {"log_level": "warning", "ws": "wsproto", "loop": "asyncio", "timeout_graceful_shutdown": 1}
     settings = uvicorn.Config(Gate(app, port, token), **how)
     server = _Server(settings)
-    server.ends = stopping
+    server.ends, server.after_startup = stopping, opening.proceed
     tell(f"http://{HOST}:{port}/?token={token}")
     server.run(sockets=[taken])
     opening.check()
