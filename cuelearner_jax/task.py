@@ -137,6 +137,7 @@ class Task:
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
     named: str = ""  # its name in commands, if other than `name`: "gymnasium:FetchReach-v4"
     origin: str = ""  # "package.module:name" of a task from outside, set by the code that resolved it
+    robot: str = field(default="", compare=False)  # as `on` was asked for it; empty: the task's own
     default: Any = None  # the default configuration; None: `config()`
     # configuration -> default metric that judges adapted policies
     judge_by: Callable[[Any], str] = lambda config: "reward"
@@ -252,7 +253,7 @@ class Task:
         """
         if body is None:
             return self
-        body, _, folder = body.partition(":")
+        robot, (body, _, folder) = body, body.partition(":")
         if len(self.bodies) == 1:
             raise UserError(f"{self.name} has no robots to choose from: leave out --robot")
         known = {one.name: one for one in self.bodies}
@@ -263,7 +264,7 @@ class Task:
             if found.made_of is None:
                 raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
             found = found.made_of(Path(folder))
-        return dataclasses.replace(self, bodies=(found, *others))
+        return dataclasses.replace(self, bodies=(found, *others), robot=robot)
 
     def engine(self, name: str | None) -> Rollout | None:
         """Return the first body's roll-out in other physics (None: its own). Raises UserError for an unknown engine."""

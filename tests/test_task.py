@@ -79,6 +79,7 @@ def test_a_body_takes_the_first_place_and_keeps_all_else():
     assert TWO.on(None) is TWO
     assert changed.on("point") == TWO
     assert changed.presets == TWO.presets
+    assert (TWO.robot, changed.robot) == ("", "wide")
 
 
 def test_bodies_and_engines_that_are_not_there_are_refused():

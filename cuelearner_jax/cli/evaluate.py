@@ -80,7 +80,7 @@ def run(arguments: list[str]) -> None:
         found = evaluate.run(source, asked, watch)
         others = evaluate.run(other[0], replace(asked, policy=other[1], guidance=()), watch) if other else []
     compared = measurements.differences(found, others) if other else None
-    told = {"robot": asked.robot, "engine": asked.engine, "scenario": asked.scenario}
+    told = {"robot": source.task.robot, "engine": asked.engine, "scenario": asked.scenario}
     told = {name: value for name, value in told.items() if value}
     robot = {"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {}
     amount = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"

@@ -250,7 +250,7 @@ def _choices(task: Task, preset: str = PAPER) -> str:
     groups = {
         f"presets (--preset{default})": presets,
         "changed worlds (--scenario of adapt, evaluate and render)": scenarios,
-        "robots (--robot of adapt, evaluate, label and render)": bodies,
+        "robots (--robot)": bodies,
     }
     # A line that is not indented would be taken for the end of the one above: the groups stand apart.
     return "\n\n".join(f"{title}:\n{_rows(rows)}" for title, rows in groups.items() if rows)

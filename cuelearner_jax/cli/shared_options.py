@@ -15,6 +15,7 @@ from cuelearner_jax.cli.pages import Subject
 from cuelearner_jax.cli.parsing import about, parse, taken
 from cuelearner_jax.cli.sources import preset_of, source_of, task_of, world_of
 from cuelearner_jax.environment import offers
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import PARTS, RunConfig
 from cuelearner_jax.runs import trained
@@ -93,6 +94,8 @@ class Training(Generic[RunT]):
     """Label file to use instead of asking the teacher."""
     tuning: Flag[bool] = False
     """Evaluate on the tuning episodes, which are for choosing settings, not on the validation episodes."""
+    robot: str | None = None
+    """Another robot of the task, which acts in training and in its evaluations (default: the task's own)."""
     track: str | None = None
     """Tracker that also gets the curves, as means over seeds: tensorboard or wandb (offline), below the run's
     folder."""
@@ -131,7 +134,10 @@ def asked_of_preset(
     config, run_type, rest = parts_of(request.config, rest, request.grid.guidance)
     default = kind[run_type](config, out=Path("runs") / f"{task.name}-{name}", **options(request.grid))
     subject = pages.subject_of(typed_name(task), task.name, task)
-    return task, parse(kind[run_type], rest, f"{command} {subject.typed}", default, about(kind, task), subject)
+    asked = parse(kind[run_type], rest, f"{command} {subject.typed}", default, about(kind, task), subject)
+    if asked.robot is not None and ":" in asked.robot:
+        raise UserError(f"--robot is {asked.robot}, but training takes no folder of a robot: give its name alone")
+    return task.on(asked.robot), asked
 
 
 def typed_name(task: Task) -> str:

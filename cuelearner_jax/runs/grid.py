@@ -93,6 +93,7 @@ def describe(
     return {
         "format": formats.FORMATS["config"],
         "task": {"name": task.name, **origin, **configuration.to_json(config.task)},
+        **({"robot": task.robot} if task.robot else {}),
         **({"files": files} if (files := task.files(config.task)) else {}),
         **run_config.to_json(config),
         "grid": {"guidance": list(grid.guidance), "seeds": list(grid.seeds), "labels": list(grid.labels)},
@@ -128,6 +129,8 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     values = formats.read("config", path)
     try:
         task, world = world_of(values["task"], find, path)
+        if "robot" in values:
+            task = _on(task, values["robot"])
         config = run_config.from_json(world, values)
         grid = _grid(values["grid"])
         if "shard" in values:
@@ -139,6 +142,13 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
     return task, config, grid
+
+
+def _on(task: Task, robot: Any) -> Task:
+    """Return the task with the robot of a run. Raises ValueError for one that it lacks."""
+    if robot not in [body.name for body in task.bodies]:
+        raise ValueError(f"{task.name} has no robot {robot!r}")
+    return task.on(robot)
 
 
 def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:

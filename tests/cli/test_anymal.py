@@ -17,6 +17,8 @@ FEW = ["--episodes", "3", "--task.worlds", "8", "--task.max-steps", "4"]
 
 REFUSED = [
     (["evaluate", "billiards", "--robot", "anymal"], "unknown robot 'anymal'"),
+    (["train", "navigation", "--robot", "anymall", "--out", "run"], "unknown robot 'anymall', did you mean 'anymal'"),
+    (["sweep", "navigation", "--robot", "anymal:own", "--out", "run"], "training takes no folder of a robot: give its"),
     (["evaluate", "navigation", "--robot", "anymall"], "unknown robot 'anymall', did you mean 'anymal'"),
     (["evaluate", "navigation", "--engine", "mujoco"], "--engine mujoco needs --robot: choose one of anymal"),
     (["evaluate", "navigation", "--robot", "anymal", "--engine", "bullet"], "unknown engine 'bullet'"),

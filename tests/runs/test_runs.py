@@ -1,5 +1,6 @@
 """What a run says of itself, grids that make no sense, and runs that are refused."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -56,6 +57,18 @@ def test_a_run_comes_back_from_its_description(out):
     assert found == config
     assert isinstance(found.agent.q_layers, tuple)
     assert grid == GRID
+
+
+def test_a_run_of_another_robot_is_described_and_comes_back_on_that_robot(out, tmp_path):
+    (own,) = TASK.bodies
+    two = dataclasses.replace(TASK, bodies=(own, dataclasses.replace(own, name="other")))
+    folder = tmp_path / "other"
+    prepare_folder(folder, described(task=two.on("other")), clean=False)
+    assert [body.name for body in runs.load(folder, lambda name: two)[0].bodies] == ["other", "point"]
+    assert runs.load(out, lambda name: two)[0] is two
+    with pytest.raises(UserError, match="was run with other values of robot: give the same options"):
+        check_folder(out, described(task=two.on("other")), resume=True, overwrite=False)
+    not_loaded(folder, "damaged or of another program")  # the task that is known here lacks the robot
 
 
 @pytest.mark.parametrize(
