@@ -7,8 +7,8 @@ rewarded, and nothing decides whether a model is used.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import _coach
@@ -20,6 +20,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+import cuelearner_jax as cl
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import Adaptation, LaneState, ask_round, begin, product
 from cuelearner_jax.config import GuideSizes, Scalars
@@ -27,7 +28,7 @@ from cuelearner_jax.environment import Quantity, WholeObservations, actions_of, 
 from cuelearner_jax.evaluate import episodes, rollout_lanes
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.base import Kind
-from cuelearner_jax.policies import Common, Heuristic, in_space, policy_of
+from cuelearner_jax.policies import Common, Heuristic, Middle
 from cuelearner_jax.spaces import Box, Cue
 from cuelearner_jax.types import Step
 
@@ -42,6 +43,7 @@ CORRECTIONS: Mapping[str, Kind] = {  # what a kind is where a finished policy is
     "clic": _energy.KIND,
 }
 FIRST_SEED = {"validation": 0, "tuning": 100}  # of labels
+ARM_EPS, ARM_BOUND = 0.05, 0.5  # shares of a cue's range: strength of an answer, largest correction of a script
 Settings = Mapping[str, Any]  # "sizes.…", "scalars.…", and options of a kind by their own names
 Row = dict[str, Any]
 
@@ -81,10 +83,8 @@ class Opened(NamedTuple):
     teacher: Any
     bound: float  # how far a guide may lead from that policy's actions, in the space's unit
     scalars: Scalars
-    # (policies of all lanes, seeds, episodes of each) -> success (lanes, episodes)
-    play: Callable[[Any, Sequence[int], int], Float[np.ndarray, "lanes episodes"]]
-    at_once: bool = True  # can lanes be asked side by side?
-    controls: Mapping[str, Any] = {}  # policies without labels beside the base, by name
+    # (policies of all lanes, episodes of each) -> success (lanes, episodes)
+    play: Callable[[Any, int], Float[np.ndarray, "lanes episodes"]]
 
 
 # Worlds.
@@ -97,9 +97,9 @@ def halls(split: str) -> Opened:
 
     config = NavigationConfig(worlds=64)
     env, shown = make_environment(config, "training"), make_environment(config, split)
-    scalars = dataclasses.replace(NAVIGATION_SCALARS, tau_deg=1.0)
+    scalars = replace(NAVIGATION_SCALARS, tau_deg=1.0)
 
-    def play(policies: Any, seeds: Sequence[int], count: int) -> np.ndarray:
+    def play(policies: Any, count: int) -> np.ndarray:
         rolled = rollout_lanes(shown, policies, episodes(split), count, count * config.max_steps)
         return np.asarray(rolled.each["success"])
 
@@ -155,40 +155,39 @@ class Grasp(WholeObservations, struct.PyTreeNode):
 def grasp(split: str) -> Opened:
     """Return the world of one grasp, in a box of three cues."""
     env = Grasp()
-    scalars = dataclasses.replace(plain_scalars(GRIP), eps_deg=0.1, tau_deg=0.005, scalar_within_deg=0.15)
-    scalars = dataclasses.replace(scalars, max_grad_norm=10.0)
+    scalars = replace(plain_scalars(GRIP), eps_deg=0.1, tau_deg=0.005, scalar_within_deg=0.15)
+    scalars = replace(scalars, max_grad_norm=10.0)
 
-    def play(policies: Any, seeds: Sequence[int], count: int) -> np.ndarray:
+    def play(policies: Any, count: int) -> np.ndarray:
         several = 10 * count  # an episode is one step
         return np.asarray(rollout_lanes(env, policies, episodes(split), several, several).each["success"])
 
     return Opened(env, Heuristic(env), env, 1.0, scalars, play)
 
 
-def fetch(environment: str) -> Callable[[str], Opened]:
-    """A script of Fetch whose camera stands 3 cm from where the arm believes."""
+def arm(skill: str, scenario: str = "", episodes_each: int = 4, **changes: Any) -> Callable[[str], Opened]:
+    """Return how to open the arm: nothing learned yet, or in a scenario a script whose camera is displaced.
+
+    `changes`: fields of the arm's configuration. `episodes_each`: episodes for each one that is asked for.
+    """
 
     def opened(split: str) -> Opened:
-        import fetch_hand_eye as study
+        from cuelearner_jax.tasks.arm import ARM
 
-        from cuelearner_envs.fetch.hand_eye import onlooker  # loads Gymnasium
-        from cuelearner_envs.fetch.scripts import SCRIPTS
+        config = replace(ARM.config(), skill=skill, **changes)
+        config = ARM.scenario(scenario).apply(config) if scenario else config
+        env, shown = ARM.environment(config, "training"), ARM.environment(config, split)
+        space = actions_of(env)
+        scalars = replace(plain_scalars(space), eps_deg=ARM_EPS, tau_deg=ARM_EPS / 20, max_grad_norm=10.0)
+        scalars = replace(scalars, scalar_within_deg=2 * ARM_EPS)
 
-        world = study.world_of(environment)
-        base = in_space(policy_of(jax.jit(SCRIPTS[environment])), world.actions)
-        scalars = dataclasses.replace(plain_scalars(world.actions), eps_deg=study.EPS, tau_deg=study.EPS / 20)
-        scalars = dataclasses.replace(scalars, scalar_within_deg=2 * study.EPS, max_grad_norm=10.0)
+        def play(policies: Any, count: int) -> np.ndarray:
+            several = count * episodes_each
+            rolled = rollout_lanes(shown, policies, episodes(split), several, several * config.max_steps)
+            return np.asarray(rolled.each["success"])
 
-        def played(policy: Any, offset: Sequence[float], seed: int, count: int) -> np.ndarray:
-            first = study.FIRST_EPISODE[split] + (seed - FIRST_SEED[split]) * count
-            return study.play(environment, policy, offset, range(first, first + count))
-
-        def play(policies: Any, seeds: Sequence[int], count: int) -> np.ndarray:
-            each = enumerate(seeds)
-            return np.stack([played(policies.lane(lane), study.OFFSET, seed, count) for lane, seed in each])
-
-        teacher = onlooker(environment, study.OFFSET)
-        return Opened(world.env, base, teacher, study.BOUND, scalars, play, at_once=False)
+        base, bound = (Heuristic(env), ARM_BOUND) if scenario else (Middle(space), space.reach)
+        return Opened(env, base, ARM.make_teacher(config, env), bound, scalars, play)
 
     return opened
 
@@ -205,9 +204,9 @@ def configured(kind: Kind, settings: Settings, scalars: Scalars, condition: Cond
     """Sizes, scalars and options of a kind under settings and a condition."""
     own = lambda group: {n.partition(".")[2]: v for n, v in settings.items() if n.startswith(f"{group}.")}  # noqa: E731
     bare = {name: value for name, value in settings.items() if "." not in name}
-    options = dataclasses.replace(kind.config(), **bare) if kind.config else None
-    sizes = dataclasses.replace(SIZES, **own("sizes"))
-    return sizes, dataclasses.replace(scalars, **{**own("scalars"), **condition.scalars}), options
+    options = replace(kind.config(), **bare) if kind.config else None
+    sizes = replace(SIZES, **own("sizes"))
+    return sizes, replace(scalars, **{**own("scalars"), **condition.scalars}), options
 
 
 def learned(
@@ -254,36 +253,35 @@ def measure(
     for condition in conditions:
         if not means(cues, condition, kind_of(world, name)):
             continue
-        for group in [tuple(seeds)] if opened.at_once else [(seed,) for seed in seeds]:
-            rows = []
-            at = {max(budgets)} if condition.name == "shuffled" else set(budgets)
-            for asked, policies in learned(world, opened, name, settings, condition, group, most):
-                if asked in at:
-                    success = opened.play(policies, group, count).mean(-1)
-                    about = {"condition": condition.name, "labels": asked}
-                    told = zip(group, success, strict=True)
-                    rows += [{**about, "seed": seed, "success": round(float(each), 4)} for seed, each in told]
-                if asked == max(budgets):
-                    break
-            yield rows
+        rows = []
+        at = {max(budgets)} if condition.name == "shuffled" else set(budgets)
+        for asked, policies in learned(world, opened, name, settings, condition, seeds, most):
+            if asked in at:
+                rows += rows_of({"condition": condition.name, "labels": asked}, seeds, opened.play(policies, count))
+            if asked == max(budgets):
+                break
+        yield rows
+
+
+def rows_of(about: Row, seeds: Sequence[int], success: Float[np.ndarray, "lanes episodes"]) -> list[Row]:
+    """Return a row for each label seed with its mean success."""
+    told = zip(seeds, success.mean(-1), strict=True)
+    return [{**about, "seed": seed, "success": round(float(each), 4)} for seed, each in told]
+
+
+def calibrated(
+    opened: Opened, condition: Condition, seeds: Sequence[int], budgets: Sequence[int], count: int
+) -> Iterator[list[Row]]:
+    """Return the rows of calibration of the base, a list for each budget; its own evidence decides on a change."""
+    scalars = replace(Scalars(), **{"eps_deg": opened.scalars.eps_deg, **condition.scalars})
+    for labels in budgets:
+        how: dict[str, Any] = {"guidance": "calibration", "judge_by": "labels", "labels": labels, "scalars": scalars}
+        found = [cl.adapt(opened.base, opened.env, opened.teacher, seed=seed, **how).policy for seed in seeds]
+        success = np.concatenate([opened.play(Common(policy), count) for policy in found])
+        yield rows_of({"condition": condition.name, "labels": labels}, seeds, success)
 
 
 def without_labels(opened: Opened, seeds: Sequence[int], count: int) -> list[Row]:
-    """The rows of the base policy, before any label."""
-
-    class Alone(NamedTuple):
-        """The base, as every lane's policy."""
-
-        policy: Any
-
-        def lane(self, index: int) -> Any:
-            """Return the lane."""
-            return self.policy
-
-    policies = Common(opened.base) if opened.at_once else Alone(opened.base)
-    success = opened.play(policies, seeds, count).mean(-1)
-    each = np.broadcast_to(success, len(seeds))
-    return [
-        {"condition": "plain", "labels": 0, "seed": seed, "success": round(float(value), 4)}
-        for seed, value in zip(seeds, each, strict=True)
-    ]
+    """Return the rows of the base policy, before any label."""
+    success = opened.play(Common(opened.base), count)
+    return rows_of({"condition": "plain", "labels": 0}, seeds, np.broadcast_to(success, (len(seeds), success.shape[1])))

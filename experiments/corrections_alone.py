@@ -6,16 +6,15 @@
     python experiments/corrections_page.py --data runs/corrections
 
 A piece is one kind in one world, with all its teachers (plain; wrong with a probability of 20%; one cue a label), label
-seeds and budgets. Controls: `base`, the policy before any label, and labels that have each other's answers. In `halls`
-and `grasp` a policy is learned from nothing; in `reach` and `push` a script of Fetch is corrected whose camera is
-displaced (the extra `gymnasium`). `--tuning` compares four settings of each kind with 100 labels of other seeds, on
-other episodes: CHOSEN below are the best of these. OUT/WORLD/KIND.json grows as it is measured.
+seeds and budgets. Controls: `base`, the policy before any label, and labels that have each other's answers. In `halls`,
+`grasp` and `reach` a policy is learned from nothing; in `turned` and `displaced` a script of the arm is corrected whose
+camera has moved. `--tuning` compares four settings of each kind with 100 labels of other seeds, on other episodes:
+CHOSEN below are the best of these. OUT/WORLD/KIND.json grows as it is measured.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import sys
 import time
@@ -29,12 +28,12 @@ import numpy as np
 from _corrections import (
     CONDITIONS,
     FIRST_SEED,
-    Condition,
     Opened,
     Row,
     Settings,
     World,
-    fetch,
+    arm,
+    calibrated,
     grasp,
     halls,
     measure,
@@ -49,9 +48,15 @@ WORLDS: Mapping[str, World] = {
     for world in (
         World("halls", "navigation among obstacles, learned from nothing", halls),
         World("grasp", "a grasp in a box of three cues, learned from nothing", grasp),
-        World("reach", "FetchReach with a displaced camera", fetch("FetchReach-v4"), adapts=True),
-        World("push", "FetchPush with a displaced camera", fetch("FetchPush-v4"), adapts=True, tuned_in="reach"),
-        # The task `arm` in MJX takes its place here: World("arm", "...", a function of a split, adapts=False).
+        World("reach", "the arm's gripper to a goal, learned from nothing", arm("reach")),
+        World("turned", "the arm's script of reach, its camera turned", arm("reach", "turned_camera"), adapts=True),
+        World(
+            "displaced",
+            "the arm's script of push, its camera 2 cm aside",
+            arm("push", "hand_eye", episodes_each=2),
+            adapts=True,
+            tuned_in="turned",
+        ),
     )
 }
 RELATIVE_KINDS = ("relative", "dcoach", "bdcoach", "clic")
@@ -64,8 +69,8 @@ PIECES = tuple(f"{world}/{kind}" for world, kinds in KINDS.items() for kind in k
 TUNED_LABELS = 100
 
 RATES = {"scalars.feedback_learning_rate": (1e-3, 3e-3)}
-EPS = {"halls": (20.0, 40.0), "grasp": (0.1, 0.2), "reach": (0.05, 0.1)}
-WITHIN = {"halls": (20.0, 40.0), "grasp": (0.1, 0.2), "reach": (0.05, 0.1)}
+EPS = {"halls": (20.0, 40.0), "grasp": (0.1, 0.2), "reach": (0.05, 0.2), "turned": (0.05, 0.1)}
+WITHIN = {"halls": (20.0, 40.0), "grasp": (0.1, 0.2), "reach": (0.1, 0.2), "turned": (0.05, 0.1)}
 
 
 def settings_of(world: str, kind: str) -> list[dict[str, Any]]:
@@ -103,12 +108,6 @@ CHOSEN: Mapping[str, Mapping[str, Settings]] = {
         "scalar": {**SLOW, "scalars.scalar_within_deg": 0.2},
         "clic_shown": {**FAST, "radius": 0.1},
     },
-    # Of BD-COACH as compared there. Of others, not yet: step sizes of `grasp`, and answers as in fetch_hand_eye.py.
-    "reach": {
-        **dict.fromkeys(("offset", "relative", "dcoach", "demonstration"), FAST),
-        **dict.fromkeys(("clic", "scalar"), SLOW),
-        "bdcoach": {**FAST, "scalars.eps_deg": 0.1},
-    },
 }
 
 
@@ -117,21 +116,16 @@ class Scale(NamedTuple):
 
     about: str
     budgets: tuple[int, ...]
-    seeds: int
-    seeds_played: int  # of worlds that Gymnasium plays, one environment at a time
+    seeds: int  # of labels
     episodes: int
     settings: Settings | None = None  # of the networks
-
-    def seeds_in(self, world: str) -> int:
-        """Label seeds of a world."""
-        return self.seeds_played if WORLDS[world].adapts else self.seeds
 
 
 TINY = {"sizes.feedback_layers": (8,), "sizes.fit_steps": 20, "sizes.fit_batch_size": 8}
 SCALES = {
-    "smoke": Scale("seconds a piece", (25,), 1, 1, 2, TINY),
-    "quick": Scale("a minute a piece on one core", (25, 100, 250), 4, 2, 25),
-    "paper": Scale("what is to be reported at length", (25, 100, 250, 500), 10, 10, 100),
+    "smoke": Scale("seconds a piece", (25,), 1, 2, TINY),
+    "quick": Scale("minutes a piece on one core", (25, 100, 250), 4, 25),
+    "paper": Scale("what is reported: some ten minutes a piece on one core", (25, 100, 250), 8, 50),
 }
 
 
@@ -141,47 +135,21 @@ def open_world(world: str, split: str) -> Opened:
     return WORLDS[world].opened(split)
 
 
-def calibrated(world: str, conditions: Sequence[Condition], scale: Scale, split: str) -> Iterator[list[Row]]:
-    """Rows of calibration in a displaced Fetch; its own evidence decides whether anything is changed."""
-    import fetch_hand_eye as study
-
-    import cuelearner_jax as cl
-    from cuelearner_envs.fetch.hand_eye import onlooker
-    from cuelearner_envs.fetch.scripts import SCRIPTS
-    from cuelearner_jax.config import Scalars
-    from cuelearner_jax.policies import policy_of
-
-    environment = {"reach": "FetchReach-v4", "push": "FetchPush-v4"}[world]
-    for number in range(scale.seeds_in(world)):
-        seed = FIRST_SEED[split] + number
-        for condition, labels in product(conditions, scale.budgets):
-            if condition.name == "shuffled":  # measured in fetch_hand_eye.py
-                continue
-            scalars = dataclasses.replace(Scalars(), eps_deg=study.EPS, **condition.scalars)
-            script, teacher = policy_of(study.jax.jit(SCRIPTS[environment])), onlooker(environment, study.OFFSET)
-            how: dict[str, Any] = {"guidance": "calibration", "judge_by": "labels", "seed": seed}
-            found = cl.adapt(script, study.world_of(environment), teacher, labels=labels, scalars=scalars, **how)
-            first = study.FIRST_EPISODE[split] + number * scale.episodes
-            success = study.play(environment, found.policy, study.OFFSET, range(first, first + scale.episodes))
-            about = {"condition": condition.name, "labels": labels, "seed": seed}
-            yield [{**about, "success": round(float(success.mean()), 4)}]
-
-
 def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]]) -> Iterator[list[Row]]:
     """The rows of a piece, a list a run, but for conditions that are known."""
     world, kind = piece.split("/")
     split = "tuning" if tuning else "validation"
-    seeds = [FIRST_SEED[split] + number for number in range(scale.seeds_in(world))]
+    seeds, opened = [FIRST_SEED[split] + number for number in range(scale.seeds)], open_world(world, split)
     if kind == "base":
         if not known:
-            yield without_labels(open_world(world, split), seeds, scale.episodes)
+            yield without_labels(opened, seeds, scale.episodes)
         return
     conditions = [one for one in CONDITIONS if (one.name,) not in known]
     if kind == "calibration":
-        if not tuning:
-            yield from calibrated(world, conditions, scale, split)
+        for condition in (one for one in conditions if one.name != "shuffled"):  # which calibration refuses
+            yield from calibrated(opened, condition, seeds, scale.budgets, scale.episodes)
         return
-    place = WORLDS[world], open_world(world, split), kind
+    place = WORLDS[world], opened, kind
     if not tuning:
         settings = {**CHOSEN.get(WORLDS[world].tuned_in or world, {}).get(kind, {}), **(scale.settings or {})}
         yield from measure(*place, settings, conditions, seeds, scale.budgets, scale.episodes, max(scale.budgets))
@@ -214,7 +182,7 @@ def run(piece: str, scale: str, tuning: bool, out: Path, resume: bool) -> None:
             raise UserError(f"{file} is of the scale {found['scale']}, tuning {found['tuning']}: give another --out")
         if found["finished"]:
             return
-        rows = [] if tuning else whole(found["rows"], SCALES[scale].seeds_in(piece.split("/", maxsplit=1)[0]))
+        rows = [] if tuning else whole(found["rows"], SCALES[scale].seeds)
     command = f"corrections_alone.py --scale {scale} {'--tuning ' if tuning else ''}--pieces {piece}"
     about = {"scale": scale, "tuning": tuning, **provenance(), "command": command}
 

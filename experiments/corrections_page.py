@@ -31,7 +31,7 @@ from cuelearner_jax.guides import registry
 from cuelearner_jax.report import statistics
 from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
 
-REFERENCE = {"halls": "relative", "grasp": "relative", "reach": "offset", "push": "offset"}
+REFERENCE = {world: "offset" if "offset" in kinds else "relative" for world, kinds in KINDS.items()}
 MATCHED = 100  # labels of the reference
 TEACHERS = {"plain": "no fault", "wrong": "20% wrong", "one": "one cue a label"}
 SHUFFLED = "shuffled"
@@ -60,7 +60,7 @@ def read(folder: Path) -> dict[tuple[str, str, str], Curve]:
         for kind in kinds:
             file = folder / world / f"{kind}.json"
             told = json.loads(file.read_text()) if file.exists() else {"scale": "smoke", "rows": []}
-            rows = whole(told["rows"], SCALES[told["scale"]].seeds_in(world))
+            rows = whole(told["rows"], SCALES[told["scale"]].seeds)
             for condition in dict.fromkeys(row["condition"] for row in rows):
                 own = [row for row in rows if row["condition"] == condition]
                 seeds = sorted({row["seed"] for row in own})

@@ -170,11 +170,11 @@ def arms() -> list[list[str]]:
         (row["world"], row["kind"], row["teacher"], row["labels"]): row["success"]
         for row in read_csv(DATA / "corrections_alone/success.csv")
     }
-    base = success["reach", "base", "plain", 0]
+    base = success["turned", "base", "plain", 0]
     for kind, name in (("offset", "`offset`"), ("dcoach", "deep COACH")):
-        title = f"FetchReach, 20% of 100 answers wrong, {name}: success"
+        title = f"MJX `reach`, camera turned by 10 degrees, 20% of 100 answers wrong, {name}: success"
         rows.append(
-            [title, f"{100 * success['reach', kind, 'wrong', 100]:.0f}%", f"{100 * base:.0f}%", MORE["corrections"]]
+            [title, f"{100 * success['turned', kind, 'wrong', 100]:.0f}%", f"{100 * base:.0f}%", MORE["corrections"]]
         )
     turned = [
         json.loads((DATA / f"arms/reach_fetch_turned{end}.json").read_text())["rows"][0]["success"][0]
