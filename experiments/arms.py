@@ -10,7 +10,7 @@ A piece of training is a sweep with a folder of its own, resumed where it stands
 guide without labels, and `alone`. `rlpd` fits a policy to as many demonstrations; half of all episodes are that
 policy's, and so is half of every minibatch. In `stored` each label corrects the step that is executed, and these steps
 are half of every minibatch; with demonstrations this is RLPD (Ball et al., 2023). In `corrections` the agent never
-learns: what counts is the guide of uniform actions.
+learns: what counts is the guide of uniform actions. Worlds `reach_in_fetch` and `push_in_fetch` train in Fetch itself.
 
 A piece of adaptation corrects a script, or in Fetch a trained agent, by labels. Held-out labels judge: no step is
 rewarded. Demonstrations and good/bad labels cannot judge: 20 tuning episodes do, and their steps are counted. A piece
@@ -74,6 +74,13 @@ WORLDS: dict[str, Options] = {
     "push_free": {**steps(480_000, 24_000), "task.skill": "push", "task.obstacle": False},
     "pick": {**steps(480_000, 24_000), "task.skill": "pick"},
 }
+# Fetch steps in processes on the host, so evaluations are short there.
+IN_FETCH: Options = {"robot": "fetch", "schedule.eval-steps": 1_000, "schedule.eval-envs": 20}
+FETCH_WORLDS: dict[str, Options] = {
+    "reach_in_fetch": {**steps(9_600, 800), "task.skill": "reach", **IN_FETCH},
+    "push_in_fetch": {**steps(480_000, 24_000), "task.skill": "push", **IN_FETCH},
+}
+PLAIN_RUNS = ("alone", "stored", "stored_random")  # without a guide whose every action is refined
 BY_VALUE: Options = {"arbiter": "by_value"}
 ACTING: Options = {"arbiter.in-targets": False}
 OWN_POLICY: Options = {"arbiter.in-policy": False}  # the finished policy is the agent's, which a folder can keep
@@ -98,7 +105,7 @@ ONE: Options = {"scalars.says": "one"}
 
 def variants(world: str, options: Options) -> list[Piece]:
     """Return the variants compared in one world."""
-    minutes = 3 if world == "reach" else 9
+    minutes = 3 if world.startswith("reach") else 9
     valued, plain, alone = {**options, **BY_VALUE}, {**options, **EPISODES}, {**options, **UNLEARNED}
     stored = {**options, **STORED}
     rows: list[tuple[str, str, tuple[int, ...], Options, str]] = [
@@ -120,7 +127,15 @@ def variants(world: str, options: Options) -> list[Piece]:
     return [Piece(world, run, kind, (kind,), labels, SEEDS, own, minutes, why) for run, kind, labels, own, why in rows]
 
 
-TRAINED = tuple(piece for world, options in WORLDS.items() for piece in variants(world, options))
+TRAINED = (
+    *(piece for world, options in WORLDS.items() for piece in variants(world, options)),
+    *(
+        piece
+        for world, options in FETCH_WORLDS.items()
+        for piece in variants(world, options)
+        if piece.run in PLAIN_RUNS
+    ),
+)
 PIECES = (*TRAINED, *CORRECTED)
 
 SMALL: Options = {
