@@ -71,17 +71,24 @@ TUNED_LABELS = {"reach": 250}  # where no kind does anything with 100, the numbe
 RATES = {"scalars.feedback_learning_rate": (1e-3, 3e-3)}
 EPS = {"halls": (20.0, 40.0), "grasp": (0.1, 0.2), "reach": (0.05, 0.2), "turned": (0.05, 0.1)}
 WITHIN = {"halls": (20.0, 40.0), "grasp": (0.1, 0.2), "reach": (0.1, 0.2), "turned": (0.05, 0.1)}
+FITTED = ("reach", "turned")  # worlds in which more fitting is tried as well
+FITTING = {"dcoach": {"replay_steps": (5, 15)}, "bdcoach": {"batch_steps": (5, 15)}}  # for each label
 
 
 def settings_of(world: str, kind: str) -> list[dict[str, Any]]:
-    """Four settings of a kind that are compared in a world: two step sizes, and two of what matters most beside."""
+    """Return the settings of a kind that are compared in a world.
+
+    Four: two step sizes, and two of what matters most beside. In the arm eight: also with three times as much fitting.
+    """
     second: dict[str, tuple[Any, ...]] = {"scalars.eps_deg": EPS[world]}
     if kind == "scalar":
         second = {"scalars.scalar_within_deg": WITHIN[world]}
     if kind == "demonstration":
-        second = {"sizes.fit_steps": (300, 600)}
+        second = {"sizes.fit_batch_size": (32, 128)} if world in FITTED else {"sizes.fit_steps": (300, 600)}
     if kind == "clic_shown":
         second = {"radius": (0.5, 0.1)}
+    if world in FITTED:
+        second |= FITTING.get(kind, {"sizes.fit_steps": (300, 900)})
     grid = {**RATES, **second}
     found = [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
     return [{**FRAMES.get(world, {}), **one} for one in found]
