@@ -74,8 +74,14 @@ WORLDS: dict[str, Options] = {
     "push_free": {**steps(480_000, 24_000), "task.skill": "push", "task.obstacle": False},
     "pick": {**steps(480_000, 24_000), "task.skill": "pick"},
 }
-# Fetch steps in processes on the host, so evaluations are short there.
-IN_FETCH: Options = {"robot": "fetch", "schedule.eval-steps": 1_000, "schedule.eval-envs": 20}
+# Fetch steps in processes on the host, so evaluations are short there. Guides, which never act there, are small.
+IN_FETCH: Options = {
+    "robot": "fetch",
+    "schedule.eval-steps": 1_000,
+    "schedule.eval-envs": 20,
+    "sizes.feedback-layers": (64, 64),
+    "sizes.fit-steps": 400,
+}
 FETCH_WORLDS: dict[str, Options] = {
     "reach_in_fetch": {**steps(9_600, 800), "task.skill": "reach", **IN_FETCH},
     "push_in_fetch": {**steps(480_000, 24_000), "task.skill": "push", **IN_FETCH},
