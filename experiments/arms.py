@@ -47,6 +47,7 @@ from _pieces import (
 
 from cuelearner_jax.arbiters import by_value
 from cuelearner_jax.cli import main as cuelearner
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import results
 from cuelearner_jax.storage.provenance import provenance
 
@@ -208,7 +209,10 @@ def guides_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
     """Success of uniform actions under the guides of `corrections` and its like, over the labels asked for."""
     found = []
     for piece in pieces:
-        table = results.read_guides([out / piece.path]) if (out / piece.path).exists() else None
+        try:
+            table = results.read_guides([out / piece.path])
+        except UserError:  # the first guide is not measured yet
+            continue
         for (budget, asked), own in grouped(table.to_pylist() if table else [], "labels", "asked"):
             row = {"world": piece.world, "run": piece.run, "guidance": piece.kinds[0], "budget": budget}
             found.append({**row, "labels": asked, **spread([one["guide_success"] for one in own])})

@@ -33,6 +33,7 @@ AGENTS = {"reach": "`reach`, one agent", "push_free": "`push` without a post, 8 
 STEPS = (3_200, 6_400, 9_600, 12_800)
 
 
+TRAINED = ("reach", "reach_in_fetch", "push", "push_free")  # worlds of the table
 RUNS = {
     "alone": "SAC alone",
     "alone_10": "SAC alone, ten critics",
@@ -64,7 +65,7 @@ def run_name(row: dict) -> str:
 def training(data: Path) -> str:
     """Return the table of steps to 80% success, with the ratio to the agent alone."""
     cells = []
-    for world in ("reach", "push", "push_free"):
+    for world in TRAINED:
         found = studied(data, world)
         named = itemgetter("run", "guidance", "labels")
         guides = {named(row): row["mean"] for row in found["guides"]}

@@ -46,13 +46,14 @@ def test_pieces_are_bounded_and_every_world_has_its_controls(study):
 def test_every_training_is_a_sweep_that_would_begin(study, scale, monkeypatch, tmp_path):
     orders = []
     monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
-    worlds = ("push",) if scale == "paper" else ("reach",)
+    worlds = ("push", "push_in_fetch") if scale == "paper" else ("reach", "reach_in_fetch")
     for piece in (piece for piece in study.TRAINED if piece.world in worlds):
         left = study.scaled(piece, study.SCALES[scale])
         assert main(study.sweep_command("arm", left, tmp_path, resume=False)) == 0, piece.path
         assert left.options.get("arbiter", "episodes") == orders[-1].config.arbiter.NAME
         assert orders[-1].config.sizes.store_labelled == piece.run.startswith("stored")
         assert orders[-1].config.agent.NAME == "sac"
+        assert orders[-1].task.bodies[0].name == ("fetch" if piece.world.endswith("_in_fetch") else "gripper")
 
 
 def test_every_adaptation_is_a_command_that_would_begin(study, corrections, monkeypatch, tmp_path):
