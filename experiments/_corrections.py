@@ -24,6 +24,7 @@ import cuelearner_jax as cl
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import Adaptation, LaneState, ask_round, begin, product
 from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import Quantity, WholeObservations, actions_of, spaces_of
 from cuelearner_jax.evaluate import episodes, rollout_lanes
 from cuelearner_jax.guides import registry
@@ -216,6 +217,7 @@ def learned(
 
     Whoever needs fewer labels stops before: the program is the same.
     """
+    release_programs()
     kind = kind_of(world, name)
     sizes, scalars, options = configured(kind, settings, opened.scalars, condition)
     guide = kind.make(sizes, spaces_of(opened.env), options)
