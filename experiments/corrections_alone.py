@@ -115,6 +115,15 @@ CHOSEN: Mapping[str, Mapping[str, Settings]] = {
         "scalar": {**SLOW, "scalars.scalar_within_deg": 0.2},
         "clic_shown": {**FAST, "radius": 0.1},
     },
+    "reach": {
+        "relative": {**FAST, "scalars.eps_deg": 0.2, "sizes.fit_steps": 900},
+        "dcoach": {**FAST, "scalars.eps_deg": 0.2, "replay_steps": 5},
+        "bdcoach": {**SLOW, "scalars.eps_deg": 0.2, "batch_steps": 15},
+        "clic": {**FAST, "scalars.eps_deg": 0.05, "sizes.fit_steps": 900},
+        "demonstration": {**SLOW, "sizes.fit_batch_size": 128, "sizes.fit_steps": 900},
+        "scalar": {**SLOW, "scalars.scalar_within_deg": 0.2, "sizes.fit_steps": 900},
+        "clic_shown": {**FAST, "radius": 0.5, "sizes.fit_steps": 300},
+    },
 }
 
 
