@@ -159,6 +159,8 @@ def _given(of: Calibrating, base: Any, seed: int, rows: Label) -> _Lane:
     calibration = Calibration(base, of.family, actions_of(of.env), float(of.scalars.eps_deg), seed)
     valid = np.asarray(rows.valid)
     calibration.learn(*(np.asarray(part)[valid] for part in (rows.obs, rows.action, rows.answer)))
+    if calibration.is_far:
+        calibration.cross_confirm()
     return _Lane(calibration.result(), rows, [])
 
 

@@ -1,8 +1,9 @@
 """Confirmation: answers that tell whether a corrected policy is nearer to what the teacher means.
 
 Where teacher and policy still differ widely after most labels, the model of answers is wrong, and its evidence too
-certain. The last answers then judge without it. They are about actions halfway between the policy and the corrected
-one, and each is for one of the two, whatever else is wrong with the policy.
+certain. Answers that were not learned then judge without it: each that points from the action in question to one of both
+policies and away from the other is for the first, whatever else is wrong with it. A teacher is asked about actions
+halfway between the two, for which every answer is of that sort.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ def halfway(
 
     One question comes from each of `count` equal parts of the situations. Doubts and expected information are zero.
     """
-    before, offset = _correction(meaning, fit, obs)
+    before, after = _right(meaning, fit, obs)
+    offset = meaning.offsets((), np.zeros((1, 0)), after[None], before)[0]
     apart = np.abs(offset).max(-1) / eps
     differs = np.where(apart <= MOVED[1], np.minimum(apart, MOVED[0]), 0) + 1e-3 * random.random(len(obs))
     index = np.array([own[differs[own].argmax()] for own in np.array_split(np.arange(len(obs)), count)])
@@ -45,17 +47,22 @@ def halfway(
 
 
 def counts(
-    meaning: Meaning, fit: Fit, obs: Float[Floats, "n obs"], answer: Float[Array | Floats, "n cues"]
+    meaning: Meaning,
+    fit: Fit,
+    obs: Float[Floats, "n obs"],
+    action: Float[Floats, "n action"],
+    answer: Float[Array | Floats, "n cues"],
 ) -> tuple[int, int]:
-    """Return how many answers are for the corrected policy, and how many against it.
+    """Return how many answers about actions are for the corrected policy, and how many against it.
 
     The paired counts of a sign test (Dixon and Mood, 1946), out of sample where the fit has not learned the answers.
+    Answers that point to both policies, or to neither, do not count.
     """
     if not len(obs):
         return 0, 0
     said = np.where(np.asarray(is_answered(jnp.asarray(answer))) & np.isfinite(answer), answer, 0)
-    toward = (said * _correction(meaning, fit, obs)[1]).sum(-1)
-    return int((toward > 0).sum()), int((toward < 0).sum())
+    before, after = (said * meaning.offsets((), np.zeros((2, 0)), _right(meaning, fit, obs), action)).sum(-1)
+    return int(((after > 0) & (before < 0)).sum()), int(((before > 0) & (after < 0)).sum())
 
 
 def refuses(confirmed: tuple[int, int]) -> bool:
@@ -63,10 +70,9 @@ def refuses(confirmed: tuple[int, int]) -> bool:
     return confirmed[0] <= AGREE * confirmed[1]
 
 
-def _correction(meaning: Meaning, fit: Fit, obs: Floats) -> tuple[Floats, Floats]:
-    """Return the actions that the teacher would call right without changes, and the vectors to those with them."""
+def _right(meaning: Meaning, fit: Fit, obs: Float[Floats, "n obs"]) -> Float[Floats, "2 n action"]:
+    """Return the actions that the teacher would call right without changes, and with them."""
     theta = fit.interval()[0]
     of_teacher = np.concatenate([np.full(len(one.unknowns), one.of_teacher) for one in fit.family])
     thetas = np.stack([np.where(of_teacher, theta, 0), theta])
-    right = meaning.right(fit.family, thetas, meaning.actions(fit.asks, thetas[:, : fit.changes], obs))
-    return right[0], meaning.offsets((), np.zeros((1, 0)), right[1:], right[0])[0]
+    return meaning.right(fit.family, thetas, meaning.actions(fit.asks, thetas[:, : fit.changes], obs))

@@ -111,14 +111,16 @@ class EvidenceLearner(Learner):
             beside = np.concatenate([obs, self._beside])
             doubt = ties(self._known.meaning, (), np.zeros(0), beside, self._known.eps)[: len(obs)]
             self._known.learn(obs, action, answer, doubt)
-            self._rows = rows
+            self._rows, self._known.confirmed = rows, None
+            if len(rows) >= SOUND and self._known.is_far:
+                self._known.cross_confirm()
         told = describe_result(self._known.result(), len(rows)) if len(rows) >= LEAST else ()
         self.newest = Fitted(self._theory(), len(rows), self.newest.number + 1, told=told)
 
 
 def describe_result(result: Result, labels: int) -> tuple[str, ...]:
     """Return lines that report what the answers so far show."""
-    if result.verdict == CHANGED:
+    if result.verdict == CHANGED or result.refused:
         return tuple(result.words())
     if result.verdict == UNEXPLAINED and labels >= SOUND:
         return ("none of these changes explains the answers",)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from known_worlds import BOX, Yard, aims, changed, grips, person, situations
 
-from cuelearner_jax.calibration import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, calibrate
+from cuelearner_jax.calibration import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, calibrate, confirmation
 from cuelearner_jax.calibration.families import declared_distortions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of
@@ -150,6 +150,21 @@ def test_a_change_is_refused_without_more_than_three_answers_for_it_to_two_again
     assert (found.verdict, found.refused) == ((CHANGED, ()) if named else (UNEXPLAINED, ("direction: change",)))
     assert (found.policy is turned[0].base) is not named
     assert named or "did not confirm" in found.words()[0]
+
+
+def test_answers_that_nobody_asked_to_confirm_judge_changes_fitted_to_the_others(turned):
+    calibration = turned[0].copy(np.random.default_rng(0))
+    calibration.cross_confirm()
+    agree, against = calibration.confirmed
+    assert agree > 4 * against
+    assert agree + against < calibration.asked  # others point to both policies, or to neither
+    assert calibration.result().changes == ("direction: change",)
+    told = calibration.answers
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], told.answer.shape)
+    control = Calibration(POLICY, TURN, DIRECTIONS, EPS_DEG)
+    control.learn(told.obs, told.action, told.answer * signs)
+    control.cross_confirm()
+    assert confirmation.refuses(control.confirmed)
 
 
 def test_too_few_answers_and_spaces_without_cues_are_refused():

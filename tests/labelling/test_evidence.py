@@ -78,3 +78,17 @@ def test_an_answer_taken_back_is_forgotten_and_a_policy_that_is_right_is_told_to
     known = session._learner._known.answers
     np.testing.assert_array_equal(known.answer, np.asarray(session._labels().answer)[:20])
     assert status.newest.told == ("no change seen yet",)
+
+
+@pytest.mark.long
+def test_a_teacher_who_differs_widely_has_to_confirm_a_change_and_confirms_none(opened):
+    """The teacher means what the policy does, turned by 40 degrees to either side at random."""
+    session, draws = opened(**{**SETTINGS, "labels": 40}), np.random.default_rng(0)
+    seen, asked, meant = draws.uniform(-180, 180, 40), draws.uniform(-15, 15, 40), draws.normal(0, 40, 40)
+    obs, action = (
+        np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32) for angle in np.deg2rad([seen, seen + asked])
+    )
+    learner = session._learner
+    learner.fit(learner.padded(list(zip(obs, action, np.sign(meant - asked)[:, None], strict=True))))
+    assert learner._known.confirmed is not None
+    assert not LINE.match(learner.newest.told[0])
