@@ -30,7 +30,7 @@ import numpy as np
 from cuelearner_envs.billiards.environment import Balls
 from cuelearner_jax.adaptation.by_model import settling
 from cuelearner_jax.agents.choice import best_near_peaks
-from cuelearner_jax.calibration import Result, calibrate
+from cuelearner_jax.calibration import Result, calibrate, read_answers
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
 from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.simulator import simulator_distortion
@@ -153,6 +153,16 @@ def found_policy(row: dict[str, Any], base: Any, family: tuple[Distortion, ...])
     return Calibrated(base, jnp.asarray(row["theta"], jnp.float32), own)
 
 
+def ready_made(walk: Walk, base: Any, key: Any, labels: int, space: Any, most_deg: float) -> tuple[Any, Any, Any]:
+    """Situations, actions turned at random from the base's by at most so much, and answers: as a file holds them."""
+    k_where, k_turn, k_act, k_answer = jax.random.split(key, 4)
+    states, obs = walk.situations(k_where, base, labels)
+    most = space.from_unit(most_deg)
+    turns = jax.random.uniform(k_turn, (labels, len(space.cues)), minval=-most, maxval=most)
+    actions = jax.vmap(space.exp)(base.act(k_act, states, obs), turns)
+    return obs, actions, walk.answers(k_answer, states, obs, actions)
+
+
 class Study(NamedTuple):
     """Base policies, worlds and answers of one study."""
 
@@ -182,10 +192,13 @@ class Study(NamedTuple):
         world, family = self.world(name)
         start, used, walk = time.time(), time.process_time(), Walk(world.env, world.teacher, world.scalars)
         key = jax.random.fold_in(jax.random.key(seed), labels)
-        found = calibrate(
-            self.bases[base], family, walk.situations, walk.answers, labels, key,
-            space=actions_of(world.env), eps_deg=float(world.scalars.eps_deg),
-        )  # fmt: skip
+        space, how = actions_of(world.env), {"eps_deg": float(world.scalars.eps_deg)}
+        if self.asked.ready_made_deg:
+            told = ready_made(walk, self.bases[base], key, labels, space, self.asked.ready_made_deg)
+            found = read_answers(self.bases[base], family, *told, space=space, seed=seed, **how)
+        else:
+            situations, answers = walk.situations, walk.answers
+            found = calibrate(self.bases[base], family, situations, answers, labels, key, space=space, **how)
         row = {"world": name, "base": base, "labels": labels, "seed": seed, **to_row(found)}
         row["eps_deg"] = float(world.scalars.eps_deg)
         row["seconds"] = round(time.time() - start, 1)
@@ -235,6 +248,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--eps-deg", type=float, default=0.0, help="strength of an answer (default: the scenario's)")
     parser.add_argument("--mistakes", type=float, default=0.0, help="that an answer is reversed; 0.5: a control")
     parser.add_argument("--bias-deg", type=float, default=0.0, help="of everything that the teacher means")
+    parser.add_argument("--ready-made-deg", type=float, default=0.0, help="questions turned by as much, as in a file")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--shard", type=int, nargs=2, default=(1, 1), metavar=("K", "N"), help="the K-th of N shares")
     parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation; 0: none")

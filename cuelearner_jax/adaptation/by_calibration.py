@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from cuelearner_jax.adaptation.by_model import SIZES, AdaptationResult
 from cuelearner_jax.adaptation.judging import LABELS, Judge, Judgement, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
-from cuelearner_jax.calibration import CHANGED, Calibrated, Calibration, Distortion, Result, Walk, calibrate
+from cuelearner_jax.calibration import CHANGED, Calibrated, Distortion, Result, Walk, calibrate, read_answers
 from cuelearner_jax.calibration.families import Family, unknowns_of
 from cuelearner_jax.config import GuideSizes, Scalars, TeacherFaults
 from cuelearner_jax.devices import lane_mesh
@@ -156,12 +156,10 @@ def _asked(
 
 
 def _given(of: Calibrating, base: Any, seed: int, rows: Label) -> _Lane:
-    calibration = Calibration(base, of.family, actions_of(of.env), float(of.scalars.eps_deg), seed)
     valid = np.asarray(rows.valid)
-    calibration.learn(*(np.asarray(part)[valid] for part in (rows.obs, rows.action, rows.answer)))
-    if calibration.is_far:
-        calibration.cross_confirm()
-    return _Lane(calibration.result(), rows, [])
+    answers = (np.asarray(part)[valid] for part in (rows.obs, rows.action, rows.answer))
+    how = {"space": actions_of(of.env), "eps_deg": float(of.scalars.eps_deg), "seed": seed}
+    return _Lane(read_answers(base, of.family, *answers, **how), rows, [])
 
 
 def _theta(policy: Calibrated) -> Theta:

@@ -1,6 +1,6 @@
 """Calibration: estimate from relative answers what changed in the world."""
 
-from cuelearner_jax.calibration.asking import calibrate
+from cuelearner_jax.calibration.asking import calibrate, read_answers
 from cuelearner_jax.calibration.estimation import Calibration
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
 from cuelearner_jax.calibration.policy import Calibrated
@@ -21,5 +21,6 @@ __all__ = [
     "Walk",
     "calibrate",
     "declared_distortions",
+    "read_answers",
     "simulator_distortion",
 ]

@@ -1,4 +1,4 @@
-"""Calibration by a teacher who is asked: questions in batches, and the last of them to confirm."""
+"""Calibration by a teacher who is asked, in batches of which the last confirms; or by answers that are given."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.calibration import confirmation
 from cuelearner_jax.calibration.estimation import BATCH, Calibration
@@ -71,4 +71,34 @@ def calibrate(
         there = np.isfinite(answers).any(-1)
         learn(obs[there], asked.action[there], answers[there], asked.doubt[there])
         left -= count
+    return calibration.result()
+
+
+def read_answers(
+    policy: Any,
+    family: Sequence[Distortion],
+    obs: Float[Array | np.ndarray, "n obs"],
+    action: Float[Array | np.ndarray, "n action"],
+    answer: Float[Array | np.ndarray, "n cues"],
+    *,
+    space: Space,
+    eps_deg: float,
+    seed: int = 0,
+) -> Result:
+    """Estimate the changes from answers that are there already: those of a file, or of the labelling page.
+
+    Where teacher and policy differ widely, each fifth of the answers judges changes that are fitted to the others.
+
+    Args:
+        policy, family, space, eps_deg: as for `calibrate`.
+        obs, action, answer: situations, the actions in question, and answers -1, 0, 1 or `UNSAID`.
+        seed: seed of all random numbers.
+
+    Raises:
+        UserError: settings that make no sense, or too few answers.
+    """
+    calibration = Calibration(policy, family, space, eps_deg, seed)
+    calibration.learn(obs, action, answer)
+    if calibration.is_far:
+        calibration.cross_confirm()
     return calibration.result()

@@ -1,9 +1,9 @@
 """Confirmation: answers that tell whether a corrected policy is nearer to what the teacher means.
 
 Where teacher and policy still differ widely after most labels, the model of answers is wrong, and its evidence too
-certain. Answers that were not learned then judge without it: each that points from the action in question to one of both
-policies and away from the other is for the first, whatever else is wrong with it. A teacher is asked about actions
-halfway between the two, for which every answer is of that sort.
+certain. Answers that were not learned then judge without it. An answer that points from the action in question to one
+of both policies, and away from the other, is for the first, whatever else is wrong with it. A teacher is asked about
+actions halfway between the two, for which every answer is of that sort.
 """
 
 from __future__ import annotations
