@@ -124,6 +124,16 @@ CHOSEN: Mapping[str, Mapping[str, Settings]] = {
         "scalar": {**SLOW, "scalars.scalar_within_deg": 0.2, "sizes.fit_steps": 900},
         "clic_shown": {**FAST, "radius": 0.5, "sizes.fit_steps": 300},
     },
+    # No setting of deep COACH reached a goal there: its first.
+    "turned": {
+        "offset": {**SLOW, "scalars.eps_deg": 0.1, "sizes.fit_steps": 300},
+        "relative": {**SLOW, "scalars.eps_deg": 0.05, "sizes.fit_steps": 900},
+        "dcoach": {**SLOW, "scalars.eps_deg": 0.05, "replay_steps": 5},
+        "bdcoach": {**SLOW, "scalars.eps_deg": 0.05, "batch_steps": 5},
+        "clic": {**SLOW, "scalars.eps_deg": 0.1, "sizes.fit_steps": 300},
+        "demonstration": {**SLOW, "sizes.fit_batch_size": 32, "sizes.fit_steps": 900},
+        "scalar": {**SLOW, "scalars.scalar_within_deg": 0.1, "sizes.fit_steps": 300},
+    },
 }
 
 
