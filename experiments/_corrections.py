@@ -173,13 +173,13 @@ def arm(skill: str, scenario: str = "", episodes_each: int = 4, **changes: Any) 
     """
 
     def opened(split: str) -> Opened:
+        from cuelearner_envs.arm.environment import ACTIONS
         from cuelearner_jax.tasks.arm import ARM
 
         config = replace(ARM.config(), skill=skill, **changes)
         config = ARM.scenario(scenario).apply(config) if scenario else config
         env, shown = ARM.environment(config, "training"), ARM.environment(config, split)
-        space = actions_of(env)
-        scalars = replace(plain_scalars(space), eps_deg=ARM_EPS, tau_deg=ARM_EPS / 20, max_grad_norm=10.0)
+        scalars = replace(plain_scalars(ACTIONS), eps_deg=ARM_EPS, tau_deg=ARM_EPS / 20, max_grad_norm=10.0)
         scalars = replace(scalars, scalar_within_deg=2 * ARM_EPS)
 
         def play(policies: Any, count: int) -> np.ndarray:
@@ -187,7 +187,7 @@ def arm(skill: str, scenario: str = "", episodes_each: int = 4, **changes: Any) 
             rolled = rollout_lanes(shown, policies, episodes(split), several, several * config.max_steps)
             return np.asarray(rolled.each["success"])
 
-        base, bound = (Heuristic(env), ARM_BOUND) if scenario else (Middle(space), space.reach)
+        base, bound = (Heuristic(env), ARM_BOUND) if scenario else (Middle(ACTIONS), ACTIONS.reach)
         return Opened(env, base, ARM.make_teacher(config, env), bound, scalars, play)
 
     return opened
