@@ -35,6 +35,7 @@ REFERENCE = {world: "offset" if "offset" in kinds else "relative" for world, kin
 MATCHED = 100  # labels of the reference
 TEACHERS = {"plain": "no fault", "wrong": "20% wrong", "one": "one cue a label"}
 SHUFFLED = "shuffled"
+TICKS = (25, 100, 250, 500)  # labels
 
 
 class Curve(NamedTuple):
@@ -198,7 +199,7 @@ def draw(curves: Curves, stem: Path) -> None:
             axes.set(ylim=(0, 100), title=f"{world}, {told}")
             axes.set_xscale("log")
             axes.spines[["top", "right"]].set_visible(False)
-            axes.set_xticks([25, 100, 250], ["25", "100", "250"], minor=False)
+            axes.set_xticks(TICKS, [str(labels) for labels in TICKS], minor=False)
             axes.minorticks_off()
         panels[-1][column].set_xlabel("labels")
     for row in panels:

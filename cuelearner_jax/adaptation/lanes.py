@@ -126,8 +126,6 @@ class Adaptation(struct.PyTreeNode):
         """Return every lane's policy: its base's actions under its model, within its bound.
 
         `env`: where the policy is to act (default: the world of the questions).
-
-        `env`: where it is to act (default: where was asked).
         """
         base, view = self.bases.lane(block.base), view_of(self.env if env is None else env)
         return Guided(base, block.guide.model, view, self.scalars, self.guidance, block.bound, self.sizes)
