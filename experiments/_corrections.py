@@ -273,14 +273,16 @@ def rows_of(about: Row, seeds: Sequence[int], success: Float[np.ndarray, "lanes 
 
 def calibrated(
     opened: Opened, condition: Condition, seeds: Sequence[int], budgets: Sequence[int], count: int
-) -> Iterator[list[Row]]:
-    """Return the rows of calibration of the base, a list for each budget; its own evidence decides on a change."""
+) -> list[Row]:
+    """Return the rows of calibration of the base; its own evidence decides on a change."""
     scalars = replace(Scalars(), **{"eps_deg": opened.scalars.eps_deg, **condition.scalars})
+    rows: list[Row] = []
     for labels in budgets:
         how: dict[str, Any] = {"guidance": "calibration", "judge_by": "labels", "labels": labels, "scalars": scalars}
         found = [cl.adapt(opened.base, opened.env, opened.teacher, seed=seed, **how).policy for seed in seeds]
         success = np.concatenate([opened.play(Common(policy), count) for policy in found])
-        yield rows_of({"condition": condition.name, "labels": labels}, seeds, success)
+        rows += rows_of({"condition": condition.name, "labels": labels}, seeds, success)
+    return rows
 
 
 def without_labels(opened: Opened, seeds: Sequence[int], count: int) -> list[Row]:

@@ -175,7 +175,7 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
     if kind == "calibration":
         for condition in (one for one in conditions if one.name != "shuffled"):  # which calibration refuses
             budgets = [labels for labels in scale.budgets if labels <= MOST_CALIBRATED]
-            yield from calibrated(opened, condition, seeds, budgets, scale.episodes)
+            yield calibrated(opened, condition, seeds, budgets, scale.episodes)
         return
     place = WORLDS[world], opened, kind
     if not tuning:

@@ -5,8 +5,8 @@
 The data are what `corrections_alone.py` leaves in its `--out`. The short table goes between the lines
 `<!-- corrections -->` and `<!-- end of corrections -->` of the page. Written beside the data: two figures;
 `success.csv`, success of each kind, teacher and budget with its interval over label seeds; and `labels.csv`, success
-with 100 labels and the labels that match 100 of the reference. The latter are read off nondecreasing curves, on
-straight lines over the logarithm of the labels.
+with 100 labels (`reach`: 250) and the labels that match as many of the reference. The latter are read off nondecreasing
+curves, on straight lines over the logarithm of the labels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from _efficiency_statistics import Bounds, isotonic, labels_for, percentiles
 from _pages import GREY, Bar, forest, markdown, new_figure, rendered, viewer_link
 from _pages import write_csv as write_text_csv
-from corrections_alone import KINDS, SCALES, whole
+from corrections_alone import KINDS, SCALES, TUNED_LABELS, whole
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
@@ -32,7 +32,7 @@ from cuelearner_jax.report import statistics
 from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
 
 REFERENCE = {world: "offset" if "offset" in kinds else "relative" for world, kinds in KINDS.items()}
-MATCHED = 100  # labels of the reference
+MATCHED = {world: TUNED_LABELS.get(world, 100) for world in KINDS}  # labels of the reference that others match
 TEACHERS = {"plain": "no fault", "wrong": "20% wrong", "one": "one cue a label"}
 SHUFFLED = "shuffled"
 TICKS = (25, 100, 250, 500)  # labels
@@ -72,18 +72,18 @@ def read(folder: Path) -> dict[tuple[str, str, str], Curve]:
     return found
 
 
-def ratio(kind: Curve, reference: Curve) -> tuple[Bounds, tuple[float, float]] | None:
-    """Return the labels of a kind that match `MATCHED` of the reference, over `MATCHED`, with their 95% interval.
+def ratio(kind: Curve, reference: Curve, matched: int = 100) -> tuple[Bounds, tuple[float, float]] | None:
+    """Return the labels of a kind that match so many of the reference, over these, with their 95% interval.
 
     None where the reference never had so many, or the kind has one budget alone.
     """
-    if MATCHED not in reference.budgets or len(kind.budgets) < 2:
+    if matched not in reference.budgets or len(kind.budgets) < 2:
         return None
     own = [statistics.interquartile_mean(kind.success)[None], statistics.resampled(kind.success, seed=1)]
     other = [statistics.interquartile_mean(reference.success)[None], statistics.resampled(reference.success, seed=2)]
-    wanted = isotonic(np.concatenate(other))[:, reference.budgets.index(MATCHED)]
+    wanted = isotonic(np.concatenate(other))[:, reference.budgets.index(matched)]
     found = labels_for(np.array(kind.budgets), isotonic(np.concatenate(own)), wanted)
-    shares = Bounds(found.lower / MATCHED, found.upper / MATCHED)
+    shares = Bounds(found.lower / matched, found.upper / matched)
     first = Bounds(shares.lower[0], shares.upper[0])
     return first, percentiles(Bounds(shares.lower[1:], shares.upper[1:]))
 
@@ -113,8 +113,8 @@ def title_of(kind: str) -> str:
 
 def table(curves: Curves) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of `labels.csv`."""
-    header = ["world", "kind"]
-    header += [f"{MATCHED} labels, {told} [%]" for told in TEACHERS.values()]
+    header = ["world", "kind", "labels"]
+    header += [f"success, {told} [%]" for told in TEACHERS.values()]
     header += [f"most labels, answers {SHUFFLED} [%]"]
     header += [f"times the labels of the reference, {told}" for told in TEACHERS.values()]
     rows = []
@@ -123,27 +123,27 @@ def table(curves: Curves) -> tuple[list[str], list[list[str]]]:
             own = {teacher: curves.get((world, kind, teacher)) for teacher in (*TEACHERS, SHUFFLED)}
             if not any(own.values()):
                 continue
-            labels = 0 if kind == "base" else MATCHED
+            labels = 0 if kind == "base" else MATCHED[world]
             cells = [percent(curve.at(labels)) if (curve := own[teacher]) else "" for teacher in TEACHERS]
             control = own[SHUFFLED]
             cells.append(percent(control.at(control.budgets[-1])) if control else "")
             for teacher in TEACHERS:
                 reference, curve = curves.get((world, REFERENCE[world], teacher)), own[teacher]
                 said = kind != REFERENCE[world] and curve is not None and reference is not None
-                cells.append(ratio_words(ratio(curve, reference)) if said else "")  # pyright: ignore[reportArgumentType]
-            rows.append([world, title_of(kind), *cells])
+                cells.append(ratio_words(ratio(curve, reference, MATCHED[world])) if said else "")  # pyright: ignore[reportArgumentType]
+            rows.append([world, title_of(kind), str(labels), *cells])
     return header, rows
 
 
 def short_table(curves: Curves) -> str:
-    """Return the page's table: success of each kind with 100 labels of a teacher without faults, a column a world."""
+    """Return the page's table: success of each kind under a teacher without faults, a column a world."""
     worlds, rows = worlds_of(curves), {}
     for world, kinds in KINDS.items():
         for kind in kinds:
             if (curve := curves.get((world, kind, "plain"))) is not None:
-                rows.setdefault(kind, {})[world] = percent(curve.at(0 if kind == "base" else MATCHED))
+                rows.setdefault(kind, {})[world] = percent(curve.at(0 if kind == "base" else MATCHED[world]))
     cells = [[title_of(kind), *(row.get(world, "") for world in worlds)] for kind, row in rows.items()]
-    return markdown([f"success with {MATCHED} labels [%]", *(f"`{world}`" for world in worlds)], cells)
+    return markdown(["success [%]", *(f"`{world}`, {MATCHED[world]} labels" for world in worlds)], cells)
 
 
 def worlds_of(curves: Curves) -> list[str]:
@@ -159,7 +159,7 @@ def section(curves: Curves, data: Path, page: Path) -> str:
 
 
 def draw_budget(curves: Curves, stem: Path) -> None:
-    """Draw success with 100 labels of a teacher without faults, a panel a world."""
+    """Draw success under a teacher without faults, a panel a world."""
     worlds = worlds_of(curves)
     with matplotlib.rc_context(STYLE):
         figure = new_figure(3.6 * len(worlds), 3.4)
@@ -167,7 +167,7 @@ def draw_budget(curves: Curves, stem: Path) -> None:
             bars = []
             for kind in KINDS[world]:
                 curve = curves.get((world, kind, "plain"))
-                found = curve.at(0 if kind == "base" else MATCHED) if curve else None
+                found = curve.at(0 if kind == "base" else MATCHED[world]) if curve else None
                 if found is not None:
                     colour = GREY if kind == "base" else colour_of(kind)
                     bars.append(
@@ -176,7 +176,7 @@ def draw_budget(curves: Curves, stem: Path) -> None:
             forest(axes, bars, bars[0].found, "{:.0f}")
             axes.set_xlim(-3, 103)
             axes.set_title(world, fontweight="bold", fontsize=11)
-            axes.set_xlabel(f"success with {MATCHED} labels [%]")
+            axes.set_xlabel(f"success with {MATCHED[world]} labels [%]")
         save_figure(figure, stem)
 
 

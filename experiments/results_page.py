@@ -171,7 +171,7 @@ def arms() -> list[list[str]]:
         for row in read_csv(DATA / "corrections_alone/success.csv")
     }
     base = success["turned", "base", "plain", 0]
-    for kind, name in (("offset", "`offset`"), ("dcoach", "deep COACH")):
+    for kind, name in (("calibration", "`calibration`"), ("offset", "`offset`"), ("dcoach", "deep COACH")):
         title = f"MJX `reach`, camera turned by 10 degrees, 20% of 100 answers wrong, {name}: success"
         rows.append(
             [title, f"{100 * success['turned', kind, 'wrong', 100]:.0f}%", f"{100 * base:.0f}%", MORE["corrections"]]
