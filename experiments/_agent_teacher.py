@@ -1,7 +1,7 @@
-"""Billiards whose teacher may be an agent: `--task.teacher RUN` names the folder of its run.
+"""Billiards whose teacher may be an agent, `--task.teacher RUN`, and whose shots Chipmunk may play, `--robot chipmunk`.
 
 The public code's teacher imitates an agent that was trained for long on raw coordinates; the shipped teachers search
-exactly. Named as `_agent_teacher:TASK` wherever a task is asked for, in the folder that holds this file or by a script
+exactly. RUN is the folder of that agent's run. Named as `_agent_teacher:TASK` wherever a task is asked for, in the folder that holds this file or by a script
 in it.
 """
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from _coarse_step import BODY
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -45,4 +46,6 @@ def _files(config: BilliardsConfig) -> dict[str, str]:
     return {} if (Path(config.teacher) / CONFIG).is_file() else BILLIARDS.files(config)
 
 
-TASK = dataclasses.replace(BILLIARDS, name="billiards_by_agents", teacher=make_teacher, files=_files)
+TASK = dataclasses.replace(
+    BILLIARDS, name="billiards_by_agents", bodies=(*BILLIARDS.bodies, BODY), teacher=make_teacher, files=_files
+)

@@ -5,7 +5,8 @@
     python experiments/paper_third.py --out FOLDER --report
 
 The preset `paper` to 3 million steps with 1,000 labels, 16 paired seeds. Then the same with refined uniform actions in
-guided episodes, with fits of up to 10,000 epochs, and with an agent as the teacher: train `teacher/raw` first.
+guided episodes, with fits of up to 10,000 epochs, and with an agent as the teacher: train `teacher/raw` first. Last, 8
+seeds with and without labels where Chipmunk plays the shots in steps of 0.02 s, as the public code's simulator does.
 """
 
 from __future__ import annotations
@@ -43,6 +44,12 @@ def third(run: str, kind: str, labels: tuple[int, ...], serves: str, **options: 
     return Piece("third", run, kind.partition(":")[0].strip("_"), (kind,), labels, SEEDS, settings, 20, serves)
 
 
+def in_coarse_steps(kind: str, labels: tuple[int, ...]) -> Piece:
+    """Half as many agents where Chipmunk plays: the processor plays a few hundred shots a second on each core."""
+    piece = third("raw", kind, labels, "a coarse step of simulation", robot="chipmunk")
+    return piece._replace(world="coarse", seeds=SEEDS // 2)
+
+
 PIECES = (
     third("raw", "none", (), "more seeds, farther"),
     third("raw", "relative", LABELS, "more seeds, farther"),
@@ -50,6 +57,8 @@ PIECES = (
     third("epochs", "relative", LABELS, "longer fits", **EPOCHS),
     Piece("teacher", "raw", "none", ("none",), (), 1, {**FULL, **RAW}, 25, "an agent of 10 million steps, the teacher"),
     third("by-an-agent", "relative", (500, 1_000), "an agent is the teacher", **BY_AN_AGENT),
+    in_coarse_steps("none", ()),
+    in_coarse_steps("relative", LABELS),
 )
 SMALL = OTHERS["smoke"]
 SCALES = {
@@ -60,7 +69,7 @@ SCALES = {
     ),
     "paper": Scale("what is reported", reported=True),
 }
-REPORT = {"third": ("--level-at", "3000000")}
+REPORT = {"third": ("--level-at", "3000000"), "coarse": ()}
 EXPERIMENT = Experiment("_agent_teacher:TASK", PIECES, SCALES, REPORT, folder="paper_third")
 
 

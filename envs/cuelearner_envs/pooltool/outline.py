@@ -1,10 +1,12 @@
-"""Inputs and outputs of shots in pooltool, in plain numbers."""
+"""Inputs of shots in pooltool, in plain numbers."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
+
+from cuelearner_envs.billiards.processes import Played
 
 
 class Outline(NamedTuple):
@@ -20,12 +22,8 @@ class Outline(NamedTuple):
     side_pockets: bool
     strike_speed: float  # of the cue ball, which leaves without spin [m/s]
 
+    def __call__(self, positions: np.ndarray, pocketed: np.ndarray, angles: np.ndarray) -> Played:
+        """Play shots in pooltool, one after another (`cuelearner_envs.billiards.processes.Engine`)."""
+        from cuelearner_envs.pooltool.game import play  # seconds to load: not where others play
 
-class Played(NamedTuple):
-    """Outcomes of shots."""
-
-    positions: np.ndarray  # (shots, balls, 2) at rest; of a pocketed ball without meaning [m]
-    pocketed: np.ndarray  # (shots, balls) bool, those from before included
-    duration: np.ndarray  # (shots,) [s]
-    events: np.ndarray  # (shots,) int
-    exhausted: np.ndarray  # (shots,) bool: halted after `game.MOST_EVENTS`
+        return play(self, positions, pocketed, angles)

@@ -11,9 +11,10 @@ import cuelearner_jax as cl
 from cuelearner_envs.billiards.config import BilliardsConfig
 from cuelearner_envs.billiards.config import make_environment as make_billiards
 from cuelearner_envs.billiards.environment import Balls
+from cuelearner_envs.billiards.foreign import ForeignBilliards
+from cuelearner_envs.billiards.processes import play_many
 from cuelearner_envs.billiards.teacher import NearbyTeacher
 from cuelearner_envs.pooltool import environment as foreign
-from cuelearner_envs.pooltool.processes import play_many
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.tasks import registry
 
@@ -60,7 +61,7 @@ def test_its_teacher_plays_shots_there_whatever_the_learned_one_thinks(monkeypat
     world = cl.make("billiards", robot="pooltool", teacher="learned")
     teacher = cl.teacher_of(world)
     assert isinstance(teacher, NearbyTeacher)
-    assert isinstance(teacher.env, foreign.PooltoolBilliards)
+    assert isinstance(teacher.env, ForeignBilliards)
     with pytest.raises(UserError, match="unknown robot 'pooltol', did you mean 'pooltool'"):
         cl.make("billiards", robot="pooltol")
 
@@ -79,7 +80,7 @@ def test_a_straight_shot_pockets_its_ball_in_both_engines(env):
 def test_a_lonely_ball_slides_rolls_and_rests_where_the_equations_say(env):
     """v^2 12 / (49 mu_s g) of sliding, then (5 v / 7)^2 / (2 mu_r g) of rolling."""
     start = np.array([[-0.4, 0.0], [0.4, 0.19], [0.4, -0.19], [0.0, 0.19]], np.float32)
-    slow = env.replace(outline=env.outline._replace(strike_speed=0.4))
+    slow = env.replace(outline=env.engine._replace(strike_speed=0.4))
     shot = slow.shot(state(start), jnp.float32(0.0))  # exactly along two cushions
     way = 0.4**2 * (12 / (49 * 0.2 * 9.81) + (5 / 7) ** 2 / (2 * 0.01 * 9.81))
     np.testing.assert_allclose(shot.positions[0], start[0] + [way, 0.0], atol=1e-5)
@@ -92,7 +93,7 @@ def test_spin_comes_from_the_cloth(env):
     """A ball that was hit full keeps rolling after it: on our table, without a cloth, the cue ball stops."""
     start = np.array([[-0.4, 0.0], [-0.1, 0.0], [0.4, 0.19], [0.4, -0.19]], np.float32)
     there, here = env.shot(state(start), jnp.float32(0.0)), make_billiards(CONFIG).shot(state(start), jnp.float32(0.0))
-    contact = -0.1 - 2 * env.outline.ball_radius
+    contact = -0.1 - 2 * env.engine.ball_radius
     assert abs(float(here.positions[0, 0]) - contact) < 1e-3
     assert float(there.positions[0, 0]) > contact + 0.02
 
@@ -107,7 +108,7 @@ def test_balls_never_overlap_nor_lie_beside_the_table(env):
         left = places[~out]
         assert (np.abs(left) < np.array([0.441, 0.221])).all()
         apart = np.linalg.norm(left[:, None] - left[None], axis=-1)[np.triu_indices(len(left), 1)]
-        assert (apart > 2 * env.outline.ball_radius - 1e-6).all()
+        assert (apart > 2 * env.engine.ball_radius - 1e-6).all()
     assert float(jnp.abs(shots.positions - states.positions).max()) > 0.1  # they were played
 
 
@@ -116,6 +117,6 @@ def test_balls_never_overlap_nor_lie_beside_the_table(env):
 def test_processes_play_the_same_shots(env):
     positions = np.repeat(LINE[None], 6, axis=0)
     angles = STRAIGHT + np.linspace(-0.1, 0.1, 6)
-    alone, shared = (play_many(env.outline, positions, np.zeros((6, 4), bool), angles, count) for count in (1, 2))
+    alone, shared = (play_many(env.engine, positions, np.zeros((6, 4), bool), angles, count) for count in (1, 2))
     for one, other in zip(alone, shared, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -1,4 +1,4 @@
-"""Shots shared out over processes: one of pooltool's takes some 10 ms of one core, and nothing of it runs in JAX."""
+"""Shots of another engine, shared out over processes: nothing of them runs in JAX."""
 
 from __future__ import annotations
 
@@ -6,14 +6,29 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
-from cuelearner_envs.pooltool.outline import Outline, Played
-
 PORTIONS = 4  # of the shots for each process, so that a long one holds up few
+
+
+class Played(NamedTuple):
+    """Outcomes of shots."""
+
+    positions: np.ndarray  # (shots, balls, 2) at rest; of a pocketed ball without meaning [m]
+    pocketed: np.ndarray  # (shots, balls) bool, those from before included
+    duration: np.ndarray  # (shots,) [s]
+    events: np.ndarray  # (shots,) int
+    exhausted: np.ndarray  # (shots,) bool: halted before the balls rested
+
+
+# Plays shots one after another: positions (shots, balls, 2) [m], pocketed (shots, balls) bool, angles (shots,) [rad] ->
+# outcomes. A value that can be pickled, compared and hashed.
+Engine = Callable[[np.ndarray, np.ndarray, np.ndarray], Played]
 
 
 def cores() -> int:
@@ -23,22 +38,16 @@ def cores() -> int:
 
 
 def play_many(
-    outline: Outline, positions: np.ndarray, pocketed: np.ndarray, angles: np.ndarray, processes: int
+    engine: Engine, positions: np.ndarray, pocketed: np.ndarray, angles: np.ndarray, processes: int
 ) -> Played:
-    """`game.play` of any number of shots; the same whatever the number of processes (0: one for each processor)."""
+    """Any number of an engine's shots; the same whatever the number of processes (0: one for each processor)."""
     count = processes or cores()
     if count == 1:
-        return _play(outline, positions, pocketed, angles)
+        return engine(positions, pocketed, angles)
     pieces = min(len(angles), PORTIONS * count)
     shares = (np.array_split(column, pieces) for column in (positions, pocketed, angles))
-    found = list(_pool(count).map(_play, [outline] * pieces, *shares))
+    found = list(_pool(count).map(engine, *shares))
     return Played(*(np.concatenate(column) for column in zip(*found, strict=True)))
-
-
-def _play(outline: Outline, positions: np.ndarray, pocketed: np.ndarray, angles: np.ndarray) -> Played:
-    from cuelearner_envs.pooltool.game import play  # seconds to load: not where others play
-
-    return play(outline, positions, pocketed, angles)
 
 
 @lru_cache(maxsize=1)
