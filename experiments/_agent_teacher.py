@@ -1,8 +1,8 @@
 """Billiards whose teacher may be an agent, `--task.teacher RUN`, and whose shots Chipmunk may play, `--robot chipmunk`.
 
 The public code's teacher imitates an agent that was trained for long on raw coordinates; the shipped teachers search
-exactly. RUN is the folder of that agent's run. Named as `_agent_teacher:TASK` wherever a task is asked for, in the folder that holds this file or by a script
-in it.
+exactly. RUN is the folder of that agent's run. Named as `_agent_teacher:TASK` wherever a task is asked for, in the
+folder that holds this file or by a script in it.
 """
 
 from __future__ import annotations

@@ -42,7 +42,11 @@ VARIED = {"wrong": (EVIDENCE, "relative"), "one_cue": (EVIDENCE, "relative"), "s
 LABELS, FETCH_LABELS, SEEDS, EPISODES = 100, 200, 8, 200
 JUDGED = 20  # episodes that judge where held-out answers cannot
 FETCH_BUDGET = 500  # of the agents that act in Fetch
-FETCHED = {"reach": "own_policy", "push_free": "stored"}  # runs whose finished policies are the agents alone
+FETCHED = {
+    "reach": "own_policy",
+    "push_free": "stored",
+    "pick": "stored",
+}  # runs whose finished policies are the agents alone
 
 
 NOWHERE: Options = {}
@@ -97,8 +101,7 @@ def _in_world(world: str) -> list[Corrected]:
 
 def _in_fetch(trained: str) -> list[Corrected]:
     """An agent of MJX there and in Fetch, and corrected in Fetch: as it is, and with a turned camera."""
-    skill = "reach" if trained == "reach" else "push"
-    plain: Options = {"task.skill": skill, "task.obstacle": False}
+    plain: Options = {"task.skill": trained.removesuffix("_free"), "task.obstacle": False}
     fetch: Options = {**plain, "robot": "fetch"}
     turned: Options = {**fetch, "scenario": "turned_camera"}
     source, world, labels = f"{trained}/{FETCHED[trained]}/relative", f"{trained}_fetch", (FETCH_LABELS,)

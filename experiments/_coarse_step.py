@@ -47,7 +47,7 @@ class Chipmunk(NamedTuple):
 
 @lru_cache(maxsize=2)
 def _opened(table: str, step: float) -> Any:
-    from pymunk_table import PymunkTable
+    from pymunk_table import PymunkTable  # pyright: ignore[reportMissingImports]
 
     return PymunkTable(getattr(Table, table)(), step)
 

@@ -231,8 +231,8 @@ def reached(rows: Sequence[dict[str, Any]]) -> list[float]:
 def compared(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Steps to the level for each variant, and their ratio to those of the agent alone with its 95% interval.
 
-    For the ratio a seed that never gets there counts with all of its steps: with such seeds among the unguided ones the
-    true ratio is smaller. The interval draws seeds of both, each by itself.
+    The ratio is over the steps that both have: a seed that does not get there within these counts with all of them.
+    With such seeds among the unguided ones the true ratio is smaller. The interval draws seeds of both, each by itself.
     """
     found, lines = dict(grouped(rows, "world", "run", "guidance", "labels")), []
     for names, own in found.items():
@@ -241,10 +241,8 @@ def compared(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         row |= {"steps": [step if np.isfinite(step) else None for step in at], "reached": int(np.isfinite(at).sum())}
         row["median"] = float(np.median(at)) if np.isfinite(np.median(at)) else None
         if alone is not None and alone is not own:
-            row["ratio"] = _ratio(
-                np.minimum(at, own[-1]["step"]),
-                np.minimum(reached(alone), alone[-1]["step"]),
-            )
+            last = min(own[-1]["step"], alone[-1]["step"])
+            row["ratio"] = _ratio(np.minimum(at, last), np.minimum(reached(alone), last))
         end = {name: own[-1][name] for name in ("step", "rewarded_steps", "mean", "low", "high")}
         lines.append({**row, "end": end})
     return lines

@@ -11,12 +11,13 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+from collections.abc import Sequence
 from operator import itemgetter
 from pathlib import Path
 
 import matplotlib
 import numpy as np
-from _pages import GREY, image, markdown, name_ends, new_figure, rendered
+from _pages import GREY, fold, image, markdown, name_ends, new_figure, rendered
 from _pieces import grouped
 from matplotlib.ticker import EngFormatter
 
@@ -33,21 +34,22 @@ AGENTS = {"reach": "`reach`, one agent", "push_free": "`push` without a post, 8 
 STEPS = (3_200, 6_400, 9_600, 12_800)
 
 
-TRAINED = ("reach", "reach_in_fetch", "push", "push_free")  # worlds of the table
+TRAINED = ("pick", "push", "push_in_fetch", "push_free")  # worlds of the table
+REACHED = ("reach", "reach_in_fetch")  # of the table behind a fold
 RUNS = {
     "alone": "SAC alone",
     "alone_10": "SAC alone, ten critics",
     "by_value": "{labels} {labelled}, compared by value",
     "acting": "{labels} {labelled}, compared while acting",
     "own_policy": "{labels} {labelled}, compared in training",
+    "shuffled": "control: {labels} shuffled answers, compared by value",
     "rlpd": "{labels} {labelled}, a policy of them",
     "stored": "{labels} {labelled}, corrected steps",
     "stored_random": "control: {labels} answers at random, corrected steps",
 }
 LABELLED = {"relative": "relative labels", "demonstration": "demonstrations"}
 HEURISTIC = "control: the script compared by value, no label"
-DRAWN = {"alone": "-", "stored": "-", "by_value": "--", "acting": "--"}  # runs that are drawn, with 500 labels
-SHOWN_STEPS = 16_000  # of reach; all curves are level by then
+DRAWN = {"alone": "-", "stored": "-", "acting": "--"}  # runs that are drawn, with 500 labels
 
 
 def studied(data: Path, world: str) -> dict[str, list[dict]]:
@@ -62,10 +64,10 @@ def run_name(row: dict) -> str:
     return RUNS[row["run"]].format(labels=row["labels"], labelled=LABELLED.get(row["guidance"], ""))
 
 
-def training(data: Path) -> str:
+def training(data: Path, worlds: Sequence[str]) -> str:
     """Return the table of steps to 80% success, with the ratio to the agent alone."""
     cells = []
-    for world in TRAINED:
+    for world in worlds:
         found = studied(data, world)
         named = itemgetter("run", "guidance", "labels")
         guides = {named(row): row["mean"] for row in found["guides"]}
@@ -73,8 +75,9 @@ def training(data: Path) -> str:
             ratio = "{:.2f} [{:.2f}, {:.2f}]".format(*row["ratio"]) if "ratio" in row else ""
             guide = guides.get(named(row))
             alone = "" if guide is None else f"{100 * guide:.0f}%"
-            end = f"{100 * row['end']['mean']:.0f}%"
-            cells.append([f"`{world}`, {run_name(row)}", alone, f"{row['median']:,.0f}", ratio, end])
+            end, last = f"{100 * row['end']['mean']:.0f}%", row["end"]["step"]
+            median = f"above {last:,}" if row["median"] is None else f"{row['median']:,.0f}"
+            cells.append([f"`{world}`, {run_name(row)}", alone, median, ratio, end])
     header = ["8 seeds", "guide alone", "steps to 80%, median", "of the steps alone", "success at the end"]
     return markdown(header, cells)
 
@@ -83,10 +86,9 @@ def draw_training(data: Path, stem: Path) -> None:
     """Draw success over steps, with labels and without."""
     with matplotlib.rc_context(STYLE):
         figure = new_figure(11, 3.8)
-        for axes, world in zip(figure.subplots(1, 2), ("reach", "push"), strict=True):
+        for axes, world in zip(figure.subplots(1, 2), ("push", "pick"), strict=True):
             rows = studied(data, world)["training"]
             ends = []
-            rows = [row for row in rows if world == "push" or row["step"] <= SHOWN_STEPS]
             for (run, guidance, labels), own in grouped(rows, "run", "guidance", "labels"):
                 if run not in DRAWN or labels == 100 or guidance == "heuristic":
                     continue
@@ -96,7 +98,12 @@ def draw_training(data: Path, stem: Path) -> None:
                 axes.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
                 axes.plot(steps, means, color=colour, linewidth=1.8, linestyle=DRAWN[run])
                 ends.append((means[-1], run_name(own[0]), colour))
-            axes.set(xlim=(0, steps[-1]), ylim=(0, 1.03), xlabel="environment steps of a seed", ylabel="success")
+            axes.set(
+                xlim=(0, max(row["step"] for row in rows)),
+                ylim=(0, 1.03),
+                xlabel="environment steps of a seed",
+                ylabel="success",
+            )
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.set_title(world, fontweight="bold", fontsize=11)
             name_ends(axes, ends)
@@ -160,7 +167,7 @@ def sections(data: Path, page: Path) -> dict[str, str]:
     """Return the sections of the page."""
     picture = image("success of agents in MJX and in Fetch", data / "transfer", page)
     curves = image("success of an arm over steps, with labels and without", data / "training", page)
-    study = f"{curves}\n\n{training(data)}"
+    study = f"{curves}\n\n{training(data, TRAINED)}\n\n{fold('The gripper alone', training(data, REACHED))}"
     return {"training": study, "transfer": f"{picture}\n\n{transfer(measured(data))}", "settings": settings(data)}
 
 

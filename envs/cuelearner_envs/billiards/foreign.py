@@ -44,9 +44,7 @@ class ForeignBilliards(Billiards, kw_only=True):
         return Shot(places.astype(jnp.float32), *rest)
 
 
-def _played(
-    engine: Engine, processes: int, positions: Array, pocketed: Array, angle: Array
-) -> tuple[np.ndarray, ...]:
+def _played(engine: Engine, processes: int, positions: Array, pocketed: Array, angle: Array) -> tuple[np.ndarray, ...]:
     """Shots with any leading axes."""
     leading, balls = np.shape(angle), np.shape(pocketed)[-1]
     found = play_many(

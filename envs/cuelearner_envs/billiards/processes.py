@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 PORTIONS = 4  # of the shots for each process, so that a long one holds up few
@@ -57,7 +58,8 @@ def _pool(count: int) -> ProcessPoolExecutor:
 
 
 def _attend() -> None:
-    """An interrupt is for the process that waits, which then ends these; and none of them outlives it."""
+    """An interrupt is for the process that waits, which then ends these; none of them outlives it or takes its GPU."""
+    jax.config.update("jax_platforms", "cpu")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
