@@ -124,14 +124,10 @@ def billiards(rows: Sequence[Row], folder: Path, out: Output) -> str:
     whole = whole_of(rows, LEAST)
     if whole is None:
         return ""
-    tables, curves, gains = {}, {}, []
-    for world in (*BOUNDS_DEG, UNCHANGED):
-        known = lines(rows, world, least=LEAST)
-        if len(known) < (2 if world == UNCHANGED else 1):  # in the unchanged world the other methods are a control
-            continue
-        tables[world] = world_table(rows, known, whole, world)
+    tables, curves, gains = world_tables(rows, whole, LEAST), {}, []
+    for world in tables:
         if world != UNCHANGED:
-            curves[world] = curve_points(known, "reward", whole)
+            curves[world] = curve_points(lines(rows, world, least=LEAST), "reward", whole)
             gains += [[world, *cells] for cells in gain_cells(curves[world])]
     parts = []
     if any(curves.values()):
@@ -145,6 +141,29 @@ def billiards(rows: Sequence[Row], folder: Path, out: Output) -> str:
     original = f"{len(whole.bases)} base agents earn {spread(whole.columns['reward'])} a shot in the unchanged world."
     parts.append(f"{original} {out.links(*links)}")
     return "\n\n".join(parts)
+
+
+def world_tables(rows: Sequence[Row], whole: Line, least: float) -> dict[str, Table]:
+    """Return the tables of the worlds that were measured; in the unchanged one the other methods are a control."""
+    known = {world: lines(rows, world, least=least) for world in (*BOUNDS_DEG, UNCHANGED)}
+    return {
+        world: world_table(rows, own, whole, world)
+        for world, own in known.items()
+        if len(own) >= (2 if world == UNCHANGED else 1)
+    }
+
+
+def with_label_seeds(data: Path, out: Output) -> str:
+    """Return the section of eight billiards agents trained anew, four label seeds each."""
+    rows = read(data / "anew" / "billiards")
+    whole = whole_of(rows, 0.0)
+    if whole is None:
+        return ""
+    tables = world_tables(rows, whole, 0.0)
+    header, cells = joined(tables)
+    told = f"The agents earn {spread(whole.columns['reward'])} a shot in the unchanged world. Table:"
+    link = out.link("billiards_anew", "all rows, rewards and models used", header, cells)
+    return f"{side_by_side(tables, 'of the original [%]')}\n\n{told}\n{link}."
 
 
 def world_table(rows: Sequence[Row], known: Sequence[Line], whole: Line, world: str) -> Table:
@@ -377,6 +396,7 @@ def sections(data: Path, page: Path) -> dict[str, str]:
             found[name] = part(rows, data / task, out)
         compared += settings(rows, "reward" if task == "billiards" else "success", "paper")
     compared += settings(read(data / "cpu" / "navigation"), "success", "cpu")
+    found["label-seeds"] = with_label_seeds(data, out)
     found["look-ahead"] = with_look_ahead(data, out)
     found["two-cores"] = on_two_cores(data, out)
     if compared:
