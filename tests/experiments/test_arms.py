@@ -115,6 +115,9 @@ def test_the_table_counts_the_seeds_that_reach_the_level(study):
     assert "0.733 [" in line
     assert "at 200; 2 of 3, median step 167" in line
     assert "3 of 3, median step 100; 0.64 [" in other
+    stopped = [row for row in faster if row["step"] == 100]
+    ratio = study.compared([*rows, *stopped])[-1]["ratio"]
+    assert ratio == [1.0, 1.0, 1.0]  # over 100 steps all three needed as many, or more, with labels and without
 
 
 @pytest.mark.long

@@ -6,11 +6,15 @@ import numpy as np
 import paper_third
 import probes
 import pytest
-from _agent_teacher import AgentTeacher
+from _agent_teacher import TASK, AgentTeacher
+from _coarse_step import STEP, Chipmunk
 from _pieces import sweep_command
 
+from cuelearner_envs.billiards.config import BilliardsConfig
+from cuelearner_envs.billiards.table import Table
 from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry
 from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.spaces.directions import evenly_spaced
@@ -58,3 +62,25 @@ def test_an_agent_means_its_own_action():
             return -obs
 
     np.testing.assert_array_equal(AgentTeacher(Agent()).best_action(None, OBS[1]), -OBS[1])
+
+
+def test_chipmunk_plays_what_is_on_the_table():
+    from pymunk_table import PymunkTable, scenes
+
+    places, angles = scenes(Table.regulation(), 3, 0)
+    pocketed = np.array([[False] * 4, [False, True, False, False], [False, False, True, True]])
+    played = Chipmunk("regulation", STEP)(places.astype(np.float32), pocketed, angles)
+    game = PymunkTable(Table.regulation(), STEP)
+    for place, out, angle, rests, fell, lasted in zip(places, pocketed, angles, *played[:3], strict=True):
+        own = game.play(place[~out].astype(np.float32), float(angle))
+        np.testing.assert_allclose(rests[~out], own[0], atol=1e-6)
+        np.testing.assert_array_equal(fell[~out], own[1])
+        assert fell[out].all()
+        assert lasted == pytest.approx(own[2])
+
+
+def test_chipmunk_is_a_body_of_the_study_and_refuses_a_tilt():
+    there = TASK.on("chipmunk")
+    assert there.environment(BilliardsConfig("regulation")).engine == Chipmunk("regulation", 0.02)
+    with pytest.raises(UserError, match="the table in Chipmunk is level: leave out --task"):
+        there.environment(BilliardsConfig(acceleration=(0.0, 0.005)))
