@@ -39,7 +39,7 @@ def test_the_engine_decides_where_balls_rest_and_pocketed_ones_stand_beside_the_
     shots = jax.jit(jax.vmap(jax.vmap(lambda angle: env_of(Still()).shot(state, angle))))(angles)
     np.testing.assert_array_equal(shots.pocketed[..., 1], [[True, False], [True, False]])
     np.testing.assert_array_equal(shots.pocketed[..., 2], True)  # from before
-    np.testing.assert_allclose(shots.positions[0, 1, :2], PLACES[:2] + [0.01, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(shots.positions[0, 1, :2], PLACES[:2] + np.array([0.01, 0.0]), rtol=1e-6)
     np.testing.assert_allclose(shots.positions[0, 0, 1], parking(OWN.table)[1])
     assert shots.duration.shape == (2, 2)
     assert float(shots.duration[0, 0]) == 2.0
