@@ -30,7 +30,11 @@ PLACES = {
     "fetch_turned": "in Fetch, camera turned by 10 degrees",
     "fetch_turned_calibrated": "the same world, after 200 labels",
 }
-AGENTS = {"reach": "`reach`, one agent", "push_free": "`push` without a post, 8 agents"}
+AGENTS = {
+    "reach": "`reach`, one agent",
+    "push_free": "`push` without a post, 8 agents",
+    "pick": "`pick`, 8 agents",
+}
 STEPS = (3_200, 6_400, 9_600, 12_800)
 
 
@@ -114,7 +118,10 @@ def measured(data: Path) -> dict[str, dict[str, list[float]]]:
     """Return the success of each skill's agents in each place: mean, and ends of the interval over agents."""
     found: dict[str, dict[str, list[float]]] = {}
     for skill, place in itertools.product(AGENTS, PLACES):
-        each = json.loads((data / f"{skill}_{place}.json").read_text())["rows"][0]["success"]
+        file = data / f"{skill}_{place}.json"
+        if not file.exists():  # not run
+            continue
+        each = json.loads(file.read_text())["rows"][0]["success"]
         interval = mean_interval(np.array(each, float)).tolist() if len(each) > 1 else [each[0]] * 3
         found.setdefault(skill, {})[place] = interval
     return found
@@ -122,7 +129,10 @@ def measured(data: Path) -> dict[str, dict[str, list[float]]]:
 
 def transfer(found: dict[str, dict[str, list[float]]]) -> str:
     """Return the table of agents in MJX and in Fetch."""
-    cells = [[told, *(_percent(found[skill][place]) for skill in AGENTS)] for place, told in PLACES.items()]
+    cells = [
+        [told, *(_percent(found[skill][place]) if place in found[skill] else "not run" for skill in AGENTS)]
+        for place, told in PLACES.items()
+    ]
     return markdown(["success [%]", *AGENTS.values()], cells)
 
 
@@ -146,15 +156,17 @@ def settings(data: Path) -> str:
 def draw(found: dict[str, dict[str, list[float]]], stem: Path) -> None:
     """Draw the success of both skills' agents in every place."""
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(11, 2.4)
+        figure = new_figure(11, 2.6)
         for axes, (skill, told) in zip(figure.subplots(1, len(AGENTS), sharey=True), AGENTS.items(), strict=True):
             for row, place in enumerate(PLACES):
+                if place not in found[skill]:
+                    continue
                 mean, low, high = (100 * value for value in found[skill][place])
                 colour = colour_of("calibration") if place.endswith("calibrated") else GREY
                 axes.barh(row, mean, color=colour, xerr=[[mean - low], [high - mean]], ecolor="0.25")
                 axes.text(max(mean, high) + 2, row, f"{mean:.0f}%", va="center", fontsize=9)
             axes.set_yticks(range(len(PLACES)), list(PLACES.values()))
-            axes.set_title(told.replace("`", ""), fontweight="bold", fontsize=11)
+            axes.set_title(told.replace("`", "").replace(", ", "\n"), fontweight="bold", fontsize=11)
             axes.set(xlim=(0, 115), xlabel="success [%]")
             axes.set_xticks(range(0, 101, 20))
             axes.grid(visible=False, axis="y")
