@@ -180,9 +180,15 @@ def arms() -> list[list[str]]:
         json.loads((DATA / f"arms/reach_fetch_turned{end}.json").read_text())["rows"][0]["success"][0]
         for end in ("_calibrated", "")
     ]
-    steps = {(row["run"], row["labels"]): row["median"] for row in arms_page.studied(DATA / "arms", "reach")["steps"]}
-    title = "MJX `reach`, 100 relative labels: steps to 80% success (no gain)"
-    rows.append([title, f"{steps['by_value', 100]:,.0f}", f"{steps['alone', 0]:,.0f}", MORE["arms"]])
+    for skill, run, labels, told in (
+        ("pick", "stored", 500, "500 relative labels correct executed steps"),
+        ("push", "stored", 100, "100 relative labels correct executed steps"),
+        ("reach", "by_value", 100, "100 relative labels, no gain"),
+    ):
+        studied = arms_page.studied(DATA / "arms", skill)["steps"]
+        steps = {(row["run"], row["labels"]): row["median"] for row in studied if row["guidance"] != "demonstration"}
+        title = f"MJX `{skill}`, {told}: steps to 80% success"
+        rows.append([title, f"{steps[run, labels]:,.0f}", f"{steps['alone', 0]:,.0f}", MORE["arms"]])
     title = "An MJX agent in Fetch, camera turned by 10 degrees, 200 labels: success"
     rows.append([title, *(f"{100 * value:.0f}%" for value in turned), MORE["arms"]])
     return rows
