@@ -163,7 +163,8 @@ def with_label_seeds(data: Path, out: Output) -> str:
     header, cells = joined(tables)
     told = f"The agents earn {spread(whole.columns['reward'])} a shot in the unchanged world. Table:"
     link = out.link("billiards_anew", "all rows, rewards and models used", header, cells)
-    return f"{side_by_side(tables, 'of the original [%]')}\n\n{told}\n{link}."
+    text = f"{side_by_side(tables, 'of the original [%]')}\n\n{told}\n{link}."
+    return fold("Eight agents trained anew, four label seeds each", text)
 
 
 def world_table(rows: Sequence[Row], known: Sequence[Line], whole: Line, world: str) -> Table:

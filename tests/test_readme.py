@@ -73,14 +73,16 @@ def test_success_in_rooms():
     assert without == f"{success('none'):.1f}%"
 
 
-def test_steps_of_navigation_and_labels_worth_as_much():
-    report = DATA / "bootstrapping/clutter/report"
-    with (report / "efficiency.csv").open() as file:
-        found = {(row["guidance"], row["labels"]): row for row in csv.DictReader(file) if row["run"] == "frame"}
-    labelled, without = row("steps to 90% success")[1:3]
-    assert labelled == f"100 labels: {round(float(found['relative', '100']['steps_to_level']), -3):,.0f}"
-    assert without == f"{float(found['none', '0']['steps_to_level_above']):,.0f} are not enough"
-    with (report / "equal_area.csv").open() as file:
+def test_steps_of_an_arm_that_learns_to_pick():
+    steps = json.loads((DATA / "arms/training_pick.json").read_text())["steps"]
+    medians = {(row["run"], row["guidance"], row["labels"]): f"{round(row['median'], -3):,.0f}" for row in steps}
+    labelled, without = row("steps to 80% success of an arm")[1:3]
+    assert labelled == f"500 labels: {medians['stored', 'relative', 500]}"
+    assert without == medians["alone", "none", 0]
+
+
+def test_labels_worth_as_much_in_navigation():
+    with (DATA / "bootstrapping/clutter/report/equal_area.csv").open() as file:
         kind = ("frame", "relative", "100")
         own = [row for row in csv.DictReader(file) if (row["run"], row["reference"], row["reference_labels"]) == kind]
     worth = {row["guidance"]: row for row in own}

@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from typing import NamedTuple
+
+import numpy as np
 
 from cuelearner_envs.billiards.config import BilliardsConfig
 from cuelearner_envs.billiards.config import make_environment as make_billiards
 from cuelearner_envs.billiards.foreign import ForeignBilliards
+from cuelearner_envs.billiards.processes import Played
 from cuelearner_envs.billiards.table import CORNER_GAP, Table
 from cuelearner_envs.pooltool.outline import Outline
 from cuelearner_jax.errors import UserError
 
 # With it a free ball comes to rest after 1.3 m, as on our table, where it leaves with 0.5 m/s [m/s].
 STRIKE_SPEED = 0.7
+
+
+class Pooltool(NamedTuple):
+    """Pooltool's physics on a table (`cuelearner_envs.billiards.processes.Engine`)."""
+
+    outline: Outline
+
+    def __call__(self, positions: np.ndarray, pocketed: np.ndarray, angles: np.ndarray) -> Played:
+        """Play shots one after another."""
+        from cuelearner_envs.pooltool.game import play  # seconds to load: not where others play
+
+        return play(self.outline, positions, pocketed, angles)
 
 
 def make_environment(config: BilliardsConfig) -> ForeignBilliards:
@@ -31,7 +47,7 @@ def make_environment(config: BilliardsConfig) -> ForeignBilliards:
         observation_bias=plain.observation_bias,
         max_shots=plain.max_shots,
         mirrors=plain.mirrors,
-        engine=outline_of(getattr(Table, config.table)()),
+        engine=Pooltool(outline_of(getattr(Table, config.table)())),
     )
 
 

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
-from cuelearner_envs.billiards.processes import Played
-
 
 class Outline(NamedTuple):
     """A table and a strike, in numbers; as `billiards.Table` has them."""
@@ -21,9 +17,3 @@ class Outline(NamedTuple):
     pocket_margin: float  # how far outside a ball's centre is pocketed [m]
     side_pockets: bool
     strike_speed: float  # of the cue ball, which leaves without spin [m/s]
-
-    def __call__(self, positions: np.ndarray, pocketed: np.ndarray, angles: np.ndarray) -> Played:
-        """Play shots in pooltool, one after another (`cuelearner_envs.billiards.processes.Engine`)."""
-        from cuelearner_envs.pooltool.game import play  # seconds to load: not where others play
-
-        return play(self, positions, pocketed, angles)

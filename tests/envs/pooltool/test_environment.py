@@ -80,7 +80,7 @@ def test_a_straight_shot_pockets_its_ball_in_both_engines(env):
 def test_a_lonely_ball_slides_rolls_and_rests_where_the_equations_say(env):
     """v^2 12 / (49 mu_s g) of sliding, then (5 v / 7)^2 / (2 mu_r g) of rolling."""
     start = np.array([[-0.4, 0.0], [0.4, 0.19], [0.4, -0.19], [0.0, 0.19]], np.float32)
-    slow = env.replace(outline=env.engine._replace(strike_speed=0.4))
+    slow = env.replace(engine=foreign.Pooltool(env.engine.outline._replace(strike_speed=0.4)))
     shot = slow.shot(state(start), jnp.float32(0.0))  # exactly along two cushions
     way = 0.4**2 * (12 / (49 * 0.2 * 9.81) + (5 / 7) ** 2 / (2 * 0.01 * 9.81))
     np.testing.assert_allclose(shot.positions[0], start[0] + [way, 0.0], atol=1e-5)
@@ -93,7 +93,7 @@ def test_spin_comes_from_the_cloth(env):
     """A ball that was hit full keeps rolling after it: on our table, without a cloth, the cue ball stops."""
     start = np.array([[-0.4, 0.0], [-0.1, 0.0], [0.4, 0.19], [0.4, -0.19]], np.float32)
     there, here = env.shot(state(start), jnp.float32(0.0)), make_billiards(CONFIG).shot(state(start), jnp.float32(0.0))
-    contact = -0.1 - 2 * env.engine.ball_radius
+    contact = -0.1 - 2 * env.engine.outline.ball_radius
     assert abs(float(here.positions[0, 0]) - contact) < 1e-3
     assert float(there.positions[0, 0]) > contact + 0.02
 
@@ -108,7 +108,7 @@ def test_balls_never_overlap_nor_lie_beside_the_table(env):
         left = places[~out]
         assert (np.abs(left) < np.array([0.441, 0.221])).all()
         apart = np.linalg.norm(left[:, None] - left[None], axis=-1)[np.triu_indices(len(left), 1)]
-        assert (apart > 2 * env.engine.ball_radius - 1e-6).all()
+        assert (apart > 2 * env.engine.outline.ball_radius - 1e-6).all()
     assert float(jnp.abs(shots.positions - states.positions).max()) > 0.1  # they were played
 
 
