@@ -7,6 +7,7 @@ has is in `Environment`, what it may have in `OptionalMembers`; no module asks f
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -214,15 +215,32 @@ class Spaces(NamedTuple):
 def spaces_of(env: Any) -> Spaces:
     """Return an environment's spaces; shapes in place of its arrays will do."""
     spaces = Spaces(env.obs_size, actions_of(env))
-    # New functions for each call, which share no trace: JAX 0.10 and 0.12 take dataclasses of different classes with
-    # equal fields for the same tree, and now and then give one class the trace of another.
     obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
+    features, aims = _traced(_classes(jax.tree.structure(env)))
     if offers(env, "features"):
-        seen = jax.eval_shape(lambda env, obs, action: env.features(obs, action), env, obs, action)
+        seen = jax.eval_shape(features, env, obs, action)
         spaces = spaces._replace(features=(seen.own.shape[-1], seen.turned.shape[-1]))
     if offers(env, "aims"):
-        spaces = spaces._replace(aims=jax.eval_shape(lambda env, obs: env.aims(obs), env, obs).features.shape[-1])
+        spaces = spaces._replace(aims=jax.eval_shape(aims, env, obs).features.shape[-1])
     return spaces
+
+
+def _classes(structure: Any) -> tuple[Any, ...]:
+    """Return the class of every node of a tree."""
+    data = structure.node_data()
+    inner = (kind for child in structure.children() for kind in _classes(child))
+    return () if data is None else (data[0], *inner)
+
+
+@lru_cache(maxsize=64)
+def _traced(classes: tuple[Any, ...]) -> tuple[Callable[..., Features], Callable[..., Aims]]:
+    """Return the functions that JAX traces for the shapes of `features` and of `aims`.
+
+    JAX keeps traces by function and tree. There are functions for each tuple of classes, since JAX 0.10 and 0.12 take
+    dataclasses of different classes with equal fields for the same tree, and now and then give one class the trace of
+    another.
+    """
+    return lambda env, obs, action: env.features(obs, action), lambda env, obs: env.aims(obs)
 
 
 def symmetries_of(env: Any) -> int:

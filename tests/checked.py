@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 from typing import TypeVar
 
 from beartype import BeartypeConf, beartype
@@ -22,7 +23,18 @@ def checked(function: Function) -> Function:
     """Return the function with its arguments and result checked at every call.
 
     Constructors are left alone: JAX rebuilds pytrees with whatever stands for their leaves (shapes, axes, None), which
-    is not what their fields are declared to hold.
+    is not what their fields are declared to hold. The checks are written at the first call: a process calls a part of
+    the functions that it imports, and beartype needs milliseconds for each.
     """
-    left_alone = function.__name__ == "__init__" or function.__module__.startswith(DOORS)
-    return function if left_alone else beartype(function, conf=_conf)
+    if function.__name__ == "__init__" or function.__module__.startswith(DOORS):
+        return function
+    checks: list[Function] = []
+
+    @wraps(function)
+    def checking(*arguments, **named):
+        __tracebackhide__ = True
+        if not checks:
+            checks.append(beartype(function, conf=_conf))
+        return checks[0](*arguments, **named)
+
+    return checking

@@ -42,13 +42,24 @@ def lies_in(path, places):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """Freeze imported objects, so that the garbage collector never traverses them during collection and tests."""
+    """Freeze imported objects, so that the garbage collector never traverses them during collection and tests.
+
+    Nor does it look at the programs that tests trace as often as by default, which took a twelfth of the time.
+    """
     gc.disable()
     try:
         return (yield)
     finally:
         gc.freeze()
+        gc.set_threshold(20_000, 20, 20)
         gc.enable()
+
+
+@pytest.fixture(scope="module")
+def garbage_of_its_own():
+    """For a file whose tests collect garbage often: what other files left is frozen and not traversed each time."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_addoption(parser):

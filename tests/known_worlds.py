@@ -1,5 +1,7 @@
 """Cheap worlds whose truth is known: a policy written by hand, and people who know what changed."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,15 +29,22 @@ class Yard(WholeObservations, struct.PyTreeNode):
 
 def situations(key, policy, count):
     """Random ones."""
+    return None, drawn(key, count)
+
+
+@partial(jax.jit, static_argnums=1)
+def drawn(key, count):
+    """Observations of random situations."""
     k_place, k_wind, k_beams = jax.random.split(key, 3)
     places = jax.random.uniform(k_place, (count, 4), minval=-0.4, maxval=0.4)
     wind = retract(jax.random.normal(k_wind, (count, 2)))
     angle = jnp.arange(BEAMS) * (2 * jnp.pi / BEAMS)
     centre = jax.random.uniform(k_beams, (count, 1), maxval=2 * jnp.pi)
     beams = jnp.exp(2 * (jnp.cos(angle[None] - centre) - 1))
-    return None, jnp.concatenate([places, wind, beams], -1)
+    return jnp.concatenate([places, wind, beams], -1)
 
 
+@jax.jit
 def aims(obs):
     """Toward a point between ball and pocket, blown aside by the wind, away from what is near: a direction."""
     ball, pocket, wind, beams = obs[:, :2], obs[:, 2:4], obs[:, 4:6], obs[:, 6:]
@@ -45,6 +54,7 @@ def aims(obs):
     return retract(toward)
 
 
+@jax.jit
 def grips(obs):
     """Three numbers of a box."""
     ball, wind = obs[:, :2], obs[:, 4:6]
@@ -56,14 +66,15 @@ def grips(obs):
 def person(space, eps, meant, wrong=0.0):
     """Someone who answers about actions by what is meant in a situation: function (observations) -> actions."""
 
-    def answers(key, states, obs, actions):
-        away = space.log(actions, meant(obs))
+    @jax.jit
+    def told_of(key, actions, best):
+        away = space.log(actions, best)
         told = jnp.where(jnp.abs(away) <= eps / 2, 0.0, jnp.sign(away))
         k_wrong, k_which = jax.random.split(key)
         other = jax.random.randint(k_which, told.shape, -1, 2).astype(told.dtype)
         return jnp.where(jax.random.bernoulli(k_wrong, wrong, told.shape), other, told)
 
-    return answers
+    return lambda key, states, obs, actions: told_of(key, actions, meant(obs))
 
 
 def changed(obs, shift=(0.0, 0.0), lidar_deg=0.0, wind_deg=0.0):

@@ -40,10 +40,10 @@ from cuelearner_jax.spaces import directions
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 OBS = directions.evenly_spaced(40)
 STATES = OBS  # the bandit's state is what it shows
-BEST = directions.rotate(OBS, 0.6)
+BEST = jax.jit(directions.rotate)(OBS, 0.6)
 KEY = jax.random.key(5)
 Q = q_network(probes.AGENT.q_layers)
-AGENT = Agent(Q.init(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.FUNCTIONS)
+AGENT = Agent(jax.jit(Q.init)(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.FUNCTIONS)
 LANES, MESH = 4, lane_mesh()
 
 

@@ -60,15 +60,19 @@ def found():
     return by_model.adapt(of(), LANES, dataclasses.replace(JUDGING, every=10), EXPERT, mesh=MESH)
 
 
-def degrees(turn):
-    return np.degrees(np.asarray(turn))
+# In one program each, as all lanes have the same shapes.
+distance = jax.jit(DIRECTIONS.distance)
+acted = jax.jit(lambda policy, obs: policy.act(jax.random.key(0), None, obs))
+
+
+def apart(one, other):
+    """How far actions lie from others [deg]."""
+    return np.degrees(np.asarray(distance(one, other)))
 
 
 def errors(policy, lane):
     """How far a lane's actions lie from the best ones, over all observations [deg]."""
-    return degrees(
-        DIRECTIONS.distance(policy.lane(lane).act(jax.random.key(0), None, OBS), directions.rotate(OBS, 0.6))
-    )
+    return apart(acted(policy.lane(lane), OBS), directions.rotate(OBS, 0.6))
 
 
 def test_lanes_are_every_combination_or_one_each():
@@ -97,13 +101,12 @@ def test_the_bound_is_never_exceeded():
     policy, labels = found().policy(ENV), found().labels
     for lane, bound in enumerate(LANES.bound_deg):
         base = Shifted(jnp.array(SHIFTS[LANES.base[lane]]))
-        own = base.act(None, None, OBS)
-        moved = degrees(DIRECTIONS.distance(own, policy.lane(lane).act(jax.random.key(0), None, OBS)))
+        moved = apart(acted(base, OBS), acted(policy.lane(lane), OBS))
         assert moved.max() <= bound + 1e-3
         if bound == 10:  # too near to be right: as far as it may go
             np.testing.assert_allclose(moved, bound, atol=0.5)
         rows = jax.tree.map(lambda leaf, lane=lane: leaf[lane][labels.valid[lane]], labels)
-        away = degrees(DIRECTIONS.distance(base.act(None, None, rows.obs), rows.action))
+        away = apart(acted(base, rows.obs), rows.action)
         assert away.max() <= bound + 1e-3
         assert away[:10].max() < 1e-3  # the first round is about its own actions
         assert away[10:].max() > 4.0  # later ones about refined ones
@@ -114,10 +117,10 @@ def test_the_bound_is_never_exceeded():
     policy = of().policy(wild)
     everywhere = directions.evenly_spaced(100)
     for lane, bound in enumerate(LANES.bound_deg):
-        own = Shifted(jnp.array(SHIFTS[LANES.base[lane]])).act(None, None, everywhere)
-        moved = DIRECTIONS.distance(own, policy.lane(lane).act(jax.random.key(0), None, everywhere))
-        assert degrees(moved).max() <= bound + 1e-3
-        assert degrees(moved).max() > bound / 2
+        base = Shifted(jnp.array(SHIFTS[LANES.base[lane]]))
+        moved = apart(acted(base, everywhere), acted(policy.lane(lane), everywhere))
+        assert moved.max() <= bound + 1e-3
+        assert moved.max() > bound / 2
 
 
 def _blown(leaf):

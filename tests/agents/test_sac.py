@@ -172,6 +172,7 @@ def test_normalised_layers_bound_a_critics_value_of_any_action():
 GUIDED = np.arange(16) % 5 == 0  # steps 0, 5, 10, 15
 
 
+@cache
 def memory():
     """The first steps of sixteen walks, whose actions are their numbers."""
     buffer, keys = buffer_for(ENV, True), jax.random.split(KEY, 16)
@@ -184,13 +185,10 @@ def memory():
     return Memory(ENV, buffer, rows, jnp.array(16), 16, True, counts)
 
 
-MEMORY = memory()
-
-
 @pytest.mark.parametrize(("share", "count"), [(0.0, 0), (0.25, 2), (0.5, 4), (1.0, 8)])
 def test_a_minibatch_has_its_share_of_guided_steps(share, count):
     for number in range(4):
-        (batch,) = MEMORY.batches(jax.random.key(number), 8, guided_share=jnp.float32(share))
+        (batch,) = memory().batches(jax.random.key(number), 8, guided_share=jnp.float32(share))
         drawn = np.asarray(batch.action)[:, 0].astype(int)
         assert [n % 5 == 0 for n in drawn] == [True] * count + [False] * (8 - count)
 
@@ -198,9 +196,10 @@ def test_a_minibatch_has_its_share_of_guided_steps(share, count):
 @cache
 def update_of(still):
     """The compiled update of options without their floats."""
+    kept = memory()
     return jax.jit(
         lambda options, scalars, params, rest: agent_of(still).update(
-            ENV, options, scalars, jnp.array(1), params, rest, MEMORY, KEY
+            ENV, options, scalars, jnp.array(1), params, rest, kept, KEY
         )
     )
 

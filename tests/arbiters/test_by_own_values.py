@@ -19,7 +19,7 @@ OBS = jnp.stack([jnp.linspace(-1, 1, 9), jnp.zeros(9)], -1)
 BASE = BOX.sample(jax.random.key(1), (9,))
 OPTIONS = by_value.Config()
 HEURISTIC, NONE = (registry.make(kind, probes.SIZES, ENV) for kind in ("heuristic", "none"))
-GUIDED = np.asarray(jax.vmap(ENV.heuristic)(OBS))
+GUIDED = np.asarray(jax.jit(jax.vmap(ENV.heuristic))(OBS))
 
 
 class Fond:

@@ -21,7 +21,7 @@ FAMILY, POLICY = (
 )
 TURN = FAMILY[-1:]
 EPS = float(np.deg2rad(EPS_DEG))
-TURNED = lambda obs: rotate(aims(obs), -jnp.deg2rad(30.0))  # noqa: E731
+TURNED = jax.jit(lambda obs: rotate(aims(obs), -jnp.deg2rad(30.0)))
 SHIFTED = lambda obs: aims(changed(obs, shift=(0.05, -0.03)))  # noqa: E731
 
 
@@ -79,7 +79,7 @@ def test_no_change_is_told_and_nothing_is_corrected():
 
 
 def test_a_change_outside_the_family_is_told_and_nothing_is_corrected():
-    side = lambda obs: rotate(aims(obs), jnp.where(jnp.sin(40 * obs[:, 1]) > 0, 0.5, -0.5))  # noqa: E731
+    side = jax.jit(lambda obs: rotate(aims(obs), jnp.where(jnp.sin(40 * obs[:, 1]) > 0, 0.5, -0.5)))
     found = asked(side, family=FAMILY[1:])
     assert (found.verdict, found.changes) == (UNEXPLAINED, ())
     assert found.confirmed is not None

@@ -42,11 +42,14 @@ def situations(key, policy, count):
     return None, jax.random.uniform(key, (count, 2), minval=-1.5, maxval=1.5)
 
 
+chances = jax.jit(log_chances)
+
+
 def asked(space, change, says, labels):
     """What calibration finds where a teacher, who speaks of such cues, wants actions changed by a constant."""
     eps = 1.0 if space.grain else 0.04
     policy = jax.jit(partial(acts, space))
-    meant = lambda obs: space.exp(policy(obs), jnp.array(change))  # noqa: E731
+    meant = jax.jit(lambda obs: space.exp(policy(obs), jnp.array(change)))
     scalars = dataclasses.replace(Scalars(), eps_deg=eps, says=says)
 
     @jax.jit
@@ -70,8 +73,9 @@ def asked(space, change, says, labels):
         eps_deg=eps,
     )
     obs = situations(jax.random.key(9), None, 100)[1]
-    left = np.abs(space.log(found.policy.act(jax.random.key(0), None, obs), meant(obs))).mean()
-    return found.verdict, left / np.abs(space.log(policy(obs), meant(obs))).mean()
+    log = jax.jit(space.log)
+    left = np.abs(log(found.policy.act(jax.random.key(0), None, obs), meant(obs))).mean()
+    return found.verdict, left / np.abs(log(policy(obs), meant(obs))).mean()
 
 
 CHANGES = {1: [0.15], 3: [0.15, -0.1, 0.0], 7: [0.15, 0.0, -0.1, 0.0, 0.1, 0.0, -0.05]}
@@ -100,10 +104,10 @@ def test_a_change_by_two_steps_of_a_row_of_choices_is_found():
 def test_an_answer_is_as_likely_as_what_it_says_of_the_cues_it_speaks_of():
     offset, spread = jnp.array([[1.0, -3.0, 0.2]]), jnp.zeros((1, 3))
     answer, doubt = jnp.array([[1.0, UNSAID, UNSAID]]), jnp.zeros(1)
-    alone = log_chances(offset[:, :1], spread[:, :1], answer[:, :1], jnp.ones((1, 1)), doubt)
-    told = log_chances(offset, spread, answer, jnp.array([[1.0, 0.0, 0.0]]), doubt)
+    alone = chances(offset[:, :1], spread[:, :1], answer[:, :1], jnp.ones((1, 1)), doubt)
+    told = chances(offset, spread, answer, jnp.array([[1.0, 0.0, 0.0]]), doubt)
     np.testing.assert_allclose(told, alone, rtol=1e-5)
-    far = log_chances(offset.at[0, 1:].set(9.0), spread, answer, jnp.array([[1.0, 0.0, 0.0]]), doubt)
+    far = chances(offset.at[0, 1:].set(9.0), spread, answer, jnp.array([[1.0, 0.0, 0.0]]), doubt)
     np.testing.assert_array_equal(told, far)
 
 

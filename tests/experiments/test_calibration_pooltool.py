@@ -16,7 +16,7 @@ OWN = cl.make("billiards", table="regulation").env
 # A cut into a corner: the target stands on the way to the pocket, the cue ball aside. The others are out of the way.
 PLACES = np.array([[0.0, 0.0], [0.28, 0.08], [-0.3, -0.1], [-0.3, 0.1]], np.float32)
 STATE = Balls(jnp.asarray(PLACES), jnp.zeros(4, bool), jnp.zeros((), jnp.int32))
-OBS = OWN.observe(STATE)
+OBS = jax.jit(OWN.observe)(STATE)
 
 
 @jax.jit

@@ -20,7 +20,7 @@ from cuelearner_jax.types import Label
 
 ENV = probes.Aimed()
 OBS = directions.evenly_spaced(5)
-BASE = directions.rotate(OBS, 0.3)
+BASE = jax.jit(directions.rotate)(OBS, 0.3)
 ONE = dataclasses.replace(probes.SIZES, feedback_layers=(8,), fit_steps=20)
 FOUR = dataclasses.replace(ONE, ensemble=4)
 CHOOSING = dataclasses.replace(FOUR, candidates=6)

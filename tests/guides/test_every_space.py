@@ -68,6 +68,7 @@ def scalars_of(space, **faults):
     return dataclasses.replace(plain, eps_deg=eps, tau_deg=eps / 20, tau_max_deg=most, **faults)
 
 
+@partial(jax.jit, static_argnums=(0, 2, 3))
 def told(space, scalars, form, count):
     """Labels about actions that lie uniformly round the policy's own, with the answers of a teacher of the goal."""
     k_obs, k_turn, k_say = jax.random.split(KEY, 3)
@@ -94,14 +95,15 @@ def left(kind, name, labels=200, **faults):
     rows = told(space, scalars, guide.form.name, labels)
     model = jax.jit(lambda rows: guide.fit(KEY, env, rows, guide.init(KEY), scalars))(rows)
     obs = jax.random.uniform(jax.random.key(77), (COUNT, 2), minval=-1.0)
-    first, goals = (jax.vmap(partial(which, space))(obs) for which in (missing, goal))
+    first, goals = (jax.jit(jax.vmap(partial(which, space)))(obs) for which in (missing, goal))
     acted = jax.jit(lambda: guide.act(model, env, obs, first, jnp.ones(COUNT, bool), scalars).actions)()
-    np.testing.assert_allclose(space.retract(acted), acted, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(space.retract)(acted), acted, atol=1e-5)
     within = dataclasses.replace(scalars, tau_max_deg=0.5 * scalars.eps_deg if not space.grain else 1.0)
-    near = guide.act(model, env, obs[:4], first[:4], jnp.ones(4, bool), within).actions
+    log = jax.jit(space.log)
+    near = jax.jit(lambda: guide.act(model, env, obs[:4], first[:4], jnp.ones(4, bool), within).actions)()
     if kind != "scalar":
-        assert np.abs(space.log(first[:4], near)).max() <= within.tau_max_deg + 1e-5  # tau_max holds along every cue
-    away = lambda actions: float(np.abs(space.log(actions, goals)).mean())  # noqa: E731
+        assert np.abs(log(first[:4], near)).max() <= within.tau_max_deg + 1e-5  # tau_max holds along every cue
+    away = lambda actions: float(np.abs(log(actions, goals)).mean())  # noqa: E731
     return away(acted) / away(first)
 
 
@@ -148,19 +150,20 @@ def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
     labels = Label(obs, action, answer, jnp.ones(2, bool))
     scalars = scalars_of(space)
     guide = RELATIVE.make(SIZES, Spaces(2, space))
-    rows = lessons(labels, guide.target, scalars, space)
+    rows = jax.jit(lambda labels: lessons(labels, guide.target, scalars, space))(labels)
     eps = scalars.eps_deg
     np.testing.assert_allclose(rows.target, [[2 * eps, 0, 0], [0, -4 * eps, 0]], atol=1e-6)
     off = jnp.array([[0.2, 77.0, 0.0], [-5.0, 0.4, 3.0]])
-    np.testing.assert_allclose(squared_errors(rows, rows.target + off), [0.1**2, 0.1**2], rtol=1e-3)
-    gradient = jax.grad(lambda predicted: squared_errors(rows, predicted).sum())(rows.target + off)
+    errors = lambda predicted: (squared_errors(rows, predicted).sum(), squared_errors(rows, predicted))  # noqa: E731
+    gradient, found = jax.jit(jax.grad(errors, has_aux=True))(rows.target + off)
+    np.testing.assert_allclose(found, [0.1**2, 0.1**2], rtol=1e-3)
     np.testing.assert_array_equal(gradient == 0, [[False, True, True], [True, False, True]])
     np.testing.assert_allclose(gradient[0, 0], 2 * 0.2 / 2**2, rtol=1e-3)  # d/dx (x / range)^2
 
 
 def test_what_a_network_predicts_of_an_unsaid_cue_changes_no_fit():
     space, scalars = SPACES["3"], scalars_of(SPACES["3"], says="one")
-    rows = RELATIVE.make(SIZES, Spaces(2, space)).lessons(told(space, scalars, "relative", 20), scalars)
+    rows = jax.jit(RELATIVE.make(SIZES, Spaces(2, space)).lessons)(told(space, scalars, "relative", 20), scalars)
     other = rows.replace(target=jnp.where(rows.said, rows.target, 99.0))
     fit = jax.jit(
         lambda rows: fit_least_squares(
@@ -180,8 +183,8 @@ def test_a_label_that_says_nothing_of_any_cue_is_none():
     labels = told(space, scalars_of(space), "relative", 10)
     silent = labels.replace(answer=jnp.full((10, 3), UNSAID))
     guide = RELATIVE.make(SIZES, Spaces(2, space))
-    assert not guide.lessons(silent, scalars_of(space)).valid.any()
-    assert not bool(guide.fit(KEY, None, silent, guide.init(KEY), scalars_of(space)).fitted)
+    assert not jax.jit(guide.lessons)(silent, scalars_of(space)).valid.any()
+    assert not bool(jax.jit(guide.fit)(KEY, None, silent, guide.init(KEY), scalars_of(space)).fitted)
 
 
 def test_lessons_of_one_cue_count_whole():

@@ -22,7 +22,7 @@ from cuelearner_jax.types import Label
 
 ENV = probes.Window()
 OBS = directions.evenly_spaced(6)
-BASE = directions.rotate(OBS, 0.3)
+BASE = jax.jit(directions.rotate)(OBS, 0.3)
 ACTIVE = jnp.array([True, False, True, True, False, False])
 
 

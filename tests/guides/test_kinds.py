@@ -21,7 +21,7 @@ SIZES = probes.SIZES
 OPTIONS = {"scalar": scalar.Config(guide_directions=36)}
 SCALARS = dataclasses.replace(probes.SCALARS, scalar_within_deg=20.0)
 OBS = directions.evenly_spaced(4)
-BEST = jax.vmap(ENV.best)(OBS)
+BEST = jax.jit(jax.vmap(ENV.best))(OBS)
 KEY = jax.random.key(3)
 
 

@@ -1,7 +1,7 @@
 """BD-COACH and CLIC: what their papers say of single labels, by numbers that a hand can compute."""
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -21,18 +21,21 @@ SIZES = GuideSizes(feedback_layers=(16,), labels_per_round=10, fit_steps=100, fi
 KEY = jax.random.key(3)
 SEEN = jnp.array([[1.0, 0.0], [0.0, 1.0]])
 MIDDLE = SMALL.middle()
+exp, log = jax.jit(SMALL.exp), jax.jit(SMALL.log)
 
 
 def log_sigmoid(value):
     return -np.log1p(np.exp(-np.asarray(value)))
 
 
+@jax.jit
 def log_desired(x, h, implicit, gamma):
     return jax.vmap(lambda x: clic.log_desired(x, h, implicit, gamma))(x)
 
 
+@partial(jax.jit, static_argnums=2)
 def directions_at(h, angle_deg, count):
-    return jax.vmap(lambda key: clic.direction_at(key, h, np.deg2rad(angle_deg)))(jax.random.split(KEY, count))
+    return jax.vmap(lambda key: clic.direction_at(key, h, jnp.deg2rad(angle_deg)))(jax.random.split(KEY, count))
 
 
 @cache
@@ -94,10 +97,11 @@ def test_implicit_directions_are_as_long_as_the_answer_and_lie_at_their_angle():
 def test_what_was_shown_has_a_ball_whose_radius_is_a_share_of_the_way_there():
     """Shown two eps away, radius one eps: members at 0, 1 and 2 eps from it by (1 - distance) / softness."""
     guide, eps = made("clic_shown"), SCALARS.eps_deg
-    shown = SMALL.exp(MIDDLE, jnp.array([2 * eps, 0.0, 0.0]))
+    shown = exp(MIDDLE, jnp.array([2 * eps, 0.0, 0.0]))
     row = contrast("clic_shown", MIDDLE, shown)
-    actions = jax.vmap(lambda away: SMALL.exp(shown, away * jnp.array([0.0, eps, 0.0])))(jnp.array([0.0, 1.0, 2.0]))
-    found = guide.membership(KEY, row, actions, SCALARS)
+    away = np.array([[0.0], [1.0], [2.0]]) * np.array([0.0, eps, 0.0])
+    actions = exp(jnp.tile(shown, (3, 1)), jnp.asarray(away, jnp.float32))
+    found = jax.jit(guide.membership)(KEY, row, actions, SCALARS)
     np.testing.assert_allclose(found, clic.SHARPNESS * log_sigmoid(np.array([1.0, 0.0, -1.0]) / 0.25), rtol=1e-4)
 
 
@@ -106,7 +110,7 @@ def test_what_was_shown_has_a_ball_whose_radius_is_a_share_of_the_way_there():
 
 def contrast(kind, action, answer):
     """One label as CLIC learns from it."""
-    return jax.tree.map(lambda leaf: leaf[0], made(kind).contrasts(labels(action[None], answer[None])))
+    return jax.tree.map(lambda leaf: leaf[0], jax.jit(made(kind).contrasts)(labels(action[None], answer[None])))
 
 
 def labels(action, answer, obs=None, base=None):
@@ -144,11 +148,11 @@ def test_the_least_energy_lies_on_the_corrected_side():
     scalars = dataclasses.replace(SCALARS, feedback_learning_rate=1e-2)
     model = jax.jit(guide.fit)(KEY, ENV, told, guide.init(KEY), scalars)
     acted = jax.jit(guide.act)(model, ENV, SEEN, jnp.tile(MIDDLE, (2, 1)), jnp.ones(2, bool), scalars)
-    moved = SMALL.log(MIDDLE, acted.actions[0])
+    moved = log(MIDDLE, acted.actions[0])
     assert moved[0] > 0.05
     assert moved[1] < -0.05
-    better, worse = (SMALL.exp(MIDDLE, sign * 0.3 * answer.at[2].set(0.0)) for sign in (1, -1))
-    log_p = guide.log_p(model, ENV, SEEN[0], jnp.stack([better, MIDDLE, worse]), scalars)
+    better, worse = (exp(MIDDLE, jnp.array([sign * 0.3, -sign * 0.3, 0.0])) for sign in (1, -1))
+    log_p = jax.jit(guide.log_p)(model, ENV, SEEN[0], jnp.stack([better, MIDDLE, worse]), scalars)
     assert log_p[0] > log_p[1] > log_p[2]
 
 
@@ -168,10 +172,10 @@ def test_the_search_finds_the_least_energy_within_the_bound_and_always_the_same(
     far, again = (act(model, ENV, obs, first, active, SCALARS).actions for _ in range(2))
     np.testing.assert_array_equal(far, again)
     np.testing.assert_array_equal(far[3], first[3])
-    np.testing.assert_allclose(SMALL.log(MIDDLE, far[:3]), [[0.21, -0.37, 0.0]] * 3, atol=0.02)
+    np.testing.assert_allclose(log(jnp.tile(MIDDLE, (3, 1)), far[:3]), [[0.21, -0.37, 0.0]] * 3, atol=0.02)
     near = act(model, ENV, obs, first, active, dataclasses.replace(SCALARS, tau_max_deg=0.1)).actions
-    assert np.abs(SMALL.log(first, near)).max() <= 0.1 + 1e-5
-    np.testing.assert_allclose(SMALL.log(MIDDLE, near[0]), [0.1, -0.1, 0.0], atol=0.02)
+    assert np.abs(log(first, near)).max() <= 0.1 + 1e-5
+    np.testing.assert_allclose(log(MIDDLE, near[0]), [0.1, -0.1, 0.0], atol=0.02)
 
 
 @pytest.mark.parametrize("kind", ["clic", "bdcoach"])
@@ -188,13 +192,14 @@ def test_the_human_model_leads_the_policy_by_eps_at_most_and_along_all_cues():
     guide = made("bdcoach")
     params = jax.tree.map(jnp.zeros_like, guide.init(KEY).params.human)
     acted = jnp.tile(MIDDLE, (2, 1))
-    rows = guide.lessons(labels(acted, jnp.array([[1.0, UNSAID, 0.0]] * 2)), SCALARS)
-    still = guide.policy_targets(ENV, params, rows, acted, SCALARS)
+    rows = jax.jit(guide.lessons)(labels(acted, jnp.array([[1.0, UNSAID, 0.0]] * 2)), SCALARS)
+    targets = jax.jit(guide.policy_targets)
+    still = targets(ENV, params, rows, acted, SCALARS)
     np.testing.assert_allclose(still.target, acted, atol=1e-6)  # it says "already right"
     assert still.said.all()
     loud = jax.tree.map(lambda leaf: jnp.full_like(leaf, 9.0) if leaf.shape == (3,) else leaf, params)
-    moved = guide.policy_targets(ENV, loud, rows, acted, SCALARS)
-    np.testing.assert_allclose(SMALL.log(acted, moved.target), SCALARS.eps_deg, rtol=1e-5)
+    moved = targets(ENV, loud, rows, acted, SCALARS)
+    np.testing.assert_allclose(log(acted, moved.target), SCALARS.eps_deg, rtol=1e-5)
 
 
 def test_the_human_model_is_taught_answers_and_nothing_of_other_cues():
@@ -202,15 +207,16 @@ def test_the_human_model_is_taught_answers_and_nothing_of_other_cues():
     guide = made("bdcoach")
     params = jax.tree.map(jnp.zeros_like, guide.init(KEY).params.human)
     told = [[1.0, UNSAID, UNSAID], [1.0, 0.0, UNSAID], [1.0, -1.0, 0.0]]
-    rows = [guide.lessons(labels(MIDDLE[None], jnp.array([answer])), SCALARS) for answer in told]
-    found = [float(guide.human_loss(ENV, params, row, SCALARS)) for row in rows]
+    lessons, loss = jax.jit(guide.lessons), jax.jit(guide.human_loss)
+    rows = [lessons(labels(MIDDLE[None], jnp.array([answer])), SCALARS) for answer in told]
+    found = [float(loss(ENV, params, row, SCALARS)) for row in rows]
     np.testing.assert_allclose(found, [1.0, 1.0, 2.0], rtol=1e-4)
 
 
 def test_bd_coach_goes_on_from_where_it_was_by_what_is_new():
     guide = made("bdcoach")
     action = SMALL.sample(KEY, (8,))
-    given = labels(action, SMALL.sense(action, ENV.best(SEEN[0])))
+    given = labels(action, jax.jit(SMALL.sense)(action, ENV.best(SEEN[0])))
     fit, fresh = jax.jit(guide.fit), guide.init(KEY)
     half = fit(KEY, ENV, given.replace(valid=jnp.arange(8) < 4), fresh, SCALARS)
     assert int(half.params.learned) == 4

@@ -26,6 +26,8 @@ from cuelearner_jax.labelling.server import Commands
 from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.storage import label_files
 
+pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
+
 
 @contextlib.contextmanager
 def told_browser(user):

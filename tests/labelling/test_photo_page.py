@@ -22,6 +22,8 @@ from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.types import Sketch
 
+pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
+
 CUES = "left,right;up,down;open,close"
 SMALL = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20", "--no-practice")
 BOUNDS = ("--task.low", "-0.5", "0", "-1", "--task.high", "0.5", "0.4", "1")

@@ -18,6 +18,8 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import checkpoint
 from cuelearner_jax.storage.checkpoint import KEPT, checkpoints
 
+pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
+
 
 def state(seed=0):
     """Everything that a lane may hold: keys, empty leaves, missing subtrees, all kinds of numbers."""
