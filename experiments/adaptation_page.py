@@ -13,12 +13,12 @@ import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import _adaptation_overview as overview
-import adaptation_billiards
 import numpy as np
-from _adaptation import UNCHANGED, Study
+from _adaptation import UNCHANGED
+from _adaptation_billiards_tables import billiards, with_label_seeds
+from _adaptation_cells import AMOUNTS, Output, Table, after, amounts, shares_used, shown, whole_of
 from _adaptation_curves import GAIN_HEADER, curve_points, figure, gain_cells
 from _adaptation_overview import on_side
 from _adaptation_tables import (
@@ -31,179 +31,15 @@ from _adaptation_tables import (
     percent,
     read,
     recovered,
-    rewarded_steps,
-    share,
     spread,
     tuned,
 )
-from _pages import fold, image, markdown, rendered, viewer_link, write_csv
+from _pages import fold, image, rendered
 from _trajectories import FILE, draw
-from adaptation_billiards import BOUNDS_DEG, LEAST, PLAYED
 from adaptation_navigation import STUDY
 
 SIDES = ("left", "right")
 WALKED = {"relative": NAMES["relative"], "intent-180": NAMES["intent"]}  # pieces whose ways are drawn
-
-
-BUDGET = overview.BUDGET  # labels of the lines that short tables show
-
-
-class Table(NamedTuple):
-    """A table whose rows are lines of recorded data; the page shows some of its rows and columns."""
-
-    header: list[str]
-    lines: list[Line]
-    cells: list[list[str]]
-
-    def short(self, columns: Sequence[str]) -> str:
-        """Return the page's table: the rows of `few_of`, the first column and those named."""
-        few, at = few_of(self.lines), [0, *(self.header.index(name) for name in columns if name in self.header)]
-        rows = [row for line, row in zip(self.lines, self.cells, strict=True) if any(line is one for one in few)]
-        return markdown([self.header[place] for place in at], [[row[place] for place in at] for row in rows])
-
-
-class Output(NamedTuple):
-    """Where the page and its tables are written."""
-
-    data: Path
-    page: Path
-
-    def link(self, name: str, text: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
-        """Write a table as a CSV file; return a link to it on the viewer page."""
-        file = self.data / "tables" / f"{name}.csv"
-        write_csv(file, header, cells)
-        return viewer_link(text, file, self.page)
-
-    def links(self, *links: str) -> str:
-        """Return the line of a section that leads to its tables."""
-        return "Tables:\n" + ",\n".join(link for link in links if link) + "."
-
-
-def few_of(known: Sequence[Line]) -> list[Line]:
-    """Return, of each method and variant, the line with the most labels up to `BUDGET`; of fine-tuning the last."""
-    found: dict[tuple[str, str], Line] = {}
-    for line in sorted(known, key=lambda line: line.after):
-        key = line.method, line.variant
-        if key not in found or line.method == "finetuning" or line.after <= BUDGET:
-            found[key] = line
-    return list(found.values())
-
-
-def whole_of(rows: Sequence[Row], least: float) -> Line | None:
-    """Return the line of the base agents in the unchanged world."""
-    found = lines(rows, UNCHANGED, least=least)
-    return found[0] if found else None
-
-
-def after(line: Line) -> str:
-    """Return labels or steps as a cell."""
-    if line.method == "finetuning":
-        return f"{line.after:,} steps"
-    return f"{line.after:,} labels" if line.after else ""
-
-
-AMOUNTS = ["labels", "rewarded steps"]
-
-
-def amounts(line: Line, start: Line, study: Study) -> list[str]:
-    """Return labels and rewarded steps as cells."""
-    labels = f"{line.after:,}" if line.after and line.method != "finetuning" else ""
-    steps = rewarded_steps(line, start, study)
-    return [labels, "" if steps is None else f"{steps:,}"]
-
-
-def shown(known: Sequence[Line]) -> list[Line]:
-    """Return the lines of whole tables: of fine-tuning the first, a quarter and the last."""
-    steps = [line.after for line in known if line.method == "finetuning" and line.after]
-    few = {value for value in steps if value in (min(steps), max(steps)) or value * 4 == max(steps)} if steps else set()
-    return [line for line in known if line.method != "finetuning" or line.after in few]
-
-
-def billiards(rows: Sequence[Row], folder: Path, out: Output) -> str:
-    """Return the section of the three tables: shares of the original, with the gains and everything else as CSV."""
-    whole = whole_of(rows, LEAST)
-    if whole is None:
-        return ""
-    tables, curves, gains = world_tables(rows, whole, LEAST), {}, []
-    for world in tables:
-        if world != UNCHANGED:
-            curves[world] = curve_points(lines(rows, world, least=LEAST), "reward", whole)
-            gains += [[world, *cells] for cells in gain_cells(curves[world])]
-    parts = []
-    if any(curves.values()):
-        figure(curves, folder / "shares", "share of the original reward", (1.0, "original"))
-        parts.append(image("reward as a share of the original", folder / "shares", out.page))
-    worlds = [world for world in tables if world != UNCHANGED]
-    parts.append(side_by_side({world: tables[world] for world in worlds}, "of the original [%]"))
-    header, cells = joined(tables)
-    links = [out.link("billiards", "all rows, rewards and held-out agents", header, cells)]
-    links += [out.link("billiards_gains", "labels or steps to a gain", ["world", *GAIN_HEADER], gains)] if gains else []
-    original = f"{len(whole.bases)} base agents earn {spread(whole.columns['reward'])} a shot in the unchanged world."
-    parts.append(f"{original} {out.links(*links)}")
-    return "\n\n".join(parts)
-
-
-def world_tables(rows: Sequence[Row], whole: Line, least: float) -> dict[str, Table]:
-    """Return the tables of the worlds that were measured; in the unchanged one the other methods are a control."""
-    known = {world: lines(rows, world, least=least) for world in (*BOUNDS_DEG, UNCHANGED)}
-    return {
-        world: world_table(rows, own, whole, world)
-        for world, own in known.items()
-        if len(own) >= (2 if world == UNCHANGED else 1)
-    }
-
-
-def with_label_seeds(data: Path, out: Output) -> str:
-    """Return the section of eight billiards agents trained anew, four label seeds each."""
-    rows = read(data / "anew" / "billiards")
-    whole = whole_of(rows, 0.0)
-    if whole is None:
-        return ""
-    tables = world_tables(rows, whole, 0.0)
-    header, cells = joined(tables)
-    told = f"The agents earn {spread(whole.columns['reward'])} a shot in the unchanged world. Table:"
-    link = out.link("billiards_anew", "all rows, rewards and models used", header, cells)
-    text = f"{side_by_side(tables, 'of the original [%]')}\n\n{told}\n{link}."
-    return fold("Eight agents trained anew, four label seeds each", text)
-
-
-def world_table(rows: Sequence[Row], known: Sequence[Line], whole: Line, world: str) -> Table:
-    """Return what all methods reach on one table."""
-    start, few = next(line for line in known if line.method == "none"), shown(known)
-    chosen_on, cells = tuned(rows, world) & set(start.bases), []
-    for line in few:
-        shares = share(line, whole)
-        others = shares[~np.isin(np.intersect1d(line.bases, whole.bases), list(chosen_on))]
-        own = [spread(line.columns["reward"]), percent(shares), percent(others) if chosen_on else ""]
-        bound = {**BOUNDS_DEG, UNCHANGED: PLAYED[UNCHANGED]}[world]
-        cells.append([line.name, *amounts(line, start, adaptation_billiards.STUDY), *own, _used(line), f"{bound:g}"])
-    header = ["method", *AMOUNTS, "reward", "of the original [%]", "of the original, held-out agents [%]"]
-    return Table([*header, "models used", "bound [degrees]"], few, cells)
-
-
-def joined(tables: dict[str, Table]) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of several tables as one, the first column naming the world."""
-    header = next(iter(tables.values())).header
-    return ["world", *header], [[world, *row] for world, table in tables.items() for row in table.cells]
-
-
-def side_by_side(tables: dict[str, Table], column: str) -> str:
-    """Return a table with a column for each world: one quantity of the methods that short tables show."""
-    rows: dict[str, dict[str, str]] = {}
-    for world, table in tables.items():
-        few = few_of(table.lines)
-        for line, cells in zip(table.lines, table.cells, strict=True):
-            if any(line is one for one in few):
-                name = line.name + (f", {after(line)}" if line.after else "")
-                name = line.name + ", most steps" if line.method == "finetuning" else name
-                rows.setdefault(name, {})[world] = cells[table.header.index(column)]
-    names = [world.replace("_", " ") for world in tables]
-    cells = [[name, *(row.get(world, "") for world in tables)] for name, row in rows.items()]
-    return markdown([column, *names], cells)
-
-
-def _used(line: Line) -> str:
-    return f"{100 * line.columns['used'].mean():.0f}%" if "used" in line.columns else ""
 
 
 def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> Table | None:
@@ -229,7 +65,7 @@ def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> Table | Non
             back = recovered(now, before, matched(most, start, "success")[0])
         held = [held_out(line, "success", chosen_on)] if chosen_on else []
         own = [percent(line.columns["success"]), *held, *(percent(line.columns[name]) for name in WAYS_TO_FAIL)]
-        cells.append([name, *used, *own, *([back] if most else []), _used(line)])
+        cells.append([name, *used, *own, *([back] if most else []), shares_used(line)])
     gained = ["of the loss [%]" if whole else "of the way to the teacher [%]"] if most else []
     held = ["success, held-out agents [%]"] if chosen_on else []
     header = ["method", *AMOUNTS, "success [%]", *held, "collisions [%]", "time-outs [%]", *gained, "models used"]
