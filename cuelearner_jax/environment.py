@@ -50,7 +50,7 @@ class Features(NamedTuple):
 
 @runtime_checkable
 class View(Protocol):
-    """What a policy looks at: the observation, and optional members such as `features`, `aims`, `heuristic`, `mirror`.
+    """Parts that a policy reads: the observation and optional members (`features`, `aims`, `heuristic`, `mirror`).
 
     Every environment is one; one whose episodes need more than that (generated worlds, say) offers `view()`.
     """
