@@ -1,4 +1,4 @@
-"""Another engine's shots in our environment. The engine here moves no ball and pockets those that it is told to."""
+"""Another engine's shots in our environment. The engine of these tests moves every ball a little along x."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ PLACES = np.array([[-0.2, 0.0], [0.1, 0.0], [0.2, 0.1], [0.2, -0.1]], np.float32
 
 
 class Still(NamedTuple):
-    """Pocket the first target wherever the strike points to the right of the table."""
+    """Moves every ball along x, and pockets the first target where the strike points to the right."""
 
     moved: float = 0.01  # of every ball along x [m]
 
