@@ -65,13 +65,18 @@ def calibrate(
             met = max(confirmation.SITUATIONS, met)
         states, obs = situations(k_where, calibration.policy(), met)
         asked = ask(np.asarray(obs), count)
-        states = jax.tree.map(lambda leaf, index=asked.index: leaf[index], states)
+        states = _rows(states, asked.index)
         obs = np.asarray(obs)[asked.index]
         answers = np.asarray(teacher(k_answer, states, jnp.asarray(obs), jnp.asarray(asked.action)))
         there = np.isfinite(answers).any(-1)
         learn(obs[there], asked.action[there], answers[there], asked.doubt[there])
         left -= count
     return calibration.result()
+
+
+@jax.jit
+def _rows(states: Any, index: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], states)
 
 
 def read_answers(

@@ -23,6 +23,8 @@ FAR = (10.0, 40.0)  # distance up to which an answer is about the meant action [
 ZERO = (1 / 3, 0.06)  # share of "already right" in other answers: careless ones, or about other actions
 GRID = np.array(list(product(RHO, WIDTH, RIGHT, FAR, ZERO)))  # (grid, 5)
 LOG_PRIOR = np.log((1 - GRID[:, 0]) / (1 - GRID[:, 0]).sum())  # (grid,)
+# A logarithm costs more than all else here. Chances are 0.001 at least, so that float32 holds such a product.
+TOGETHER = 8
 LOGISTIC = np.pi**2 / 3  # variance of a logistic distribution of width 1
 
 
@@ -77,6 +79,31 @@ def log_chances(
         told: 1 where the answer says something of a cue, else 0.
         doubt: each situation's doubt, see `chances`.
     """
+    return _log_product(_of_cues(offset, spread, answer, told, doubt))
+
+
+def log_chance(
+    offset: Float[Array, "*samples n cues"],
+    spread: Float[Array, "*samples n cues"],
+    answer: Float[Array, "n cues"],
+    told: Float[Array, "n cues"],
+    doubt: Float[Array, " n"],
+) -> Float[Array, "*samples grid"]:
+    """Return the logarithm of the probability of all answers together; arguments as in `log_chances`."""
+    each = _of_cues(offset, spread, answer, told, doubt)
+    return _log_product(each.reshape(*each.shape[:-3], -1, each.shape[-1]))
+
+
+def _of_cues(offset: Array, spread: Array, answer: Array, told: Array, doubt: Array) -> Array:
+    """The probability of what is said of each cue (samples, n, cues, grid); 1 where nothing is said."""
     answer, told, doubt = (jnp.broadcast_to(part, offset.shape) for part in (answer, told, doubt[:, None]))
-    each = jnp.log(chances(offset, spread, answer, doubt))
-    return jnp.sum(each * told[..., None], -2)
+    return jnp.where(told[..., None] > 0, chances(offset, spread, answer, doubt), 1.0)
+
+
+def _log_product(chance: Float[Array, "*rows factors grid"]) -> Float[Array, "*rows grid"]:
+    """The logarithm of a product, which takes one logarithm for every `TOGETHER` factors."""
+    groups = -(-chance.shape[-2] // TOGETHER)
+    more = [(0, 0)] * (chance.ndim - 2) + [(0, groups * TOGETHER - chance.shape[-2]), (0, 0)]
+    padded = jnp.pad(chance, more, constant_values=1.0)
+    grouped = padded.reshape(*chance.shape[:-2], groups, TOGETHER, chance.shape[-1])
+    return jnp.sum(jnp.log(jnp.prod(grouped, -2)), -2)

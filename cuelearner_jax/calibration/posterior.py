@@ -7,16 +7,16 @@ their likelihood. The mean weight is the family's evidence, by which families ar
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaln, logsumexp, stdtrit
 
 from cuelearner_jax.calibration.families import Family, unknowns_of
-from cuelearner_jax.calibration.likelihood import GRID, LOG_PRIOR, log_chances
+from cuelearner_jax.calibration.likelihood import GRID, LOG_PRIOR, log_chance, log_chances
 from cuelearner_jax.calibration.meaning import in_portions
 from cuelearner_jax.calibration.response import Response, Responses
 
@@ -42,10 +42,10 @@ class Answers(NamedTuple):
     doubt: Float[Floats, " n"]  # probability that the situation is one of a tie, see `questions.ties`
 
 
-def log_student(x: Floats, freedom: float) -> Floats:
-    """Return the logarithm of the density of Student's t, for each entry."""
+def log_student(x: Float[Floats, "*n unknowns"], freedom: float) -> Float[Floats, "*n"]:
+    """Return the logarithm of the joint density of independent Student's t: one logarithm a row, which is the cost."""
     norm = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
-    return norm - (freedom + 1) / 2 * np.log1p(np.square(x) / freedom)
+    return x.shape[-1] * norm - (freedom + 1) / 2 * np.log(np.prod(1 + np.square(x) / freedom, -1))
 
 
 class Prior(NamedTuple):
@@ -66,7 +66,7 @@ class Prior(NamedTuple):
 
     def log_density(self, theta: Floats) -> Floats:
         """Return the logarithm of the density of rows (n,)."""
-        return log_student(theta / self.scale, PRIOR_FREEDOM).sum(-1) - np.log(self.scale).sum()
+        return log_student(theta / self.scale, PRIOR_FREEDOM) - np.log(self.scale).sum()
 
     def closer(self) -> Prior:
         """Return the prior with much smaller scales."""
@@ -95,7 +95,7 @@ class Kernels(NamedTuple):
         """Return the logarithm of the density of rows (n,)."""
         inverse = np.linalg.inv(self.shape)
         away = (theta[:, None] - self.centres[None]) @ inverse.T
-        each = log_student(away, KERNEL_FREEDOM).sum(-1) + np.log(np.abs(np.diag(inverse))).sum()
+        each = log_student(away, KERNEL_FREEDOM) + np.log(np.abs(np.diag(inverse))).sum()
         near = logsumexp(each, axis=1) - np.log(len(self.centres))
         return np.logaddexp(np.log1p(-ANEW) + near, np.log(ANEW) + self.prior.log_density(theta))
 
@@ -103,6 +103,7 @@ class Kernels(NamedTuple):
 class Round(NamedTuple):
     """The samples of one round, their proposal, and their likelihoods."""
 
+    number: int
     proposal: Kernels | Prior
     theta: Float[Floats, "samples unknowns"]
     offset: Float[Floats, "samples n cues"]  # from asked actions to the ones that the teacher would call right [eps]
@@ -127,6 +128,9 @@ class Fit:
         self.columns = [responses.names.index(one.name) for one in unknowns_of(self.asks)]
         self.prior = _prior(self.family, scales)
         self.rounds: list[Round] = []
+        self.count = 0  # of the rounds so far
+        # log densities of a round's samples, under a round's proposal
+        self.densities: dict[tuple[int, int], Floats] = {}
         self.answers: Answers | None = None
 
     @property
@@ -142,7 +146,7 @@ class Fit:
     def learn(self, answers: Answers, response: Response, rounds: int = 1) -> None:
         """Take all answers so far and the policy's responses in their situations; add rounds of samples."""
         self.answers, self.response = answers, response
-        self.rounds = [self._round(one.proposal, one.theta) for one in self.rounds]
+        self.rounds = [self._round(*one[:3]) for one in self.rounds]
         if self.rounds:
             self._weigh()
         for _ in range(max(rounds if self.unknowns else 0, 1 - len(self.rounds))):
@@ -181,13 +185,14 @@ class Fit:
         none = np.zeros((len(theta), 0))
         return self.responses.meaning.offsets((), none, right, self.answers.action) / self.responses.eps, spread
 
-    def _round(self, proposal: Kernels | Prior, theta: Floats) -> Round:
+    def _round(self, number: int, proposal: Kernels | Prior, theta: Floats) -> Round:
         offset, spread = self._offsets(theta)
-        return Round(proposal, theta, offset, self._log_each(offset, spread, summed=True))
+        return Round(number, proposal, theta, offset, self._log_each(offset, spread, summed=True))
 
     def _add(self) -> None:
         proposal = self._proposal()
-        drawn = self._round(proposal, proposal.draw(self.random, SAMPLES * self.unknowns or 1))
+        self.count += 1
+        drawn = self._round(self.count, proposal, proposal.draw(self.random, SAMPLES * self.unknowns or 1))
         self.rounds = [*self.rounds[:FIRST], *self.rounds[FIRST:][1 - KEPT :], drawn]
         self._weigh()
 
@@ -207,7 +212,7 @@ class Fit:
 
     def _weigh(self) -> None:
         """Compute the weights of all samples under all answers."""
-        self.theta, self.offset, self.log_likelihood = map(np.concatenate, list(zip(*self.rounds, strict=True))[1:])
+        self.theta, self.offset, self.log_likelihood = map(np.concatenate, list(zip(*self.rounds, strict=True))[2:])
         prior, drawn = self._log_densities()
         self.log_origin = prior - drawn
         self.log_density = logsumexp(self.log_likelihood, axis=1) + prior
@@ -217,7 +222,8 @@ class Fit:
         """Return log probabilities of each answer (samples, n, grid), or of all answers with the grid's prior."""
         assert self.answers is not None
         count = offset.shape[1]
-        size = 1 << max(6, (count - 1).bit_length())  # few batch sizes, so that few programs are compiled
+        step = 1 << max(6, (count - 1).bit_length() - 2)  # few sizes, so that few programs are compiled
+        size = -(-count // step) * step
         answer, told, doubt = (
             np.pad(np.asarray(rows, np.float32), [(0, size - count)] + [(0, 0)] * (rows.ndim - 1))
             for rows in self.answers[2:]
@@ -231,8 +237,13 @@ class Fit:
         """Return each sample's log density: under the prior, and under the mixture of all proposals."""
         if not self.unknowns:
             return np.zeros(len(self.theta)), np.zeros(len(self.theta))
-        counts = np.array([len(one.theta) for one in self.rounds])
-        drawn = [one.proposal.log_density(self.theta) for one in self.rounds] + np.log(counts / counts.sum())[:, None]
+        counts, known = np.array([len(one.theta) for one in self.rounds]), {}
+        for one, other in product(self.rounds, repeat=2):  # few pairs are new, and these densities are expensive
+            key = one.number, other.number
+            known[key] = self.densities[key] if key in self.densities else one.proposal.log_density(other.theta)
+        self.densities = known
+        drawn = np.concatenate(list(known.values())).reshape(len(counts), -1)
+        drawn += np.log(counts / counts.sum())[:, None]
         prior = np.where(self.prior.allows(self.theta), self.prior.log_density(self.theta), -np.inf)
         return prior, logsumexp(drawn, axis=0)
 
@@ -297,7 +308,7 @@ def _each(*rows: Any) -> Any:
 
 @jax.jit
 def _summed(*rows: Any) -> Any:
-    return jnp.sum(log_chances(*rows), 1)
+    return log_chance(*rows)
 
 
 def temper(log_weight: Floats, enough: float) -> Floats:

@@ -49,7 +49,7 @@ class Walk:
             if (len(keys) - 1 - number) % APART == 0 and len(keys) - number <= steps:
                 met.append((self.states, self.obs))
         # Situations of one environment are adjacent, so that one question is chosen from few environments.
-        return jax.tree.map(lambda *rows: jnp.stack(rows, 1).reshape(-1, *rows[0].shape[1:])[:count], *met)
+        return _adjacent(count, met)
 
     def answers(
         self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
@@ -62,6 +62,11 @@ class Walk:
 @jax.jit
 def _act(policy: Any, key: Any, states: Any, obs: Any) -> Any:
     return policy.act(key, states, obs)
+
+
+@partial(jax.jit, static_argnums=0)
+def _adjacent(count: int, met: Any) -> Any:
+    return jax.tree.map(lambda *rows: jnp.stack(rows, 1).reshape(-1, *rows[0].shape[1:])[:count], *met)
 
 
 @jax.jit
