@@ -11,12 +11,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_envs.arm.config import ArmConfig
 from cuelearner_envs.arm.config import make_environment as make_arm
 from cuelearner_envs.arm.environment import Arm, Camera
-from cuelearner_envs.arm.physics import Ground
+from cuelearner_envs.arm.physics import REACH, WORKSPACE, Ground
 from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Step
 
+CLEAR = 0.42  # of the gripper [m]: lower, Fetch's fingers touch the table
 ACHIEVED, RELATIVE = slice(0, 3), slice(12, 15)  # in an observation
 
 
@@ -46,8 +47,14 @@ class FetchArm(Arm, kw_only=True):
         return state, self.observe(state)
 
     def step(self, key: PRNGKeyArray, state: Played, action: Float[Array, "4"]) -> tuple[Played, Step]:
-        """Execute an action; a new episode follows the end of one."""
-        episode, step = self.plays.step(key, state.episode, action)
+        """Execute an action; a new episode follows the end of one.
+
+        Its target keeps within the workspace, as in `physics.command`, and above the table. Fetch itself would press
+        the fingers on it, where friction holds them.
+        """
+        lowest, highest = (jnp.asarray(WORKSPACE).at[0, 2].set(CLEAR) - state.true[None, GRIPPER]) / REACH
+        moved = jnp.clip(jnp.clip(action[:3], lowest, highest), -1.0, 1.0)
+        episode, step = self.plays.step(key, state.episode, action.at[:3].set(moved))
         following, after = Played(episode, step.obs), Played(episode, step.final_obs)
         final_obs, distance = self.observe(after), self.distance(after)
         success = (distance < self.within).astype(jnp.float32)

@@ -20,7 +20,7 @@ from cuelearner_jax.policies import policy_of
 from cuelearner_jax.tasks import arm
 
 CAMERA = {"camera_turn_deg": 90.0, "camera_offset": (0.0, 0.02, 0.0)}
-ACTIONS = np.array([[1.0, 0.5, -0.5, 1.0], [-1.0, 0.0, 0.25, 0.0], [0.1, -1.0, 1.0, -1.0]], np.float32)
+ACTIONS = np.array([[1.0, 0.5, 0.5, 1.0], [-1.0, 0.0, 0.25, 0.0], [0.1, -1.0, 1.0, -1.0]], np.float32)
 
 
 def here(config):
@@ -77,6 +77,20 @@ def test_it_is_fetch_behind_the_camera(skill):
     assert bool(taken.truncated)
     assert int(state.episode.seed) != first
     np.testing.assert_allclose(taken.obs, env.observe(state), atol=1e-6)
+
+
+def test_fingers_that_go_down_do_not_press_on_the_table():
+    pytest.importorskip("gymnasium_robotics")
+    env = here(ArmConfig("pick", obstacle=False))
+    reset, step = jax.jit(lambda env, key: env.reset(key)), jax.jit(lambda env, *rest: env.step(*rest))
+    state, _ = reset(env, jax.random.key(0))
+    for action in ([0.0, 0.0, -1.0, 1.0],) * 9 + ([0.0, 0.0, -1.0, -1.0],) * 3 + ([1.0, 0.0, -1.0, 0.0],) * 2:
+        before = state.true
+        state, _ = step(env, jax.random.key(1), state, jnp.array(action))
+        if action[0]:
+            assert state.true[6] - before[6] > 0.025  # as far as in the air; pressed down they move 1 cm
+    assert state.true[8] < 0.425
+    np.testing.assert_allclose(state.true[15:17], 0.0, atol=0.003)  # closed; pressed down they are 4.8 cm open each
 
 
 class Still(WholeObservations):
