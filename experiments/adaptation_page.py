@@ -99,6 +99,14 @@ def lidar(rows: Sequence[Row], folder: Path, out: Output) -> str:
     return f"{text}\n\n{out.links(*links)}"
 
 
+def lidar_with_label_seeds(data: Path, out: Output) -> str:
+    """Return the section of eight walkers trained anew, four label seeds each."""
+    found = outcomes(read(data / "anew" / "navigation"), "turned_lidar", None)
+    title = "Eight agents trained anew, four label seeds each"
+    text = tables(out, [("lidar_anew", "A turned lidar", found)])
+    return fold(title, text) if text else ""
+
+
 CEILINGS_HEADER = ["cloned from the road map", "actions", "seeds", "success [%]", "collisions [%]", "time-outs [%]"]
 
 
@@ -234,6 +242,7 @@ def sections(data: Path, page: Path) -> dict[str, str]:
         compared += settings(rows, "reward" if task == "billiards" else "success", "paper")
     compared += settings(read(data / "cpu" / "navigation"), "success", "cpu")
     found["label-seeds"] = with_label_seeds(data, out)
+    found["lidar-seeds"] = lidar_with_label_seeds(data, out)
     found["look-ahead"] = with_look_ahead(data, out)
     found["two-cores"] = on_two_cores(data, out)
     if compared:

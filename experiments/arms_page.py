@@ -76,13 +76,14 @@ def training(data: Path, worlds: Sequence[str]) -> str:
         named = itemgetter("run", "guidance", "labels")
         guides = {named(row): row["mean"] for row in found["guides"]}
         for row in found["steps"]:
-            ratio = "{:.2f} [{:.2f}, {:.2f}]".format(*row["ratio"]) if "ratio" in row else ""
+            ratio = "{:.2f} [{:.2f}, {:.2f}]".format(*row["ratio"]) if "ratio" in row and row["reached"] else ""
             guide = guides.get(named(row))
             alone = "" if guide is None else f"{100 * guide:.0f}%"
-            end, last = f"{100 * row['end']['mean']:.0f}%", row["end"]["step"]
+            last = row["end"]["step"]
+            end = f"{100 * row['end']['mean']:.0f}% at {EngFormatter(sep='')(last)}"
             median = f"above {last:,}" if row["median"] is None else f"{row['median']:,.0f}"
             cells.append([f"`{world}`, {run_name(row)}", alone, median, ratio, end])
-    header = ["8 seeds", "guide alone", "steps to 80%, median", "of the steps alone", "success at the end"]
+    header = ["8 seeds", "guide alone", "steps to 80%, median", "of the steps alone", "success at the last step"]
     return markdown(header, cells)
 
 
