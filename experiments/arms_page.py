@@ -38,8 +38,8 @@ AGENTS = {
 STEPS = (3_200, 6_400, 9_600, 12_800)
 
 
-TRAINED = ("pick", "push", "push_in_fetch", "push_free")  # worlds of the table
-REACHED = ("reach", "reach_in_fetch")  # of the table behind a fold
+TRAINED = ("pick", "push")  # worlds of the table
+FOLDED = ("push_in_fetch", "push_free", "reach", "reach_in_fetch")  # of the table behind a fold
 RUNS = {
     "alone": "SAC alone",
     "alone_10": "SAC alone, ten critics",
@@ -180,7 +180,7 @@ def sections(data: Path, page: Path) -> dict[str, str]:
     """Return the sections of the page."""
     picture = image("success of agents in MJX and in Fetch", data / "transfer", page)
     curves = image("success of an arm over steps, with labels and without", data / "training", page)
-    study = f"{curves}\n\n{training(data, TRAINED)}\n\n{fold('The gripper alone', training(data, REACHED))}"
+    study = f"{curves}\n\n{training(data, TRAINED)}\n\n{fold('Push in Fetch and without a post, and reach', training(data, FOLDED))}"
     return {"training": study, "transfer": f"{picture}\n\n{transfer(measured(data))}", "settings": settings(data)}
 
 
