@@ -180,7 +180,8 @@ def sections(data: Path, page: Path) -> dict[str, str]:
     """Return the sections of the page."""
     picture = image("success of agents in MJX and in Fetch", data / "transfer", page)
     curves = image("success of an arm over steps, with labels and without", data / "training", page)
-    study = f"{curves}\n\n{training(data, TRAINED)}\n\n{fold('Push in Fetch and without a post, and reach', training(data, FOLDED))}"
+    folded = fold("Push in Fetch and without a post, and reach", training(data, FOLDED))
+    study = f"{curves}\n\n{training(data, TRAINED)}\n\n{folded}"
     return {"training": study, "transfer": f"{picture}\n\n{transfer(measured(data))}", "settings": settings(data)}
 
 
