@@ -10,7 +10,7 @@ import pytest
 
 from cuelearner_jax.calibration import CHANGED, Calibration, calibrate
 from cuelearner_jax.calibration.families import declared_distortions
-from cuelearner_jax.calibration.likelihood import log_chances
+from cuelearner_jax.calibration.likelihood import log_chance, log_chances
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
@@ -109,6 +109,14 @@ def test_an_answer_is_as_likely_as_what_it_says_of_the_cues_it_speaks_of():
     np.testing.assert_allclose(told, alone, rtol=1e-5)
     far = chances(offset.at[0, 1:].set(9.0), spread, answer, jnp.array([[1.0, 0.0, 0.0]]), doubt)
     np.testing.assert_array_equal(told, far)
+
+
+def test_answers_together_are_as_likely_as_the_product_of_each():
+    random = np.random.default_rng(0)  # 33 factors, so that the last group of eight is not full
+    offset, spread = (jnp.asarray(9 * random.random((2, 11, 3)), jnp.float32) for _ in range(2))
+    answer, told = random.integers(-1, 2, (11, 3)) * 1.0, random.integers(0, 2, (11, 3)) * 1.0
+    rows = offset, spread, jnp.asarray(answer), jnp.asarray(told), jnp.asarray(random.random(11))
+    np.testing.assert_allclose(jax.jit(log_chance)(*rows), chances(*rows).sum(1), rtol=1e-5)
 
 
 def test_an_answer_that_says_nothing_is_no_answer():
