@@ -59,8 +59,29 @@ def with_label_seeds(data: Path, out: Output) -> str:
     header, cells = joined(tables)
     told = f"The agents earn {spread(whole.columns['reward'])} a shot in the unchanged world. Table:"
     link = out.link("billiards_anew", "all rows, rewards and models used", header, cells)
-    text = f"{side_by_side(tables, 'of the original [%]')}\n\n{told}\n{link}."
-    return fold("Eight agents trained anew, four label seeds each", text)
+    text = f"{side_by_side(tables, 'of the original [%]')}\n\n{told}\n{link}.\n\n{shifted(data, out)}"
+    return fold("Eight agents trained anew, four label seeds each", text.rstrip())
+
+
+SHIFTED = "shifted_balls"
+SHIFTED_HEADER = ["method", *AMOUNTS, "reward", "of not adapted [%]", "models used"]
+
+
+def shifted(data: Path, out: Output) -> str:
+    """Return the table of shifted balls for eight further agents: rewards, and shares of what these earn unadapted.
+
+    What they earn where nothing is shifted was not measured.
+    """
+    known, cells = lines(read(data / "anew" / "shifted"), SHIFTED), []
+    start = next((line for line in known if line.method == "none"), None)
+    if start is None:
+        return ""
+    for line in known:
+        paid = amounts(line, start, adaptation_billiards.STUDY)
+        cells.append([line.name, *paid, spread(line.columns["reward"]), percent(share(line, start)), shares_used(line)])
+    found = Table(SHIFTED_HEADER, known, cells)
+    link = out.link("billiards_shifted_anew", "all rows", SHIFTED_HEADER, cells)
+    return f"**Shifted balls, eight further agents**\n\n{found.short(SHIFTED_HEADER[1:])}\n\nTable: {link}."
 
 
 def world_table(rows: Sequence[Row], known: Sequence[Line], whole: Line, world: str) -> Table:
