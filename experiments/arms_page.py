@@ -39,7 +39,8 @@ STEPS = (3_200, 6_400, 9_600, 12_800)
 
 
 TRAINED = ("pick", "push")  # worlds of the table
-FOLDED = ("push_in_fetch", "push_free", "reach", "reach_in_fetch")  # of the table behind a fold
+# Of the table behind a fold; `pressed`: before targets kept above the table.
+FOLDED = ("push_in_fetch", "push_in_fetch_pressed", "push_free", "reach", "reach_in_fetch")
 RUNS = {
     "alone": "SAC alone",
     "alone_10": "SAC alone, ten critics",
