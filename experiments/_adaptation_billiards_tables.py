@@ -10,7 +10,7 @@ import numpy as np
 from _adaptation import UNCHANGED
 from _adaptation_cells import AMOUNTS, Output, Table, after, amounts, few_of, shares_used, shown, whole_of
 from _adaptation_curves import GAIN_HEADER, curve_points, figure, gain_cells
-from _adaptation_tables import Line, Row, lines, percent, read, share, spread, tuned
+from _adaptation_tables import NAMES, Line, Row, lines, percent, read, share, spread, tuned
 from _pages import fold, image, markdown
 from adaptation_billiards import BOUNDS_DEG, LEAST, PLAYED
 
@@ -50,43 +50,25 @@ def world_tables(rows: Sequence[Row], whole: Line, least: float) -> dict[str, Ta
 
 
 def with_label_seeds(data: Path, out: Output) -> str:
-    """Return the section of eight billiards agents trained anew, four label seeds each."""
-    rows = read(data / "anew" / "billiards")
-    whole = whole_of(rows, 0.0)
-    if whole is None:
-        return ""
-    tables = world_tables(rows, whole, 0.0)
-    header, cells = joined(tables)
-    told = f"The agents earn {spread(whole.columns['reward'])} a shot in the unchanged world. Table:"
-    link = out.link("billiards_anew", "all rows, rewards and models used", header, cells)
-    text = f"{side_by_side(tables, 'of the original [%]')}\n\n{told}\n{link}.\n\n{shifted(data, out)}"
-    return fold("Eight agents trained anew, four label seeds each", text.rstrip())
-
-
-SHIFTED = "shifted_balls"
-SHIFTED_HEADER = ["method", *AMOUNTS, "reward", "of not adapted [%]", "models used"]
-
-
-def shifted(data: Path, out: Output) -> str:
-    """Return the table of shifted balls for eight further agents: rewards, and shares of what these earn unadapted.
-
-    What they earn where nothing is shifted was not measured.
-    """
-    known, cells = lines(read(data / "anew" / "shifted"), SHIFTED), []
-    start = next((line for line in known if line.method == "none"), None)
-    if start is None:
-        return ""
-    for line in known:
-        paid = amounts(line, start, adaptation_billiards.STUDY)
-        cells.append([line.name, *paid, spread(line.columns["reward"]), percent(share(line, start)), shares_used(line)])
-    found = Table(SHIFTED_HEADER, known, cells)
-    link = out.link("billiards_shifted_anew", "all rows", SHIFTED_HEADER, cells)
-    return f"**Shifted balls, eight further agents**\n\n{found.short(SHIFTED_HEADER[1:])}\n\nTable: {link}."
+    """Return the section of billiards agents trained anew, four label seeds each: eight, and eight further ones."""
+    parts = []
+    for name, folder, told in (("billiards_anew", ".", "The agents"), ("billiards_further", "further", "Eight others")):
+        rows = read(data / "anew" / folder / "billiards")
+        whole = whole_of(rows, 0.0)
+        if whole is None:
+            continue
+        tables = world_tables(rows, whole, 0.0)
+        header, cells = joined(tables)
+        earned = f"{told} earn {spread(whole.columns['reward'])} a shot in the unchanged world. Table:"
+        link = out.link(name, "all rows, rewards and models used", header, cells)
+        parts.append(f"{side_by_side(tables, 'of the original [%]')}\n\n{earned}\n{link}.")
+    return fold("Agents trained anew, four label seeds each", "\n\n".join(parts)) if parts else ""
 
 
 def world_table(rows: Sequence[Row], known: Sequence[Line], whole: Line, world: str) -> Table:
     """Return what all methods reach on one table."""
-    start, few = next(line for line in known if line.method == "none"), shown(known)
+    start = known[0]._replace(method="none")  # where fine-tuning alone was run, the agents before its first step
+    few = shown([start, *known[1:]])
     chosen_on, cells = tuned(rows, world) & set(start.bases), []
     for line in few:
         shares = share(line, whole)
@@ -108,14 +90,16 @@ def joined(tables: dict[str, Table]) -> tuple[list[str], list[list[str]]]:
 
 def side_by_side(tables: dict[str, Table], column: str) -> str:
     """Return a table with a column for each world: one quantity of the methods that short tables show."""
-    rows: dict[str, dict[str, str]] = {}
+    rows: dict[tuple[int, str], dict[str, str]] = {}
     for world, table in tables.items():
         few = few_of(table.lines)
         for line, cells in zip(table.lines, table.cells, strict=True):
             if any(line is one for one in few):
                 name = line.name + (f", {after(line)}" if line.after else "")
                 name = line.name + ", most steps" if line.method == "finetuning" else name
-                rows.setdefault(name, {})[world] = cells[table.header.index(column)]
+                at = list(NAMES).index(line.method)
+                rows.setdefault((at, name), {})[world] = cells[table.header.index(column)]
     names = [world.replace("_", " ") for world in tables]
-    cells = [[name, *(row.get(world, "") for world in tables)] for name, row in rows.items()]
+    ordered = sorted(rows.items(), key=lambda item: item[0][0])  # of methods that one world alone has, too
+    cells = [[name, *(row.get(world, "") for world in tables)] for (_, name), row in ordered]
     return markdown([column, *names], cells)

@@ -100,11 +100,13 @@ def lidar(rows: Sequence[Row], folder: Path, out: Output) -> str:
 
 
 def lidar_with_label_seeds(data: Path, out: Output) -> str:
-    """Return the section of eight walkers trained anew, four label seeds each."""
-    found = outcomes(read(data / "anew" / "navigation"), "turned_lidar", None)
-    title = "Eight agents trained anew, four label seeds each"
-    text = tables(out, [("lidar_anew", "A turned lidar", found)])
-    return fold(title, text) if text else ""
+    """Return the section of walkers trained anew, four label seeds each: eight, and eight further ones."""
+    parts = [
+        ("lidar_anew", "Eight agents", data / "anew" / "navigation"),
+        ("lidar_further", "Eight further agents", data / "anew" / "further" / "navigation"),
+    ]
+    text = tables(out, [(name, title, outcomes(read(folder), "turned_lidar", None)) for name, title, folder in parts])
+    return fold("Agents trained anew, four label seeds each", text) if text else ""
 
 
 CEILINGS_HEADER = ["cloned from the road map", "actions", "seeds", "success [%]", "collisions [%]", "time-outs [%]"]
