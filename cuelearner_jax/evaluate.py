@@ -140,6 +140,7 @@ def evaluate_policy(
 
 
 RESAMPLES = 2_000
+DRAWN_TOGETHER = 1 << 18  # values, at most: small arrays take no loop in Python, and large ones little memory
 
 
 def mean_interval(
@@ -154,8 +155,12 @@ def mean_interval(
     if count == 1:
         return np.stack([mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)])
     random = np.random.default_rng(seed)
-    drawn = (values[..., random.integers(0, count, count)].mean(-1) for _ in range(resamples))
-    return np.stack([mean, *np.quantile(np.stack(list(drawn)), [0.025, 0.975], axis=0)])
+    together = max(1, DRAWN_TOGETHER // values.size)
+    means = []
+    for first in range(0, resamples, together):
+        rows = random.integers(0, count, (min(together, resamples - first), count))
+        means.append(np.moveaxis(values[..., rows].mean(-1), -1, 0))
+    return np.stack([mean, *np.quantile(np.concatenate(means), [0.025, 0.975], axis=0)])
 
 
 MOST_STRETCHES = 25  # most stretches of a roll-out with progress

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import jaxlib.version
 import pytest
-from checked import LOOSE_RANKS, PACKAGES
-from jaxtyping import install_import_hook
+from checked import LOOSE_RANKS, install
 
 TESTS = Path(__file__).resolve().parent
 
@@ -31,7 +30,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
-install_import_hook(PACKAGES, "checked.checked")  # before anything of them is imported
+install()  # before anything of these packages is imported
 
 
 @cache
