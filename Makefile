@@ -10,7 +10,7 @@ UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make gallery      the films of docs/gallery.md"
-	@echo "make test         run the tests (about 8 minutes on 2 cores)"
+	@echo "make test         run the tests (8 to 20 minutes on 2 cores, by their speed)"
 	@echo "make test-all     these, and what checks the same at length"
 	@echo "make test-quick   those in files that take little of that (under 3 minutes)"
 	@echo "make test-foreign those of policies of PyTorch, Stable-Baselines3 and onnxruntime, which it installs"

@@ -19,7 +19,8 @@ PACKAGES = ["cuelearner_envs", "cuelearner_jax"]  # packages whose functions and
 DOORS = "cuelearner_jax.api."  # public functions check their arguments themselves, with better messages
 LOOSE_RANKS = ("bridges", "experiments/test_train_walking.py", "cli/test_anymal.py", "envs/anymal", "examples")
 
-_conf = BeartypeConf(is_pep484_tower=True)  # an int is a float, as pyright has it
+# An int is a float, as pyright has it. What damaged files hold is a TypeError, as it is without checks.
+_conf = BeartypeConf(is_pep484_tower=True, violation_type=jaxtyping.TypeCheckError)
 _with_dimensions = jaxtyping.jaxtyped
 _named = re.compile(r"\b(Float|Int|UInt|Bool|Shaped|Num|Integer|Key|PyTree|PRNGKeyArray)\b")  # of jaxtyping
 
@@ -51,7 +52,7 @@ def checked(function: Any = None, **_: Any) -> Any:
             made.append(_with_checks(function))
         return made[0](*arguments, **keywords)
 
-    return checking
+    return _as_of_a_library(checking)
 
 
 def _with_checks(function: Any) -> Callable:
@@ -59,8 +60,16 @@ def _with_checks(function: Any) -> Callable:
     function.__annotations__ = _known_hints(function)
     checks = beartype(function, conf=_conf)
     function.__annotations__ = declared
+    if checks is not function:  # which is returned where nothing is annotated
+        _as_of_a_library(checks)
     named = any(_named.search(str(annotation)) for annotation in declared.values())
     return _with_dimensions(checks, typechecker=None) if named else checks
+
+
+def _as_of_a_library(wrapper: Any) -> Callable:
+    """Return the wrapper, with frames of jaxtyping's file: the package takes unknown ones for the user's code."""
+    wrapper.__code__ = wrapper.__code__.replace(co_filename=jaxtyping.__file__)
+    return wrapper
 
 
 def _known_hints(function: Any) -> dict[str, Any]:

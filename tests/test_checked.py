@@ -5,8 +5,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
-from beartype.roar import BeartypeCallHintViolation
 from checked import LOOSE_RANKS
+from jaxtyping import TypeCheckError
 
 from cuelearner_envs.billiards import Table
 from cuelearner_envs.navigation.geometry import in_frame
@@ -16,14 +16,14 @@ from cuelearner_jax.storage.footer import read_declared
 
 def test_an_array_of_another_shape_than_the_signatures_is_refused():
     assert in_frame(jnp.zeros((3, 5)), jnp.zeros(2)).shape == (3, 2)
-    with pytest.raises(BeartypeCallHintViolation, match="boxes"):
+    with pytest.raises(TypeCheckError, match="boxes"):
         in_frame(jnp.zeros((3, 4)), jnp.zeros(2))
-    with pytest.raises(BeartypeCallHintViolation):
+    with pytest.raises(TypeCheckError):
         jax.eval_shape(in_frame, jnp.zeros((3, 5)), jnp.zeros(3))
 
 
 def test_functions_that_name_no_array_are_checked_too():
-    with pytest.raises(BeartypeCallHintViolation, match="path"):
+    with pytest.raises(TypeCheckError, match="path"):
         read_declared("a string")  # pyright: ignore[reportArgumentType]
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from beartype.roar import BeartypeCallHintViolation
+from jaxtyping import TypeCheckError
 
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.replay import Transition
@@ -45,7 +45,7 @@ def test_the_online_network_chooses_and_the_target_network_values():
 
 
 def test_numbers_of_another_rank_are_refused():
-    with pytest.raises((AssertionError, BeartypeCallHintViolation)):
+    with pytest.raises((AssertionError, TypeCheckError)):
         ddqn.target(jnp.ones(2), jnp.ones(2), jnp.ones(2))
 
 
