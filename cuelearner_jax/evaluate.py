@@ -155,7 +155,7 @@ def mean_interval(
     if count == 1:
         return np.stack([mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)])
     random = np.random.default_rng(seed)
-    together = max(1, DRAWN_TOGETHER // values.size)
+    together = max(1, DRAWN_TOGETHER // max(1, values.size))
     means = []
     for first in range(0, resamples, together):
         rows = random.integers(0, count, (min(together, resamples - first), count))

@@ -67,8 +67,10 @@ def with_label_seeds(data: Path, out: Output) -> str:
 
 def world_table(rows: Sequence[Row], known: Sequence[Line], whole: Line, world: str) -> Table:
     """Return what all methods reach on one table."""
-    start = known[0]._replace(method="none")  # where fine-tuning alone was run, the agents before its first step
-    few = shown([start, *known[1:]])
+    # Where fine-tuning alone was run, its agents before the first step are those that are not adapted.
+    first = next(line for line in known if line.method in ("none", "finetuning") and not line.after)
+    start = first._replace(method="none")
+    few = shown([start, *(line for line in known if line is not first)])
     chosen_on, cells = tuned(rows, world) & set(start.bases), []
     for line in few:
         shares = share(line, whole)

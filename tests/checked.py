@@ -14,9 +14,9 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 PACKAGES = ["cuelearner_envs", "cuelearner_jax"]  # packages whose functions and methods are checked
+DOORS = "cuelearner_jax.api."  # public functions check their arguments themselves, with better messages
 # Folders and files of tests in which an operand of a lower rank is filled up by NumPy's rule,
 # which brax and MuJoCo's MJX rely on; elsewhere it is an error.
-DOORS = "cuelearner_jax.api."  # public functions check their arguments themselves, with better messages
 LOOSE_RANKS = ("bridges", "experiments/test_train_walking.py", "cli/test_anymal.py", "envs/anymal", "examples")
 
 # An int is a float, as pyright has it. What damaged files hold is a TypeError, as it is without checks.
