@@ -44,7 +44,7 @@ DOUBT = 2.0  # least evidence for each change [nats]
 SURE = 3.0  # least evidence for all changes, against no change [nats]
 LOOSE = 5.0  # least evidence where answers differ much from the corrected policy [nats]
 LARGEST = 3  # most changes at once
-SETTLED, SETTLING = 10.0, 6  # effective samples for each unknown and one in the end; most rounds for these
+SETTLED, SETTLING = 10.0, 12  # effective samples for each unknown and one in the end; most rounds for these
 MOSTLY = 0.75  # share of answers about something else, above which the verdict is UNEXPLAINED
 APART = 2.5  # [eps]: larger typical distance between teacher and policy gives the verdict UNEXPLAINED
 

@@ -201,8 +201,11 @@ class Fit:
         if len(self.rounds) < FIRST or not self.unknowns:
             return self.prior if not self.rounds else self.prior.closer()
         enough = min(0.25 * len(self.log_weight), ENOUGH * (1 + self.unknowns))
-        # While few samples carry all the weight, the next proposal is centred on the best ones.
-        weight = self.weight if self.effective >= enough else temper(self.log_density, enough)
+        # While few samples carry all the weight, the next proposal is centred on the best ones. By density alone
+        # kernels narrow with each round, as most samples lie where they were; by weight alone they follow far samples.
+        weight = self.weight
+        if self.effective < enough:
+            weight = temper((self.log_weight + self.log_density) / 2, enough)
         size = self.unknowns
         centres = self.theta[self.random.choice(len(self.theta), 32, p=weight)]
         away = self.theta - weight @ self.theta
