@@ -103,7 +103,12 @@ def read_answers(
         UserError: settings that make no sense, or too few answers.
     """
     calibration = Calibration(policy, family, space, eps_deg, seed)
-    calibration.learn(obs, action, answer)
+    # In instalments, each of which asks the policy again near the changes that are likely by then.
+    size, read = BATCH, 0
+    while read < len(obs):
+        part = slice(read, read + max(size, read // 2))
+        calibration.learn(obs[part], action[part], answer[part])
+        read = part.stop
     if calibration.is_far:
         calibration.cross_confirm()
     return calibration.result()
