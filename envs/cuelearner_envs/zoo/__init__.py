@@ -1,0 +1,29 @@
+"""A zoo: small robots drawn by chance, in changed worlds, on which methods that correct policies are judged.
+
+`robots` draws a group; `changed` the world of an error; `rollout` plays an episode; `answer` is the teacher's. All are
+pure JAX. `robots` and `measure` take many robots, the others one world, to be mapped by `jax.vmap`.
+"""
+
+from cuelearner_envs.zoo.distil import robots
+from cuelearner_envs.zoo.measure import Scores, measure
+from cuelearner_envs.zoo.robots import TASKS, Robot, policy
+from cuelearner_envs.zoo.worlds import (
+    ERRORS,
+    STEPS,
+    State,
+    World,
+    answer,
+    changed,
+    observe,
+    reset,
+    right,
+    rollout,
+    step,
+    success,
+    unchanged,
+)
+
+__all__ = [
+    "ERRORS", "STEPS", "TASKS", "Robot", "Scores", "State", "World", "answer", "changed", "measure", "observe",
+    "policy", "reset", "right", "robots", "rollout", "step", "success", "unchanged",
+]  # fmt: skip
