@@ -26,6 +26,7 @@ BUILT_IN = {
     "navigation": "cuelearner_jax.tasks.navigation:NAVIGATION",
     "brax": "cuelearner_jax.tasks.brax:BRAX",
     "playground": "cuelearner_jax.tasks.playground:PLAYGROUND",
+    "zoo": "cuelearner_jax.tasks.zoo:ZOO",
 }
 # Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task with the
 # family's name. The family's own task, which reads its folders, is built in.
@@ -34,6 +35,7 @@ FAMILIES: dict[str, str] = {
     "logs": "cuelearner_jax.tasks.logs:task_of",
     "brax": "cuelearner_jax.tasks.brax:task_of",
     "playground": "cuelearner_jax.tasks.playground:task_of",
+    "zoo": "cuelearner_jax.tasks.zoo:task_of",
 }
 
 _registered: dict[str, Task] = {}

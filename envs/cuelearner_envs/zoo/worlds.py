@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.zoo.robots import (
     AVOID,
-    FULL,
     INSERT,
     RADIUS,
     SURFACE,

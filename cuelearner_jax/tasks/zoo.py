@@ -1,0 +1,98 @@
+"""Define the zoo task: zoo:3 has small robots with three cues, drawn by chance, each in the world of an error."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import jax
+
+from cuelearner_envs.bounds import MOST_SEED, check_number, check_word
+from cuelearner_envs.zoo import ERRORS, STEPS, Robot, changed, robots
+from cuelearner_envs.zoo.distil import SPLITS
+from cuelearner_envs.zoo.environment import ZooEnvironment, ZooTeacher
+from cuelearner_jax.adaptation.by_model import plain_scalars
+from cuelearner_jax.config import Sizes
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import Heuristic
+from cuelearner_jax.run_config import RunConfig
+from cuelearner_jax.spaces import DIRECTIONS, Box
+from cuelearner_jax.task import Body, Preset, Task
+
+MOST_CUES = 7
+
+
+@dataclass(frozen=True)
+class ZooConfig:
+    """A robot of the zoo, and the world for it."""
+
+    cues: int = 3
+    """Number of cues of the robot's actions, up to 7; 1: directions in the plane."""
+    number: int = 0
+    """Which of the robots with as many cues; those with odd numbers have a neural policy, where it succeeds."""
+    group: str = "tuning"
+    """Which of two groups of robots: tuning or held_out."""
+    error: str = "nothing"
+    """What is wrong in the world: nothing, constant, gain, mixing, seen_shift, seen_turn, region, waves, two, other_way,
+    other_way_shift (`cuelearner_envs.zoo.worlds` explains them)."""
+    seed: int = 0
+    """Seed of the robots and of their errors."""
+
+    def __post_init__(self) -> None:
+        """Raise UserError with one line for the first value that cannot work."""
+        check_number("cues", self.cues, 1, MOST_CUES, whole=True)
+        check_number("number", self.number, 0, MOST_SEED, whole=True)
+        check_word("group", self.group, SPLITS)
+        check_word("error", self.error, ERRORS)
+        check_number("seed", self.seed, 0, MOST_SEED, whole=True)
+
+
+@cache
+def _robot(cues: int, number: int, group: str, seed: int) -> Robot:
+    """Return a robot, drawn once in a process."""
+    count, key = 1 + number % 2, jax.random.key(seed)
+    with jax.ensure_compile_time_eval():
+        drawn = _robots(key, cues, count, split=group, first=number + 1 - count)
+        return jax.tree.map(lambda leaf: leaf[-1], drawn)
+
+
+_robots = jax.jit(robots, static_argnames=("cues", "count", "split"))
+
+
+def make_environment(config: ZooConfig, split: str = "training") -> ZooEnvironment:
+    """Return the world of a configuration; splits differ only in their episodes' keys."""
+    robot = _robot(config.cues, config.number, config.group, config.seed)
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), config.cues), config.number)
+    return ZooEnvironment.of(changed(key, robot, ERRORS.index(config.error)))
+
+
+def make_teacher(config: ZooConfig, env: Any) -> ZooTeacher:
+    """Return the teacher, who knows what is wrong."""
+    return ZooTeacher(env.world)
+
+
+ZOO = Task(
+    name="zoo",
+    about="small robots drawn by chance, in changed worlds: zoo:3 has those with three cues",
+    wants=lambda config: "The robot is to do its task.",
+    config=ZooConfig,
+    bodies=(Body("zoo", "velocity commands in a few dimensions", make_environment),),
+    teacher=make_teacher,
+    proposed=Heuristic,
+    longest=lambda config: STEPS,
+    judge_by=lambda config: "success",
+)
+
+
+@cache
+def task_of(name: str) -> Task:
+    """Return the task of the robots with as many cues as `name` says. Raises UserError for another name."""
+    if name not in map(str, range(1, MOST_CUES + 1)):
+        raise UserError(f"unknown robots 'zoo:{name}': give zoo:1, zoo:2, ... or zoo:{MOST_CUES}, the number of cues")
+    config = ZooConfig(cues=int(name))
+    space = DIRECTIONS if config.cues == 1 else Box((-1.0,) * config.cues, (1.0,) * config.cues)
+    run = RunConfig(config, Sizes(), plain_scalars(space))
+    preset = Preset("labels about a policy's actions", run, ("relative",), (100,))
+    return dataclasses.replace(ZOO, default=config, presets={"paper": preset})
