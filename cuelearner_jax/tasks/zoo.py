@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
+from jaxtyping import PRNGKeyArray
 
 from cuelearner_envs.bounds import MOST_SEED, check_number, check_word
-from cuelearner_envs.zoo import ERRORS, STEPS, Robot, changed, robots
+from cuelearner_envs.zoo import ERRORS, STEPS, World, changed, robots
 from cuelearner_envs.zoo.distil import SPLITS
 from cuelearner_envs.zoo.environment import ZooEnvironment, ZooTeacher
 from cuelearner_jax.adaptation.by_model import plain_scalars
@@ -35,8 +36,8 @@ class ZooConfig:
     group: str = "tuning"
     """Which of two groups of robots: tuning or held_out."""
     error: str = "nothing"
-    """What is wrong in the world: nothing, constant, gain, mixing, seen_shift, seen_turn, region, waves, two, other_way,
-    other_way_shift (`cuelearner_envs.zoo.worlds` explains them)."""
+    """What is wrong in the world: nothing, constant, gain, mixing, seen_shift, seen_turn, region, waves, two,
+    other_way, other_way_shift (`cuelearner_envs.zoo.worlds` explains them)."""
     seed: int = 0
     """Seed of the robots and of their errors."""
 
@@ -50,22 +51,23 @@ class ZooConfig:
 
 
 @cache
-def _robot(cues: int, number: int, group: str, seed: int) -> Robot:
-    """Return a robot, drawn once in a process."""
-    count, key = 1 + number % 2, jax.random.key(seed)
+def _world(config: ZooConfig) -> World:
+    """Return the world of a configuration, drawn once in a process."""
+    error = ERRORS.index(config.error)
     with jax.ensure_compile_time_eval():
-        drawn = _robots(key, cues, count, split=group, first=number + 1 - count)
-        return jax.tree.map(lambda leaf: leaf[-1], drawn)
+        return _drawn(jax.random.key(config.seed), config.cues, config.group, config.number % 2, config.number, error)
 
 
-_robots = jax.jit(robots, static_argnames=("cues", "count", "split"))
+@partial(jax.jit, static_argnames=("cues", "group", "odd"))
+def _drawn(key: PRNGKeyArray, cues: int, group: str, odd: int, number: int, error: int) -> World:
+    pair = robots(key, cues, 1 + odd, group, number - odd)  # an odd robot behind its even neighbour
+    robot = jax.tree.map(lambda leaf: leaf[odd], pair)
+    return changed(jax.random.fold_in(jax.random.fold_in(key, cues), number), robot, error)
 
 
 def make_environment(config: ZooConfig, split: str = "training") -> ZooEnvironment:
     """Return the world of a configuration; splits differ only in their episodes' keys."""
-    robot = _robot(config.cues, config.number, config.group, config.seed)
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), config.cues), config.number)
-    return ZooEnvironment.of(changed(key, robot, ERRORS.index(config.error)))
+    return ZooEnvironment.of(_world(config))
 
 
 def make_teacher(config: ZooConfig, env: Any) -> ZooTeacher:

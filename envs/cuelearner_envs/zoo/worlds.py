@@ -247,14 +247,12 @@ def answer(
         state: the situation.
         action: the action in question.
         eps: strength of an answer, in shares of the range or rad: differences below eps / 2 are answered by 0.
-        wrong: share of cues that are answered by another value of h, drawn at random.
+        wrong: share of answers with the wrong sign.
         one_cue: whether one cue alone is answered, the one that differs most.
     """
-    k_wrong, k_other = jax.random.split(key)
     left = world.robot.log(action, right(world, state))
     h = jnp.where(jnp.abs(left) > eps / 2, jnp.sign(left), 0.0)
-    other = jnp.mod(h + 1 + jax.random.randint(k_other, h.shape, 1, 3), 3) - 1
-    h = jnp.where(jax.random.uniform(k_wrong, h.shape) < wrong, other, h)
+    h = jnp.where(jax.random.uniform(key, h.shape) < wrong, -h, h)
     most = jnp.arange(h.shape[0]) == jnp.argmax(jnp.abs(left))
     return jnp.where(jnp.asarray(one_cue) & ~most, UNSAID, h)
 
