@@ -8,7 +8,7 @@ from functools import cache, partial
 from typing import Any
 
 import jax
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from cuelearner_envs.bounds import MOST_SEED, check_number, check_word
 from cuelearner_envs.zoo import ERRORS, STEPS, World, changed, robots
@@ -23,6 +23,7 @@ from cuelearner_jax.spaces import DIRECTIONS, Box
 from cuelearner_jax.task import Body, Preset, Task
 
 MOST_CUES = 7
+Index = int | Int[Array, ""]
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def _world(config: ZooConfig) -> World:
 
 
 @partial(jax.jit, static_argnames=("cues", "group", "odd"))
-def _drawn(key: PRNGKeyArray, cues: int, group: str, odd: int, number: int, error: int) -> World:
+def _drawn(key: PRNGKeyArray, cues: int, group: str, odd: int, number: Index, error: Index) -> World:
     pair = robots(key, cues, 1 + odd, group, number - odd)  # an odd robot behind its even neighbour
     robot = jax.tree.map(lambda leaf: leaf[odd], pair)
     return changed(jax.random.fold_in(jax.random.fold_in(key, cues), number), robot, error)
