@@ -34,8 +34,8 @@ class ZooConfig:
     """Number of cues of the robot's actions, up to 7; 1: directions in the plane."""
     number: int = 0
     """Which of the robots with as many cues; those with odd numbers have a neural policy, where it succeeds."""
-    group: str = "tuning"
-    """Which of two groups of robots: tuning or held_out."""
+    split: str = "tuning"
+    """Which robots: tuning, for choosing settings, or held_out, for reports."""
     error: str = "nothing"
     """What is wrong in the world: nothing, constant, gain, mixing, seen_shift, seen_turn, region, waves, two,
     other_way, other_way_shift (`cuelearner_envs.zoo.worlds` explains them)."""
@@ -46,7 +46,7 @@ class ZooConfig:
         """Raise UserError with one line for the first value that cannot work."""
         check_number("cues", self.cues, 1, MOST_CUES, whole=True)
         check_number("number", self.number, 0, MOST_SEED, whole=True)
-        check_word("group", self.group, SPLITS)
+        check_word("split", self.split, SPLITS)
         check_word("error", self.error, ERRORS)
         check_number("seed", self.seed, 0, MOST_SEED, whole=True)
 
@@ -56,12 +56,12 @@ def _world(config: ZooConfig) -> World:
     """Return the world of a configuration, drawn once in a process."""
     error = ERRORS.index(config.error)
     with jax.ensure_compile_time_eval():
-        return _drawn(jax.random.key(config.seed), config.cues, config.group, config.number % 2, config.number, error)
+        return _drawn(jax.random.key(config.seed), config.cues, config.split, config.number % 2, config.number, error)
 
 
-@partial(jax.jit, static_argnames=("cues", "group", "odd"))
-def _drawn(key: PRNGKeyArray, cues: int, group: str, odd: int, number: Index, error: Index) -> World:
-    pair = robots(key, cues, 1 + odd, group, number - odd)  # an odd robot behind its even neighbour
+@partial(jax.jit, static_argnames=("cues", "split", "odd"))
+def _drawn(key: PRNGKeyArray, cues: int, split: str, odd: int, number: Index, error: Index) -> World:
+    pair = robots(key, cues, 1 + odd, split, number - odd)  # an odd robot behind its even neighbour
     robot = jax.tree.map(lambda leaf: leaf[odd], pair)
     return changed(jax.random.fold_in(jax.random.fold_in(key, cues), number), robot, error)
 
