@@ -7,6 +7,7 @@ a way of its own. Functions take one world; `jax.vmap` serves many.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -258,7 +259,7 @@ def answer(
 
 
 def rollout(
-    key: PRNGKeyArray, world: World, act: Callable[[Array], Array], steps: int = STEPS, *, knows: bool = False
+    key: PRNGKeyArray, world: World, act: Callable[[Any], Array], steps: int = STEPS, *, knows: bool = False
 ) -> tuple[Float[Array, "steps obs"], State, Float[Array, ""], Bool[Array, ""]]:
     """Play an episode; return the observations and states acted in, the return and the success.
 
