@@ -65,8 +65,12 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
                 "folder of one of them"
             )
     pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
-    seeds = tuple(seed for piece in pieces for seed in piece.grid.seeds)
-    return task, config, Grid(first.guidance, seeds, first.labels), pieces
+    folders: dict[int, Path] = {}
+    for piece in pieces:
+        for seed in piece.grid.seeds:
+            if (other := folders.setdefault(seed, piece.folder)) != piece.folder:
+                raise UserError(f"{other} and {piece.folder} both hold seed {seed}: delete the one that is a copy")
+    return task, config, Grid(first.guidance, tuple(folders), first.labels), pieces
 
 
 def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:

@@ -64,6 +64,13 @@ def test_pieces_give_what_the_whole_gives_and_a_report_says_which_are_missing(wh
     assert {path: path.stat().st_mtime_ns for path in out.rglob("results.parquet")} == before
 
 
+def test_a_piece_that_was_copied_over_another_is_not_counted_twice(whole, refused, tmp_path):
+    out = tmp_path / "run"
+    assert main([*SWEEP, "--shard", "1/2", "--out", str(out)]) == 0
+    shutil.copytree(out / "shard-1-of-2", out / "shard-2-of-2")
+    refused(["evaluate", out, "--guidance", "none"], "both hold seed 7: delete the one that is a copy", out)
+
+
 def test_other_options_for_a_piece_that_has_begun_are_refused(refused, tmp_path):
     command = [*SWEEP, "--shard", "3/3", "--out", tmp_path / "run"]
     assert main([str(part) for part in command]) == 0
