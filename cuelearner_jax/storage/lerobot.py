@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import re
 from collections.abc import Callable
 from functools import lru_cache
@@ -164,28 +165,19 @@ def _frames(path: Path, info: dict[str, Any], table: pa.Table, key: str) -> Call
     """Return a function from a row to its camera picture."""
     if info["features"][key]["dtype"] == "image":
         return lambda row: _embedded(path, key, table[key][row].as_py())
-    names = {name: f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")}
-    starts: dict[int, tuple[int, int, float]] = {}
+    names = [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    starts: dict[int, list[Any]] = {}
     for file in sorted((path / "meta/episodes").glob("chunk-*/file-*.parquet")):
-        told = _parquet(path, file, ["episode_index", *names.values()])
-        columns = (told[name].to_pylist() for name in ("episode_index", *names.values()))
-        starts |= {episode: tuple(rest) for episode, *rest in zip(*columns, strict=True)}
+        episodes = _parquet(path, file, ["episode_index", *names])
+        starts |= {row["episode_index"]: [row[name] for name in names] for row in episodes.to_pylist()}
 
     def frame(row: int) -> Picture:
-        episode, since = table["episode_index"][row].as_py(), table["timestamp"][row].as_py()
-        if episode not in starts:
-            raise UserError(f"{path / 'meta/episodes'} does not name the episode {episode}: restore it")
-        chunk, number, start = starts[episode]
-        try:
-            name, frame = (
-                VIDEO.format(key=key, chunk=int(chunk), file=int(number)),
-                round((start + since) * info["fps"]),
-            )
-        except (TypeError, ValueError, OverflowError) as error:
-            raise UserError(
-                f"{path / 'meta/episodes'} does not say where episode {episode} begins: restore it"
-            ) from error
-        return Picture(_decoded(inside(path, name, "the video"), frame), "image/png")
+        episode, timestamp = table["episode_index"][row].as_py(), table["timestamp"][row].as_py()
+        chunk, number, start = starts.get(episode, (None, None, None))
+        if chunk is None or number is None or start is None or not math.isfinite(start + timestamp):
+            raise UserError(f"{path / 'meta/episodes'} does not say where episode {episode} begins: restore it")
+        video = inside(path, VIDEO.format(key=key, chunk=chunk, file=number), "the video")
+        return Picture(_decoded(video, start + timestamp), "image/png")
 
     return frame
 
@@ -205,17 +197,22 @@ def _embedded(path: Path, key: str, stored: Any) -> Picture:
 
 
 @lru_cache(maxsize=64)
-def _decoded(file: Path, number: int) -> bytes:
-    """Return one frame of a video as PNG. Raises UserError if the frame cannot be decoded."""
-    import imageio.v2 as imageio  # takes a while to load
+def _decoded(file: Path, time: float) -> bytes:
+    """Return the frame nearest to a time [s] of a video, as PNG. Raises UserError if there is none.
+
+    The video's own rate may differ from the dataset's.
+    """
+    from imageio_ffmpeg import read_frames  # takes a while to load
     from PIL import Image
 
     try:
-        with imageio.get_reader(file, format="FFMPEG") as video:  # pyright: ignore[reportArgumentType]
-            frame = np.asarray(video.get_data(number))  # pyright: ignore[reportAttributeAccessIssue]
-    except (OSError, RuntimeError, IndexError, ValueError) as error:
+        interval = 1 / next(read_frames(file))["fps"]
+        frames = read_frames(file, input_params=["-ss", f"{max(0.0, time - interval / 2):.6f}"])
+        picture = Image.frombytes("RGB", next(frames)["size"], next(frames))
+        frames.close()
+    except (OSError, RuntimeError, StopIteration, ZeroDivisionError) as error:
         why = re.sub(r"\s+", " ", str(error))[:80]
-        raise UserError(f"frame {number} of {file} cannot be had ({why}): restore the video") from error
+        raise UserError(f"{file} has no frame at {time:.3f} s ({why}): restore the video") from error
     stored = io.BytesIO()
-    Image.fromarray(frame).save(stored, "PNG")
+    picture.save(stored, "PNG")
     return stored.getvalue()

@@ -37,8 +37,9 @@ def test_the_digest_tells_situations_apart(tmp_path):
     assert first != other
 
 
-def test_a_lerobot_dataset_is_read(tmp_path):
-    observations, actions = recorded.write_lerobot(tmp_path / "set")
+@pytest.mark.parametrize("video_fps", [10, 30])
+def test_a_lerobot_dataset_is_read(tmp_path, video_fps):
+    observations, actions = recorded.write_lerobot(tmp_path / "set", video_fps=video_fps)
     found = situations.read(tmp_path / "set")
     np.testing.assert_array_equal(found.observations, observations)
     np.testing.assert_array_equal(found.actions, actions)
@@ -175,7 +176,7 @@ def test_episodes_that_begin_nowhere_are_told(tmp_path):
     with pytest.raises(UserError, match="does not say where episode 0 begins"):
         found.picture(0)
     episodes.unlink()
-    with pytest.raises(UserError, match="does not name the episode 0"):
+    with pytest.raises(UserError, match="does not say where episode 0 begins"):
         situations.read(tmp_path / "set").picture(0)
 
 
