@@ -58,27 +58,30 @@ def read(path: Path) -> Recording:
     """
     info = _info(path)
     features = info["features"]
-    seen = [key for key, told in features.items() if key.startswith(f"{OBSERVATION}.") and _is_vector(told)]
-    for name, found in ((f"{OBSERVATION}.state", seen), (ACTION, _is_vector(features.get(ACTION)))):
-        if not found:
-            raise UserError(
-                f"{path} has no feature {name} of numbers (it has {', '.join(features)}): give a dataset with one"
-            )
+    parts = {name: _parts(path, features, name) for name in (OBSERVATION, ACTION)}
     cameras = [
         key for key, told in features.items() if isinstance(told, dict) and told.get("dtype") in ("video", "image")
     ]
-    table = _rows(path, [*seen, ACTION, "episode_index", "timestamp", *_stored(features, cameras[:1])])
-    vectors = {key: _vectors(path, table, key, features[key]) for key in [*seen, ACTION]}
-    observed = [
-        name for key in seen for name in _entries(features[key], key.partition(".")[2] if len(seen) > 1 else "")
-    ]
-    return Recording(
-        np.concatenate([vectors[key] for key in seen], -1),
-        vectors[ACTION],
-        tuple(observed) if len(set(observed)) == sum(vectors[key].shape[1] for key in seen) else (),
-        _entries(features[ACTION], ""),
-        _frames(path, info, table, cameras[0]) if cameras else None,
-    )
+    stored = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
+    table = _rows(path, [*parts[OBSERVATION], *parts[ACTION], "episode_index", "timestamp", *stored])
+    vectors = {
+        name: np.concatenate([_vectors(path, table, key, features[key]) for key in parts[name]], -1) for name in parts
+    }
+    entries = {name: _entries(features, parts[name]) for name in parts}
+    frames = _frames(path, info, table, cameras[0]) if cameras else None
+    return Recording(vectors[OBSERVATION], vectors[ACTION], entries[OBSERVATION], entries[ACTION], frames)
+
+
+def _parts(path: Path, features: dict[str, Any], name: str) -> list[str]:
+    """Return the features of numbers called `name` or `name.PART`. Raises UserError if there are none."""
+    vectors = [key for key, told in features.items() if _is_vector(told)]
+    parts = [name] if name in vectors else [key for key in vectors if key.startswith(f"{name}.")]
+    if not parts:
+        there = ", ".join(features)
+        raise UserError(
+            f"{path} has no feature {name} or {name}.PART of numbers (it has {there}): give a dataset with one"
+        )
+    return parts
 
 
 def _info(path: Path) -> dict[str, Any]:
@@ -102,15 +105,10 @@ def _info(path: Path) -> dict[str, Any]:
 
 def _is_vector(told: Any) -> bool:
     """Return whether a feature is a row of numbers."""
-    if not isinstance(told, dict) or not str(told.get("dtype")).startswith(("float", "int")):
+    if not isinstance(told, dict) or not str(told.get("dtype")).startswith(("float", "int", "uint", "bool")):
         return False
     shape = told.get("shape")
     return isinstance(shape, list) and len(shape) == 1 and type(shape[0]) is int and shape[0] > 0
-
-
-def _stored(features: dict[str, Any], cameras: list[str]) -> list[str]:
-    """Return the cameras whose pictures are stored in the rows themselves."""
-    return [key for key in cameras if features[key].get("dtype") == "image"]
 
 
 def _rows(path: Path, columns: list[str]) -> pa.Table:
@@ -122,7 +120,6 @@ def _rows(path: Path, columns: list[str]) -> pa.Table:
 
 
 def _parquet(path: Path, file: Path, columns: list[str]) -> pa.Table:
-    inside(path, str(file.relative_to(path)), "the file")
     try:
         opened = pq.ParquetFile(file)
         groups = (opened.metadata.row_group(group) for group in range(opened.num_row_groups))
@@ -146,19 +143,25 @@ def _vectors(path: Path, table: pa.Table, key: str, told: dict[str, Any]) -> Flo
     return found
 
 
-def _entries(told: dict[str, Any], before: str) -> tuple[str, ...]:
-    """Return the names of a vector's entries; empty if the dataset names none, or not as many."""
-    names: Any = told.get("names")
-    size = told["shape"][0]
-    if isinstance(names, dict):
-        values = list(names.values())
-        if all(isinstance(value, list) for value in values):
-            names = [name for value in values for name in value]
-        elif all(type(value) is int for value in values):
-            names = sorted(names, key=lambda name: names[name])
-    if not isinstance(names, list) or len(names) != size or len(set(map(str, names))) != size:
-        return ()
-    return tuple(f"{before}: {name}" if before else str(name) for name in names)
+def _entries(features: dict[str, Any], parts: list[str]) -> tuple[str, ...]:
+    """Return the names of the parts' entries, one after the other; empty unless each entry has a name of its own."""
+    entries = []
+    for key in parts:
+        names = _flat(features[key].get("names"))
+        if len(names) != features[key]["shape"][0]:
+            return ()
+        part = key.partition(".")[2]
+        entries += [f"{part}: {name}" for name in names] if len(parts) > 1 else names
+    return tuple(entries) if len(set(entries)) == len(entries) else ()
+
+
+def _flat(names: Any) -> list[str]:
+    """Return the names in nested lists and groups, or in a map of names to positions, in the order of the entries."""
+    if isinstance(names, dict) and all(type(position) is int for position in names.values()):
+        return sorted(names, key=lambda name: names[name])
+    if isinstance(names, dict | list):
+        return [name for group in (names.values() if isinstance(names, dict) else names) for name in _flat(group)]
+    return [] if names is None else [str(names)]
 
 
 def _frames(path: Path, info: dict[str, Any], table: pa.Table, key: str) -> Callable[[int], Picture]:
