@@ -15,7 +15,6 @@ Nothing in such a folder is executed: no pickles, and no path that leads out of 
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import re
 import zipfile
@@ -27,12 +26,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float
+from pyarrow import csv
 
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError, format_numbers, format_value
 from cuelearner_jax.storage import lerobot
 from cuelearner_jax.storage.picture_files import Picture, PictureFiles
-from cuelearner_jax.storage.room import check_room
 
 STEM = "situations"
 OBSERVATION, ACTION, PICTURE = "observation", "action", "picture"
@@ -64,6 +63,12 @@ def read(path: Path) -> Situations:
         return _whole(path, found.observations, found.actions, slices, found.action_entries, found.frames)
     table = _table_in(path)
     columns = _READERS[table.suffix](table)
+    known = (OBSERVATION, ACTION, PICTURE)
+    if strange := [name for name in columns if name not in known and name.partition(".")[0] not in known[:2]]:
+        raise UserError(
+            f"{table} has an unknown column {format_value(strange[0])}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
+            "or leave it out"
+        )
     observations, seen = _matrix(table, columns, OBSERVATION)
     actions, entries = _matrix(table, columns, ACTION)
     if len(actions) != len(observations):
@@ -132,30 +137,27 @@ def _table_in(path: Path) -> Path:
 
 def _of_parquet(table: Path) -> dict[str, Any]:
     try:
-        file = pq.ParquetFile(table)
-        size = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
-        check_room(f"{table} is large", 4 * size, "give fewer rows")
-        found = file.read()
-        return {name: found[name].to_pylist() for name in found.column_names}
+        return _columns(table, pq.ParquetFile(table).read())
     except (pa.ArrowException, OSError, ValueError) as error:
         raise _damaged(table, error) from error
 
 
 def _of_csv(table: Path) -> dict[str, Any]:
     try:
-        with table.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file, strict=True))
-    except (OSError, UnicodeError, csv.Error) as error:
+        columns = _columns(table, csv.read_csv(table))
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise _damaged(table, error) from error
-    head, *rows = rows or [[]]
-    for number, row in enumerate(rows, start=2):
-        if len(row) != len(head):
-            raise UserError(f"{table}: line {number} has {len(row)} fields, the head {len(head)}: give as many")
-    columns: dict[str, Any] = {name: list(values) for name, values in zip(head, zip(*rows, strict=True), strict=False)}
-    for name in columns.keys() - {PICTURE}:
-        if name in (OBSERVATION, ACTION):
-            columns[name] = [re.split(r"[\s;,]+", text.strip("[] ")) for text in columns[name]]
-    return columns or {name: [] for name in head}
+    for name in columns.keys() & {OBSERVATION, ACTION}:
+        columns[name] = [re.split(r"[\s;,]+", str(text).strip("[] ")) for text in columns[name]]
+    return columns
+
+
+def _columns(table: Path, rows: pa.Table) -> dict[str, Any]:
+    """Return the columns of a table by name. Raises UserError for two columns with one name."""
+    names = [name.strip() for name in rows.column_names]
+    if doubled := [name for name in names if names.count(name) > 1]:
+        raise UserError(f"{table} has two columns {format_value(doubled[0])}: give each column a name of its own")
+    return {name: column.to_pylist() for name, column in zip(names, rows.columns, strict=True)}
 
 
 def _of_npz(table: Path) -> dict[str, Any]:

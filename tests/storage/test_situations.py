@@ -126,6 +126,36 @@ def test_what_does_not_fit_is_told(changed, told, tmp_path):
     assert any(words in str(error.value) for words in told.split("|"))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeffobservation,action.x,action.y\n1 2,3,4\n",
+        "observation, action.x, action.y\n1 2, 3, 4\n",
+        'action.x,action.y,observation\n3,4,"[1, 2]"\n',
+    ],
+)
+def test_a_csv_file_of_any_program_is_read(text, tmp_path):
+    (tmp_path / "situations.csv").write_text(text, encoding="utf-8")
+    found = situations.read(tmp_path)
+    np.testing.assert_array_equal(found.observations, [[1, 2]])
+    np.testing.assert_array_equal(found.actions, [[3, 4]])
+    assert found.entries == ("x", "y")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("observation,action.x,action.x\n1,2,3\n", "has two columns 'action.x'"),
+        ("observation,action,reward\n1,2,3\n", "has an unknown column 'reward'"),
+        ("observation,action\n1,2,3\n", "Expected 2 columns, got 3"),
+    ],
+)
+def test_a_csv_file_of_other_columns_is_told(text, told, tmp_path):
+    (tmp_path / "situations.csv").write_text(text)
+    with pytest.raises(UserError, match=told):
+        situations.read(tmp_path)
+
+
 def test_sizes_that_differ_are_told(tmp_path):
     (tmp_path / "there").mkdir()
     np.savez(tmp_path / "there/situations.npz", observation=np.zeros((3, 2)), action=np.zeros((2, 1)))
