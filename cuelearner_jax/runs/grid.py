@@ -118,6 +118,11 @@ def config_hash(described: dict[str, Any]) -> str:
     return configuration.digest({**learned_from, "task": task})
 
 
+def run_key(described: dict[str, Any], kind: str) -> str:
+    """Return the hash by which a file knows its run, given the run's config.json, and its kind of guidance."""
+    return configuration.digest({**described, "kind": kind})
+
+
 def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid]:
     """Read a run folder's config.json; return its task, configuration and grid. Code that it names is not loaded.
 

@@ -153,9 +153,16 @@ class _LateComplaints:
 class Checkpoints:
     """The checkpoints of one program's run in one folder."""
 
-    def __init__(self, folder: Path, read_only: bool = False, damaged: str = DAMAGED) -> None:
-        """Open a folder of checkpoints. `damaged` is the remedy in the message about a damaged checkpoint."""
-        self._damaged = damaged
+    def __init__(self, folder: Path, read_only: bool = False, damaged: str = DAMAGED, run: str = "") -> None:
+        """Open a folder of checkpoints.
+
+        Args:
+            folder: the folder.
+            read_only: change nothing on disk.
+            damaged: the remedy in the message about a damaged checkpoint.
+            run: the key of the run that the checkpoints belong to (`grid.run_key`); empty: of none.
+        """
+        self._damaged, self._run = damaged, run
         logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax's threads log what `save` raises anyway
         self._folder = folder.resolve()
         self._manager = ocp.CheckpointManager(
@@ -176,7 +183,7 @@ class Checkpoints:
             raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
         flat = {name: _flat(item) for name, item in items.items()}
         args: dict[str, Any] = {name: ocp.args.StandardSave(item) for name, item in flat.items()}
-        args[DIGESTS] = ocp.args.JsonSave({name: _digests(item) for name, item in flat.items()})
+        args[DIGESTS] = ocp.args.JsonSave({"run": self._run, **{name: _digests(item) for name, item in flat.items()}})
         with saving(), _quiet():
             try:
                 self._manager.save(number, args=ocp.args.Composite(**args))
@@ -218,7 +225,10 @@ class Checkpoints:
             args: dict[str, Any] = {name: ocp.args.StandardRestore(item) for name, item in wanted.items()}
             args[DIGESTS] = ocp.args.JsonRestore()
             restored = self._manager.restore(int(folder.name), args=ocp.args.Composite(**args))
-            self._verify({name: restored[name] for name in like}, restored[DIGESTS])
+            digests = dict(restored[DIGESTS])
+            if digests.pop("run", self._run) != self._run:
+                raise _OfAnother("it belongs to another run")
+            self._verify({name: restored[name] for name in like}, digests)
             return {name: _unflat(restored[name], like[name]) for name in like}
 
     @contextmanager
@@ -255,9 +265,9 @@ class Checkpoints:
 
 
 @contextmanager
-def checkpoints(folder: Path, read_only: bool = False, damaged: str = DAMAGED) -> Iterator[Checkpoints]:
-    """Open `Checkpoints` for the duration of a context. `read_only` changes nothing on disk."""
-    manager = Checkpoints(folder, read_only, damaged)
+def checkpoints(folder: Path, read_only: bool = False, damaged: str = DAMAGED, run: str = "") -> Iterator[Checkpoints]:
+    """Open `Checkpoints` for the duration of a context."""
+    manager = Checkpoints(folder, read_only, damaged, run)
     try:
         yield manager
     finally:

@@ -81,6 +81,7 @@ class LabelFile(NamedTuple):
     people: People | None = None  # None: the labels of a simulated teacher, or a merge that includes such labels
     session: dict[str, Any] | None = None  # settings of the page that asked, see `labelling.session`
     said: dict[str, int] | None = None  # number of rows of each kind in `SAID`, all rows counted
+    run: str | None = None  # the key of the run that wrote the file (`grid.run_key`)
 
     @property
     def budget(self) -> int:
@@ -189,6 +190,7 @@ def write(
     seeds: np.ndarray,
     labels: Label,
     meaning: str = "",
+    **told: Any,
 ) -> None:
     """Write the valid labels of lanes as Parquet, replacing `path` atomically.
 
@@ -198,11 +200,12 @@ def write(
         seeds: the lanes' seeds, (lanes,).
         labels: (lanes, slots, ...).
         meaning: meaning of an answer's numbers, written into the file.
+        told: further entries of the file's head.
     """
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
     seed = np.broadcast_to(np.asarray(seeds)[:, None], valid.shape)[valid]
-    write_file(path, LabelFile(task, answers, space, eps, seed, rows), meaning, fresh=False)
+    write_file(path, LabelFile(task, answers, space, eps, seed, rows), meaning, fresh=False, **told)
 
 
 def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = True, **told: Any) -> None:
@@ -245,7 +248,7 @@ def read(path: Path) -> LabelFile:
     people = None
     if "item" in columns and not (columns["item"] < 0).any():
         people = People(*(columns[name] for name in People._fields))
-    return LabelFile(*named, people, head.get("session"), said)
+    return LabelFile(*named, people, head.get("session"), said, head.get("run"))
 
 
 def _standing(table: pa.Table) -> pa.Table:

@@ -80,7 +80,8 @@ def run(order: Order) -> None:
             # Nobody else can change it any more.
             check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(order.task))
             for group in made.groups if order.resume else ():
-                check_standing(group, order.out / group.guidance.name, given=plan.labels is not None)
+                described = formats.read("config", order.out / CONFIG)
+                check_standing(group, order.out / group.guidance.name, described, given=plan.labels is not None)
             prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
             # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
             described = formats.read("config", order.out / CONFIG)
