@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.protocol import stand_in
 from cuelearner_jax.arbiters import episodes
-from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
@@ -25,7 +22,6 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import formats, label_files
 from cuelearner_jax.storage.folders import CONFIG
-from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.task import Task
 
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key, so they must differ
@@ -143,7 +139,6 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
         if values["split"] not in SPLITS or values["total_steps"] != config.schedule.total_steps:
             raise ValueError("its evaluation settings are invalid")
         run_config.check(config)
-        _check_room(path, config, grid)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
     return task, config, grid
@@ -154,18 +149,6 @@ def _on(task: Task, robot: Any) -> Task:
     if robot not in [body.name for body in task.bodies]:
         raise ValueError(f"{task.name} has no robot {robot!r}")
     return task.on(robot)
-
-
-def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:
-    """Raise UserError if a run's lanes or evaluations need more memory than is free."""
-    lanes, spaces = len(grid.seeds) * max(1, len(grid.labels)), Spaces(1, stand_in(config.agent), (1, 1))
-    agent = config.agent.make(config.sizes.frame, spaces, config.bootstraps)
-    weights = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(agent.init, jax.random.key(0))))
-    check_room(f"{path} has {lanes:,} lanes of {weights:,} weights", 4 * weights * lanes, "restore the file")
-    for option, floats in agent.working(1, 1).items():
-        check_room(f"{path} has too large {option}", 4 * floats, "restore the file")
-    envs = config.schedule.eval_envs
-    check_room(f"{path} has {envs:,} schedule.eval_envs", 4 * envs, "restore the file")
 
 
 def _grid(values: dict[str, Any]) -> Grid:

@@ -27,7 +27,6 @@ from jaxtyping import Float
 
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.storage.picture_files import Picture, inside
-from cuelearner_jax.storage.room import check_room, check_size
 
 INFO = Path("meta/info.json")
 VERSION = "v3.0"  # of the format
@@ -88,7 +87,6 @@ def _info(path: Path) -> dict[str, Any]:
     """Return the contents of info.json. Raises UserError for another version of the format or invalid contents."""
     file = path / INFO
     try:
-        check_size(file)
         info = json.loads(file.read_text(encoding="utf-8"))
         version, sound = info["codebase_version"], isinstance(info["features"], dict) and info["fps"] > 0
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -122,8 +120,6 @@ def _rows(path: Path, columns: list[str]) -> pa.Table:
 def _parquet(path: Path, file: Path, columns: list[str]) -> pa.Table:
     try:
         opened = pq.ParquetFile(file)
-        groups = (opened.metadata.row_group(group) for group in range(opened.num_row_groups))
-        check_room(f"{file} is large", 4 * sum(group.total_byte_size for group in groups), "give fewer episodes")
         if missing := [name for name in columns if name not in opened.schema_arrow.names]:
             raise UserError(f"{file} has no column {missing[0]}: restore it from where the dataset came from")
         return opened.read(columns=columns)

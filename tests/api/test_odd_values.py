@@ -82,20 +82,6 @@ def test_layers_may_be_a_list_or_an_array_and_are_kept_as_a_tuple(layers):
     assert hash(sizes) == hash(SIZES)
 
 
-@pytest.mark.parametrize("changes", [{"feedback_layers": (10**9,)}, {"fit_batch_size": 2**31 - 1}, {"ensemble": 10**9}])
-def test_a_guide_that_memory_does_not_hold_is_refused_before_it_is_made(changes):
-    sizes = dataclasses.replace(SIZES, **changes)
-    for call in (
-        lambda: cl.fit_feedback(LABELS, sizes=sizes),
-        lambda: cl.ask(POLICY, WORLD, TEACHER, labels=5, sizes=sizes),
-        lambda: cl.adapt(POLICY, WORLD, TEACHER, labels=5, sizes=sizes),
-    ):
-        with pytest.raises(cl.UserError, match=r"sizes.feedback_layers .* GB are free"):
-            call()
-    with pytest.raises(cl.UserError, match="at most 64"):
-        cl.fit_feedback(LABELS, sizes=dataclasses.replace(SIZES, feedback_layers=(8,) * 65))
-
-
 class Odd(struct.PyTreeNode):
     """A teacher that gives what no teacher gives."""
 

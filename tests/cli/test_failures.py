@@ -180,7 +180,7 @@ def test_a_damaged_checkpoint_is_refused(refused, copy):
 
 def test_a_checkpoint_of_another_run_is_refused(refused, copy):
     probes.edit_json(copy / "config.json", lambda values: values["agent"].update(q_layers=[24]))
-    refused(["evaluate", copy, "--guidance", "none"], "expected (1, 24)", copy)
+    refused(["evaluate", copy, "--guidance", "none"], "belongs to another run", copy)
 
 
 def test_a_run_without_checkpoints_is_refused(refused, copy):

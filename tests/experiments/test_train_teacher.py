@@ -183,7 +183,6 @@ def test_settings_that_cannot_work_are_refused(change, says):
     [
         (["--seed", "-1"], "--seed is -1"),
         (["--eval-steps", "150"], "beyond 100 a multiple"),
-        (["--teacher.tables", "1000000000"], "GB are free: lower --teacher.tables"),
         (["--preset", "no"], "unknown --preset 'no'"),
         (["--out", "."], "not empty"),
     ],
