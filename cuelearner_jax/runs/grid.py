@@ -19,7 +19,6 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME, Guide, Kind
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import formats, label_files
 from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.task import Task
@@ -134,10 +133,6 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
             task = _on(task, values["robot"])
         config = run_config.from_json(world, values)
         grid = _grid(values["grid"])
-        if "shard" in values:
-            Shard.of(values["shard"])
-        if values["split"] not in SPLITS or values["total_steps"] != config.schedule.total_steps:
-            raise ValueError("its evaluation settings are invalid")
         run_config.check(config)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
@@ -153,15 +148,10 @@ def _on(task: Task, robot: Any) -> Task:
 
 def _grid(values: dict[str, Any]) -> Grid:
     """Parse a grid; its kinds of guidance may be unknown. Raises ValueError, TypeError or KeyError if invalid."""
-    kinds, seeds, labels = parts = [values[name] for name in ("guidance", "seeds", "labels")]
-    if not all(isinstance(part, list) and len(set(part)) == len(part) for part in parts) or not (kinds and seeds):
-        raise ValueError("its lists of kinds of guidance, seeds and label budgets are missing or have duplicates")
-    if not all(isinstance(kind, str) and NAME.fullmatch(kind) for kind in kinds):
-        raise ValueError(f"{kinds} are not names of kinds of guidance")
-    numbers = [(number, end) for part, end in ((seeds, LARGEST_SEED), (labels, LARGEST_BUDGET)) for number in part]
-    if not all(type(number) is int and 0 <= number < end for number, end in numbers):
-        raise ValueError("a seed or label budget is invalid")
-    return Grid(*map(tuple, parts))
+    grid = Grid(*(tuple(values[name]) for name in ("guidance", "seeds", "labels")))
+    if not all(NAME.fullmatch(kind) for kind in grid.guidance):  # they name folders, and never code
+        raise ValueError(f"{grid.guidance} are not names of kinds of guidance")
+    return grid
 
 
 def world_of(told: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:

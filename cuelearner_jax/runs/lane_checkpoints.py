@@ -14,7 +14,7 @@ from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import acting_state
-from cuelearner_jax.runs.grid import config_hash, run_key
+from cuelearner_jax.runs.grid import run_key
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
@@ -93,12 +93,9 @@ def read_due(folder: Path, step: int, lanes: int) -> dict[str, np.ndarray] | Non
     path = folder / DUE
     if not path.exists():
         return None
-    told = formats.read("due", path)
-    try:
-        columns = {name: np.array(values, np.float32).reshape(lanes) for name, values in told["columns"].items()}
-        return columns if told["step"] == step else None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise formats.damaged("due", path) from error
+    values = formats.read("due", path)
+    columns = {name: np.array(column, np.float32).reshape(lanes) for name, column in values["columns"].items()}
+    return columns if values["step"] == step else None
 
 
 def check_standing(group: LaneGroup, folder: Path, described: dict[str, Any], given: bool = False) -> None:
@@ -113,7 +110,6 @@ def check_standing(group: LaneGroup, folder: Path, described: dict[str, Any], gi
     schedule, finished = group.config.schedule, (folder / results.PARQUET).exists()
     step, rounds = (schedule.total_steps, group.rounds) if finished else (0, 0)
     key = run_key(described, group.guidance.name)
-    constants = {"guidance": group.guidance.name, "config_hash": config_hash(described)}
     waits = False  # whether the newest stretch still needs its evaluation
     if not finished and (folder / "checkpoints").is_dir():
         with checkpoints(folder / "checkpoints", read_only=True, run=key) as saved:
@@ -128,13 +124,13 @@ def check_standing(group: LaneGroup, folder: Path, described: dict[str, Any], gi
         evaluated = range(0, step if waits else step + 1, schedule.eval_every)
         rows = [(*lane, at) for lane in lanes for at in evaluated]
         columns, among = ("seed", "labels", "step"), pc.field("step").isin(list(evaluated))
-        results.check_complete(folder, results.SCHEMA, columns, rows, among, constants)
+        results.check_complete(folder, results.SCHEMA, columns, rows, among, key)
     elif (folder / results.JSONL).exists():
         tables.read(folder / results.JSONL, results.SCHEMA)
     # runs finished by earlier versions have no such table
     if results.GUIDES.found_in(folder) or (rounds and not finished):
         columns, among = ("seed", "labels", "asked"), pc.field("round") <= rounds
-        results.check_complete(folder, results.GUIDES, columns, group.looks(rounds, given), among, constants)
+        results.check_complete(folder, results.GUIDES, columns, group.looks(rounds, given), among, key)
     labels = folder / label_files.PARQUET
     is_torn = not finished and not label_files.readable(labels)  # by a kill: it is written anew
     if group.guidance.asks and not is_torn and label_files.read(labels).run not in (None, key):

@@ -65,10 +65,10 @@ class Runner:
         self._bar = self.bars.add_task(self.name, total=self.group.config.schedule.total_steps, note="preparing")
         with checkpoints(self.folder / "checkpoints", run=self.key) as saved:
             self._restore(saved)
-            constants = self._constants()
+            constants, about = self._constants(), {"run": self.key}
             with (
-                TableWriter(self.folder, results.SCHEMA, constants) as writer,
-                TableWriter(self.folder, results.GUIDES, constants) if asks else nullcontext() as guides,
+                TableWriter(self.folder, results.SCHEMA, constants, about) as writer,
+                TableWriter(self.folder, results.GUIDES, constants, about) if asks else nullcontext() as guides,
                 tracking.open_tracker(self.order.track, self.folder, self.described, self.training.step) as tracker,
             ):
                 if guides is not None:

@@ -74,18 +74,18 @@ def check_complete(
     columns: Sequence[str],
     rows: Iterable[tuple[int, ...]],
     among: pc.Expression,
-    constants: dict[str, str],
+    run: str,
 ) -> None:
     """Raise UserError unless a folder's table has each of the rows exactly once, and no other row in `among`.
 
-    `rows` are values of the `columns`; `constants` are those of all rows. A missing table has no rows.
+    `rows` are values of the `columns`. `run` is the key of the table's run, which tables of earlier versions lack. A
+    missing table has no rows.
     """
     path = schema.found_in(folder) or folder / schema.jsonl
     wanted, found = Counter(rows), Counter[tuple[int, ...]]()
     if path.exists() and (table := tables.read(path, schema)).num_rows:
-        for name, value in constants.items():
-            if others := {*table[name].to_pylist()} - {value}:
-                raise UserError(f"{path} belongs to another run (its {name} is {others.pop()}): put its own back")
+        if (tables.about_of(table) or {}).get("run", run) != run:
+            raise UserError(f"{path} belongs to another run: put its own back")
         found.update(zip(*(table.filter(among)[name].to_pylist() for name in columns), strict=True))
     if found == wanted:
         return

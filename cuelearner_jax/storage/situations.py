@@ -71,16 +71,16 @@ def read(path: Path) -> Situations:
         )
     observations, seen = _matrix(table, columns, OBSERVATION)
     actions, entries = _matrix(table, columns, ACTION)
-    if len(actions) != len(observations):
-        raise UserError(f"{table} has {len(observations)} observations and {len(actions)} actions: give equally many")
     files = columns.get(PICTURE)
+    if len({len(observations), len(actions), len(observations if files is None else files)}) > 1:
+        raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
     return _whole(
         table,
         observations,
         actions,
         named_slices(seen, observations.shape[1]),
         entries,
-        None if files is None else PictureFiles(table, files, len(observations)),
+        None if files is None else PictureFiles(table, files),
     )
 
 
@@ -193,36 +193,21 @@ def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.n
         )
     if name in columns and entries:
         raise UserError(f"{table} has the columns {name} and {name}.{entries[0]}: give only one of the two forms")
-    if entries:
-        parts = [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries]
-        if len({len(part) for part in parts}) > 1:
-            raise UserError(f"{table}: columns {name}.NAME have several lengths: give equally many rows of each")
-        return np.stack(parts, -1), entries
-    return _numbers(table, name, columns[name], 2), ()
+    if not entries:
+        return _numbers(table, name, columns[name], 2), ()
+    return np.stack(
+        [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries], -1
+    ), entries
 
 
 def _numbers(table: Path, name: str, values: Any, axes: int) -> np.ndarray:
     """Convert a column to 32-bit floats. Raises UserError for rows of several sizes, or non-numbers."""
     try:
-        found = np.asarray(values)
-        if found.dtype.kind in "US" or found.dtype == object:
-            found = np.asarray([[float(entry) for entry in row] if axes == 2 else float(row) for row in values])
-        if found.dtype.kind not in "fiu":
-            raise TypeError
+        with np.errstate(over="ignore"):
+            found = np.asarray(values, np.float32)
+        if found.size and found.ndim != axes:
+            raise ValueError
     except (TypeError, ValueError):
-        sizes = {len(row) for row in values if isinstance(row, list | tuple)}
-        why = (
-            f"rows of {format_numbers(sizes)} entries"
-            if len(sizes) > 1
-            else f"values that are not numbers ({format_value(values[0])[:60]} ...)"
-        )
-        raise UserError(
-            f"{table}: the column {name} holds {why}: give the same number of numbers in every row"
-        ) from None
-    if found.ndim != axes and found.size:
-        raise UserError(
-            f"{table}: the column {name} has the shape {found.shape}: give {'(n, size)' if axes == 2 else '(n,)'}"
-        )
-    with np.errstate(over="ignore"):
-        found = found.astype(np.float32)
-    return found if axes == 1 or found.ndim == 2 else np.zeros((len(found), 0), np.float32)
+        wanted = "the same number of numbers" if axes == 2 else "one number"
+        raise UserError(f"{table}: give {wanted} in every row of the column {name}") from None
+    return found if found.size else np.zeros((len(found), 0)[:axes], np.float32)

@@ -13,6 +13,7 @@ as not written. A Parquet file holds a SHA-256 of its contents, and is refused i
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import math
@@ -28,6 +29,7 @@ import pyarrow.parquet as pq
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage.whole import replacing, unreadable
+from cuelearner_jax.terminal import console
 
 META = b"cuelearner"  # Parquet metadata key of the table's description
 DIGEST = b"cuelearner.sha256"  # Parquet metadata key of the digest of the contents
@@ -219,7 +221,7 @@ def read(path: Path, schema: Schema) -> pa.Table:
         path = path.with_name(schema.parquet)  # the table was finished after the file was found
     try:
         with path.open("rb") as file:
-            is_parquet = file.read(4) == b"PAR1"
+            is_parquet = file.read(4) == b"PAR1" or path.suffix == ".parquet"
         table = _finished(path, schema) if is_parquet else _grown(path, schema)
     except OSError as error:
         if error.errno is None:  # an error of Arrow's own
@@ -275,7 +277,9 @@ def _text(rows: Iterable[Row]) -> bytes:
 
 def _lines(path: Path, schema: Schema) -> list[Row]:
     """Return the parsed whole lines of a JSONL file. Raises UserError if the file is damaged."""
-    *lines, _ = path.read_bytes().split(b"\n")
+    *lines, torn = path.read_bytes().split(b"\n")
+    if torn:
+        _warn(f"warning: the last line of {path} is torn, by a crash or a cut, and is left out")
     rows = []
     for number, line in enumerate(lines, start=1):
         try:
@@ -288,6 +292,11 @@ def _lines(path: Path, schema: Schema) -> list[Row]:
         elif row.keys() != {"end"}:
             raise _damaged(path, schema, f"line {number}: it is not a row of {schema.stem}")
     return rows
+
+
+@functools.cache  # once, however often a file is read
+def _warn(line: str) -> None:
+    console.print(line)
 
 
 def _rewrite(path: Path, rows: Iterable[Row]) -> None:

@@ -4,13 +4,10 @@ import dataclasses
 import json
 from pathlib import Path
 
-import json_ways
 import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import config as configuration
-from cuelearner_jax import run_config
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import grid as runs
@@ -148,34 +145,6 @@ def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
 def test_the_description_of_another_program_is_not_loaded(out, change, message):
     probes.edit_json(out / "config.json", change)
     not_loaded(out, message)
-
-
-JUNK = [None, -1, 1e30, 10**20, True, "", "mro", [], [None], {"a": 1}, float("nan"), [1, 10**9]]
-
-
-@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.long)])
-def test_nonsense_in_a_description_is_refused_wherever_it_stands(out, every):
-    """And what is not refused is a run that the program could have described."""
-    path, taken = out / "config.json", []
-    whole = {**formats.read("config", path), "shard": {"index": 1, "count": 2, "seeds": [4, 9, 10, 11]}}
-    for way in [way for way in json_ways.ways(whole) if not isinstance(way[-1], int)][::every]:
-        for junk in JUNK:
-            values = json_ways.changed(whole, way, junk)
-            path.write_text(json.dumps({**values, "digest": configuration.digest(values)}))
-            try:
-                _, config, grid = runs.load(out, find)
-            except UserError as error:
-                assert "\n" not in str(error)
-                continue
-            taken.append((way, junk))
-            run_config.check(config)
-            assert all(isinstance(kind, str) for kind in grid.guidance)
-            assert all(isinstance(number, int) for number in (*grid.seeds, *grid.labels))
-    assert {way for way, junk in taken if isinstance(junk, str)} <= {
-        ("grid", "guidance", "x"),
-        ("labels_from",),
-        ("format",),
-    }
 
 
 def test_the_learned_teachers_description_is_no_run(out):

@@ -108,13 +108,16 @@ GOOD = {"observation": [[0.0, 1.0], [2.0, 3.0]], "action": [[0.5], [0.25]]}
     ("changed", "told"),
     [
         ({"action": None}, "has no column action (its columns: observation)"),
-        ({"observation": [[0.0, 1.0], [2.0]]}, "rows of 1 to 2 entries|rows of 1, 2 entries"),
+        (
+            {"observation": [[0.0, 1.0], [2.0]]},
+            "give the same number of numbers in every row of the column observation",
+        ),
         ({"observation": [[0.0, 1.0], [2.0, float("nan")]]}, "the rows 1 are not finite"),
-        ({"action": [["a"], ["b"]]}, "values that are not numbers"),
+        ({"action": [["a"], ["b"]]}, "give the same number of numbers in every row of the column action"),
         ({"picture": ["../secret.png", None]}, "leads out of"),
         ({"picture": ["/etc/passwd", None]}, "leads out of"),
-        ({"picture": ["notes.txt", None]}, "has a type that the page does not show"),
-        ({"picture": [1.0, 2.0]}, "give the name of a file"),
+        ({"picture": ["notes.txt", None]}, "is no picture's file that the page shows"),
+        ({"picture": [1.0, 2.0]}, "is no picture's file"),
         ({"observation": [], "action": []}, "holds no observations"),
     ],
 )
@@ -123,7 +126,7 @@ def test_what_does_not_fit_is_told(changed, told, tmp_path):
     table(tmp_path / "there", **columns)
     with pytest.raises(UserError) as error:
         situations.read(tmp_path / "there")
-    assert any(words in str(error.value) for words in told.split("|"))
+    assert told in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +162,7 @@ def test_a_csv_file_of_other_columns_is_told(text, told, tmp_path):
 def test_sizes_that_differ_are_told(tmp_path):
     (tmp_path / "there").mkdir()
     np.savez(tmp_path / "there/situations.npz", observation=np.zeros((3, 2)), action=np.zeros((2, 1)))
-    with pytest.raises(UserError, match="3 observations and 2 actions"):
+    with pytest.raises(UserError, match="columns of several lengths"):
         situations.read(tmp_path / "there")
 
 
