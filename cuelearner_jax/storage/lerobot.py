@@ -58,9 +58,7 @@ def read(path: Path) -> Recording:
     info = _info(path)
     features = info["features"]
     parts = {name: _parts(path, features, name) for name in (OBSERVATION, ACTION)}
-    cameras = [
-        key for key, told in features.items() if isinstance(told, dict) and told.get("dtype") in ("video", "image")
-    ]
+    cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
     stored = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
     table = _rows(path, [*parts[OBSERVATION], *parts[ACTION], "episode_index", "timestamp", *stored])
     vectors = {
@@ -73,7 +71,7 @@ def read(path: Path) -> Recording:
 
 def _parts(path: Path, features: dict[str, Any], name: str) -> list[str]:
     """Return the features of numbers called `name` or `name.PART`. Raises UserError if there are none."""
-    vectors = [key for key, told in features.items() if _is_vector(told)]
+    vectors = [key for key, feature in features.items() if _is_vector(feature)]
     parts = [name] if name in vectors else [key for key in vectors if key.startswith(f"{name}.")]
     if not parts:
         there = ", ".join(features)
@@ -88,25 +86,20 @@ def _info(path: Path) -> dict[str, Any]:
     file = path / INFO
     try:
         info = json.loads(file.read_text(encoding="utf-8"))
-        version, sound = info["codebase_version"], isinstance(info["features"], dict) and info["fps"] > 0
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        version, _ = info["codebase_version"], info["features"].items()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{file} is damaged: restore it from where the dataset came from") from error
     if version != VERSION:
         raise UserError(
             f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is needed: convert it by "
             "LeRobot's own script first"
         )
-    if not sound:
-        raise UserError(f"{file} is damaged: restore it from where the dataset came from")
     return info
 
 
-def _is_vector(told: Any) -> bool:
+def _is_vector(feature: dict[str, Any]) -> bool:
     """Return whether a feature is a row of numbers."""
-    if not isinstance(told, dict) or not str(told.get("dtype")).startswith(("float", "int", "uint", "bool")):
-        return False
-    shape = told.get("shape")
-    return isinstance(shape, list) and len(shape) == 1 and type(shape[0]) is int and shape[0] > 0
+    return feature["dtype"].startswith(("float", "int", "uint", "bool")) and len(feature["shape"]) == 1
 
 
 def _rows(path: Path, columns: list[str]) -> pa.Table:

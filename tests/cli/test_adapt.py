@@ -327,6 +327,8 @@ def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
 
 
 def test_the_arrays_of_another_policy_are_refused(adapted, tmp_path):
+    act = lambda folder: cl.load_policy(folder, task="own_turned:TASK", base=lambda obs: obs)  # noqa: E731
+    act(adapted)
     mixed = tmp_path / "mixed"  # of two folders, each of them whole
     shutil.copytree(adapted, mixed)
     shutil.rmtree(mixed / "arrays")
@@ -339,7 +341,7 @@ def test_the_arrays_of_another_policy_are_refused(adapted, tmp_path):
     )
     (mixed / "spare" / "arrays").rename(mixed / "arrays")
     with pytest.raises(cl.UserError, match="holds the arrays of another policy"):
-        cl.load_policy(mixed, task="own_turned:TASK", base=lambda obs: obs)
+        act(mixed)
 
 
 def _shapes(folder):

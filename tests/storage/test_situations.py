@@ -206,7 +206,6 @@ def test_nothing_is_unpickled(tmp_path, capsys):
     [
         (lambda info: info.update(codebase_version="v2.1"), "of the format 'v2.1', v3.0 is needed"),
         (lambda info: info.update(features=[]), "is damaged"),
-        (lambda info: info.pop("fps"), "is damaged"),
         (lambda info: info["features"].pop("action"), "has no feature action"),
         (lambda info: info["features"]["observation.state"].update(dtype="string"), "has no feature observation"),
         (lambda info: info["features"]["action"].update(shape=[2]), "action does not hold 2 numbers"),
