@@ -279,7 +279,7 @@ def _lines(path: Path, schema: Schema) -> list[Row]:
     """Return the parsed whole lines of a JSONL file. Raises UserError if the file is damaged."""
     *lines, torn = path.read_bytes().split(b"\n")
     if torn:
-        _warn(f"warning: the last line of {path} is torn, by a crash or a cut, and is left out")
+        _warn(f"warning: the last line of {path} is incomplete and is left out")
     rows = []
     for number, line in enumerate(lines, start=1):
         try:
