@@ -6,7 +6,7 @@ UV := $(BIN)/python -m uv
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart gallery smoke test test-all test-quick test-foreign durations fuzz lint format docs bench release constraints clean
+.PHONY: help setup quickstart gallery smoke test test-all test-quick test-foreign durations lint format docs bench release constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make gallery      the films of docs/gallery.md"
@@ -16,7 +16,6 @@ help:
 	@echo "make test-foreign those of policies of PyTorch, Stable-Baselines3 and onnxruntime, which it installs"
 	@echo "make durations    make test, and tests/durations.txt: the seconds of each file"
 	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
-	@echo "make fuzz         damaged folders and files by chance, CASES=2000 SEED=0 (hours on 2 cores)"
 	@echo "make lint         ruff and pyright"
 	@echo "make format       what ruff can put right by itself"
 	@echo "make docs         the pages of docs/ as a site, in site/ (under half a minute)"
@@ -74,12 +73,6 @@ test-foreign: $(VENV)/.foreign
 
 durations: $(VENV)/.tested
 	$(PYTEST) -m "not long" --durations-to tests/durations.txt
-
-CASES ?= 2000
-SEED ?= 0
-fuzz: $(VENV)/.tested
-	PYTHONPATH=tests JAX_PLATFORMS=cpu $(BIN)/python tests/damaged_folders.py --cases $(CASES) --seed $(SEED)
-	PYTHONPATH=tests JAX_PLATFORMS=cpu $(BIN)/python tests/damaged_files.py --cases $(CASES) --seed $(SEED)
 
 lint: $(VENV)/.tested
 	$(BIN)/ruff check .

@@ -21,8 +21,7 @@ import jax
 
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.memory_report import state_bytes
-from cuelearner_jax.runs.speed import Timed, learning
+from cuelearner_jax.runs.speed import Timed, learning, state_bytes
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks.navigation import NAVIGATION
 

@@ -61,8 +61,8 @@ def no_space(error: BaseException) -> bool:
     return mentions(error, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), *words)
 
 
-def file_system_message(error: BaseException, resumes: bool) -> str | None:
-    """Return one line about an exception that the file system caused; None for any other.
+def machine_message(error: BaseException, resumes: bool) -> str | None:
+    """Return one line about an exception that the file system or a lack of memory caused; None for any other.
 
     `resumes`: whether the command can resume from what it saved.
     """
@@ -71,6 +71,9 @@ def file_system_message(error: BaseException, resumes: bool) -> str | None:
         return f"the disk is full: free some, then {again}"
     if isinstance(error, OSError) and error.filename is not None and error.errno in FILE_SYSTEM:
         return f"{error.filename}: {error.strerror}; what was saved before is safe"
+    if mentions(error, (errno.ENOMEM,), "RESOURCE_EXHAUSTED", "Out of memory") or isinstance(error, MemoryError):
+        words = (str(error).splitlines() or [""])[0][:200]
+        return f"not enough memory ({words}): lower the sizes that were given, or the number of seeds at once"
     return None
 
 

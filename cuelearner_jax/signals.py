@@ -14,7 +14,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a scheduler, a terminal that was closed
@@ -23,7 +22,6 @@ SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # clears a progress bar's line and shows its
 _listening = threading.Event()  # set in a process of the command's own
 _leaving = threading.Lock()
 _saves = threading.RLock()
-_litter: set[Path] = set()  # files to delete when this process ends
 
 
 class Interrupted(Exception):
@@ -103,17 +101,6 @@ def saving() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-@contextmanager
-def removed(file: Path) -> Iterator[None]:
-    """Delete a file at the end, also when a signal ends this process at once."""
-    _litter.add(file)
-    try:
-        yield
-    finally:
-        _litter.discard(file)
-        file.unlink(missing_ok=True)
-
-
 def listen() -> None:
     """Make a signal end this process at once with one line and status 128 plus its number, except in `interruptible`.
 
@@ -161,9 +148,6 @@ def _stop_at_once(number: int) -> None:
 def _leave(number: int) -> None:
     if not _leaving.acquire(blocking=False):
         return
-    for file in tuple(_litter):
-        with contextlib.suppress(OSError):
-            file.unlink()
     with contextlib.suppress(OSError):  # bypasses Python's streams, whose locks another thread may hold
         shown = SHOW_CURSOR if os.isatty(2) else b""
         os.write(2, shown + b"stopped at once; what was saved before is safe\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,10 +15,8 @@ from cuelearner_jax.config import GuideSizes, Scalars, check_types
 from cuelearner_jax.environment import Environment, View, offers, view_of
 from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import EnvState, Policy, Reel, Sketch, Teacher
 
-COPIES = 3  # bytes of a world while it is made
 PAPER = "paper"  # name of the default preset
 
 # Of a scenario's sizes: the paper's networks and their fitting, in place of the smaller ones that `adapt` else has
@@ -203,13 +200,7 @@ class Task:
         return self.presets[self.first_preset()].config if self.presets else RunConfig(self.plain())
 
     def environment(self, config: Any, split: str = "training") -> Environment:
-        """Return the world of a configuration with the first body in it, for the episodes of a split.
-
-        Raises UserError if it is more than memory holds, before any of it is made.
-        """
-        leaves = jax.tree.leaves(shape_of(self, config))
-        needed = COPIES * sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
-        check_room(f"the world of {self.name} is large", needed, "lower those of --task or of the file")
+        """Return the world of a configuration with the first body in it, for the episodes of a split."""
         return self.bodies[0].environment(config, split)
 
     def view(self, config: Any) -> View:

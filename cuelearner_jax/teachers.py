@@ -20,12 +20,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.agents.networks import all_finite, as_function, q_network
 from cuelearner_jax.agents.view import network_inputs
-from cuelearner_jax.config import LARGEST, MOST_LAYERS, from_json, to_json
+from cuelearner_jax.config import from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.checkpoint import checkpoints
-from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import Params
 
 ABOUT = "teacher.json"
@@ -112,13 +111,6 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
         shape = from_json(Shape, {name: about["config"][name] for name in ("layers", "directions")})
     except (ValueError, KeyError, TypeError) as error:
         raise formats.damaged("teacher", folder / ABOUT) from error
-    if not 1 <= len(shape.layers) <= MOST_LAYERS or not all(
-        1 <= n <= LARGEST for n in (*shape.layers, shape.directions)
-    ):
-        raise formats.damaged("teacher", folder / ABOUT, "layers or directions that no teacher has")
-    told = f"{folder / ABOUT} has {shape.directions:,} directions"
-    # the same remedy as for a run (`grid.load`)
-    check_room(told, 8 * max(shape.layers) * shape.directions, "restore the file")
     template = jax.eval_shape(lambda key: init_params(shape.layers, env, key), jax.random.key(0))
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:

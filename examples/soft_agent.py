@@ -83,10 +83,6 @@ class SoftQ:
         hidden = [layer for width in self.options.layers for layer in (nn.Dense(width), nn.relu)]
         return nn.Sequential([*hidden, nn.Dense(len(self.choices))])
 
-    def working(self, num_envs: int, portion: int) -> dict[str, int]:
-        """Return the floats of a batch's activations and gradients."""
-        return {"--agent.batch-size": 4 * self.options.batch_size * (sum(self.options.layers) + len(self.choices))}
-
     def init(self, key: Array) -> tuple[Params, Any]:
         """Return random parameters; beside them the target network, their copy, and the state of Adam."""
         params = self.network.init(key, jnp.zeros(self.spaces.obs_size))

@@ -10,7 +10,6 @@ A run is labelled by the folder with --task.teacher FOLDER.
 from __future__ import annotations
 
 import argparse
-import math
 import shlex
 import shutil
 import sys
@@ -22,7 +21,7 @@ from typing import Any, Generic, TypeVar
 import jax
 import numpy as np
 import tyro
-from _teacher_program import TeacherConfig, Trainer, check_config, finished, make_program
+from _teacher_program import TeacherConfig, check_config, finished, make_program
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import teachers
@@ -34,7 +33,6 @@ from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, in_use, prepare_folder
 from cuelearner_jax.storage.provenance import provenance
-from cuelearner_jax.storage.room import free_bytes
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.teachers import LearnedTeacher
@@ -65,7 +63,7 @@ class Asked(Generic[TaskT]):
 
 
 def check(task: Task, asked: Asked) -> None:
-    """Raise UserError for values that cannot work, or for more memory than is free."""
+    """Raise UserError for values that cannot work."""
     check_config(asked.teacher)
     if not 0 <= asked.seed <= LARGEST:
         raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST}")
@@ -74,20 +72,6 @@ def check(task: Task, asked: Asked) -> None:
     shape = shape_of(task, asked.task)
     if not hasattr(shape, "features"):
         raise UserError(f"{task.name} gives a teacher no features to learn from")
-    needed, free = needed_bytes(asked.teacher, shape), free_bytes()
-    if free and needed > free:
-        raise UserError(
-            f"the training needs about {needed / 1e9:,.1f} GB, {free / 1e9:.1f} GB are free: lower --teacher.tables, "
-            "--teacher.memory or --teacher.search"
-        )
-
-
-def needed_bytes(config: TeacherConfig, env: Any) -> int:
-    """Memory that a training takes, about [bytes]: what it keeps, and the activations of its widest pass twice."""
-    state = jax.eval_shape(Trainer(config).init, env, jax.random.key(0))
-    kept = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-    rows = max(config.tables * config.search, config.batch_size * len(config.layers))
-    return kept + 2 * 4 * max(config.layers) * rows
 
 
 def train(task: Task, asked: Asked, command: str) -> float:

@@ -46,7 +46,7 @@ def write(folder, rows=12, form="parquet", pictures=True):
     return observations, actions
 
 
-def write_lerobot(folder, lengths=(5, 7), fps=10, version="v3.0", names=True):
+def write_lerobot(folder, lengths=(5, 7), fps=10, version="v3.0", names=True, video_fps=10):
     """Write a LeRobot dataset of the format v3.0, a camera's frames as bright as they are far; return its arrays.
 
     Two data files, one video file in which the episodes follow one another, as the format has it.
@@ -92,7 +92,7 @@ def write_lerobot(folder, lengths=(5, 7), fps=10, version="v3.0", names=True):
         f"{key}/to_timestamp": [float(end) / fps for end in starts[1:]],
     }
     pq.write_table(pa.table(episodes), folder / "meta/episodes/chunk-000/file-000.parquet")
-    with imageio.get_writer(folder / key / "chunk-000/file-000.mp4", fps=fps, macro_block_size=2) as video:
-        for row in range(rows):
-            video.append_data(np.full((32, 48, 3), 20 * row, np.uint8))
+    with imageio.get_writer(folder / key / "chunk-000/file-000.mp4", fps=video_fps, macro_block_size=2) as video:
+        for frame in range(rows * video_fps // fps):
+            video.append_data(np.full((32, 48, 3), 20 * (frame * fps // video_fps), np.uint8))
     return observations, actions

@@ -11,7 +11,7 @@ from jaxtyping import TypeCheckError
 from cuelearner_envs.billiards import Table
 from cuelearner_envs.navigation.geometry import in_frame
 from cuelearner_envs.navigation.robot import Robot
-from cuelearner_jax.storage.footer import read_declared
+from cuelearner_jax.storage.label_files import found_in
 
 
 def test_an_array_of_another_shape_than_the_signatures_is_refused():
@@ -23,8 +23,8 @@ def test_an_array_of_another_shape_than_the_signatures_is_refused():
 
 
 def test_functions_that_name_no_array_are_checked_too():
-    with pytest.raises(TypeCheckError, match="path"):
-        read_declared("a string")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeCheckError, match="place"):
+        found_in("a string")  # pyright: ignore[reportArgumentType]
 
 
 def test_pytrees_may_hold_what_stands_for_arrays():

@@ -15,7 +15,6 @@ compiled program: side by side on an accelerator, one by one on a CPU (`devices.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import partial
 from itertools import product as combinations
@@ -35,11 +34,7 @@ from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_l
 from cuelearner_jax.environment import Environment, actions_of, view_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, PolicyBlock
-from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import Label, Teacher
-
-FLOAT = 4  # bytes
-OPTIMIZER = 4  # parameters, their gradients and Adam's two moments
 
 
 class Lanes(NamedTuple):
@@ -151,19 +146,7 @@ def begin(of: Adaptation, lanes: Lanes) -> LaneState:
     slots = rounds(lanes, of.sizes) * of.sizes.labels_per_round
     bound = actions_of(of.env).from_unit(lanes.bound_deg)
     columns = (*(jnp.asarray(column) for column in (lanes.base, lanes.seed, lanes.budget)), bound)
-    check_memory(of.sizes, jax.eval_shape(partial(_begin, of.guidance, of.sizes, slots), of.env, columns))
     return _begin(of.guidance, of.sizes, slots, of.env, columns)
-
-
-def check_memory(sizes: GuideSizes, kept: Any) -> None:
-    """Raise UserError if guides and their fitting need more memory than is free.
-
-    `kept`: a tree of their shapes.
-    """
-    size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(kept))
-    fitting = 3 * FLOAT * sizes.ensemble * sizes.fit_batch_size * sum(sizes.feedback_layers)  # activations, gradients
-    declared = f"sizes.feedback_layers {sizes.feedback_layers} with sizes.fit_batch_size {sizes.fit_batch_size}"
-    check_room(declared, OPTIMIZER * size + fitting, "lower these, or the number of labels and lanes")
 
 
 def ask_round(of: Adaptation, teacher: Teacher, block: LaneState, mesh: Mesh | None = None) -> LaneState:

@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.agents import view
-from cuelearner_jax.agents.choice import best_near_peaks, best_of, values_per_choice
+from cuelearner_jax.agents.choice import best_near_peaks, best_of
 from cuelearner_jax.agents.networks import as_function, q_network, widen_layers
 from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers, Scalars, Sizes, part
@@ -114,19 +114,6 @@ class DoubleDQN:
     def described(self) -> dict[str, Any]:
         """The set of actions and the network's frame, as JSON values for an export's contract."""
         return {"directions": self.options.directions, "frame": self.frame}
-
-    def working(self, num_envs: int, portion: int) -> dict[str, int]:
-        """Return the number of activations of the widest passes: acting, targets, and a minibatch's gradient."""
-        own = self.options
-        looked = values_per_choice(own.directions, own.coarse_directions, own.peaks)
-        rows = {
-            "--agent.directions": min(num_envs * looked, max(portion, looked)),
-            "--agent.batch-size": 3 * own.batch_size * len(own.q_layers),
-        }
-        if self.bootstraps:
-            rows["--agent.target-directions"] = own.batch_size * own.target_directions * (2 if own.n_step > 1 else 1)
-        needed = {option: 4 * max(own.q_layers) * number for option, number in rows.items()}
-        return {**needed, "--agent.n-step": 8 * own.batch_size * own.n_step}
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, DDQNState]:
         """Return random parameters, and a target network that is a copy of them."""

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from cuelearner_jax.agents.replay import Memory
 from cuelearner_jax.config import Frame, Scalars, Sizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Params
 
 # (observations (n, obs), actions (n, action)) -> actions (n, action) offered in their place
@@ -38,13 +37,6 @@ class AgentFunctions(Protocol):
     @property
     def described(self) -> dict[str, Any]:
         """Facts for an export's contract, as JSON values."""
-        ...
-
-    def working(self, num_envs: int, portion: int) -> dict[str, int]:
-        """Return the floats that one lane takes beside its state in each kind of work, by the option that decides it.
-
-        `portion`: values of actions that are computed at once.
-        """
         ...
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, Any]:
@@ -128,7 +120,6 @@ class OptionalFacts(Protocol):
         bool
     ]  # True if an actor chooses, not the argmax of `value`; `update` then takes an `Offer`, `other`
     SORTS: ClassVar[bool]  # True if `update` draws guided and own steps separately; replay then counts guided steps
-    ACTS_IN: ClassVar[Space]  # one of the spaces in which it acts, where these are not all
 
 
 def has_actor(options: Any) -> bool:
@@ -143,8 +134,3 @@ def has_actor(options: Any) -> bool:
 def draws_sorts(options: Any) -> bool:
     """Return whether agents of these options draw guided and own steps separately (`guided_share`)."""
     return getattr(options, "SORTS", False)
-
-
-def stand_in(options: Any) -> Space:
-    """Return a small space in which agents of these options act, for where the task's space is not known."""
-    return getattr(options, "ACTS_IN", DIRECTIONS)

@@ -29,7 +29,7 @@ from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces import Box, Space
+from cuelearner_jax.spaces import Box
 from cuelearner_jax.types import Params
 
 LOG_STD = (-20.0, 2.0)  # bounds of the logarithm of the Gaussian's standard deviation
@@ -43,7 +43,6 @@ class Config:
     ABOUT: ClassVar[str] = "soft actor-critic in a box, with any number of critics"
     ACTOR: ClassVar[bool] = True
     SORTS: ClassVar[bool] = True
-    ACTS_IN: ClassVar[Space] = Box((-1.0,), (1.0,))
 
     actor_layers: Layers = (256, 256)
     """Hidden layers of the actor."""
@@ -149,15 +148,6 @@ class SoftActorCritic:
     def described(self) -> dict[str, Any]:
         """The rule of choice and the networks' frame, as JSON values for an export's contract."""
         return {"rule": "tanh of the actor's mean", "frame": self.frame}
-
-    def working(self, num_envs: int, portion: int) -> dict[str, int]:
-        """Return the number of activations of a minibatch with its gradients, and of acting."""
-        own = self.options
-        passes = 3 * own.critics * sum(own.critic_layers) + 3 * sum(own.actor_layers)
-        return {
-            "--agent.batch-size": own.batch_size * (passes + 4 * own.critics),
-            "--sizes.num-envs": 2 * num_envs * max(own.actor_layers),
-        }
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, SACState]:
         """Return random parameters, target critics that are copies, and the first temperature."""

@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import by_model
-from cuelearner_jax.adaptation.lanes import Adaptation, blame, check_memory, product
+from cuelearner_jax.adaptation.lanes import Adaptation, blame, product
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, entries_of
@@ -106,7 +106,6 @@ def fit_feedback(
     sizes, scalars = settings(space, sizes, scalars, eps_deg)
     guidance = KIND.make(sizes, spaces)
     k_init, k_fit = jax.random.split(jax.random.key(seed))
-    check_memory(sizes, jax.eval_shape(guidance.init, k_init))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
     model = fit(k_fit, jax.tree.map(jnp.asarray, rows), guidance.init(k_init), scalars)
     if not all_finite(model):

@@ -24,7 +24,6 @@ from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space
-from cuelearner_jax.storage import whole
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.types import EnvState
@@ -169,7 +168,6 @@ def load_policy(
         task = registry.resolve(arguments.text("task", task))
     arguments.optional(arguments.instance, "task", task, Task, "a task, or its name")
     arguments.optional(a_world, "world", world)
-    whole.check_not_aside(path)
     if not path.exists():
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
     find = lambda name: task if task and task.name == name else registry.find(name)  # noqa: E731

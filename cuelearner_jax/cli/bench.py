@@ -23,12 +23,11 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig, check
 from cuelearner_jax.runs import speed
 from cuelearner_jax.runs.grid import LARGEST_SEED
-from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.studies.train import preset_kinds
-from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.terminal import Interrupted, console, interruptible, progress_bars
+from cuelearner_jax.terminal import Interrupted, interruptible, progress_bars
 
 COLUMNS = {  # column -> name and format of its measurement
     "steps/s": ("steps_a_second", ",.0f"),
@@ -130,11 +129,8 @@ def _check(asked: Measuring, works: list[tuple[Task, str, RunConfig]]) -> Mesh:
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")
     mesh = lane_mesh(jax.local_devices()[: asked.devices or None])
-    for task, preset, config in works:
+    for *_, config in works:
         check(config)
-        for seeds in asked.seeds:
-            lanes = speed.lanes(config, shape_of(task, config.task), "none", seeds, mesh=mesh)
-            console.print(f"{task.name} {preset}, {memory_report(lanes)}")
     return mesh
 
 

@@ -28,7 +28,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 from cuelearner_jax import __version__
 from cuelearner_jax.cli import pages
 from cuelearner_jax.cli.pages import HELP
-from cuelearner_jax.errors import NotFinite, UserError, file_system_message, suggestion
+from cuelearner_jax.errors import NotFinite, UserError, machine_message, suggestion
 from cuelearner_jax.signals import Interrupted
 
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, its option classes by command name.
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         abandon(sys.stdout)
         return 141
     except Exception as error:
-        told = file_system_message(error, _resumes(arguments))
+        told = machine_message(error, _resumes(arguments))
         if told is None:
             raise
         _tell(f"error: {told}")

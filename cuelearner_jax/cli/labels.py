@@ -22,8 +22,7 @@ from cuelearner_jax.labelling import comparing
 from cuelearner_jax.report.escaping import cell
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.storage.label_checks import UNDONE, UNSURE
-from cuelearner_jax.storage.label_files import LabelFile
+from cuelearner_jax.storage.label_files import UNDONE, UNSURE, LabelFile
 from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry

@@ -16,7 +16,7 @@ from cuelearner_jax.policies import policy_of, teaching
 from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.storage import policy_folders, whole
+from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import PAPER, Preset, Task, shape_of
 from cuelearner_jax.tasks import registry, shipped
 
@@ -79,7 +79,6 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
     if rest and (known is None or not rest[0].startswith("-")):
         name, rest = rest[0], rest[1:]
         folder = shipped.folder_of(name)
-        whole.check_not_aside(folder)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
         if holds or (folder.exists() and name not in registry.names()):
             source = _of_folder(folder, known, code, changed)

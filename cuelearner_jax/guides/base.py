@@ -77,15 +77,6 @@ class Candidates(NamedTuple):
     possible: Bool[Array, " candidates"]  # False: not possible in this situation
 
 
-class Footprint(NamedTuple):
-    """The sizes of a guide's network for one situation, from which its memory is computed."""
-
-    option: str  # the option that sets its layers
-    layers: tuple[int, ...]  # units
-    inputs: int = 0  # numbers that the network sees beside the observation
-    searched: tuple[str, int] | None = None  # actions that the guide values at once, after the option that decides it
-
-
 @dataclass(frozen=True)
 class Guide:
     """One kind of guidance for one lane: pure functions over an explicit model, chosen in Python before tracing.
@@ -138,10 +129,6 @@ class Guide:
     def network(self) -> GuideModel:
         """The network, or ensemble, whose outputs are added to an action."""
         return guide_model(self.sizes, self.spaces)
-
-    def footprint(self, env: Any) -> Footprint:
-        """Return the sizes that memory is computed from; shapes in place of an environment's arrays will do."""
-        return Footprint("--sizes.feedback-layers", self.sizes.feedback_layers)
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " outputs"]:
         """Return what the network is to predict for one label; here the answer."""

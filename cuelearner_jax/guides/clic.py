@@ -38,7 +38,7 @@ from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import POSITIVE, SHARE, Bounds, part
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
-from cuelearner_jax.guides.base import Footprint, Guide, Kind
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refinement
@@ -149,12 +149,6 @@ class Clic(Guide):
     def network(self) -> GuideModel:
         """The network, or ensemble, whose output is minus the energy of an action."""
         return guide_model(self.sizes, self.spaces, outputs=1)
-
-    def footprint(self, env: Any) -> Footprint:
-        """Return the sizes of the layers, and the number of actions that the search values."""
-        return (
-            super().footprint(env)._replace(searched=(f"--{self.name}.searched-actions", self.options.searched_actions))
-        )
 
     def energy(
         self,

@@ -28,7 +28,7 @@ from cuelearner_jax.config.parts import Bounds, Layers, part
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.aims import SPREAD, log_density, open_aims
-from cuelearner_jax.guides.base import Candidates, Footprint, Guide, Kind
+from cuelearner_jax.guides.base import Candidates, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, ensemble
 from cuelearner_jax.guides.refining import Refinement
@@ -156,12 +156,6 @@ class Intent(Guide):
         if not self.options.from_rule:
             return aims
         return aims._replace(features=jnp.concatenate([aims.features, env.rule(obs)[:, None]], -1))
-
-    def footprint(self, env: Any) -> Footprint:
-        """Return the sizes of the layers, which every aim goes through."""
-        aims, features = jax.eval_shape(self.aims, env, jnp.zeros(self.spaces.obs_size)).features.shape
-        layers = tuple(aims * width for width in self.options.aim_layers)
-        return Footprint("--intent.aim-layers", layers, aims * features)
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars

@@ -25,7 +25,7 @@ from cuelearner_jax.agents.choice import best_of
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import POSITIVE, SHARE, part
 from cuelearner_jax.feedback.answers import SCALAR
-from cuelearner_jax.guides.base import Footprint, Guide, Kind
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel
@@ -52,11 +52,6 @@ class Scalar(Guide):
     def network(self) -> GuideModel:
         """The network, or ensemble, whose output is whether an action is called good."""
         return guide_model(self.sizes, self.spaces, outputs=1)
-
-    def footprint(self, env: Any) -> Footprint:
-        """Return the sizes of the layers, and the number of actions that the search values."""
-        searched = ("--scalar.guide-directions", self.options.guide_directions)
-        return super().footprint(env)._replace(searched=searched)
 
     def act(
         self,

@@ -29,7 +29,7 @@ from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import advance, begin, keys_of, lived, programs
 from cuelearner_jax.policies import policy_name
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.storage.label_checks import ANSWERED, UNDONE, UNSURE
+from cuelearner_jax.storage.label_files import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import Label, Reel, Sketch
@@ -54,7 +54,7 @@ class Item(NamedTuple):
 class Said(NamedTuple):
     """The recorded response to an item."""
 
-    said: str  # one of `label_checks.SAID`
+    said: str  # one of `label_files.SAID`
     obs: np.ndarray
     action: np.ndarray
     answer: np.ndarray | None

@@ -31,16 +31,8 @@ class Planned(NamedTuple):
     def of(cls, file: Path) -> Planned:
         """Read the plan from a config.json. Raises UserError if the file cannot be read or is invalid."""
         values = formats.read("config", file)
-        total, grid = values.get("total_steps"), values.get("grid", {})
-        if not isinstance(grid, dict) or not (total is None or _is_number(total)):
-            raise formats.damaged("config", file)
-        axes = [grid.get(name, []) for name in ("guidance", "seeds", "labels")]
-        if not all(isinstance(axis, list) for axis in axes):
-            raise formats.damaged("config", file)
-        kinds, seeds, labels = axes
-        if not all(isinstance(kind, str) for kind in kinds) or not all(map(_is_number, seeds + labels)):
-            raise formats.damaged("config", file)
-        return cls(total, tuple(kinds), tuple(seeds), tuple(labels))
+        grid = values.get("grid", {})
+        return cls(values.get("total_steps"), *(tuple(grid.get(name, ())) for name in ("guidance", "seeds", "labels")))
 
 
 def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[str]:
@@ -153,7 +145,3 @@ def _configuration(folder: Path) -> Path | None:
 def _listed(numbers: set[int]) -> str:
     more = f" and {len(numbers) - LISTED:,} more" if len(numbers) > LISTED else ""
     return f"{', '.join(map(str, sorted(numbers)[:LISTED]))}{more}"
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0

@@ -19,7 +19,7 @@ from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.policies import Common, lanes_in, layers
-from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED, world_of
+from cuelearner_jax.runs.grid import world_of
 from cuelearner_jax.storage import formats, label_files, policy_folders, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.provenance import provenance
@@ -27,8 +27,7 @@ from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.types import Label
 
-# columns that describe the lanes
-COLUMNS = {"base": int, "seeds": int, "labels": int, "bounds_deg": float, "used": bool}
+COLUMNS = ("base", "seeds", "labels", "bounds_deg", "used")  # that describe the lanes
 CONVENTIONS = {
     "action": "the base policy's, refined by the model until a pass moves it by less than tau, within the bound; or, "
     "calibrated, of the observation as it was before the changes, led back to what it meant",
@@ -104,33 +103,12 @@ def open_folder(
     try:
         task, world = world_of(values["task"], find, path)
         serialization.check(values["policy"])
-        lanes, used = _lanes(values["lanes"], values["rows"])
+        *columns, used = (np.array(values["lanes"][name]) for name in COLUMNS)
     except UserError as error:
         raise error if str(path) in str(error) else UserError(f"{path}: {error}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("policy", path) from error
-    return task, world, AdaptedLanes(folder, values, lanes, used, values["rows"], code, changes)
-
-
-def _lanes(told: dict[str, Any], rows: int | None) -> tuple[Lanes, np.ndarray]:
-    """Parse the lanes in a policy file; return them and whether each model is used (lanes,).
-
-    `rows`: number of base policies; None: the lanes share one. Raises ValueError or KeyError for invalid contents.
-    """
-    columns = [told[column] for column in COLUMNS]
-    for column, kind in zip(columns, COLUMNS.values(), strict=True):
-        sound = isinstance(column, list) and len(column) == len(columns[0]) > 0
-        if not sound or not all(type(value) is kind for value in column):
-            raise ValueError("its lanes' columns are of several lengths, or hold something else than they should")
-    base, seeds, labels, bounds, used = columns
-    if rows is not None and (type(rows) is not int or not 1 <= rows <= len(seeds)):
-        raise ValueError(f"{len(seeds)} lanes have {rows!r} base policies")
-    ends = ((base, rows or 1), (seeds, LARGEST_SEED), (labels, LARGEST_BUDGET))
-    if not all(0 <= value < end for column, end in ends for value in column) or not all(0 < b <= 180 for b in bounds):
-        raise ValueError("a lane has an invalid base, seed, label budget or bound")
-    if len(set(zip(base, seeds, labels, bounds, strict=True))) < len(seeds):
-        raise ValueError("two lanes are equal")
-    return Lanes(*(np.array(column) for column in columns[:-1])), np.array(used)
+    return task, world, AdaptedLanes(folder, values, Lanes(*columns), used, values["rows"], code, changes)
 
 
 def write(

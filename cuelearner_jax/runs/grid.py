@@ -7,25 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.protocol import stand_in
 from cuelearner_jax.arbiters import episodes
-from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME, Guide, Kind
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import formats, label_files
 from cuelearner_jax.storage.folders import CONFIG
-from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.task import Task
 
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key, so they must differ
@@ -118,6 +113,11 @@ def config_hash(described: dict[str, Any]) -> str:
     return configuration.digest({**learned_from, "task": task})
 
 
+def run_key(described: dict[str, Any], kind: str) -> str:
+    """Return the hash by which a file knows its run, given the run's config.json, and its kind of guidance."""
+    return configuration.digest({**described, "kind": kind})
+
+
 def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid]:
     """Read a run folder's config.json; return its task, configuration and grid. Code that it names is not loaded.
 
@@ -133,12 +133,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
             task = _on(task, values["robot"])
         config = run_config.from_json(world, values)
         grid = _grid(values["grid"])
-        if "shard" in values:
-            Shard.of(values["shard"])
-        if values["split"] not in SPLITS or values["total_steps"] != config.schedule.total_steps:
-            raise ValueError("its evaluation settings are invalid")
         run_config.check(config)
-        _check_room(path, config, grid)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
     return task, config, grid
@@ -151,29 +146,12 @@ def _on(task: Task, robot: Any) -> Task:
     return task.on(robot)
 
 
-def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:
-    """Raise UserError if a run's lanes or evaluations need more memory than is free."""
-    lanes, spaces = len(grid.seeds) * max(1, len(grid.labels)), Spaces(1, stand_in(config.agent), (1, 1))
-    agent = config.agent.make(config.sizes.frame, spaces, config.bootstraps)
-    weights = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(agent.init, jax.random.key(0))))
-    check_room(f"{path} has {lanes:,} lanes of {weights:,} weights", 4 * weights * lanes, "restore the file")
-    for option, floats in agent.working(1, 1).items():
-        check_room(f"{path} has too large {option}", 4 * floats, "restore the file")
-    envs = config.schedule.eval_envs
-    check_room(f"{path} has {envs:,} schedule.eval_envs", 4 * envs, "restore the file")
-
-
 def _grid(values: dict[str, Any]) -> Grid:
     """Parse a grid; its kinds of guidance may be unknown. Raises ValueError, TypeError or KeyError if invalid."""
-    kinds, seeds, labels = parts = [values[name] for name in ("guidance", "seeds", "labels")]
-    if not all(isinstance(part, list) and len(set(part)) == len(part) for part in parts) or not (kinds and seeds):
-        raise ValueError("its lists of kinds of guidance, seeds and label budgets are missing or have duplicates")
-    if not all(isinstance(kind, str) and NAME.fullmatch(kind) for kind in kinds):
-        raise ValueError(f"{kinds} are not names of kinds of guidance")
-    numbers = [(number, end) for part, end in ((seeds, LARGEST_SEED), (labels, LARGEST_BUDGET)) for number in part]
-    if not all(type(number) is int and 0 <= number < end for number, end in numbers):
-        raise ValueError("a seed or label budget is invalid")
-    return Grid(*map(tuple, parts))
+    grid = Grid(*(tuple(values[name]) for name in ("guidance", "seeds", "labels")))
+    if not all(NAME.fullmatch(kind) for kind in grid.guidance):  # they name folders, and never code
+        raise ValueError(f"{grid.guidance} are not names of kinds of guidance")
+    return grid
 
 
 def world_of(told: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:

@@ -14,6 +14,7 @@ from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import acting_state
+from cuelearner_jax.runs.grid import run_key
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
@@ -92,28 +93,26 @@ def read_due(folder: Path, step: int, lanes: int) -> dict[str, np.ndarray] | Non
     path = folder / DUE
     if not path.exists():
         return None
-    told = formats.read("due", path)
-    try:
-        columns = {name: np.array(values, np.float32).reshape(lanes) for name, values in told["columns"].items()}
-        return columns if told["step"] == step else None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise formats.damaged("due", path) from error
+    values = formats.read("due", path)
+    columns = {name: np.array(column, np.float32).reshape(lanes) for name, column in values["columns"].items()}
+    return columns if values["step"] == step else None
 
 
-def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
+def check_standing(group: LaneGroup, folder: Path, described: dict[str, Any], given: bool = False) -> None:
     """Check that a group can resume from its folder: no rows are missing and nothing was changed.
 
     Rows must reach up to the newest checkpoint, or to the end of a finished run. Rows after the checkpoint are
-    computed again. `given`: whether the labels come from a file.
+    computed again. `described`: contents of config.json. `given`: whether the labels come from a file.
 
     Raises UserError if rows are missing, a file cannot be read, or the checkpoint is of another version of the program;
     nothing has been changed.
     """
     schedule, finished = group.config.schedule, (folder / results.PARQUET).exists()
     step, rounds = (schedule.total_steps, group.rounds) if finished else (0, 0)
+    key = run_key(described, group.guidance.name)
     waits = False  # whether the newest stretch still needs its evaluation
     if not finished and (folder / "checkpoints").is_dir():
-        with checkpoints(folder / "checkpoints", read_only=True) as saved:
+        with checkpoints(folder / "checkpoints", read_only=True, run=key) as saved:
             if saved.latest() is not None:
                 item, shapes = _shapes(group, saved)
                 saved.compare({name: shapes[name] for name in ("policy", "rest")})
@@ -125,18 +124,20 @@ def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
         evaluated = range(0, step if waits else step + 1, schedule.eval_every)
         rows = [(*lane, at) for lane in lanes for at in evaluated]
         columns, among = ("seed", "labels", "step"), pc.field("step").isin(list(evaluated))
-        results.check_complete(folder, results.SCHEMA, columns, rows, among)
+        results.check_complete(folder, results.SCHEMA, columns, rows, among, key)
     elif (folder / results.JSONL).exists():
         tables.read(folder / results.JSONL, results.SCHEMA)
     # runs finished by earlier versions have no such table
     if results.GUIDES.found_in(folder) or (rounds and not finished):
         columns, among = ("seed", "labels", "asked"), pc.field("round") <= rounds
-        results.check_complete(folder, results.GUIDES, columns, group.looks(rounds, given), among)
-    if finished and group.guidance.asks:
-        label_files.read(folder / label_files.PARQUET)
+        results.check_complete(folder, results.GUIDES, columns, group.looks(rounds, given), among, key)
+    labels = folder / label_files.PARQUET
+    is_torn = not finished and not label_files.readable(labels)  # by a kill: it is written anew
+    if group.guidance.asks and not is_torn and label_files.read(labels).run not in (None, key):
+        raise UserError(f"{labels} belongs to another run: put its own back")
 
 
-def restore_policies(folder: Path, like: Any, lanes: int) -> tuple[dict[str, Any], int]:
+def restore_policies(folder: Path, like: Any, lanes: int, run: str) -> tuple[dict[str, Any], int]:
     """Restore what the lanes of a run's folder act with, and whether each has failed.
 
     A failed lane is restored at its last finite state.
@@ -145,6 +146,7 @@ def restore_policies(folder: Path, like: Any, lanes: int) -> tuple[dict[str, Any
         folder: the folder of one kind of guidance.
         like: shapes of what one lane acts with (`policies.acting_state`).
         lanes: number of lanes.
+        run: the key of the run and kind (`grid.run_key`).
 
     Returns:
         What the lanes act with, and "failed", with lanes as leading axis; and their training step.
@@ -154,7 +156,7 @@ def restore_policies(folder: Path, like: Any, lanes: int) -> tuple[dict[str, Any
     """
     if not (folder / "checkpoints").is_dir():
         raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
-    with checkpoints(folder / "checkpoints", read_only=True) as saved:
+    with checkpoints(folder / "checkpoints", read_only=True, run=run) as saved:
         clock, count, size = _clock(saved, lanes)
         block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), like)
         found = saved.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})

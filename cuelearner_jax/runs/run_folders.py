@@ -17,7 +17,7 @@ from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import acting_state, arbiter_of
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
-from cuelearner_jax.runs.grid import Grid, defaults, load
+from cuelearner_jax.runs.grid import Grid, defaults, load, run_key
 from cuelearner_jax.runs.lane_checkpoints import restore_policies
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import CONFIG
@@ -65,8 +65,12 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
                 "folder of one of them"
             )
     pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
-    seeds = tuple(seed for piece in pieces for seed in piece.grid.seeds)
-    return task, config, Grid(first.guidance, seeds, first.labels), pieces
+    folders: dict[int, Path] = {}
+    for piece in pieces:
+        for seed in piece.grid.seeds:
+            if (other := folders.setdefault(seed, piece.folder)) != piece.folder:
+                raise UserError(f"{other} and {piece.folder} both hold seed {seed}: delete the one that is a copy")
+    return task, config, Grid(first.guidance, tuple(folders), first.labels), pieces
 
 
 def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:
@@ -90,7 +94,9 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
             told.append(f"{folder}: no checkpoint of {kind} guidance, left out")
             continue
         seeds, budgets = grid.lanes(guidance)
-        policies, step = restore_policies(folder / kind, like, len(seeds))
+        policies, step = restore_policies(
+            folder / kind, like, len(seeds), run_key(formats.read("config", folder / CONFIG), kind)
+        )
         found.setdefault(step, []).append(RunLanes(guidance, seeds, budgets, policies, step))
         if step < config.schedule.total_steps:
             told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")

@@ -13,7 +13,7 @@ from rich.progress import Progress
 from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.runs.failures import LISTED, variant_name
-from cuelearner_jax.runs.grid import config_hash
+from cuelearner_jax.runs.grid import config_hash, run_key
 from cuelearner_jax.runs.lane_checkpoints import items, read_due, restore_blocks, write_due
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
@@ -50,6 +50,7 @@ class Runner:
         self.stopping, self.bars = stopping, bars
         self.name = group.guidance.name
         self.folder = order.out / self.name
+        self.key = run_key(described, self.name)
         self.failed = np.zeros(len(group.seeds), bool)  # lanes whose failure has been reported
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
@@ -62,12 +63,12 @@ class Runner:
             return
         asks = self.group.guidance.asks
         self._bar = self.bars.add_task(self.name, total=self.group.config.schedule.total_steps, note="preparing")
-        with checkpoints(self.folder / "checkpoints") as saved:
+        with checkpoints(self.folder / "checkpoints", run=self.key) as saved:
             self._restore(saved)
-            constants = self._constants()
+            constants, about = self._constants(), {"run": self.key}
             with (
-                TableWriter(self.folder, results.SCHEMA, constants) as writer,
-                TableWriter(self.folder, results.GUIDES, constants) if asks else nullcontext() as guides,
+                TableWriter(self.folder, results.SCHEMA, constants, about) as writer,
+                TableWriter(self.folder, results.GUIDES, constants, about) if asks else nullcontext() as guides,
                 tracking.open_tracker(self.order.track, self.folder, self.described, self.training.step) as tracker,
             ):
                 if guides is not None:
@@ -178,7 +179,7 @@ class Runner:
         eps = config.scalars.eps_deg if form.by_eps else None
         space = actions_of(self.group.env)
         told = form.name, space, eps, seeds, labels, form.meaning(space)
-        label_files.write(self.folder / label_files.PARQUET, task, *told)
+        label_files.write(self.folder / label_files.PARQUET, task, *told, run=self.key)
 
     def _train(self, saved: Checkpoints, writer: TableWriter, tracker: tracking.Tracker | None) -> None:
         now, schedule = self.training, self.group.config.schedule

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import re
 from pathlib import Path
@@ -10,11 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import CONFIG, differences
 
-MOST_PIECES = min(SPLITS.values())  # one for each possible seed
 OWN = ("grid.seeds", "shard.index")  # entries of config.json that differ between shards of one sweep
 
 
@@ -65,16 +64,6 @@ class Shard(NamedTuple):
         """Return the shard's entry in config.json: its number, and the seeds of all shards."""
         return {**self._asdict(), "seeds": list(seeds)}
 
-    @classmethod
-    def of(cls, described: dict[str, Any]) -> Shard:
-        """Parse the entry in config.json. Raises ValueError, TypeError or KeyError if it is invalid."""
-        shard, seeds = cls(described["index"], described["count"]), described["seeds"]
-        if not isinstance(seeds, list) or not all(type(number) is int for number in (*shard, *seeds)):
-            raise TypeError("a shard has whole numbers")
-        if not 1 <= shard.index <= shard.count <= min(MOST_PIECES, len(seeds)):
-            raise ValueError(f"{shard} is not a shard of {len(seeds)} seeds")
-        return shard
-
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shard's share of a sweep's seeds; shares differ by at most one seed.
 
@@ -95,22 +84,14 @@ def differing_options(before: dict[str, Any], now: dict[str, Any], defaults: dic
 def missing(configurations: list[Path]) -> list[str]:
     """Return one line per sweep some of whose shards have not begun, given the existing config.json files.
 
-    Unreadable files are ignored, since they say nothing of a shard. Invalid shards are named.
+    Unreadable files are ignored, since they say nothing of a shard.
     """
     begun: dict[tuple[Path, int], set[int]] = {}
     lines = []
     for path in configurations:
-        try:
-            described = formats.read("config", path)
-            if "shard" not in described:
-                continue
-            shard = Shard.of(described["shard"])
-        except UserError:
-            continue
-        except (ValueError, KeyError, TypeError):
-            lines.append(str(formats.damaged("config", path)))
-            continue
-        begun.setdefault((path.parent.parent, shard.count), set()).add(shard.index)
+        with contextlib.suppress(UserError):
+            if shard := formats.read("config", path).get("shard"):
+                begun.setdefault((path.parent.parent, shard["count"]), set()).add(shard["index"])
     for (sweep, count), there in sorted(begun.items()):
         absent = _between(sorted(there), count)
         if absent:

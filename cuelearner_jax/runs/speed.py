@@ -21,7 +21,6 @@ from cuelearner_jax.loop import start_clock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.runs.memory_report import state_bytes
 
 FEWEST_STRETCHES = 3
 STEPS_A_STRETCH = {"cpu": 128, "gpu": 1024, "tpu": 1024}  # per seed
@@ -108,6 +107,11 @@ def measure(
         "stretches": len(stretches),
         "spread": (max(stretches) - min(stretches)) / typical,
     }
+
+
+def state_bytes(tree: Any) -> int:
+    """Return the memory of a tree of arrays or shapes [bytes]."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def timed(work: Callable[[], T]) -> tuple[float, T]:

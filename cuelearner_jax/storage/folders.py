@@ -3,7 +3,7 @@
 Folder of a run:
 
     config.json                  everything that determines the results
-    .lock                        held by the process that writes here, which it names
+    .lock                        held by the process that writes here
     <guidance>/checkpoints/      the newest training states
     <guidance>/labels.parquet    the teacher's answers
     <guidance>/results.jsonl     one row per seed and evaluation; results.parquet once done
@@ -20,17 +20,18 @@ from typing import Any
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import formats
-from cuelearner_jax.storage.locks import hold
-from cuelearner_jax.storage.whole import TEMPORARY
+from cuelearner_jax.storage.whole import hold
 
 CONFIG = "config.json"
 LOCK = ".lock"  # held by the process that writes in a run's folder, which it names; stays on disk
-LEFT = (LOCK, CONFIG + TEMPORARY, "config.tmp")  # files left by a process that ended before it wrote config.json
 
 
 def in_use(out: Path) -> bool:
     """Whether `out` holds anything but the lock of a process that is about to write there."""
-    return out.exists() and (not out.is_dir() or any(entry.name not in LEFT for entry in out.iterdir()))
+    if not out.is_dir():
+        return out.exists()
+    # A process that was killed before it wrote config.json leaves parts of the file.
+    return any(entry.name != LOCK and not entry.name.startswith(f".{CONFIG}.") for entry in out.iterdir())
 
 
 def check_folder(
@@ -92,7 +93,7 @@ def claimed(out: Path) -> Iterator[None]:
     Raises UserError if another process has claimed the folder.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with hold(out / LOCK, out, stays=True):
+    with hold(out / LOCK, out):
         yield
 
 

@@ -26,7 +26,6 @@ from cuelearner_jax.storage.whole import replacing, unreadable
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
 FORMATS = {"config": 1, "labels": 1, "teacher": 1, "policy": 1, "due": 1}
-LARGEST = 1 << 26  # bytes of a JSON file
 REMEDIES = {  # the remedy in the message about a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
@@ -51,18 +50,14 @@ def read(kind: str, path: Path) -> Values:
         UserError: the file cannot be read, is damaged, was changed since it was written, or has another format.
     """
     try:
-        if (size := path.stat().st_size) > LARGEST:
-            raise damaged(kind, path, f"{size:,} bytes, more than any such file has")
         values = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(values, dict):
-            told = values.pop(DIGEST, None)
-            if values.get("format") == FORMATS[kind] and told != configuration.digest(values):
-                raise damaged(kind, path)
     except OSError as error:
         raise unreadable(path, error) from error
     except (ValueError, RecursionError) as error:
         raise damaged(kind, path) from error
     check(kind, values, path)
+    if values.pop(DIGEST, None) != configuration.digest(values):
+        raise damaged(kind, path)
     return values
 
 
@@ -76,7 +71,7 @@ def write(kind: str, path: Path, values: Values) -> None:
 def check(kind: str, values: Any, path: Path) -> None:
     """Raise UserError unless a file's values have the current format of its kind (a key of `FORMATS`)."""
     number = values.get("format") if isinstance(values, dict) else None
-    if not isinstance(number, int) or isinstance(number, bool):
+    if type(number) is not int:
         raise damaged(kind, path)
     if number != FORMATS[kind]:
         raise UserError(

@@ -38,9 +38,11 @@ from cuelearner_jax.spaces import Space
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.folders import differences
-from cuelearner_jax.storage.label_checks import ANSWERED, PEOPLE, ROW, SAID, check_head, check_rows
 from cuelearner_jax.types import Label
 
+ANSWERED, UNSURE, UNDONE = SAID = ("answer", "unsure", "undone")  # an answer, "don't know", an answer taken back
+ROW = ("obs", "action", "answer")  # columns that hold lists
+PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of a person's rows
 SCHEMA = tables.Schema(
     stem="labels",
     mark="action",
@@ -81,6 +83,7 @@ class LabelFile(NamedTuple):
     people: People | None = None  # None: the labels of a simulated teacher, or a merge that includes such labels
     session: dict[str, Any] | None = None  # settings of the page that asked, see `labelling.session`
     said: dict[str, int] | None = None  # number of rows of each kind in `SAID`, all rows counted
+    run: str | None = None  # the key of the run that wrote the file (`grid.run_key`)
 
     @property
     def budget(self) -> int:
@@ -152,10 +155,6 @@ class LabelWriter(tables.TableWriter):
                 raise ValueError(f"{name} has the shape {value.shape}, expected ({self._widths[name]},)")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} is not finite: {value}")
-        if person and (set(person) != set(PEOPLE) or person["said"] not in SAID):
-            raise ValueError(f"a person's row has the columns {', '.join(PEOPLE)}, and said one of {', '.join(SAID)}")
-        if person and (answer is not None) != (person["said"] == ANSWERED):
-            raise ValueError(f"a row that says {person['said']!r} has {'no' if answer is None else 'an'} answer")
         super().append(seed=int(seed), **columns, **person)
 
 
@@ -189,6 +188,7 @@ def write(
     seeds: np.ndarray,
     labels: Label,
     meaning: str = "",
+    **told: Any,
 ) -> None:
     """Write the valid labels of lanes as Parquet, replacing `path` atomically.
 
@@ -198,11 +198,12 @@ def write(
         seeds: the lanes' seeds, (lanes,).
         labels: (lanes, slots, ...).
         meaning: meaning of an answer's numbers, written into the file.
+        told: further entries of the file's head.
     """
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
     seed = np.broadcast_to(np.asarray(seeds)[:, None], valid.shape)[valid]
-    write_file(path, LabelFile(task, answers, space, eps, seed, rows), meaning, fresh=False)
+    write_file(path, LabelFile(task, answers, space, eps, seed, rows), meaning, fresh=False, **told)
 
 
 def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = True, **told: Any) -> None:
@@ -229,23 +230,23 @@ def read(path: Path) -> LabelFile:
     found = found_in(path)
     if found is None or not found.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
-    path = found
-    table, head = _told(path)
-    if head is None:
-        raise UserError(f"{path} holds no labels: collect some first")
+    table, head = _told(found)
     said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
     table = _standing(table)
-    if not table.num_rows:
-        raise UserError(f"{path} holds no labels: collect some first")
-    columns, eps = {name: _array(table[name], name) for name in table.column_names}, head["eps"]
-    rows = {name: columns[name] for name in ROW}
-    labels = Label(**rows, valid=np.ones(table.num_rows, bool))  # pyright: ignore[reportArgumentType]
-    space = spaces.from_json(head["space"])
-    named = dict(head["task"]), head["answers"], space, None if eps is None else float(eps), columns["seed"], labels
+    if head is None or not table.num_rows:
+        raise UserError(f"{found} holds no labels: collect some first")
+    try:
+        columns = {name: _array(table[name], name) for name in table.column_names}
+        labels = Label(**{name: columns[name] for name in ROW}, valid=np.ones(table.num_rows, bool))  # pyright: ignore[reportArgumentType]
+        eps = None if head["eps"] is None else float(head["eps"])
+        about = {"task": dict(head["task"]), "answers": head["answers"], "space": spaces.from_json(head["space"])}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise formats.damaged("labels", found, error) from error
     people = None
     if "item" in columns and not (columns["item"] < 0).any():
         people = People(*(columns[name] for name in People._fields))
-    return LabelFile(*named, people, head.get("session"), said)
+    rest = {"session": head.get("session"), "said": said, "run": head.get("run")}
+    return LabelFile(**about, eps=eps, seeds=columns["seed"], labels=labels, people=people, **rest)
 
 
 def _standing(table: pa.Table) -> pa.Table:
@@ -338,19 +339,12 @@ def _short(value: Any) -> str:
 
 
 def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
-    """A file's table and head in the current format, both checked; None: the file has just begun."""
+    """Return a file's table and head in the current format; None: the file has just begun."""
     table = tables.read(path, SCHEMA)
-    try:
-        head = tables.about_of(table)
-        if head is None and table.num_rows:
-            raise ValueError("it has no head")
-        if head is not None:
-            formats.check("labels", head, path)
-            check_head(head)
-            check_rows(table, head)
-        return table, head
-    except (ValueError, RecursionError) as error:
-        raise formats.damaged("labels", path, error) from error
+    head = tables.about_of(table)
+    if head is not None or table.num_rows:
+        formats.check("labels", head, path)
+    return table, head
 
 
 def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import re
 from collections.abc import Callable
 from functools import lru_cache
@@ -26,7 +27,6 @@ from jaxtyping import Float
 
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.storage.picture_files import Picture, inside
-from cuelearner_jax.storage.room import check_room, check_size
 
 INFO = Path("meta/info.json")
 VERSION = "v3.0"  # of the format
@@ -57,59 +57,49 @@ def read(path: Path) -> Recording:
     """
     info = _info(path)
     features = info["features"]
-    seen = [key for key, told in features.items() if key.startswith(f"{OBSERVATION}.") and _is_vector(told)]
-    for name, found in ((f"{OBSERVATION}.state", seen), (ACTION, _is_vector(features.get(ACTION)))):
-        if not found:
-            raise UserError(
-                f"{path} has no feature {name} of numbers (it has {', '.join(features)}): give a dataset with one"
-            )
-    cameras = [
-        key for key, told in features.items() if isinstance(told, dict) and told.get("dtype") in ("video", "image")
-    ]
-    table = _rows(path, [*seen, ACTION, "episode_index", "timestamp", *_stored(features, cameras[:1])])
-    vectors = {key: _vectors(path, table, key, features[key]) for key in [*seen, ACTION]}
-    observed = [
-        name for key in seen for name in _entries(features[key], key.partition(".")[2] if len(seen) > 1 else "")
-    ]
-    return Recording(
-        np.concatenate([vectors[key] for key in seen], -1),
-        vectors[ACTION],
-        tuple(observed) if len(set(observed)) == sum(vectors[key].shape[1] for key in seen) else (),
-        _entries(features[ACTION], ""),
-        _frames(path, info, table, cameras[0]) if cameras else None,
-    )
+    parts = {name: _parts(path, features, name) for name in (OBSERVATION, ACTION)}
+    cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
+    stored = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
+    table = _rows(path, [*parts[OBSERVATION], *parts[ACTION], "episode_index", "timestamp", *stored])
+    vectors = {
+        name: np.concatenate([_vectors(path, table, key, features[key]) for key in parts[name]], -1) for name in parts
+    }
+    entries = {name: _entries(features, parts[name]) for name in parts}
+    frames = _frames(path, info, table, cameras[0]) if cameras else None
+    return Recording(vectors[OBSERVATION], vectors[ACTION], entries[OBSERVATION], entries[ACTION], frames)
+
+
+def _parts(path: Path, features: dict[str, Any], name: str) -> list[str]:
+    """Return the features of numbers called `name` or `name.PART`. Raises UserError if there are none."""
+    vectors = [key for key, feature in features.items() if _is_vector(feature)]
+    parts = [name] if name in vectors else [key for key in vectors if key.startswith(f"{name}.")]
+    if not parts:
+        there = ", ".join(features)
+        raise UserError(
+            f"{path} has no feature {name} or {name}.PART of numbers (it has {there}): give a dataset with one"
+        )
+    return parts
 
 
 def _info(path: Path) -> dict[str, Any]:
     """Return the contents of info.json. Raises UserError for another version of the format or invalid contents."""
     file = path / INFO
     try:
-        check_size(file)
         info = json.loads(file.read_text(encoding="utf-8"))
-        version, sound = info["codebase_version"], isinstance(info["features"], dict) and info["fps"] > 0
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        version, _ = info["codebase_version"], info["features"].items()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{file} is damaged: restore it from where the dataset came from") from error
     if version != VERSION:
         raise UserError(
             f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is needed: convert it by "
             "LeRobot's own script first"
         )
-    if not sound:
-        raise UserError(f"{file} is damaged: restore it from where the dataset came from")
     return info
 
 
-def _is_vector(told: Any) -> bool:
+def _is_vector(feature: dict[str, Any]) -> bool:
     """Return whether a feature is a row of numbers."""
-    if not isinstance(told, dict) or not str(told.get("dtype")).startswith(("float", "int")):
-        return False
-    shape = told.get("shape")
-    return isinstance(shape, list) and len(shape) == 1 and type(shape[0]) is int and shape[0] > 0
-
-
-def _stored(features: dict[str, Any], cameras: list[str]) -> list[str]:
-    """Return the cameras whose pictures are stored in the rows themselves."""
-    return [key for key in cameras if features[key].get("dtype") == "image"]
+    return feature["dtype"].startswith(("float", "int", "uint", "bool")) and len(feature["shape"]) == 1
 
 
 def _rows(path: Path, columns: list[str]) -> pa.Table:
@@ -121,11 +111,8 @@ def _rows(path: Path, columns: list[str]) -> pa.Table:
 
 
 def _parquet(path: Path, file: Path, columns: list[str]) -> pa.Table:
-    inside(path, str(file.relative_to(path)), "the file")
     try:
         opened = pq.ParquetFile(file)
-        groups = (opened.metadata.row_group(group) for group in range(opened.num_row_groups))
-        check_room(f"{file} is large", 4 * sum(group.total_byte_size for group in groups), "give fewer episodes")
         if missing := [name for name in columns if name not in opened.schema_arrow.names]:
             raise UserError(f"{file} has no column {missing[0]}: restore it from where the dataset came from")
         return opened.read(columns=columns)
@@ -145,47 +132,44 @@ def _vectors(path: Path, table: pa.Table, key: str, told: dict[str, Any]) -> Flo
     return found
 
 
-def _entries(told: dict[str, Any], before: str) -> tuple[str, ...]:
-    """Return the names of a vector's entries; empty if the dataset names none, or not as many."""
-    names: Any = told.get("names")
-    size = told["shape"][0]
-    if isinstance(names, dict):
-        values = list(names.values())
-        if all(isinstance(value, list) for value in values):
-            names = [name for value in values for name in value]
-        elif all(type(value) is int for value in values):
-            names = sorted(names, key=lambda name: names[name])
-    if not isinstance(names, list) or len(names) != size or len(set(map(str, names))) != size:
-        return ()
-    return tuple(f"{before}: {name}" if before else str(name) for name in names)
+def _entries(features: dict[str, Any], parts: list[str]) -> tuple[str, ...]:
+    """Return the names of the parts' entries, one after the other; empty unless each entry has a name of its own."""
+    entries = []
+    for key in parts:
+        names = _flat(features[key].get("names"))
+        if len(names) != features[key]["shape"][0]:
+            return ()
+        part = key.partition(".")[2]
+        entries += [f"{part}: {name}" for name in names] if len(parts) > 1 else names
+    return tuple(entries) if len(set(entries)) == len(entries) else ()
+
+
+def _flat(names: Any) -> list[str]:
+    """Return the names in nested lists and groups, or in a map of names to positions, in the order of the entries."""
+    if isinstance(names, dict) and all(type(position) is int for position in names.values()):
+        return sorted(names, key=lambda name: names[name])
+    if isinstance(names, dict | list):
+        return [name for group in (names.values() if isinstance(names, dict) else names) for name in _flat(group)]
+    return [] if names is None else [str(names)]
 
 
 def _frames(path: Path, info: dict[str, Any], table: pa.Table, key: str) -> Callable[[int], Picture]:
     """Return a function from a row to its camera picture."""
     if info["features"][key]["dtype"] == "image":
         return lambda row: _embedded(path, key, table[key][row].as_py())
-    names = {name: f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")}
-    starts: dict[int, tuple[int, int, float]] = {}
+    names = [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    starts: dict[int, list[Any]] = {}
     for file in sorted((path / "meta/episodes").glob("chunk-*/file-*.parquet")):
-        told = _parquet(path, file, ["episode_index", *names.values()])
-        columns = (told[name].to_pylist() for name in ("episode_index", *names.values()))
-        starts |= {episode: tuple(rest) for episode, *rest in zip(*columns, strict=True)}
+        episodes = _parquet(path, file, ["episode_index", *names])
+        starts |= {row["episode_index"]: [row[name] for name in names] for row in episodes.to_pylist()}
 
     def frame(row: int) -> Picture:
-        episode, since = table["episode_index"][row].as_py(), table["timestamp"][row].as_py()
-        if episode not in starts:
-            raise UserError(f"{path / 'meta/episodes'} does not name the episode {episode}: restore it")
-        chunk, number, start = starts[episode]
-        try:
-            name, frame = (
-                VIDEO.format(key=key, chunk=int(chunk), file=int(number)),
-                round((start + since) * info["fps"]),
-            )
-        except (TypeError, ValueError, OverflowError) as error:
-            raise UserError(
-                f"{path / 'meta/episodes'} does not say where episode {episode} begins: restore it"
-            ) from error
-        return Picture(_decoded(inside(path, name, "the video"), frame), "image/png")
+        episode, timestamp = table["episode_index"][row].as_py(), table["timestamp"][row].as_py()
+        chunk, number, start = starts.get(episode, (None, None, None))
+        if chunk is None or number is None or start is None or not math.isfinite(start + timestamp):
+            raise UserError(f"{path / 'meta/episodes'} does not say where episode {episode} begins: restore it")
+        video = inside(path, VIDEO.format(key=key, chunk=chunk, file=number), "the video")
+        return Picture(_decoded(video, start + timestamp), "image/png")
 
     return frame
 
@@ -205,17 +189,22 @@ def _embedded(path: Path, key: str, stored: Any) -> Picture:
 
 
 @lru_cache(maxsize=64)
-def _decoded(file: Path, number: int) -> bytes:
-    """Return one frame of a video as PNG. Raises UserError if the frame cannot be decoded."""
-    import imageio.v2 as imageio  # takes a while to load
+def _decoded(file: Path, time: float) -> bytes:
+    """Return the frame nearest to a time [s] of a video, as PNG. Raises UserError if there is none.
+
+    The video's own rate may differ from the dataset's.
+    """
+    from imageio_ffmpeg import read_frames  # takes a while to load
     from PIL import Image
 
     try:
-        with imageio.get_reader(file, format="FFMPEG") as video:  # pyright: ignore[reportArgumentType]
-            frame = np.asarray(video.get_data(number))  # pyright: ignore[reportAttributeAccessIssue]
-    except (OSError, RuntimeError, IndexError, ValueError) as error:
+        interval = 1 / next(read_frames(file))["fps"]
+        frames = read_frames(file, input_params=["-ss", f"{max(0.0, time - interval / 2):.6f}"])
+        picture = Image.frombytes("RGB", next(frames)["size"], next(frames))
+        frames.close()
+    except (OSError, RuntimeError, StopIteration, ZeroDivisionError) as error:
         why = re.sub(r"\s+", " ", str(error))[:80]
-        raise UserError(f"frame {number} of {file} cannot be had ({why}): restore the video") from error
+        raise UserError(f"{file} has no frame at {time:.3f} s ({why}): restore the video") from error
     stored = io.BytesIO()
-    Image.fromarray(frame).save(stored, "PNG")
+    picture.save(stored, "PNG")
     return stored.getvalue()

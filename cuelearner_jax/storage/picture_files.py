@@ -14,7 +14,6 @@ KINDS = {
     ".gif": "image/gif",
     ".mp4": "video/mp4",
 }
-LARGEST_PICTURE = 50_000_000  # bytes
 
 
 class Picture(NamedTuple):
@@ -25,42 +24,27 @@ class Picture(NamedTuple):
 
 
 def inside(folder: Path, name: str, what: str) -> Path:
-    """Return the path of a file below a folder. Raises UserError for a name that leads out of the folder."""
-    root = folder.resolve()
-    try:
-        there = (root / name).resolve()
-    except (OSError, ValueError, RuntimeError):
-        there = root
-    if Path(name).is_absolute() or not there.is_relative_to(root) or there == root:
+    """Return the path of a file below a folder. Raises UserError for a name that leads out of the folder.
+
+    Links are followed: datasets lie in the hub's cache as links to files elsewhere.
+    """
+    if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
         raise UserError(f"{what} {format_value(name)} leads out of {folder}: give the name of a file in that folder")
-    return there
+    return folder / name
 
 
 class PictureFiles:
     """Pictures in files beside a table."""
 
-    def __init__(self, table: Path, names: Any, rows: int) -> None:
-        """Check the names. Raises UserError for invalid or missing names, or names that lead out of the folder."""
-        self._folder = table.parent
-        names = [
-            None if name in (None, "") else name for name in (names.tolist() if hasattr(names, "tolist") else names)
-        ]
-        if len(names) != rows:
-            raise UserError(
-                f"{table} has {len(names)} pictures for {rows} situations: give one name per row, or an empty one"
-            )
-        if wrong := next((name for name in names if name is not None and not isinstance(name, str)), None):
-            raise UserError(
-                f"{table}: {format_value(wrong)} is not a picture's file name: give the name of a file in the folder"
-            )
-        for name in {name for name in names if name is not None}:
-            inside(self._folder, name, "picture")
-            if Path(name).suffix.lower() not in KINDS:
+    def __init__(self, table: Path, names: Any) -> None:
+        """Check the names, one a row, empty for none. Raises UserError for names that are none of a picture's file."""
+        self._folder, self._names = table.parent, [None if name in (None, "") else name for name in list(names)]
+        for name in {name for name in self._names if name is not None}:
+            if not isinstance(name, str) or Path(inside(self._folder, name, "picture")).suffix.lower() not in KINDS:
                 raise UserError(
-                    f"picture {format_value(name)} has a type that the page does not show: give one of "
+                    f"{table}: {format_value(name)} is no picture's file that the page shows: give one of "
                     f"{', '.join(KINDS)}"
                 )
-        self._names: list[str | None] = names
 
     def __call__(self, row: int) -> Picture | None:
         """Return the picture of a row; None if it has none. Raises UserError for a picture that cannot be read."""
@@ -68,9 +52,6 @@ class PictureFiles:
             return None
         place = inside(self._folder, name, "picture")
         try:
-            if place.stat().st_size > LARGEST_PICTURE:
-                raise UserError(f"picture {place} has more than {LARGEST_PICTURE:,} bytes: make it smaller")
-            data = place.read_bytes()
+            return Picture(place.read_bytes(), KINDS[place.suffix.lower()])
         except OSError as error:
             raise UserError(f"picture {place} of row {row} cannot be read ({error.strerror}): put it there") from error
-        return Picture(data, KINDS[place.suffix.lower()])

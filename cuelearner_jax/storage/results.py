@@ -69,15 +69,23 @@ LaneKey = tuple[str, int, int]
 
 
 def check_complete(
-    folder: Path, schema: tables.Schema, columns: Sequence[str], rows: Iterable[tuple[int, ...]], among: pc.Expression
+    folder: Path,
+    schema: tables.Schema,
+    columns: Sequence[str],
+    rows: Iterable[tuple[int, ...]],
+    among: pc.Expression,
+    run: str,
 ) -> None:
     """Raise UserError unless a folder's table has each of the rows exactly once, and no other row in `among`.
 
-    `rows` are values of the `columns`. A missing table has no rows.
+    `rows` are values of the `columns`. `run` is the key of the table's run, which tables of earlier versions lack. A
+    missing table has no rows.
     """
     path = schema.found_in(folder) or folder / schema.jsonl
     wanted, found = Counter(rows), Counter[tuple[int, ...]]()
     if path.exists() and (table := tables.read(path, schema)).num_rows:
+        if (tables.about_of(table) or {}).get("run", run) != run:
+            raise UserError(f"{path} belongs to another run: put its own back")
         found.update(zip(*(table.filter(among)[name].to_pylist() for name in columns), strict=True))
     if found == wanted:
         return

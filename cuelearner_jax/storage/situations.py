@@ -15,7 +15,6 @@ Nothing in such a folder is executed: no pickles, and no path that leads out of 
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import re
 import zipfile
@@ -27,12 +26,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float
+from pyarrow import csv
 
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError, format_numbers, format_value
 from cuelearner_jax.storage import lerobot
 from cuelearner_jax.storage.picture_files import Picture, PictureFiles
-from cuelearner_jax.storage.room import check_room
 
 STEM = "situations"
 OBSERVATION, ACTION, PICTURE = "observation", "action", "picture"
@@ -64,18 +63,24 @@ def read(path: Path) -> Situations:
         return _whole(path, found.observations, found.actions, slices, found.action_entries, found.frames)
     table = _table_in(path)
     columns = _READERS[table.suffix](table)
+    known = (OBSERVATION, ACTION, PICTURE)
+    if strange := [name for name in columns if name not in known and name.partition(".")[0] not in known[:2]]:
+        raise UserError(
+            f"{table} has an unknown column {format_value(strange[0])}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
+            "or leave it out"
+        )
     observations, seen = _matrix(table, columns, OBSERVATION)
     actions, entries = _matrix(table, columns, ACTION)
-    if len(actions) != len(observations):
-        raise UserError(f"{table} has {len(observations)} observations and {len(actions)} actions: give equally many")
     files = columns.get(PICTURE)
+    if len({len(observations), len(actions), len(observations if files is None else files)}) > 1:
+        raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
     return _whole(
         table,
         observations,
         actions,
         named_slices(seen, observations.shape[1]),
         entries,
-        None if files is None else PictureFiles(table, files, len(observations)),
+        None if files is None else PictureFiles(table, files),
     )
 
 
@@ -132,30 +137,27 @@ def _table_in(path: Path) -> Path:
 
 def _of_parquet(table: Path) -> dict[str, Any]:
     try:
-        file = pq.ParquetFile(table)
-        size = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
-        check_room(f"{table} is large", 4 * size, "give fewer rows")
-        found = file.read()
-        return {name: found[name].to_pylist() for name in found.column_names}
+        return _columns(table, pq.ParquetFile(table).read())
     except (pa.ArrowException, OSError, ValueError) as error:
         raise _damaged(table, error) from error
 
 
 def _of_csv(table: Path) -> dict[str, Any]:
     try:
-        with table.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file, strict=True))
-    except (OSError, UnicodeError, csv.Error) as error:
+        columns = _columns(table, csv.read_csv(table))
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise _damaged(table, error) from error
-    head, *rows = rows or [[]]
-    for number, row in enumerate(rows, start=2):
-        if len(row) != len(head):
-            raise UserError(f"{table}: line {number} has {len(row)} fields, the head {len(head)}: give as many")
-    columns: dict[str, Any] = {name: list(values) for name, values in zip(head, zip(*rows, strict=True), strict=False)}
-    for name in columns.keys() - {PICTURE}:
-        if name in (OBSERVATION, ACTION):
-            columns[name] = [re.split(r"[\s;,]+", text.strip("[] ")) for text in columns[name]]
-    return columns or {name: [] for name in head}
+    for name in columns.keys() & {OBSERVATION, ACTION}:
+        columns[name] = [re.split(r"[\s;,]+", str(text).strip("[] ")) for text in columns[name]]
+    return columns
+
+
+def _columns(table: Path, rows: pa.Table) -> dict[str, Any]:
+    """Return the columns of a table by name. Raises UserError for two columns with one name."""
+    names = [name.strip() for name in rows.column_names]
+    if doubled := [name for name in names if names.count(name) > 1]:
+        raise UserError(f"{table} has two columns {format_value(doubled[0])}: give each column a name of its own")
+    return {name: column.to_pylist() for name, column in zip(names, rows.columns, strict=True)}
 
 
 def _of_npz(table: Path) -> dict[str, Any]:
@@ -191,36 +193,21 @@ def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.n
         )
     if name in columns and entries:
         raise UserError(f"{table} has the columns {name} and {name}.{entries[0]}: give only one of the two forms")
-    if entries:
-        parts = [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries]
-        if len({len(part) for part in parts}) > 1:
-            raise UserError(f"{table}: columns {name}.NAME have several lengths: give equally many rows of each")
-        return np.stack(parts, -1), entries
-    return _numbers(table, name, columns[name], 2), ()
+    if not entries:
+        return _numbers(table, name, columns[name], 2), ()
+    return np.stack(
+        [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries], -1
+    ), entries
 
 
 def _numbers(table: Path, name: str, values: Any, axes: int) -> np.ndarray:
     """Convert a column to 32-bit floats. Raises UserError for rows of several sizes, or non-numbers."""
     try:
-        found = np.asarray(values)
-        if found.dtype.kind in "US" or found.dtype == object:
-            found = np.asarray([[float(entry) for entry in row] if axes == 2 else float(row) for row in values])
-        if found.dtype.kind not in "fiu":
-            raise TypeError
+        with np.errstate(over="ignore"):
+            found = np.asarray(values, np.float32)
+        if found.size and found.ndim != axes:
+            raise ValueError
     except (TypeError, ValueError):
-        sizes = {len(row) for row in values if isinstance(row, list | tuple)}
-        why = (
-            f"rows of {format_numbers(sizes)} entries"
-            if len(sizes) > 1
-            else f"values that are not numbers ({format_value(values[0])[:60]} ...)"
-        )
-        raise UserError(
-            f"{table}: the column {name} holds {why}: give the same number of numbers in every row"
-        ) from None
-    if found.ndim != axes and found.size:
-        raise UserError(
-            f"{table}: the column {name} has the shape {found.shape}: give {'(n, size)' if axes == 2 else '(n,)'}"
-        )
-    with np.errstate(over="ignore"):
-        found = found.astype(np.float32)
-    return found if axes == 1 or found.ndim == 2 else np.zeros((len(found), 0), np.float32)
+        wanted = "the same number of numbers" if axes == 2 else "one number"
+        raise UserError(f"{table}: give {wanted} in every row of the column {name}") from None
+    return found if found.size else np.zeros((len(found), 0)[:axes], np.float32)

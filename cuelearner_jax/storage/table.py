@@ -1,17 +1,19 @@
-"""An append-only table on disk: JSONL while it grows, Parquet once finished, whatever the rows mean.
+"""A table on disk: JSON lines while rows are added, one Parquet file once it is done, whatever the rows mean.
 
-Each line of the JSONL file is an object, of one of three kinds:
+Each JSON line is an object, of one of three kinds:
 
     {"about": {...}}         a description of the table, once, at its head; in Parquet it is metadata of the schema
     {"constants": {...}}     columns with one value for all later lines, until the next such line
     {"step": 10, ...}        a row
 
-A line is on disk when the call that writes it returns; `storage.lines` says how lines are sealed. A file is always
-replaced atomically. Parquet holds a digest of its contents. A file without seals or digest is refused.
+A line is on disk when the call that writes it returns. A last line without its end is what a crash tore, and counts
+as not written. A Parquet file holds a SHA-256 of its contents, and is refused if they have another.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import json
 import math
@@ -26,17 +28,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.storage import lines
-from cuelearner_jax.storage.footer import read_declared
-from cuelearner_jax.storage.lines import Row
-from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.storage.whole import replacing, unreadable
+from cuelearner_jax.terminal import console
 
 META = b"cuelearner"  # Parquet metadata key of the table's description
 DIGEST = b"cuelearner.sha256"  # Parquet metadata key of the digest of the contents
-VALUE = 64  # memory per value while a table is read, in Arrow, Python and NumPy together [bytes]
 
 PathLike = str | os.PathLike[str]
+Row = dict[str, Any]
 Writer = TypeVar("Writer", bound="TableWriter")
 
 
@@ -96,14 +95,15 @@ class TableWriter:
         self._schema, self._columns = schema, set(constants or ())
         self.path.parent.mkdir(parents=True, exist_ok=True)
         _reopen(self.path, schema)
-        rows = _rows(self.path, schema) if self.path.exists() else []
+        rows = _lines(self.path, schema) if self.path.exists() else []
         header = None if constants is None else {name: _plain(value) for name, value in constants.items()}
-        if about is not None and not any("about" in row for row in rows):
-            rows.append({"about": about})
         last = next((row["constants"] for row in reversed(rows) if "constants" in row), None)
+        self._file = self.path.open("ab", buffering=0)
+        self._file.truncate(self.path.read_bytes().rfind(b"\n") + 1)
+        if about is not None and not any("about" in row for row in rows):
+            self._put([{"about": about}])
         if header is not None and header != last:
-            rows.append({"constants": header})
-        self._lines = lines.Writer(self.path, rows)
+            self._put([{"constants": header}])
 
     def append(self, **columns: Any) -> None:
         """Append rows.
@@ -127,14 +127,26 @@ class TableWriter:
             raise ValueError(f"columns of one append must have one length, got {sorted(lengths)}")
         # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
         values = {name: array.tolist() for name, array in arrays.items()}
-        self._lines.append(
+        self._put(
             {name: _plain(value if own[name] else value[row]) for name, value in values.items()}
             for row in range(lengths.pop() if lengths else 1)
         )
 
+    def _put(self, rows: Iterable[Row]) -> None:
+        """Append lines, on disk when this returns; after an error the file is as before."""
+        size, text = os.fstat(self._file.fileno()).st_size, _text(rows)
+        try:
+            while text:
+                text = text[self._file.write(text) :]
+            os.fsync(self._file.fileno())
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._file.truncate(size)
+            raise
+
     def close(self) -> None:
         """Close the file; the table stays JSONL until `finish`."""
-        self._lines.close()
+        self._file.close()
 
     def __enter__(self: Writer) -> Writer:
         return self
@@ -148,8 +160,7 @@ def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> N
     path = Path(folder) / schema.jsonl
     _reopen(path, schema)
     if path.exists():
-        kept = [row for row in _rows(path, schema) if schema.mark not in row or keep(row)]
-        lines.Writer(path, kept).close()
+        _rewrite(path, [row for row in _lines(path, schema) if schema.mark not in row or keep(row)])
 
 
 def finish(folder: PathLike, schema: Schema) -> Path:
@@ -209,7 +220,9 @@ def read(path: Path, schema: Schema) -> pa.Table:
     if path.suffix != ".parquet" and not path.exists():
         path = path.with_name(schema.parquet)  # the table was finished after the file was found
     try:
-        table = _finished(path, schema) if _is_parquet(path) else _grown(path, schema)
+        with path.open("rb") as file:
+            is_parquet = file.read(4) == b"PAR1" or path.suffix == ".parquet"
+        table = _finished(path, schema) if is_parquet else _grown(path, schema)
     except OSError as error:
         if error.errno is None:  # an error of Arrow's own
             raise _damaged(path, schema, error) from error
@@ -225,16 +238,13 @@ def read(path: Path, schema: Schema) -> pa.Table:
 
 
 def about_of(table: pa.Table) -> Row | None:
-    """Return a table's description. Raises ValueError if it is not a JSON object."""
+    """Return a table's description."""
     told = (table.schema.metadata or {}).get(META)
-    about = None if told is None else json.loads(told)
-    if not isinstance(about, dict | None):
-        raise ValueError(f"the table's description {about!r} is not a JSON object")
-    return about
+    return None if told is None else json.loads(told)
 
 
 def _damaged(path: Path, schema: Schema, reason: object) -> UserError:
-    return UserError(f"{path} {schema.remedy} ({(str(reason).splitlines() or [''])[0]})")
+    return UserError(f"{path} {schema.remedy} ({(str(reason).splitlines() or [''])[0][:200]})")
 
 
 def _typed(table: pa.Table, schema: Schema) -> pa.Table:
@@ -245,33 +255,11 @@ def _typed(table: pa.Table, schema: Schema) -> pa.Table:
 
 def _finished(path: Path, schema: Schema) -> pa.Table:
     """Read the table of a Parquet file. Raises ValueError if it differs from what was written."""
-    held = read_declared(path)
-    what, remedy = f"{path} declares {held.rows:,} rows with {held.values:,} values", f"it {schema.remedy}"
-    check_room(what, VALUE * held.values + held.page_bytes, remedy)
-    # Equal strings are stored once in the file, but possibly many times in memory.
-    table = pq.read_table(path, page_checksum_verification=True, read_dictionary=list(held.strings))
-    chunks = [chunk for name in held.strings for chunk in table[name].chunks]
-    check_room(what, VALUE * held.values + 2 * sum(map(_letters, chunks)), remedy)
-    table = _typed(table, schema)
+    table = _typed(pq.ParquetFile(path, page_checksum_verification=True).read(), schema)
     metadata = table.schema.metadata or {}
-    if DIGEST not in metadata:
-        raise ValueError("it has no digest of its contents, so this program did not write it")
-    if metadata[DIGEST].decode() != digest(table, metadata.get(META, b"")):
+    if metadata.get(DIGEST, b"").decode() != digest(table, metadata.get(META, b"")):
         raise ValueError("its contents are not those that were written")
     return table.replace_schema_metadata({META: metadata[META]} if META in metadata else None)
-
-
-def _letters(texts: pa.DictionaryArray) -> int:
-    """Return the length of all strings of a column together, duplicates included [bytes]."""
-    used = np.bincount(np.asarray(texts.indices.drop_null()), minlength=len(texts.dictionary))
-    return sum(int(count) * len(text or "") for count, text in zip(used, texts.dictionary.to_pylist(), strict=True))
-
-
-def _is_parquet(path: Path) -> bool:
-    if path.suffix in (".parquet", ".jsonl"):
-        return path.suffix == ".parquet"
-    with path.open("rb") as file:
-        return file.read(4) == b"PAR1"
 
 
 def _plain(value: Any) -> Any:
@@ -283,17 +271,37 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _rows(path: Path, schema: Schema) -> list[Row]:
-    """Return the parsed lines of a JSONL file. Raises UserError if the file is damaged."""
-    try:
-        rows = lines.read(path).rows
-    except lines.Damaged as error:
-        raise _damaged(path, schema, error) from error
-    for number, row in enumerate(rows, start=1):
-        kinds = row.keys() & {"about", "constants", schema.mark}
-        if not kinds or not all(isinstance(row[name], dict) for name in kinds - {schema.mark}):
+def _text(rows: Iterable[Row]) -> bytes:
+    return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
+
+
+def _lines(path: Path, schema: Schema) -> list[Row]:
+    """Return the parsed whole lines of a JSONL file. Raises UserError if the file is damaged."""
+    *lines, torn = path.read_bytes().split(b"\n")
+    if torn:
+        _warn(f"warning: the last line of {path} is incomplete and is left out")
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            row = json.loads(line)
+            row.pop("crc", None)  # earlier versions ended each line in a checksum and the file in a closing line
+        except (ValueError, AttributeError, TypeError, RecursionError) as error:
+            raise _damaged(path, schema, f"line {number}: it is not a JSON object") from error
+        if row.keys() & {"about", "constants", schema.mark}:
+            rows.append(row)
+        elif row.keys() != {"end"}:
             raise _damaged(path, schema, f"line {number}: it is not a row of {schema.stem}")
     return rows
+
+
+@functools.cache  # once, however often a file is read
+def _warn(line: str) -> None:
+    console.print(line)
+
+
+def _rewrite(path: Path, rows: Iterable[Row]) -> None:
+    with replacing(path, "wb") as file:
+        file.write(_text(rows))
 
 
 def _reopen(path: Path, schema: Schema) -> None:
@@ -305,8 +313,7 @@ def _reopen(path: Path, schema: Schema) -> None:
         table = read(whole, schema)
         told = about_of(table)
         rows = [] if told is None else [{"about": told}]
-        rows += [{name: value for name, value in row.items() if value is not None} for row in table.to_pylist()]
-        lines.Writer(path, rows).close()
+        _rewrite(path, [*rows, *({k: v for k, v in row.items() if v is not None} for row in table.to_pylist())])
     whole.unlink()
 
 
@@ -314,40 +321,14 @@ def _grown(path: Path, schema: Schema) -> pa.Table:
     """Return the table of a JSONL file, constants included."""
     told: Row | None = None
     constants: Row = {}
-    columns: dict[str, list[Any]] = {}
-    count, rows = 0, _rows(path, schema)
-    check_room(f"{path} holds {len(rows):,} lines", _extent(rows), f"it {schema.remedy}")
-    for line in rows:
-        if "about" in line or "constants" in line:
-            told, constants = line.get("about", told), line.get("constants", constants)
-            continue
-        for name, value in (constants | line).items():
-            column = columns.setdefault(name, [])
-            column.extend([None] * (count - len(column)))  # earlier rows lacked this column
-            column.append(value)
-        count += 1
+    rows = []
+    for line in _lines(path, schema):
+        if schema.mark in line:
+            rows.append(constants | line)
+        told, constants = line.get("about", told), line.get("constants", constants)
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = {name: [row.get(name) for row in rows] for name in names}
     # Integers are cast last, since Arrow would truncate a fractional value.
-    types = {name: None if name in schema.integers else schema.type(name) for name in columns}
-    padded = {name: column + [None] * (count - len(column)) for name, column in columns.items()}
-    table = pa.table({name: pa.array(column, types[name]) for name, column in padded.items()})
-    table = _typed(table, schema)
+    types = {name: None if name in schema.integers else schema.type(name) for name in names}
+    table = _typed(pa.table({name: pa.array(column, types[name]) for name, column in columns.items()}), schema)
     return table if told is None else table.replace_schema_metadata({META: json.dumps(told).encode()})
-
-
-def _extent(rows: Iterable[Row]) -> int:
-    """Return the memory that the table of these lines needs [bytes]; constants count in every row."""
-    names: set[str] = set()
-    count, found, shared = 0, 0, 0
-    for row in rows:
-        if "about" in row:
-            continue
-        values = row.get("constants", row)
-        names.update(values)
-        lists = sum(len(value) for value in values.values() if isinstance(value, list))
-        texts = sum(len(value) for value in values.values() if isinstance(value, str))
-        size = VALUE * lists + 2 * texts
-        if "constants" in row:
-            shared = size
-        else:
-            count, found = count + 1, found + shared + size
-    return found + VALUE * count * len(names)

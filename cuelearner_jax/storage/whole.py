@@ -1,4 +1,4 @@
-"""Atomic replacement of files and folders, and errors for files that cannot be read.
+"""Locks, and files and folders that appear as a whole or not at all.
 
 While a folder NAME is written these lie beside it:
 
@@ -13,29 +13,42 @@ the new one had not yet taken its place.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from cuelearner_jax.errors import UserError, no_space
+from filelock import FileLock, Timeout
+
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.signals import saving
-from cuelearner_jax.storage.locks import hold, open_locked
 from cuelearner_jax.terminal import console
 
-TEMPORARY = ".tmp"  # suffix of an incomplete file
-TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # errors of a rename onto something that exists
+
+@contextmanager
+def hold(lock: Path, what: Path) -> Iterator[None]:
+    """Hold a lock file that claims the folder `what`; the lock ends however the process ends.
+
+    Raises UserError if another process holds the lock.
+    """
+    held = FileLock(lock, blocking=False)
+    try:
+        held.acquire()
+    except Timeout:
+        raise UserError(f"{what} is being written by another process: wait for it, or give another --out") from None
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        held.release()
 
 
 @contextmanager
 def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[Any]]:
     """Open a file that replaces `path` atomically once complete and on disk; text is UTF-8.
-
-    A failure leaves nothing behind; what a kill left is reused by the next writer. A second process that writes the
-    same file waits for the first.
 
     Args:
         path: the file.
@@ -45,27 +58,24 @@ def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[A
     Raises:
         UserError: `fresh`, and the file exists.
     """
-    folders = [folder for folder in path.parents if not folder.exists()] if fresh else []
-    temporary = path.with_name(path.name + TEMPORARY)
+
+    def check() -> None:
+        if fresh and os.path.lexists(path):
+            raise UserError(f"{path} exists: give another --out")
+
+    check()
+    if fresh:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
     try:
-        if fresh:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        with open(open_locked(temporary, wait=True), mode, encoding=None if "b" in mode else "utf-8") as file:
-            try:
-                file.truncate(0)
-                if fresh and os.path.lexists(path):
-                    raise UserError(f"{path} exists: give another --out")
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-                os.replace(temporary, path)
-            except BaseException:
-                temporary.unlink()
-                raise
+        with temporary.open(mode, encoding=None if "b" in mode else "utf-8") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        check()
+        os.replace(temporary, path)
     except BaseException:
-        for folder in folders:
-            with contextlib.suppress(OSError):  # the folder is not empty, or was never made
-                folder.rmdir()
+        temporary.unlink(missing_ok=True)
         raise
     _sync(path.parent)
 
@@ -110,15 +120,11 @@ class Place:
         """Remove or restore what a killed process left."""
         if self._new.exists():
             shutil.rmtree(self._new)
-        if not self._old.exists():
-            return
-        if is_used(self.folder):  # the new folder is in place: only the last step was missing
+        if self._old.exists() and is_used(self.folder):  # the new folder is in place: only the last step was missing
             shutil.rmtree(self._old)
-            return
-        os.rename(self._old, self.folder)
-        console.print(
-            f"{self.folder}: an earlier replacement of this folder was interrupted, so the old folder was put back"
-        )
+        elif self._old.exists():
+            os.rename(self._old, self.folder)
+            console.print(f"{self.folder}: its replacement was interrupted, so the old folder was put back")
 
     def _move(self) -> None:
         self._check()
@@ -127,14 +133,12 @@ class Place:
             os.rename(self.folder, self._old)
         try:
             os.rename(self._new, self.folder)
-        except BaseException as error:
+        except OSError as error:
             if replaces:
                 os.rename(self._old, self.folder)
-            if isinstance(error, OSError) and error.errno in TAKEN:
-                raise UserError(
-                    f"{self.folder} was created meanwhile by another program and is left as it is: give another --out"
-                ) from None
-            raise
+            raise UserError(
+                f"{self.folder} cannot be put in place ({error.strerror}), nothing was changed: give another --out"
+            ) from error
         if replaces:
             _sync(self.folder.parent)  # before the old folder is removed
             shutil.rmtree(self._old)
@@ -151,32 +155,6 @@ def is_used(folder: Path) -> bool:
 
 
 @contextmanager
-def _writable(told: Path) -> Iterator[None]:
-    """Raise UserError where the file system cannot have a folder; a full disk keeps its own error."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:  # RuntimeError: a circle of links
-        if no_space(error):
-            raise
-        why = getattr(error, "strerror", None) or "a circle of links"
-        raise UserError(f"{told} cannot be written ({why}): give another --out") from error
-
-
-def check_not_aside(folder: Path) -> None:
-    """Raise UserError for a folder whose replacement was interrupted, with the old folder still set aside."""
-    try:
-        place = folder.resolve()
-        if not place.name or is_used(place) or not (old := beside(place, "old")).exists():
-            return
-    except (OSError, RuntimeError):  # the name is too long, or a circle of links: nothing can be there
-        return
-    raise UserError(
-        f"{folder}: its replacement was interrupted, and the old folder was set aside as {old}: "
-        "rename that folder back, or run the interrupted command again"
-    )
-
-
-@contextmanager
 def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = False) -> Iterator[Place]:
     """Claim the place of a folder for this process while its new contents are prepared (`Place.writing`).
 
@@ -189,21 +167,11 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
     Raises:
         UserError: as `check`, or another process has claimed the place.
     """
-    told = folder
-    with _writable(told):
-        folder = folder.resolve()
-    check(told)
-    missing = [parent for parent in folder.parents if not parent.exists()]
-    try:
-        with contextlib.ExitStack() as stack:
-            with _writable(told):
-                folder.parent.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(hold(beside(folder, "lock"), told, stays=False))
-            place = Place(folder, lambda: check(told), overwrite)
-            place.recover()
-            check(told)  # no other process that claims places can change it any more
-            yield place
-    finally:
-        for parent in missing:  # the innermost first; a folder with contents stays
-            with contextlib.suppress(OSError):
-                parent.rmdir()
+    check(folder)
+    target = folder.resolve()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with hold(beside(target, "lock"), folder):
+        place = Place(target, lambda: check(folder), overwrite)
+        place.recover()
+        check(folder)  # no other process that claims places can change it any more
+        yield place

@@ -9,7 +9,6 @@ Kinds are trained in turn; the lanes of a kind (seeds x label budgets) are train
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,14 +24,13 @@ from cuelearner_jax.runs.grid import Grid, defaults, seeds_of
 from cuelearner_jax.runs.judging import judges_world
 from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.runs.order import Order, Plan, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, prepare_folder
 from cuelearner_jax.task import Preset, Task, shape_of
-from cuelearner_jax.terminal import console, interruptible, progress_bars
+from cuelearner_jax.terminal import interruptible, progress_bars
 from cuelearner_jax.types import Teacher
 
 
@@ -47,16 +45,10 @@ def suggested(task: Task, preset: Preset) -> TrainRequest:
     return TrainRequest(task, preset.config, Grid(preset_kinds(task, preset), seeds, preset.labels))
 
 
-def _groups(request: TrainRequest, env: Any, tell: Callable[[str], None]) -> list[LaneGroup]:
-    """Return the lane group of each kind in an environment, or in its shape; report their memory by `tell`.
-
-    Raises UserError for too little memory.
-    """
+def _groups(request: TrainRequest, env: Any) -> list[LaneGroup]:
+    """Return the lane group of each kind in an environment."""
     config = request.config
-    groups = [LaneGroup(config, env, config.guide_in(env, kind), request.grid) for kind in request.grid.guidance]
-    for group in groups:
-        tell(memory_report(group))
-    return groups
+    return [LaneGroup(config, env, config.guide_in(env, kind), request.grid) for kind in request.grid.guidance]
 
 
 def run(order: Order) -> None:
@@ -65,14 +57,13 @@ def run(order: Order) -> None:
     With a shard, train only its share of the seeds, resuming where the shard stands.
 
     Raises:
-        UserError: invalid configuration, a folder in use, or too little memory; nothing has been changed.
+        UserError: invalid configuration, or a folder in use; nothing has been changed.
         Interrupted: Ctrl-C or SIGTERM; everything is saved.
         NotFinite: everything is finished, but some lanes stopped being finite.
     """
     release_programs()
     plan = make_plan(order)
     order = plan.order
-    _groups(order, shape_of(order.task, order.config.task), console.print)  # before anything that has a size is made
     with progress_bars() as bars:
         waiting = bars.add_task("preparing", total=None, note="")
         made = _made(order, plan)
@@ -80,7 +71,8 @@ def run(order: Order) -> None:
             # Nobody else can change it any more.
             check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(order.task))
             for group in made.groups if order.resume else ():
-                check_standing(group, order.out / group.guidance.name, given=plan.labels is not None)
+                described = formats.read("config", order.out / CONFIG)
+                check_standing(group, order.out / group.guidance.name, described, given=plan.labels is not None)
             prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
             # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
             described = formats.read("config", order.out / CONFIG)
@@ -105,7 +97,7 @@ def _made(order: Order, plan: Plan) -> _Made:
     """Return the worlds and the teacher. Raises UserError for a teacher that cannot be asked."""
     task, config, mesh = order.task, order.config, lane_mesh()
     env = place(mesh, task.environment(config.task), SHARED)
-    groups = _groups(order, env, lambda told: None)
+    groups = _groups(order, env)
     asked = any(group.guidance.asks for group in groups) and plan.labels is None
     teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None
     if asked:
@@ -135,12 +127,12 @@ def in_memory(
         progress: show progress bars on standard error.
 
     Raises:
-        UserError: invalid configuration, no teacher where one is needed, or too little memory.
+        UserError: invalid configuration, or no teacher where one is needed.
     """
     release_programs()
     request = resolve_request(request)
     labels, mesh = labels_of(request), lane_mesh()
-    groups = _groups(request, place(mesh, env, SHARED), lambda told: None)
+    groups = _groups(request, place(mesh, env, SHARED))
     asking = [group.guidance.name for group in groups if group.guidance.asks]
     if asking and teacher is None and labels is None:
         raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")

@@ -5,14 +5,11 @@ import json
 import re
 import shutil
 import sys
-from pathlib import Path
 
 import chex
 import jax
 import numpy as np
 import pytest
-from damaged_folders import DAMAGES
-from small_runs import listing
 
 import cuelearner_jax as cl
 from cuelearner_jax.adaptation import serialization
@@ -329,30 +326,9 @@ def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
         cl.load_policy(adapted, task="own_turned:TASK", bound_deg=7.0, base=lambda obs: obs)
 
 
-def test_a_damaged_folder_is_refused_or_whole(adapted, tmp_path):
-    acts = lambda folder: cl.load_policy(folder, task="own_turned:TASK", base=lambda obs: obs)(SEEN)  # noqa: E731
-    whole = acts(adapted)
-    files = [path.relative_to(adapted) for path in sorted(adapted.rglob("*")) if path.is_file()]
-    needed = [path for path in files if path.parts[0] in ("arrays", "policy.json")]
-    cases = [(path, damage) for path in needed for damage in DAMAGES]
-    for number, (path, damage) in enumerate([*cases[:: len(cases) // 10], (Path("policy.json"), "flipped")]):
-        folder = tmp_path / f"damaged-{number}"
-        shutil.copytree(adapted, folder)
-        DAMAGES[damage](folder / path, 0x5EED0000 + 7919 * number)
-        before = listing(folder)
-        try:
-            np.testing.assert_array_equal(acts(folder), whole)
-        except cl.UserError as error:
-            assert "\n" not in str(error)
-            assert "adapt the policy anew" in str(error) or "run folder" in str(error), (path, damage, str(error))
-        assert listing(folder) == before
-    other = tmp_path / "other"
-    shutil.copytree(adapted, other)
-    values = json.loads((other / "policy.json").read_text())
-    values["lanes"]["used"][0] = not values["lanes"]["used"][0]
-    (other / "policy.json").write_text(json.dumps(values))
-    with pytest.raises(cl.UserError, match="is damaged: restore it, or adapt the policy anew"):
-        acts(other)
+def test_the_arrays_of_another_policy_are_refused(adapted, tmp_path):
+    act = lambda folder: cl.load_policy(folder, task="own_turned:TASK", base=lambda obs: obs)  # noqa: E731
+    act(adapted)
     mixed = tmp_path / "mixed"  # of two folders, each of them whole
     shutil.copytree(adapted, mixed)
     shutil.rmtree(mixed / "arrays")
@@ -365,7 +341,7 @@ def test_a_damaged_folder_is_refused_or_whole(adapted, tmp_path):
     )
     (mixed / "spare" / "arrays").rename(mixed / "arrays")
     with pytest.raises(cl.UserError, match="holds the arrays of another policy"):
-        acts(mixed)
+        act(mixed)
 
 
 def _shapes(folder):

@@ -64,6 +64,13 @@ def test_pieces_give_what_the_whole_gives_and_a_report_says_which_are_missing(wh
     assert {path: path.stat().st_mtime_ns for path in out.rglob("results.parquet")} == before
 
 
+def test_a_piece_that_was_copied_over_another_is_not_counted_twice(whole, refused, tmp_path):
+    out = tmp_path / "run"
+    assert main([*SWEEP, "--shard", "1/2", "--out", str(out)]) == 0
+    shutil.copytree(out / "shard-1-of-2", out / "shard-2-of-2")
+    refused(["evaluate", out, "--guidance", "none"], "both hold seed 7: delete the one that is a copy", out)
+
+
 def test_other_options_for_a_piece_that_has_begun_are_refused(refused, tmp_path):
     command = [*SWEEP, "--shard", "3/3", "--out", tmp_path / "run"]
     assert main([str(part) for part in command]) == 0
@@ -118,5 +125,7 @@ def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path):
     env["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # JAX warns of programs that it can't keep
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 1
-    told = [line for line in done.stderr.splitlines() if " lanes, " not in line and not line.startswith("none")]
-    assert told == ["error: the disk is full: free some, then go on with the same command and --resume"]
+    # Orbax's threads may complain beside it.
+    assert (
+        "error: the disk is full: free some, then go on with the same command and --resume" in done.stderr.splitlines()
+    )

@@ -5,16 +5,13 @@ import dataclasses
 import chex
 import jax
 import numpy as np
-import pytest
-from probes import CONFIG, Window, compilations, config
+from probes import CONFIG, Window, compilations
 
 from cuelearner_jax.devices import SHARED, compiler_options, place
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidance
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.memory_report import memory_report
 
 
 def group_of(seeds, kind="none", config=CONFIG, **sizes):
@@ -54,12 +51,6 @@ def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
         (1, 20),
     ]
     assert group_of(2, "heuristic").budgets.tolist() == [0, 0]
-
-
-def test_memory_is_told_before_and_too_much_is_refused():
-    assert "3 lanes" in memory_report(group_of(3))
-    with pytest.raises(UserError, match="are free: "):
-        memory_report(group_of(3, config=config(agent={"replay_capacity": 2 * 10**9})))
 
 
 def test_blocks_of_another_cut_are_cut_anew(monkeypatch):

@@ -1,5 +1,7 @@
 """Runs that were stopped or killed and resumed: bitwise the run that was left alone."""
 
+import dataclasses
+import json
 import shutil
 from contextlib import contextmanager
 from functools import cache
@@ -18,12 +20,13 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lane_checkpoints, lanes, runner, training
-from cuelearner_jax.runs.grid import Grid, config_hash
+from cuelearner_jax.runs.grid import Grid, config_hash, run_key
 from cuelearner_jax.runs.lane_checkpoints import items
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.program import make_program
+from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.spaces import DIRECTIONS
-from cuelearner_jax.storage import formats, label_files, lines, results
+from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.storage.folders import prepare_folder
@@ -100,7 +103,8 @@ def newest(out, kind, grid=GRID):
     env = TASK.environment(CONFIG.task)
     group = lanes.LaneGroup(CONFIG, env, guidances.make(kind, CONFIG.sizes, env), grid)
     like = items(group.shapes_of(group.cut), jax.eval_shape(start_clock), 0.0, group.arbiter)
-    with checkpoints(out / kind / "checkpoints", read_only=True) as saved:
+    key = run_key(formats.read("config", out / "config.json"), kind)
+    with checkpoints(out / kind / "checkpoints", read_only=True, run=key) as saved:
         found = saved.restore(like)
         del found["clock"]["wall_s"]
         return found, saved.latest()
@@ -178,14 +182,16 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
 
 @pytest.mark.long
 def test_a_run_begun_before_a_field_existed_goes_on_as_one_run(whole, tmp_path):
-    out = shutil.copytree(whole, tmp_path / "run")
+    out = tmp_path / "run"
+    out.mkdir()
+    shutil.copy(whole / "config.json", out)
     probes.edit_json(out / "config.json", lambda told: [told["sizes"].pop("frame"), told["agent"].pop("polyak")])
-    shutil.rmtree(out / "none")
-    before = {row["config_hash"] for row in rows(out)}
+    with killed_at(2, "_save"), pytest.raises(Killed):
+        run(out, resume=True)
     run(out, resume=True)
     assert_same_run(out, whole, but=("config_hash",))
     told = formats.read("config", out / "config.json")
-    assert {row["config_hash"] for row in rows(out)} == before | {config_hash(told)}
+    assert {row["config_hash"] for row in rows(out)} == {config_hash(told)}
 
 
 def test_a_checkpoint_whose_lanes_had_another_state_is_refused_before_anything_is_done(whole, tmp_path, monkeypatch):
@@ -296,10 +302,9 @@ def test_the_note_of_a_stretch_that_waits_is_of_its_step_and_whole(tmp_path):
         lane_checkpoints.read_due(tmp_path, 48, lanes=2)["train_loss"], np.float32([0.1, np.nan])
     )
     assert lane_checkpoints.read_due(tmp_path, 64, lanes=2) is None  # it lay beside another checkpoint
-    for values in ({"step": 48}, {"step": 48, "columns": [1.0]}, {"step": 48, "columns": {"train_loss": [1.0]}}):
-        formats.write("due", tmp_path / lane_checkpoints.DUE, values)
-        with pytest.raises(UserError, match=r"due\.json is damaged"):
-            lane_checkpoints.read_due(tmp_path, 48, lanes=2)
+    (tmp_path / lane_checkpoints.DUE).write_text("{}")
+    with pytest.raises(UserError, match=r"due\.json is damaged"):
+        lane_checkpoints.read_due(tmp_path, 48, lanes=2)
 
 
 def test_resuming_a_finished_run_changes_nothing(whole):
@@ -398,9 +403,9 @@ def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(stopped, whol
 
 
 def without_rows(table, drop):
-    """Rewrites a growing table without some rows, checksums included."""
-    kept = [line for line in lines.read(table).rows if not drop(line)]
-    lines.Writer(table, kept).close()
+    """Rewrites a growing table without some rows."""
+    lines = table.read_text().splitlines(keepends=True)
+    table.write_text("".join(line for line in lines if not drop(json.loads(line))))
 
 
 def refused(out, message):
@@ -447,6 +452,30 @@ def test_a_finished_kind_is_looked_at_before_it_is_called_finished(whole, tmp_pa
     labels = out / "relative" / label_files.PARQUET
     labels.write_bytes(labels.read_bytes()[:100])
     refused(out, "not a label file of cuelearner, or it is damaged")
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """A run of other settings, stopped where `stopped` was."""
+    out = tmp_path_factory.mktemp("other") / "run"
+    config = dataclasses.replace(CONFIG, scalars=dataclasses.replace(CONFIG.scalars, discount=0.4))
+    with stopping_at(6 + 3), pytest.raises(Interrupted):
+        train.run(Order(TASK, config, GRID, out))
+    return out
+
+
+@pytest.mark.parametrize("part", ["checkpoints", "results.jsonl", "guide.jsonl", "labels.parquet"])
+def test_a_part_that_was_exchanged_with_another_runs_is_refused(stopped, other, tmp_path, part):
+    out = copied(stopped, tmp_path)
+    mine = out / "relative" / part
+    if mine.is_dir():
+        shutil.rmtree(mine)
+        shutil.copytree(other / "relative" / part, mine)
+        with pytest.raises(UserError, match="another run"):
+            PolicySource.of_folder(out, lambda name: TASK).load()
+    else:
+        shutil.copy(other / "relative" / part, mine)
+    refused(out, "another run")
 
 
 @pytest.mark.parametrize(("resume", "says"), [(False, "not empty"), (True, "other values of scalars.eps_deg")])

@@ -1,11 +1,7 @@
 """Checkpoints: what was saved comes back bit by bit, and what cannot be read is said in one line."""
 
-import errno
-import gc
 import hashlib
 import shutil
-import sys
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -113,38 +109,18 @@ def test_no_checkpoint_is_said_so(tmp_path):
         restore(tmp_path)
 
 
-def spoil(path):
-    path.write_bytes(b"\0" * (path.stat().st_size // 2))
-
-
-@pytest.mark.parametrize(
-    "change", [spoil, pytest.param(lambda path: path.unlink(), marks=pytest.mark.long)], ids=["spoilt", "missing"]
-)
-@pytest.mark.parametrize("which", ["main", pytest.param("every", marks=pytest.mark.long)])
-def test_a_damaged_checkpoint_is_refused(tmp_path, change, which):
+@pytest.mark.parametrize("content", [b"", b"\0" * 100], ids=["emptied", "zeroed"])
+def test_a_damaged_checkpoint_is_refused(tmp_path, content):
     save(tmp_path, 5)
     policy = tmp_path / "5" / "policy"
-    whole = {path: path.read_bytes() for path in sorted(policy.rglob("*")) if path.is_file()}
-    main = (max(whole, key=lambda path: len(whole[path])), policy / "manifest.ocdbt")  # the numbers themselves first
-    refused = []
-    for path, content in whole.items():
-        if which == "main" and path not in main:
-            continue
-        change(path)
-        try:
-            assert_bitwise(restore(tmp_path), {"policy": state(5)})  # Orbax writes some files that it never reads
-        except UserError as refusal:
-            assert "checkpoint 5 in" in str(refusal)
-            assert "cannot be read" in str(refusal)
-            assert "\n" not in str(refusal)
-            assert "bound method" not in str(refusal)
-            refused.append(path)
+    files = [path for path in policy.rglob("*") if path.is_file()]
+    for path in (max(files, key=lambda path: path.stat().st_size), policy / "manifest.ocdbt"):  # the numbers first
+        whole = path.read_bytes()
         path.write_bytes(content)
-    assert set(main) <= set(refused)
-    for path in whole:
-        change(path)
-    with pytest.raises(UserError, match=r"checkpoint 5 in .* cannot be read"):
-        restore(tmp_path)
+        with pytest.raises(UserError, match=r"checkpoint 5 in .* cannot be read .*: it is damaged") as refusal:
+            restore(tmp_path)
+        assert "\n" not in str(refusal.value)
+        path.write_bytes(whole)
 
 
 @pytest.mark.long
@@ -175,7 +151,7 @@ def test_numbers_that_others_put_in_place_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"policy\['block'\].* is not what was written.*it is damaged"):
         restore(tmp_path / "mine")
     shutil.rmtree(tmp_path / "mine" / "5" / "digests")
-    with pytest.raises(UserError, match="the digests of its arrays are missing"):
+    with pytest.raises(UserError, match="cannot be read"):
         restore(tmp_path / "mine")
 
 
@@ -229,46 +205,17 @@ def test_a_checkpoint_of_other_shapes_is_refused(tmp_path, change):
     assert probes.files_of(tmp_path) == before
 
 
-@pytest.mark.long
-def test_what_a_refused_checkpoint_leaves_behind_is_silent(tmp_path, caplog, monkeypatch):
-    save(tmp_path, 5)
-    complaints = []
-    monkeypatch.setattr(sys, "unraisablehook", complaints.append)
-    wider = other(lambda item: item.update(weights=jax.ShapeDtypeStruct((3, 401), jnp.float32)))
-    with pytest.raises(UserError, match=r"\['weights'\] is \(3, 400\), expected \(3, 401\)"):
-        restore(tmp_path, wider)
-    gc.collect()
-    assert complaints == []
-    assert caplog.records == []
-
-
-def test_what_complains_later_still_of_a_closed_event_loop_is_silent(tmp_path, monkeypatch):
-    complaints = []
-    monkeypatch.setattr(sys, "unraisablehook", complaints.append)
-    save(tmp_path, 5)
-    with pytest.raises(UserError):
-        restore(tmp_path, other(lambda item: item.pop("weights")))
-    for error in (RuntimeError("Event loop is closed"), RuntimeError("out of ink")):
-        sys.unraisablehook(SimpleNamespace(exc_value=error))
-    assert [str(complaint.exc_value) for complaint in complaints] == ["out of ink"]
-
-
-@pytest.mark.long
-def test_what_a_refused_write_leaves_behind_is_silent(tmp_path, monkeypatch, recwarn):
-    async def fragment():
-        pass
-
-    def full(*_, **__):
-        left = [fragment()]
-        left.append(left)  # as TensorStore's are: found by the garbage collector alone
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with checkpoints(tmp_path) as saved:
-        monkeypatch.setattr(saved._manager, "save", full)
-        with pytest.raises(OSError, match="MB are needed"):
-            saved.save(5, {"policy": state()})
-    gc.collect()
-    assert list(recwarn) == []
+def test_a_checkpoint_knows_its_run(tmp_path):
+    for run in ("mine", ""):
+        with checkpoints(tmp_path / run, run=run) as saved:
+            saved.save(1, {"policy": state()})
+        with checkpoints(tmp_path / run, read_only=True, run=run) as saved:
+            saved.restore({"policy": shapes(state())})
+    with (
+        checkpoints(tmp_path / "mine", read_only=True, run="yours") as saved,
+        pytest.raises(UserError, match="it belongs to another run"),
+    ):
+        saved.restore({"policy": shapes(state())})
 
 
 def test_an_item_that_was_never_saved_is_refused(tmp_path):

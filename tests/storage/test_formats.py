@@ -79,12 +79,3 @@ def test_what_was_written_is_read_and_nothing_else(tmp_path):
 def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path):
     with pytest.raises(UserError, match=r"cannot be read \(Is a directory\): check its permissions"):
         formats.read("config", tmp_path)
-
-
-def test_a_file_larger_than_any_is_not_read(tmp_path, monkeypatch):
-    path = tmp_path / "config.json"
-    formats.write("config", path, {"task": {}})
-    monkeypatch.setattr(formats, "LARGEST", path.stat().st_size - 1)
-    monkeypatch.setattr(Path, "read_text", None)
-    with pytest.raises(UserError, match=r"is damaged or of another program.* bytes, more than any such file has"):
-        formats.read("config", path)

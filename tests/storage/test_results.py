@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.storage import lines, results
+from cuelearner_jax.storage import results
 from cuelearner_jax.storage.table import TableWriter, finish, truncate
 
 CONSTANTS = {"run": "a", "task": "one_ball", "guidance": "relative", "config_hash": "0f", "hardware": "1 x cpu"}
@@ -126,7 +126,7 @@ def test_errors_are_one_clear_line(tmp_path):
     (tmp_path / "c" / results.PARQUET).write_bytes(b"PAR1 and then rubbish")
     assert "is damaged" in message(tmp_path / "c")
     (tmp_path / "d").mkdir()
-    lines.Writer(tmp_path / "d" / results.JSONL, [{"step": 1, "reward": 2.0}]).close()
+    (tmp_path / "d" / results.JSONL).write_text('{"step": 1, "reward": 2.0}\n')
     assert "lacks the columns" in message(tmp_path / "d")
-    lines.Writer(tmp_path / "d" / results.JSONL, [{"step": "three"}]).close()
+    (tmp_path / "d" / results.JSONL).write_text('{"step": "three"}\n')
     assert "is damaged" in message(tmp_path / "d")

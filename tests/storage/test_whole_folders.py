@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from cuelearner_jax import signals
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import whole
 
@@ -71,13 +70,13 @@ def test_a_folder_appears_as_a_whole_and_nothing_else_stays(tmp_path):
 
 def test_of_what_fails_nothing_stays(tmp_path):
     with pytest.raises(OSError, match="full"):
-        write(tmp_path / "a" / "out", OSError("full"))
+        write(tmp_path / "out", OSError("full"))
     assert names(tmp_path) == []
 
 
 def test_a_second_writer_is_refused_while_the_first_works(tmp_path):
     with whole.place_of(tmp_path / "out", check):
-        with pytest.raises(UserError, match=rf"out is being written by another process \(process {os.getpid()} on "):
+        with pytest.raises(UserError, match="out is being written by another process"):
             write(tmp_path / "out", "second")
         (tmp_path / "link").symlink_to(tmp_path / "out")
         with pytest.raises(UserError, match="link is being written by another process"):
@@ -118,7 +117,7 @@ def test_what_was_made_meanwhile_stays(tmp_path, made, overwrite):
         (tmp_path / "out").mkdir()
         (tmp_path / "out" / made).write_text("theirs")
 
-    with pytest.raises(UserError, match=r"is not ours|was created meanwhile by another program and is left as it is"):
+    with pytest.raises(UserError, match=r"is not ours|cannot be put in place .*, nothing was changed"):
         write(tmp_path / "out", "mine", overwrite, meanwhile)
     assert (tmp_path / "out" / made).read_text() == "theirs"
     assert names(tmp_path) == ["out"]
@@ -134,7 +133,7 @@ def test_a_folder_that_cannot_come_leaves_the_old_one(tmp_path, monkeypatch):
         rename(source, target)
 
     monkeypatch.setattr(os, "rename", refusing)
-    with pytest.raises(OSError, match="Input/output"):
+    with pytest.raises(UserError, match="Input/output"):
         write(tmp_path / "out", "new")
     assert (tmp_path / "out" / "ours").read_text() == "old"
     assert names(tmp_path) == ["out"]
@@ -170,26 +169,3 @@ def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(tmp_path, killed
         steps += 1
     assert steps >= 4
     assert found == ({"old", "new"} if before else {None, "new"})
-
-
-def test_a_signal_that_ends_the_process_leaves_no_lock(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "_exit", lambda status: None)
-    monkeypatch.setattr(signals, "_leaving", threading.Lock())
-    with whole.place_of(tmp_path / "out", check):
-        assert names(tmp_path) == [".out.lock"]
-        signals._leave(2)
-        assert names(tmp_path) == []
-
-
-def test_readers_say_where_a_folder_stands_aside_and_writers_put_it_back(tmp_path, killed_at):
-    write(tmp_path / "out", "one")
-    revive = killed_at(3)  # the new folder is made, the old one is moved aside
-    with pytest.raises(Killed):
-        write(tmp_path / "out", "two")
-    revive()
-    assert not (tmp_path / "out").exists()
-    with pytest.raises(UserError, match=r"out: its replacement was interrupted, .* set aside as .*\.out\.old: rename"):
-        whole.check_not_aside(tmp_path / "out")
-    with whole.place_of(tmp_path / "out", check, overwrite=True):
-        whole.check_not_aside(tmp_path / "out")
-    assert (tmp_path / "out" / "ours").read_text() == "one"

@@ -56,9 +56,3 @@ def test_a_table_that_there_is_not_is_refused_in_one_line():
     billiards = registry.find("billiards")
     with pytest.raises(UserError, match=r"task\.table is 'mro': choose one of one_ball, easy, regulation"):
         billiards.environment(billiards.config(table="mro"))
-
-
-def test_worlds_that_memory_does_not_hold_are_refused_before_any_is_made():
-    task = registry.find("navigation")
-    with pytest.raises(UserError, match=r"the world of navigation is large, which needs [0-9.,]+ GB"):
-        task.environment(dataclasses.replace(task.config(), worlds=2**24))
