@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from cuelearner_jax.api.policies import CallablePolicy, load_policy
     from cuelearner_jax.api.training import Run, train
     from cuelearner_jax.api.worlds import World, from_gymnasium, make, teacher_of
-    from cuelearner_jax.calibration import Distortion, Unknown
     from cuelearner_jax.errors import UserError
+    from cuelearner_jax.reading import Distortion, Unknown
     from cuelearner_jax.spaces import UNSAID
 
 __version__ = "1.0.0"
@@ -38,12 +38,12 @@ __version__ = "1.0.0"
 _PLACES = {
     "AdaptedPolicy": "api.adaptation",
     "CallablePolicy": "api.policies",
-    "Distortion": "calibration",
+    "Distortion": "reading",
     "FeedbackModel": "api.feedback",
     "Labels": "api.feedback",
     "Run": "api.training",
     "UNSAID": "spaces",
-    "Unknown": "calibration",
+    "Unknown": "reading",
     "UserError": "errors",
     "World": "api.worlds",
     "adapt": "api.adaptation",

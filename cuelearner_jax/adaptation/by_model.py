@@ -21,12 +21,12 @@ from jaxtyping import Array
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.judging import Judge, Judgement, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState, ask_round, begin, blame, rounds, take_labels
-from cuelearner_jax.calibration import Result
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.policies import Policy, policy_name
+from cuelearner_jax.reading import Result
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Label, Teacher
 
@@ -43,10 +43,10 @@ class AdaptationResult:
 
     of: Adaptation
     lanes: Lanes
-    block: Any  # `LaneState`, or `by_calibration.Evidence`
+    block: Any  # `LaneState`, or `by_reading.Evidence`
     judged: Judgement
     curve: list[dict[str, Any]]  # a row a measurement: "asked" (lanes,) labels so far, and metrics (lanes,) by name
-    results: tuple[Result, ...] = ()  # calibration only: each lane's estimates
+    results: tuple[Result, ...] = ()  # reading only: each lane's estimates
 
     @property
     def labels(self) -> Label:

@@ -1,4 +1,4 @@
-"""The changes that calibration considers: derived from a world's declarations, or the user's own distortions."""
+"""The changes that a reading considers: derived from a world's declarations, or the user's own distortions."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import plugins
-from cuelearner_jax.calibration import Distortion, declared_distortions
-from cuelearner_jax.calibration.families import (
+from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.errors import UserError, format_value
+from cuelearner_jax.reading.families import (
+    Distortion,
     Family,
     check_family,
+    declared_distortions,
     undo_action,
     undo_observation,
     undo_physics,
     unknowns_of,
 )
-from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.errors import UserError, format_value
 
 SITUATIONS = 8  # situations in which distortions at zero are checked to change nothing
 SAME = 1e-4  # largest difference of an entry in that check
@@ -64,7 +65,7 @@ def check_acts(family: Family, env: Environment) -> None:
         nothing = jnp.zeros(len(one.unknowns))
         for name, given, found in (
             ("sees", obs, jax.vmap(partial(undo_observation, (one,), nothing))(obs)),
-            ("acts", actions, jax.vmap(partial(undo_action, (one,), nothing, corrects=False))(actions)),
+            ("acts", actions, jax.vmap(partial(undo_action, (one,), nothing))(actions)),
             ("plans", actions, jax.vmap(partial(undo_physics, (one,), nothing))(obs, actions)),
         ):
             if found.shape != given.shape:
@@ -93,7 +94,7 @@ def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Fami
             f"this policy corrects changes of code, {code}, which is not loaded because a file names it: add "
             f"--changes {code} (from Python changes=...) if you trust that code"
         )
-    known = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env, gains=True))}
+    known = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env))}
     if missing := [name for name in names if name not in known]:
         raise UserError(
             f"this policy corrects {missing[0]!r}, which {code or 'this world'} lacks: give the code "

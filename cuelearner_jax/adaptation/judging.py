@@ -1,7 +1,8 @@
-"""Judge whether an adapted policy is better than its base. An adapted policy that is worse is not used.
+"""Judge whether an adapted policy is better than its base. An adapted policy is used only if it is.
 
-With a simulator both play the same episodes, none of which reported figures are measured on: those of the "tuning"
-split of the changed world. Without one, held-out labels are predicted, against answering "already right" always.
+With a simulator both play the same episodes of the changed world, those of the split "tuning", until a sequential test
+of the paired differences decides (`PairedTest`). Reported figures are measured on other episodes. Without a simulator,
+held-out labels are predicted, against answering "already right" always; a reading has a rule of its own.
 """
 
 from __future__ import annotations
@@ -30,6 +31,10 @@ HELD_OUT = 5  # every fifth label is held out
 LABELS = "labels"  # `Judging.by` where held-out labels judge in place of a metric
 SPLIT = "tuning"  # the split that the judging episodes come from
 STEPS = 100  # steps of each environment, where a task counts steps
+AT_ONCE = 10  # episodes between two looks
+STAKES = np.array([0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # lambda of the sequential test
+DECIDED = 20.0  # value of the test martingale that decides
+SHARES = ("success", "finished")  # metrics within [0, 1]
 MOST_BOUNDS = 16  # largest number of shares of a bound
 
 
@@ -38,8 +43,8 @@ class Judging:
     """Settings of the comparison between policies and their bases, at the end and along the learning curve."""
 
     env: Environment | None  # the changed world with the episodes of `SPLIT`; None: there is no simulator
-    num_envs: int = 100
-    steps: int = 10_000  # environment steps, shared by the environments
+    num_envs: int = 50  # episodes at most
+    steps: int = 100  # environment steps of each
     by: str = "reward"  # a metric, or "labels"
     every: int = 0  # labels between two measurements on the way (0: at the end alone)
     bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
@@ -51,7 +56,7 @@ class Judgement(NamedTuple):
     by: str  # a metric, or "labels": the share of held-out answers that are predicted
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
-    used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worse than the base, or not finite
+    used: np.ndarray  # (lanes,) bool: is the correction used? Only if it is shown to be better, and finite
     within_deg: np.ndarray  # (lanes,) how far corrections then lead from the base's actions [the space's unit]
     # (lanes, 3) after less before and the ends of its 95% interval over episodes, paired; nan by labels
     difference: np.ndarray
@@ -85,8 +90,6 @@ class Judge:
     """Measures the lanes of an adaptation along the learning curve, and decides in the end which models are used.
 
     A block of lanes is a `LaneState`, or any record with `base`, `bound`, `asked`, `corrects` and `failed`.
-
-    A block of lanes is a `LaneState`, or what else has `base`, `bound`, `asked`, `corrects` and `failed`.
     """
 
     def __init__(self, of: Adaptation, lanes: Lanes, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
@@ -106,38 +109,57 @@ class Judge:
         Raises UserError if the world has no such metric, or labels cannot judge.
         """
         how, lanes = self.how, self.lanes
-        found = judged_by_labels(self.of, block) if how.by == LABELS else None
-        after = self.measure(block) if how.env is not None else None
-        if found is not None:
+        if how.by == LABELS:
+            found = judged_by_labels(self.of, block)
+            if how.env is not None:
+                self.measure(block)
             return found, block
-        assert after is not None  # a metric needs episodes
-        if how.by not in after.means:
-            raise UserError(f"there is no metric {how.by!r} to judge by{suggestion(how.by, [*after.means, LABELS])}")
-        bases = self._rolled(self.of.bases, "the policy as it was")
-        own = np.zeros(lanes.number, int) if len(bases.means[how.by]) == 1 else lanes.base
-        played = self._played(after) + self._played(bases)[own]
-        block, after, more = self._narrowed(block, after)
-        before, worth = np.asarray(bases.means[how.by])[own], np.asarray(after.means[how.by])
+        assert how.env is not None  # a metric needs episodes
+        known = metrics_of(how.env)
+        if how.by not in known:
+            raise UserError(f"there is no metric {how.by!r} to judge by{suggestion(how.by, [*known, LABELS])}")
+        if how.every:
+            self.measure(block)
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
-        used = usable & (worth >= before)  # NaN ranks below every value
-        difference = mean_interval(np.asarray(after.each[how.by]) - np.asarray(bases.each[how.by])[own]).T
-        return Judgement(how.by, before, worth, used, bounds_of(self.of, block), difference, played + more), block
+        block, spent = self._narrowed(block)
+        test, values, steps = PairedTest(lanes.number), [], np.zeros(lanes.number, int)
+        for number in range(-(-how.num_envs // AT_ONCE)):
+            pair, played = self._pair(block, number)
+            values.append(pair)
+            steps += played
+            test.add(differences(pair, how.by))
+            if (test.decided | ~usable).all():
+                break
+        before, after = (np.concatenate([pair[end][how.by] for pair in values], -1) for end in (0, 1))
+        difference = mean_interval(after - before).T
+        used = usable & test.better
+        means = before.mean(-1), after.mean(-1)
+        return Judgement(how.by, *means, used, bounds_of(self.of, block), difference, steps + spent), block
 
-    def _narrowed(self, block: Any, after: Rollout) -> tuple[Any, Rollout, np.ndarray]:
-        """Return lanes within the best share of their bounds, their value, and the rewarded steps (lanes,) of this."""
-        bound, played, by = block.bound, np.zeros(self.lanes.number, int), self.how.by
-        for share in self.how.bounds:
+    def _pair(self, block: Any, number: int) -> tuple[tuple[dict[str, np.ndarray], ...], np.ndarray]:
+        """Play episodes by base and adapted policy; return the values of each (lanes, episodes), and the steps."""
+        key = jax.random.fold_in(episodes(SPLIT), number)
+        bases = self._rolled(self.of.bases, "the policy as it was", key, AT_ONCE)
+        after = self._rolled(self._policy(block), "the corrected policy", key, AT_ONCE)
+        shared = len(next(iter(bases.each.values()))) == 1
+        own = np.zeros(self.lanes.number, int) if shared else self.lanes.base
+        pair = ({name: np.asarray(values)[own] for name, values in bases.each.items()}, after.each)
+        return pair, self._played(after, AT_ONCE) + self._played(bases, AT_ONCE)[own]
+
+    def _narrowed(self, block: Any) -> tuple[Any, np.ndarray]:
+        """Return lanes within the best share of their bounds, and the rewarded steps (lanes,) of this."""
+        spent = np.zeros(self.lanes.number, int)
+        if not self.how.bounds:
+            return block, spent
+        best, value = block.bound, np.full(self.lanes.number, -np.inf)
+        for share in (1.0, *self.how.bounds):
             tried = block.replace(bound=share * block.bound)
             found = self._rolled(self._policy(tried), f"the adapted policy within {share:g} of its bound")
-            played = played + self._played(found)
-            better = np.asarray(found.means[by] > after.means[by])
-            after = jax.tree.map(
-                lambda new, old, better=better: np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-                found,
-                after,
-            )
-            bound = jnp.where(jnp.asarray(better), tried.bound, bound)
-        return block.replace(bound=bound), after, played
+            spent = spent + self._played(found, self.how.num_envs)
+            better = np.asarray(found.means[self.how.by]) > value
+            value = np.where(better, found.means[self.how.by], value)
+            best = jnp.where(jnp.asarray(better), tried.bound, best)
+        return block.replace(bound=best), spent
 
     def measure(self, block: Any) -> Rollout:
         """Roll out the lanes' current policies, and add a row to the learning curve."""
@@ -149,20 +171,65 @@ class Judge:
     def _policy(self, block: Any) -> PolicyBlock:
         return self.of.policy(block, self.how.env)
 
-    def _rolled(self, policy: PolicyBlock, what: str) -> Rollout:
+    def _rolled(self, policy: PolicyBlock, what: str, key: Any = None, num_envs: int | None = None) -> Rollout:
         how = self.how
         assert how.env is not None
         mesh = None if policy is self.of.bases else self.mesh  # the number of environments may differ
-        return rollout_lanes(how.env, policy, episodes(SPLIT), how.num_envs, how.steps, self.watch(what), mesh)
+        key, envs = episodes(SPLIT) if key is None else key, num_envs or how.num_envs
+        return rollout_lanes(how.env, policy, key, envs, envs * how.steps, self.watch(what), mesh)
 
-    def _played(self, rolled: Rollout) -> np.ndarray:
+    def _played(self, rolled: Rollout, num_envs: int) -> np.ndarray:
         """Return the environment steps (lanes,) of a roll-out that count.
 
         Where a metric is an outcome, only the steps of first episodes count.
         """
         assert self.how.env is not None
-        first = np.asarray(rolled.episode_steps)
-        return first.sum(-1) if self.how.by in _step_of(self.how.env).outcome else np.full(len(first), self.how.steps)
+        first, whole = np.asarray(rolled.episode_steps), num_envs * self.how.steps
+        return first.sum(-1) if self.how.by in _step_of(self.how.env).outcome else np.full(len(first), whole)
+
+
+class PairedTest:
+    """A sequential test of differences in [-1, 1], whose chance to call better what is not is 1/20 at most.
+
+    Under "not better", E = mean over lambda of prod(1 + lambda d) is a test martingale; so is H with -d under "not
+    worse". The first to reach 20 decides (Ville's inequality: the chance to ever reach 20 is 1/20).
+    """
+
+    def __init__(self, lanes: int) -> None:
+        self._products = np.ones((2, len(STAKES), lanes))  # for better, for worse
+        self.better, self.worse = np.zeros(lanes, bool), np.zeros(lanes, bool)
+
+    @property
+    def decided(self) -> np.ndarray:
+        """Whether the test of each lane (lanes,) has ended."""
+        return self.better | self.worse
+
+    def add(self, differences: np.ndarray) -> None:
+        """Add episodes (lanes, episodes) in their order."""
+        for d in differences.T:
+            self._products *= 1 + np.stack([np.outer(STAKES, d), -np.outer(STAKES, d)])
+            better, worse = self._products.mean(1) >= DECIDED
+            open_yet = ~self.decided
+            self.better |= open_yet & better
+            self.worse |= open_yet & worse & ~better
+
+
+def differences(pair: tuple[dict[str, np.ndarray], ...], by: str) -> np.ndarray:
+    """Return how much better each episode (lanes, episodes) of the second policy was, in [-1, 1].
+
+    Values of a share, as success, count as they are; others in units of the first policy's largest value in the batch.
+    Where a share is equal, the returns decide, with half of the weight.
+    """
+    before, after = pair
+
+    def relative(name: str) -> np.ndarray:
+        unit = np.maximum(np.nanmax(np.abs(before[name]), axis=-1, keepdims=True), 1e-9)
+        return np.nan_to_num(np.clip((after[name] - before[name]) / unit, -1, 1))
+
+    if by in SHARES:
+        d = np.nan_to_num(after[by]) - np.nan_to_num(before[by])
+        return np.where(d == 0, 0.5 * relative("return"), d) if "return" in before else d
+    return relative(by)
 
 
 def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:

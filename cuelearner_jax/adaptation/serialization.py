@@ -1,7 +1,7 @@
 """Convert policies to plain values and arrays, and back.
 
 A policy's values are those of its `describe()`. The stored kinds are `agent` with its `params`; `guided` with its
-`model` and, where there is one, its `bound`; `calibrated` with the `theta` of its unknowns; `uniform`; `heuristic`; and
+`model` and, where there is one, its `bound`; `reading` with its `correction` and `bound`; `uniform`; `heuristic`; and
 the name of `code`, as package.module:NAME.
 
 Code is never loaded because a file names it: the caller who opens the policy names the code again.
@@ -18,17 +18,17 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import changes as own_changes
 from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.registry import AGENTS
-from cuelearner_jax.calibration import Calibrated
 from cuelearner_jax.config import Frame, GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Spaces, actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME, Guide
-from cuelearner_jax.guides.calibration import KIND
 from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, in_space, layers, uniform_in
+from cuelearner_jax.reading.policy import KIND as READING
+from cuelearner_jax.reading.policy import Read, unread
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
-CORRECTED = ("guided", "calibrated")  # policies that change another policy's actions
+CORRECTED = ("guided", READING)  # policies that change another policy's actions
 KINDS = ("agent", "uniform", "heuristic", *CORRECTED, "code")
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # groups in a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other values and the arrays hold them already
@@ -87,10 +87,6 @@ def check(values: dict[str, Any]) -> None:
             if not NAME.fullmatch(layer["guidance"]) or type(layer["bounded"]) is not bool:
                 raise ValueError(f"a guidance is called {layer['guidance']!r}, and bounded {layer['bounded']!r}")
             kind_from_json(layer["guidance"], layer["options"])
-        if kind == "calibrated":
-            told = [*layer["distortions"], *(change[part] for change in layer["changes"] for part in ("name", "unit"))]
-            if layer["guidance"] != KIND.name or not all(isinstance(name, str) for name in (layer["code"], *told)):
-                raise TypeError("changes are not described by names and units")
 
 
 def arrays_of(policy: Any) -> Any:
@@ -101,13 +97,15 @@ def arrays_of(policy: Any) -> Any:
     if kind == "guided":
         bound = {} if policy.bound is None else {"bound": policy.bound}
         return {"base": arrays_of(policy.base), "model": policy.model, **bound}
-    if kind == "calibrated":
-        return {"base": arrays_of(policy.base), "theta": policy.theta}
+    if kind == READING:
+        return {"base": arrays_of(policy.base), "correction": policy.correction, "bound": policy.bound}
     return {}
 
 
-def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None) -> Any:
+def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None, changes: Any = None) -> Any:
     """Return the shapes of a policy's arrays from its plain values; `rows`: number of policies in a block.
+
+    `changes`: the user's own distortions in it, as for `from_json`.
 
     Shapes in place of arrays will do for `env`. Raises UserError or ValueError if the policy cannot act in it.
     """
@@ -119,8 +117,9 @@ def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None) -> Any:
         if values["policy"] == "guided":
             bound = {"bound": jnp.zeros(())} if values["bounded"] else {}
             return {"base": one(values["base"]), "model": _guidance(values, env).init(jax.random.key(0)), **bound}
-        if values["policy"] == "calibrated":
-            return {"base": one(values["base"]), "theta": jnp.zeros(len(values["changes"]))}
+        if values["policy"] == READING:
+            own = _unread(values, env, own_changes.rebuild_family(values, env, changes))
+            return {"base": one(values["base"]), "correction": own.correction, "bound": own.bound}
         return {}
 
     leading = () if rows is None else (rows,)
@@ -154,9 +153,10 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
         base = from_json(values["base"], arrays["base"], env, code, changes)
         sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
         return Guided(base, arrays["model"], view_of(env), scalars, _guidance(values, env), arrays.get("bound"), sizes)
-    if kind == "calibrated":
+    if kind == READING:
         base = from_json(values["base"], arrays["base"], env, code, changes)
-        return Calibrated(base, arrays["theta"], own_changes.rebuild_family(values, env, changes), values["code"])
+        own = _unread(values, env, own_changes.rebuild_family(values, env, changes))
+        return own.replace(base=base, correction=arrays["correction"], bound=arrays["bound"])
     if kind != "code":
         raise ValueError(f"{kind!r} is no policy")
     if code is None:
@@ -165,6 +165,11 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
             f"--base {values['named']} if you trust that code"
         )
     return in_space(code, actions_of(env))
+
+
+def _unread(values: dict[str, Any], env: Any, family: Any) -> Read:
+    sizes = values["labels"], values["mixed"]
+    return unread(None, actions_of(env), family, env.obs_size, *sizes, named=values["code"])
 
 
 def _agent(values: dict[str, Any], spaces: Spaces) -> AgentFunctions:

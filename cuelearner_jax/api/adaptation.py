@@ -19,10 +19,10 @@ from cuelearner_jax.api import arguments
 from cuelearner_jax.api.feedback import Labels, check_settings, divergence_error, label_path, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.worlds import World
-from cuelearner_jax.calibration import Estimate, Result
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files, policy_folders
@@ -44,7 +44,7 @@ class AdaptedPolicy(CallablePolicy):
 
     @property
     def used(self) -> bool:
-        """Whether the correction is used. It is not if it made the policy worse, or calibration found no change."""
+        """Whether the correction is used. It is only if it is shown to be better."""
         return bool(self.outcome.found.judged.used[0])
 
     @property
@@ -71,12 +71,12 @@ class AdaptedPolicy(CallablePolicy):
 
     @property
     def result(self) -> Result | None:
-        """The verdict of calibration and its estimates with intervals. None where a feedback model was fitted."""
+        """The verdict of a reading and its estimates with intervals. None where a feedback model was fitted."""
         return next(iter(self.outcome.found.results), None)
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
-        """Calibration's estimates (name, unit, mean, low, high, changed). Empty where a feedback model was fitted."""
+        """A reading's estimates (name, unit, mean, low, high). Empty where a feedback model was fitted."""
         return self.result.estimates if self.result else ()
 
     @property
@@ -117,7 +117,7 @@ def adapt(
     scalars: Scalars | None = None,
     seed: int = 0,
     judge_by: str | None = None,
-    judge_episodes: int = 100,
+    judge_episodes: int = 50,
     judge_bounds: Sequence[float] | None = None,
     changes: Any = None,
 ) -> AdaptedPolicy:
@@ -133,21 +133,21 @@ def adapt(
         world: the world that the policy acts in; a bare environment will do.
         teacher: a teacher; or a function of observations (NumPy in, NumPy out) or another policy, which teaches what
             it does itself; None where labels are given.
-        labels: number of questions (default: 500, of calibration 100); or labels that are there already: arrays, or a
-            label file.
+        labels: number of questions (default: 100 of a reading, else 500); or labels that are there already: arrays,
+            or a label file.
         bound_deg: how far corrections may lead from the policy's own actions [deg] (default: the scenario's, of labels
             that are there already as far as they reach, or else 45).
         eps_deg: strength of an answer [deg] (default: as labels, scenario or training had it).
-        guidance: kind of guidance: what is asked, and what a model makes of it (default: the scenario's or "relative").
+        guidance: kind of guidance: what is asked, and what a model makes of it (default: the scenario's or "reading").
         sizes: sizes of the network, of its fitting, and of a round of labels.
         scalars: settings of fitting, of refinement and of the teacher's faults.
         seed: seed of all random numbers.
         judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones (default: the
-            scenario's, or "reward"; of calibration "labels").
+            scenario's or the task's; of a reading "labels").
         judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
-        changes: for guidance "calibration", the possible changes, as `Distortion`s of your own, or a function of the
+        changes: for guidance "reading", the possible changes, as `Distortion`s of your own, or a function of the
             environment that returns them (default: what the world declares).
 
     Raises:

@@ -26,7 +26,7 @@ from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.relative import KIND
+from cuelearner_jax.guides.reading import KIND
 from cuelearner_jax.policies import in_space
 from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
@@ -76,11 +76,11 @@ def correct(
         bound: how far corrections may lead from the policy's own actions, in the space's unit: shares of the range of
             each entry (default: as far as the labels reach).
         eps: strength of an answer, in the same unit (default: the file's, or 1/36 of the range).
-        guidance: how answers are used: "relative" fits a model, "calibration" estimates a constant change.
+        guidance: how answers are used: "reading" finds what changed, "relative" fits a network.
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         low, high: bounds of the actions, a number an entry (default: the range of the labels' actions).
         space: the space of the actions, such as `cuelearner_jax.spaces.DIRECTIONS`, in place of cues, low and high.
-        changes: for guidance "calibration", the possible changes, as for `adapt`.
+        changes: for guidance "reading", the possible changes, as for `adapt`.
         sizes, scalars: settings of the model and its fitting.
         seed: seed of all random numbers.
 

@@ -149,7 +149,7 @@ def load_policy(
         bound_deg: bound [deg] of a lane of a policy folder (default: the largest).
         seed: the lane's seed (default: the first).
         base: the policy that was adapted, where it is code: the folder names it, and does not hold it.
-        changes: the distortions of your own that calibration corrected: the folder names them, and does not hold them.
+        changes: the distortions of your own that a reading corrected: the folder names them, and does not hold them.
         task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
         world: the world to act in, for policies that need more than observations (default: as it was trained).
 

@@ -29,7 +29,7 @@ class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
     out: Path
     """Policy folder to write."""
     overwrite: Flag[bool] = False
-    """Delete an existing policy folder. (A further option: --changes package.module:NAME gives calibration distortions
+    """Delete an existing policy folder. (A further option: --changes package.module:NAME gives a reading distortions
     of your own in place of those that the world declares.)"""
     base: BaseLanes = field(default_factory=BaseLanes)
 

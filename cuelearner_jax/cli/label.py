@@ -16,9 +16,7 @@ import numpy as np
 import tyro
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import by_calibration, by_model, changes
-from cuelearner_jax.calibration import declared_distortions
-from cuelearner_jax.calibration.families import Family
+from cuelearner_jax.adaptation import by_model, by_reading, changes
 from cuelearner_jax.cli import pages
 from cuelearner_jax.cli.parsing import about, check_numbers, out, parse, taken
 from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind, typed_name
@@ -28,10 +26,11 @@ from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.relative import KIND
+from cuelearner_jax.guides.reading import KIND
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
 from cuelearner_jax.policies import NearAims, in_space, uniform_in
+from cuelearner_jax.reading.families import Family, declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
@@ -89,7 +88,7 @@ class Label(Generic[TaskT]):
     """Actions to ask about without a policy: uniform ones, ones near the task's aims (where it has aims), or those
     that a recording proposes."""
     changes: str | None = None
-    """For guidance calibration: package.module:NAME of your own distortions (default: those that the world
+    """For guidance reading: package.module:NAME of your own distortions (default: those that the world
     declares)."""
     practice: Flag[bool] = True
     """Begin a new file with three practice questions, whose answers are not saved."""
@@ -124,12 +123,12 @@ def run(arguments: list[str]) -> None:
     world = changed.apply(world) if changed else world
     if (cues := taken(rest, "--cues", WORDS)[0]) is not None:
         world = with_cues(task, world, cues)
-    by_evidence = _reads_evidence(rest)
+    by_evidence = _reads_evidence(rest, named is not None)
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
     if finished_policy:  # as `adapt` corrects it
         frame = source.config.sizes.frame if source else sizes.frame
         sizes = by_model.SIZES if by_evidence else dataclasses.replace(by_model.SIZES, frame=frame)
-        settling = by_calibration.settling if by_evidence else by_model.settling
+        settling = by_reading.settling if by_evidence else by_model.settling
         scalars = settling(scalars, changed.eps_deg if changed else None)
         bound = changed.bound_deg if changed and not by_evidence else None
     default = kind(
@@ -139,7 +138,7 @@ def run(arguments: list[str]) -> None:
         Path("labels") / task.name,
         guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
         bound_deg=bound,
-        labels=max(preset.labels) if named is None else by_calibration.USUAL if by_evidence else Label.labels,
+        labels=max(preset.labels) if named is None else by_reading.USUAL if by_evidence else Label.labels,
         questions=UNIFORM if named is not None else _usual_questions(task),
     )
     subject = pages.subject_of(arguments[0] if task.proposed is not None else typed_name(task), task.name, task)
@@ -161,10 +160,10 @@ def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
     return PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
 
 
-def _reads_evidence(arguments: list[str]) -> bool:
-    """Whether calibration is asked for. Raises UserError for an unknown kind."""
+def _reads_evidence(arguments: list[str], default: bool) -> bool:
+    """Return whether a reading is asked for; `default`: without --guidance. Raises UserError for an unknown kind."""
     name, _ = taken(arguments, "--guidance", ", ".join(kind.name for kind in guidances.kinds()))
-    return name is not None and guidances.resolve(name).by_evidence
+    return default if name is None else guidances.resolve(name).by_evidence
 
 
 def make_plan(
@@ -215,11 +214,11 @@ def make_plan(
 
 
 def _check_evidence(asked: Label[Any], named: str | None) -> None:
-    """Raise UserError for options that calibration does not use."""
+    """Raise UserError for options that a reading does not use."""
     if named is None or asked.again is not None:
-        raise UserError("calibration asks about a policy: name one after the task, and leave out --again")
+        raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
     scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(asked.scalars))
-    by_calibration.check_unused(asked.sizes, scalars, bound_deg=asked.bound_deg)
+    by_reading.check_unused(asked.sizes, scalars, bound_deg=asked.bound_deg)
 
 
 def _family(asked: Label[Any], env: Any) -> Family:

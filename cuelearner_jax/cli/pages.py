@@ -96,7 +96,7 @@ PAGES: dict[str, Page] = {
             ),
             Example(
                 "what changed in the world, estimated from 100 answers",
-                "adapt {subject}{base}{scenario} --guidance calibration --labels 100 --out policies/{name}-changes",
+                "adapt {subject}{base}{scenario} --guidance relative --labels 500 --out policies/{name}-relative",
             ),
             Example(
                 "labels that a person gave on the page",

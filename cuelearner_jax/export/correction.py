@@ -85,10 +85,9 @@ def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Beside]:
         raise UserError("this policy has no correction: give a corrected policy, or export the whole policy")
     layer = policy
     while (below := getattr(layer, "base", None)) is not None:
-        asks = [one.name for one in getattr(layer, "family", ()) if one.asks]
-        if asks:
+        if getattr(layer, "sees", False):
             raise UserError(
-                f"this policy asks its base about other observations ({asks[0]}), so its correction cannot be exported "
+                "this policy asks its base about other observations than are met, so its correction cannot be exported "
                 "alone: export the whole policy"
             )
         layer = below

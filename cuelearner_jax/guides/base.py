@@ -43,7 +43,7 @@ class Kind:
     config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
     sees_base: bool = False  # True if it needs a finished policy's actions; it then serves adaptation only
     by_cues: bool = False  # True if its model measures along cues, whatever its answers say
-    # True if `calibration` reads its answers; it then has no model and serves adaptation only
+    # True if `reading` reads its answers; it then has no model and serves adaptation only
     by_evidence: bool = False
 
     def __post_init__(self) -> None:

@@ -17,12 +17,11 @@ from cuelearner_jax.guides import (
     aims,
     baselines,
     bdcoach,
-    calibration,
     clic,
     dcoach,
     demonstration,
     intent,
-    offset,
+    reading,
     relative,
     scalar,
 )
@@ -31,7 +30,7 @@ from cuelearner_jax.plugins import load
 
 ENTRY_POINTS = "cuelearner.guidances"
 
-_TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, offset.KIND, calibration.KIND)
+_TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, reading.KIND)
 _PEERS = (bdcoach.KIND, clic.KIND, clic.SHOWN)
 _BUILT_IN = (
     baselines.NONE,

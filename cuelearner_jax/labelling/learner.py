@@ -42,7 +42,7 @@ class Fitted(NamedTuple):
     number: int = 0  # of the fit, from 1; 0: no fit yet
     quality: Agreement | None = None  # with the labels held out of the fit
     problem: str = ""  # why the last fit gave no model (the previous model stays)
-    told: tuple[str, ...] = ()  # calibration only: lines that report what changed
+    told: tuple[str, ...] = ()  # reading only: lines that report what changed
 
 
 class Learner:

@@ -9,11 +9,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.config import to_json
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Policy
+from cuelearner_jax.reading.families import Family
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Task
 
@@ -57,7 +57,7 @@ class Plan:
     robot: str = ""  # the robot's body and its locomotion policy, where not the task's default
     again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about, to be asked again
     again_of: str = ""  # digest of that session's file
-    family: Family = ()  # calibration only: what may have changed
+    family: Family = ()  # reading only: what may have changed
     one_cue: bool = False  # whether one press about one of several cues is the whole answer
 
     @property

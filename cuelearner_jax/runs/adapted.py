@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import by_calibration, serialization
+from cuelearner_jax.adaptation import by_reading, serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
@@ -30,7 +30,7 @@ from cuelearner_jax.types import Label
 COLUMNS = ("base", "seeds", "labels", "bounds_deg", "used")  # that describe the lanes
 CONVENTIONS = {
     "action": "the base policy's, refined by the model until a pass moves it by less than tau, within the bound; or, "
-    "calibrated, of the observation as it was before the changes, led back to what it meant",
+    "read, of the observation as it was before the changes, led back to what it meant",
     "angles": "degrees where a name ends in _deg, else radians; counterclockwise positive",
 }
 
@@ -77,8 +77,10 @@ class AdaptedLanes:
     def _arrays(self, env: Any) -> Any:
         values = self.values["policy"]
         try:
-            lanes = serialization.shapes_of({**values, "base": {"policy": "uniform"}}, env, self.lanes.number)
-            like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows)}
+            lanes = serialization.shapes_of(
+                {**values, "base": {"policy": "uniform"}}, env, self.lanes.number, self.changes
+            )
+            like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows, self.changes)}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise formats.damaged("policy", self.folder / policy_folders.POLICY) from error
         return policy_folders.read_arrays(self.folder, like, self.values)
@@ -156,7 +158,7 @@ def write(
             "difference": [_plain(ends) for ends in judged.difference],
             "rewarded_steps": judged.rewarded_steps.tolist(),
         },
-        **({"calibration": by_calibration.to_json(adapted.results)} if adapted.results else {}),
+        **({"reading": by_reading.to_json(adapted.results)} if adapted.results else {}),
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,

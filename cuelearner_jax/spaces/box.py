@@ -73,6 +73,14 @@ class Box(Space):
         bounded = jnp.clip(vector, _row(self.low, vector), _row(self.high, vector))
         return jnp.where(jnp.isfinite(vector), bounded, jnp.nan)
 
+    def room(self, action: Vectors) -> tuple[Float[Array, "... cues"], Float[Array, "... cues"]]:
+        """Return the shares of the ranges below and above each entry."""
+        return self.log(_row(self.low, action), action), self.log(action, _row(self.high, action))
+
+    def even(self, action: Vectors) -> Float[Array, "... action"]:
+        """Return the entries from -1 at the lower bound to 1 at the upper."""
+        return 2 * (jnp.asarray(action) - _row(self.low, action)) / _row(self._range, action) - 1
+
     def outward(self, vector: Vectors, action: Vectors) -> Float[Array, "... action"]:
         """Return a vector given in shares of the ranges as a vector to be added to the action."""
         return jnp.asarray(vector) * _row(self._range, vector)

@@ -77,6 +77,15 @@ class Space:
         """Return the action in the middle of every cue's range; None: there is none."""
         return None
 
+    def room(self, action: Vectors) -> tuple[Float[Array, "... cues"], Float[Array, "... cues"]]:
+        """Return how far an action can be changed to less and to more along each cue; here: without an end."""
+        ends = jnp.full((*jnp.shape(action)[:-1], len(self.cues)), jnp.inf)
+        return ends, ends
+
+    def even(self, action: Vectors) -> Float[Array, "... action"]:
+        """Return an action with entries of the order of one."""
+        return jnp.asarray(action)
+
     def to_json(self) -> dict[str, Any]:
         """Describe the space for a file; see `spaces.from_json`."""
         return {

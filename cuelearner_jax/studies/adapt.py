@@ -14,17 +14,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
-import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import by_calibration, by_model, changes, judging, serialization
-from cuelearner_jax.adaptation.by_calibration import Calibrating
+from cuelearner_jax.adaptation import by_model, by_reading, changes, judging, serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
+from cuelearner_jax.adaptation.by_reading import ReadingAdaptation
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product, side_by_side
 from cuelearner_jax.asking import label_slots
-from cuelearner_jax.calibration import Calibrated, declared_distortions
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
@@ -34,8 +32,10 @@ from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.relative import KIND
+from cuelearner_jax.guides.reading import KIND
 from cuelearner_jax.policies import Common, in_space, lanes_in
+from cuelearner_jax.reading.families import declared_distortions
+from cuelearner_jax.reading.policy import unread
 from cuelearner_jax.runs import adapted, trained
 from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
 from cuelearner_jax.runs.order import read_labels
@@ -95,8 +95,8 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     judge_by: str = "reward"
     """What decides whether the correction is used: a metric on tuning episodes, or held-out answers (labels). A model
     that makes the policy worse than it was is not used."""
-    judge_episodes: int = 100
-    """Number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
+    judge_episodes: int = 50
+    """Largest number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
     judge_every: int = 0
     """Measure the policy each time this many labels are new, into guide.parquet (0: only at the end)."""
     judge_bounds: tuple[float, ...] = ()
@@ -162,20 +162,20 @@ def suggested(
     """
     rules = source.task.scenario(scenario) if scenario else AS_IT_IS
     kind = guidances.resolve(guidance or rules.guidance or AdaptRequest.guidance)
-    if guidance not in (None, rules.guidance):
+    if kind.name != rules.guidance:
         rules = replace(rules, guidance=None, sizes={}, scalars={}, options={})  # these apply to the suggested kind
         if kind.by_evidence:
             rules = replace(rules, bound_deg=None, judge_by=None, judge_bounds=())
     if judge_by == judging.LABELS:
         rules = replace(rules, judge_bounds=())  # these need episodes to be tried on
-    labels = (by_calibration.USUAL,) if kind.by_evidence else AdaptRequest.labels
+    labels = (by_reading.USUAL,) if kind.by_evidence else AdaptRequest.labels
     if labels_from is not None:
         file = label_files.read(labels_from)
         eps_deg = file.eps if eps_deg is None else eps_deg
         labels = (file.budget,)
     frame, settling = {"frame": source.config.sizes.frame}, by_model.settling
     if kind.by_evidence:
-        frame, settling = {}, by_calibration.settling
+        frame, settling = {}, by_reading.settling
     sizes = sizes or replace(by_model.SIZES, **{**frame, **rules.sizes})
     if scalars is None:
         eps_deg = rules.eps_deg if eps_deg is None else eps_deg
@@ -202,7 +202,7 @@ def suggested(
 
 
 def reads_evidence(request: AdaptRequest[Any, Any]) -> bool:
-    """Return whether answers are read as evidence of what changed, see `by_calibration`."""
+    """Return whether answers are read as evidence of what changed, see `by_reading`."""
     return guidances.resolve(request.guidance).by_evidence
 
 
@@ -225,9 +225,9 @@ def run(
             f"guidance {kind.name!r} asks no questions, so there is nothing to learn from: choose another kind"
         )
     if subject.changes is not None and not kind.by_evidence:
-        raise UserError(f"changes is given, but guidance {kind.name!r} does not use it: give guidance calibration")
+        raise UserError(f"changes is given, but guidance {kind.name!r} does not use it: give guidance reading")
     if kind.by_evidence:
-        by_calibration.check_unused(sizes, scalars, bound_deg=request.bound_deg, judge_bounds=request.judge_bounds)
+        by_reading.check_unused(sizes, scalars, judge_bounds=request.judge_bounds)
     env = task.environment(request.task)
     for name, options in request.kinds.items():
         check_part(options, name)
@@ -251,10 +251,10 @@ def run(
         rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))
     kept = subject.policy is None or subject.named  # written to a folder
     if kind.by_evidence:
-        of = Calibrating(guidance, sizes, scalars, env, bases, *_family(subject, request, kind.name, env))
+        of = ReadingAdaptation(guidance, sizes, scalars, env, bases, *_family(subject, env))
         if kept:
-            serialization.to_json(Calibrated(bases, jnp.zeros((lanes.number, 0)), (), of.named))
-        found = by_calibration.adapt(of, lanes, how, teacher, rows, watch)
+            serialization.to_json(unread(bases, actions_of(env), of.family, env.obs_size))
+        found = by_reading.adapt(of, lanes, how, teacher, rows, watch)
     else:
         of = Adaptation(guidance, sizes, scalars, env, bases)
         if kept:
@@ -263,16 +263,10 @@ def run(
     return AdaptedStudy(found, subject, request, origin)
 
 
-def _family(subject: Subject, request: AdaptRequest, kind: str, env: Environment) -> tuple[Any, str]:
+def _family(subject: Subject, env: Environment) -> tuple[Any, str]:
     """Return what may have changed, and the name of its code. Raises UserError if the two do not fit."""
-    options = request.kinds.get(kind)
-    asked = {} if options is None else dataclasses.asdict(options)
     if subject.changes is None:
-        return declared_distortions(env, **asked), ""
-    if given := [name for name, value in asked.items() if value]:
-        raise UserError(
-            f"{kind}.{given[0]} applies to changes that the world declares: leave it out where changes is given"
-        )
+        return declared_distortions(env), ""
     family = changes.family_of(subject.changes, env)
     changes.check_acts(family, env)
     return family, subject.changes_named
@@ -312,9 +306,9 @@ def _rows(
     grid = Grid((guidance.name,), seeds, request.labels)
     check_grid(grid, adapts=True)
     if guidance.kind.by_evidence:
-        if (least := min(request.labels)) < by_calibration.LEAST:
-            raise UserError(f"labels is {least}: give at least {by_calibration.LEAST}, since some are held out")
-        request = replace(request, bound_deg=(space.reach,))  # no bound
+        if (least := min(request.labels)) < by_reading.LEAST:
+            raise UserError(f"labels is {least}: give at least {by_reading.LEAST}, since each is predicted first")
+        request = replace(request, bound_deg=request.bound_deg or (space.reach,))
     file, form = None, guidance.form
     assert form is not None  # a kind that asks has a form
     if path is not None:
@@ -349,7 +343,7 @@ def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
     steps = task.longest(request.task) if task.longest else judging.STEPS
     plays = by != judging.LABELS or request.judge_every
     tuned = task.environment(request.task, "tuning") if plays else None
-    return Judging(tuned, envs, envs * steps, by, request.judge_every, bounds=request.judge_bounds)
+    return Judging(tuned, envs, steps, by, request.judge_every, bounds=request.judge_bounds)
 
 
 def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
@@ -366,7 +360,7 @@ def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
 def sentences(found: AdaptationResult) -> list[str]:
     """Describe an adaptation's result, one line per budget and bound."""
     if found.results:
-        return by_calibration.sentences(found)
+        return by_reading.sentences(found)
     lanes, judged, lines = found.lanes, found.judged, []
     unit = actions_of(found.of.env).unit
     for bound, budget in sorted({*zip(lanes.bound_deg.tolist(), lanes.budget.tolist(), strict=True)}):

@@ -119,7 +119,7 @@ ROBOT = Body(
     environment=make_fetch,
 )
 
-_CAMERA: dict[str, Any] = {"guidance": "calibration"}
+_CAMERA: dict[str, Any] = {"guidance": "reading"}
 SCENARIOS = {
     "turned_camera": Scenario(
         "the camera is turned by 10 degrees about the robot's base", {"camera_turn_deg": 10.0}, **_CAMERA

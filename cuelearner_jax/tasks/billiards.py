@@ -22,7 +22,7 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import intent
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
+from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Teacher
 
 SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
@@ -137,7 +137,7 @@ POOLTOOL = Body(
 # Settings of the adapted agents in docs/results/adaptation.md. The teacher tries shots in the changed world and prefers
 # the good shot nearest to the agent's, and the guide sees how far a shot has been turned.
 NEAREST: dict[str, Any] = {"answer": "nearest", "nearest_aim_deg": 0.1, "feedback_learning_rate": 3e-4}
-RECIPE: dict[str, Any] = {"eps_deg": 0.1, "guidance": "offset", "sizes": PAPERS_FIT}
+RECIPE: dict[str, Any] = {"eps_deg": 0.1, "guidance": "reading"}
 
 # The worlds of the paper's section on adaptation after training.
 SCENARIOS = {

@@ -65,7 +65,7 @@ class GymnasiumConfig:
     slice_sizes: tuple[int, ...] = ()
     """Layout: numbers in each slice."""
     units: tuple[str, ...] = ()
-    """Layout: unit of each slice; those in m or rad may shift, for calibration."""
+    """Layout: unit of each slice; those in m or rad may shift, by what answers say."""
     slice_kinds: tuple[str, ...] = ()
     """Layout: own, for a slice that a robot measures of itself, or beams, or directions."""
     low: tuple[float, ...] = ()
@@ -173,7 +173,7 @@ def _longest(config: GymnasiumConfig) -> int:
 
 
 def _judge_by(config: GymnasiumConfig) -> str:
-    return SUCCESS if config.succeeds else "reward"
+    return SUCCESS if config.succeeds else "return"
 
 
 def _pictures() -> Pictures:

@@ -10,15 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cuelearner_jax.environment import Quantity, action_of, actions_of
+from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces import Box, Space
 
 AXES = ("x", "y", "z")
 SHIFTING = ("m", "rad")  # units of entries that a displaced sensor shifts by a constant
@@ -30,7 +28,7 @@ class Unknown(NamedTuple):
 
     name: str
     unit: str
-    scale: float | None = None  # typical size in its unit; None: found from the policy's actions (`scales`)
+    scale: float | None = None  # typical size in its unit; None: found from the policy's actions (`steps`)
     most: float = math.inf  # largest possible size, in its unit
 
 
@@ -46,12 +44,6 @@ class Distortion(NamedTuple):
     sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
     acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
     plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulator`
-    of_teacher: bool = False  # a fault of the teacher, which is reported and not corrected
-
-    @property
-    def asks(self) -> bool:
-        """Whether the policy, or a simulator, must be asked again when the unknowns change."""
-        return self.sees is not None or self.plans is not None
 
 
 Family = tuple[Distortion, ...]
@@ -84,14 +76,11 @@ def undo_physics(
 
 
 def undo_action(
-    family: Family, theta: Float[Array, " unknowns"], action: Float[Array, " action"], corrects: bool = True
+    family: Family, theta: Float[Array, " unknowns"], action: Float[Array, " action"]
 ) -> Float[Array, " action"]:
-    """Return the action that, after the changes, does what `action` did before them.
-
-    `corrects`: leave out faults of the teacher. If False, return the action that the teacher would call right.
-    """
+    """Return the action that, after the changes, does what `action` did before them."""
     for distortion, values in _parts(family, theta):
-        if distortion.acts is not None and not (corrects and distortion.of_teacher):
+        if distortion.acts is not None:
             action = distortion.acts(values, action)
     return action
 
@@ -112,7 +101,7 @@ def check_family(family: Sequence[Distortion]) -> Family:
     for distortion in family:
         if not distortion.unknowns:
             raise UserError(f"distortion {distortion.name!r} has no unknowns: give at least one")
-        if not distortion.asks and distortion.acts is None:
+        if distortion.sees is None and distortion.plans is None and distortion.acts is None:
             raise UserError(f"distortion {distortion.name!r} changes nothing: give `sees`, `acts` or `plans`")
     for taken in (names, [distortion.name for distortion in family]):
         if twice := sorted({name for name in taken if taken.count(name) > 1}):
@@ -120,35 +109,23 @@ def check_family(family: Sequence[Distortion]) -> Family:
     return tuple(family)
 
 
-def declared_distortions(env: Any, gains: bool = False, teacher_bias: bool = False) -> Family:
-    """Derive the distortions of an environment from what it declares of its observation and actions.
+def declared_distortions(env: Any) -> Family:
+    """Derive the distortions of what is seen from what an environment declares of its observation; empty: nothing.
 
-    Slices in metres or radians of the same size shift together. Beams at equal angles roll. Directions turn, and places
-    with an `origin` turn about that. Actions turn or shift along their cues.
-
-    Args:
-        env: an environment, or its view.
-        gains: also ask whether slices in metres and entries of a box were scaled.
-        teacher_bias: a constant difference between answers and policy is the teacher's, not the world's.
-
-    Raises:
-        UserError: the environment declares nothing that could have changed.
+    Slices in metres or radians of the same size shift together, and those in metres may be scaled. Beams at equal
+    angles roll. Directions turn, and places with an `origin` turn about that. A change of the actions needs no
+    declaration.
     """
     places = _places(env.observation)
     found: list[Distortion] = []
     for (unit, size), slices in _alike(places).items():
         found.append(_shift(unit, size, slices))
-        if gains and unit == "m":
+        if unit == "m":
             found.append(_gain(slices))
     found += _turned_places(places)
     found += [_roll(quantity, start) for quantity, start in places if quantity.kind == "beams"]
     found += [_turned(quantity, start) for quantity, start in places if quantity.kind == "directions"]
-    space, name = actions_of(env), action_of(env).name
-    if space.cues:
-        found.append(_bias(space) if teacher_bias else _acts(space, name))
-    if gains and isinstance(space, Box):
-        found.append(_action_gain(space, name))
-    return check_family(found)
+    return check_family(found) if found else ()
 
 
 def _places(observation: Sequence[Quantity]) -> list[tuple[Quantity, int]]:
@@ -268,28 +245,3 @@ def _turned_about(
 
     name = f"{_called(slices)}: turn"
     return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)
-
-
-def _along(space: Space, sign: float, theta: Array, action: Array) -> Array:
-    return space.exp(action, sign * space.from_unit(theta))
-
-
-def _acts(space: Space, name: str) -> Distortion:
-    """Return the distortion that executes actions a constant change away from the given ones."""
-    unknowns = tuple(Unknown(f"{name}: {cue.name}", space.unit, most=space.reach) for cue in space.cues)
-    return Distortion(f"{name}: change", unknowns, acts=partial(_along, space, -1.0))
-
-
-def _bias(space: Space) -> Distortion:
-    unknowns = tuple(Unknown(f"teacher: {cue.name}", space.unit, most=space.reach) for cue in space.cues)
-    return Distortion("teacher: bias", unknowns, acts=partial(_along, space, 1.0), of_teacher=True)
-
-
-def _action_gain(space: Box, name: str) -> Distortion:
-    """Return the distortion that multiplies each entry of a given action by a factor."""
-
-    def acts(theta: Array, action: Array) -> Array:
-        return space.retract(action * jnp.exp(-PERCENT * theta))
-
-    unknowns = tuple(Unknown(f"{name}: gain of {cue.name}", "percent", most=100.0) for cue in space.cues)
-    return Distortion(f"{name}: gain", unknowns, acts=acts)

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cuelearner_jax.calibration.families import Distortion, Unknown
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.reading.families import Distortion, Unknown
 from cuelearner_jax.spaces import Space
 
 NARROW = 0.5  # standard deviation of the window in which rewards are compared, in reaches

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.calibration.meaning import is_python
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.feedback.answers import relative_answer
+from cuelearner_jax.reading.session import is_python
 from cuelearner_jax.types import EnvState, Teacher
 
 BEFORE = 12  # steps before the first questions

@@ -1,0 +1,299 @@
+"""Fit hypotheses about what changed to answers, and choose among them.
+
+Hypotheses are nested: nothing; the action shifted; shifted and mixed; what is seen as well; with entries of the
+observation mixed; and the simplest and the best of these with a Gaussian process. Each is linearised at its own
+estimate `ROUNDS` times. They are compared by how well each answer is predicted from all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from cuelearner_jax.devices import each_lane
+from cuelearner_jax.reading import linear, posterior
+from cuelearner_jax.reading.correction import Correction, corrected, correction_of
+from cuelearner_jax.reading.families import Family
+from cuelearner_jax.reading.likelihood import curvature, predictive_log_likelihood
+from cuelearner_jax.reading.linear import PARTS, SCALE, Change, Frame, Labels
+from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, Parts, Posterior, Priors
+from cuelearner_jax.spaces import Space
+
+Acts = Callable[[Float[Array, "n obs"]], Float[Array, "n action"]]
+ROUNDS = 3  # linearisations of each fit
+TRUST = 1.0  # largest step of a weight at one linearisation, in standard deviations of its prior's middle
+HYPOTHESES: tuple[tuple[str, ...], ...] = (
+    (),
+    ("shift",),
+    ("shift", "gain"),
+    ("seen", "shift"),
+    ("seen", "shift", "gain"),
+    ("seen", "mixed", "shift", "gain"),
+)
+WITH_PROCESS = 2  # hypotheses that are tried with the process: the first and the best
+WORTH = 3.0  # nats by which a hypothesis must predict better than "nothing changed": a factor of 20
+# Logarithm of the width that a fit starts from: answers about actions far from the right one then still say which way
+# it lies, where a narrow width would take them for answers about something else.
+WIDE = 2.5
+_NEVER = -30.0  # logarithm of an amplitude that is no process
+
+
+class Hypothesis(struct.PyTreeNode):
+    """What one fit hands to the next."""
+
+    parts: Parts
+    change: Change
+    hyper: Hyper
+
+
+class Fit(struct.PyTreeNode):
+    """A fitted hypothesis; stacked, all of them."""
+
+    hypothesis: Hypothesis
+    posterior: Posterior
+    data: Data
+    frame: Frame
+    evidence: Float[Array, ""]  # bound of the log evidence
+    score: Float[Array, ""]  # sum over answers of log p(answer | all others) [nats]
+
+
+def unfitted(space: Space, family: Family, obs_size: int) -> tuple[Hypothesis, Hypothesis]:
+    """Return the hypotheses before any answer, stacked: those without the process, and those with it."""
+    kinds = jnp.array(linear.groups(space, family, obs_size))
+    cues, zero = len(space.cues), jnp.zeros(())
+    hyper = Hyper(
+        groups=jnp.zeros(len(PARTS)),
+        sizes=jnp.zeros(len(kinds)),
+        amplitude=jnp.zeros(cues),
+        amplitudes=zero,
+        length=zero,
+        lengths=jnp.zeros(obs_size + space.size),
+        width=jnp.float32(WIDE),
+        lapse=zero,
+        actions=space.size,
+    )
+    change = linear.no_change(space, family, obs_size)
+
+    def one(names: tuple[str, ...], process: bool) -> Hypothesis:
+        used = jnp.array([float(part in names) for part in PARTS])[kinds]
+        return Hypothesis(Parts(used, process), change, hyper)
+
+    stack = lambda each: jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)  # noqa: E731
+    return stack([one(names, False) for names in HYPOTHESES]), stack([one((), True)] * WITH_PROCESS)
+
+
+class Reader:
+    """Reads labels about a policy. `acts` may be plain Python, or be traced with everything else.
+
+    Args:
+        space: space of the actions, with cues.
+        family: distortions that the world declares or the user names; empty: any entry of the observation may shift.
+        acts: the policy: observations (n, obs) -> actions (n, action).
+        eps: strength of an answer, in the unit of `space.log`.
+        step: size of each unknown of the family that changes actions by a usual correction; None without a family.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        family: Family,
+        acts: Acts,
+        eps: Float[Array, ""] | float,
+        step: Float[Array, " unknowns"] | None = None,
+        priors: Priors = PRIORS,
+    ) -> None:
+        self.space, self.family, self.acts, self.eps, self.step, self.priors = space, family, acts, eps, step, priors
+
+    def read(self, labels: Labels, plain: Hypothesis, smooth: Hypothesis) -> Fit:
+        """Return all hypotheses fitted to labels, stacked in the order of `HYPOTHESES`, those with the process last."""
+        frame = self._frame(labels)
+        first = self._fit(frame, labels, plain)
+        best = jnp.argmax(jnp.nan_to_num(first.score, nan=-jnp.inf))
+        two = jnp.stack([jnp.zeros_like(best), best])
+        start = jax.tree.map(lambda leaf: leaf[two], first.hypothesis)
+        start = Hypothesis(Parts(start.parts.weights, True), start.change, smooth.hyper)
+        second = self._fit(frame, labels, start)
+        return jax.tree.map(lambda one, other: jnp.concatenate([one, other]), _with_process(first), second)
+
+    def _ask(self, obs: Float[Array, "*k n obs"]) -> Float[Array, "*k n action"]:
+        return self.acts(obs.reshape(-1, obs.shape[-1])).reshape(*obs.shape[:-1], -1)
+
+    def _frame(self, labels: Labels) -> Frame:
+        if self.family:
+            return linear.frame_of(self.family, labels, self.step)
+        frame = linear.frame_of((), labels)
+        change = linear.no_change(self.space, (), labels.obs.shape[-1])
+        actions = self._ask(linear.probes((), frame, change, labels.obs))
+        return linear.frame_of((), labels, None, linear.influence(self.space, frame, labels, actions))
+
+    def _fit(self, frame: Frame, labels: Labels, hypothesis: Hypothesis) -> Fit:
+        """Return stacked hypotheses fitted to labels."""
+        rows = self._data(frame, labels, hypothesis.change)
+        found = _unread(rows, hypothesis.hyper)
+        for number in range(ROUNDS):
+            rows = self._data(frame, labels, hypothesis.change) if number else rows
+            found, hypothesis = _update(rows, frame, hypothesis, found, self.priors)
+        rows = self._data(frame, labels, hypothesis.change)
+        score = _score(rows, frame, hypothesis, found, self.priors)
+        count = len(score)
+        frames = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), frame)
+        return Fit(hypothesis, found, rows, frames, found.bound, score)
+
+    def _data(self, frame: Frame, labels: Labels, change: Change) -> Data:
+        """Return the linear models at stacked estimates."""
+        asked = _probes(self.family, frame, change, labels.obs)
+        return _data(self.space, self.family, frame, change, labels, asked, self._ask(asked), self.eps)
+
+    def act(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Return corrected actions by one fit."""
+        before = _undone(self.family, fitted.hypothesis.change, obs)
+        actions = self._ask(jnp.stack([obs, before]))
+        return _act(self.space, self.family, fitted, obs, before, actions, self.eps, self.priors)
+
+    def predict(
+        self, fitted: Fit, labels: Labels
+    ) -> tuple[Float[Array, "n cues"], Float[Array, "n cues"], Float[Array, "n cues"]]:
+        """Return what one fit says about labels: mean and variance of the change to the right action, and log p.
+
+        Changes are in units of `SCALE` eps; log p [nats] is of the answer about each cue, 0 where nothing was said.
+        """
+        frame, change = fitted.frame, fitted.hypothesis.change
+        asked = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
+        own = self.act(fitted, labels.obs)
+        rest = (labels, asked, self._ask(asked), own, self.eps, self.priors)
+        return _predicted(self.space, self.family, fitted, *rest)
+
+    def spread(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n cues"]:
+        """Return the standard deviation of the right action along each cue, in the unit of `space.log`."""
+        zeros = jnp.zeros((len(obs), len(self.space.cues)))
+        labels = Labels(obs, self.act(fitted, obs), zeros, jnp.ones(len(obs), bool))
+        return SCALE * self.eps * jnp.sqrt(self.predict(fitted, labels)[1])
+
+
+def correction(fitted: Fit, eps: Any, priors: Priors = PRIORS) -> Correction:
+    """Return what is needed to act by a fit."""
+    change, frame = fitted.hypothesis.change, fitted.frame
+    return correction_of(fitted.posterior, change, frame, fitted.data.inputs, eps, priors)
+
+
+def again(fitted: Fit) -> tuple[Hypothesis, Hypothesis]:
+    """Return where the next `Reader.read` starts: the hypotheses of this one."""
+    count = len(HYPOTHESES)
+    plain, smooth = (
+        jax.tree.map(lambda leaf, part=part: leaf[part], fitted.hypothesis)
+        for part in (slice(0, count), slice(count, None))
+    )
+    wide = lambda hyper: hyper.replace(width=jnp.full_like(hyper.width, WIDE), lapse=jnp.zeros_like(hyper.lapse))  # noqa: E731
+    hyper = wide(plain.hyper.replace(amplitudes=jnp.zeros(count)))
+    smooth = smooth.replace(hyper=wide(smooth.hyper))
+    return Hypothesis(Parts(plain.parts.weights, False), plain.change, hyper), smooth
+
+
+def best_of(fitted: Fit) -> Array:
+    """Return the number of the hypothesis that predicts best; 0, nothing, where the others are not `WORTH` better."""
+    score = jnp.nan_to_num(fitted.score, nan=-jnp.inf)
+    best = jnp.argmax(score)
+    return jnp.where(score[best] < score[0] + WORTH, 0, best)
+
+
+def pick(fitted: Fit, number: Any) -> Fit:
+    """Return one of stacked fits."""
+    return jax.tree.map(lambda leaf: leaf[number], fitted)
+
+
+@partial(jax.jit, static_argnames=("space", "family", "priors"))
+def _act(
+    space: Space, family: Family, fitted: Fit, obs: Array, before: Array, actions: Array, eps: Any, priors: Priors
+) -> Array:
+    return corrected(space, family, correction(fitted, eps, priors), obs, before, actions[0], actions[1])
+
+
+@partial(jax.jit, static_argnames=("space", "family", "priors"))
+def _predicted(
+    space: Space,
+    family: Family,
+    fitted: Fit,
+    labels: Labels,
+    asked: Array,
+    actions: Array,
+    own: Array,
+    eps: Any,
+    priors: Priors,
+) -> tuple[Array, Array, Array]:
+    rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, asked, actions, eps)
+    parts, found = fitted.hypothesis.parts, fitted.posterior
+    _, variance = posterior.predict(found, fitted.data, parts, rows.features, rows.inputs, priors)
+    mean = space.log(labels.action, own) / (SCALE * eps)
+    habits = posterior.habits(found.hyper, 1 / SCALE, priors)
+    return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, habits)
+
+
+@partial(jax.jit, static_argnames="family")
+def _undone(family: Family, change: Change, obs: Array) -> Array:
+    return linear.undone(family, change, obs)
+
+
+@partial(jax.jit, static_argnames="family")
+def _probes(family: Family, frame: Frame, change: Change, obs: Array) -> Array:
+    return jax.vmap(lambda one: linear.probes(family, frame, one, obs))(change)
+
+
+@partial(jax.jit, static_argnames=("space", "family"))
+def _data(
+    space: Space, family: Family, frame: Frame, change: Change, labels: Labels, asked: Array, actions: Array, eps: Array
+) -> Data:
+    one = lambda change, asked, actions: linear.data(space, family, frame, change, labels, asked, actions, eps)  # noqa: E731
+    return jax.vmap(one)(change, asked, actions)
+
+
+@partial(jax.jit, static_argnames="priors")
+def _update(
+    rows: Data, frame: Frame, hypothesis: Hypothesis, found: Posterior, priors: Priors
+) -> tuple[Posterior, Hypothesis]:
+    """Infer each hypothesis, and move its estimate."""
+
+    def one(rows: Data, hypothesis: Hypothesis, found: Posterior) -> tuple[Posterior, Hypothesis]:
+        found = posterior.infer(rows, hypothesis.parts, jnp.float32(1 / SCALE), found, priors)
+        at = linear.weights_of(frame, hypothesis.change)
+        weights = hypothesis.parts.weights * (at + jnp.clip(found.mean - at, -TRUST, TRUST))
+        change = linear.change_of(frame, weights, hypothesis.change)
+        return found, Hypothesis(hypothesis.parts, change, found.hyper)
+
+    return each_lane(one)(rows, hypothesis, found)
+
+
+@jax.jit
+def _unread(rows: Data, hyper: Hyper) -> Posterior:
+    return jax.vmap(posterior.unread)(rows, hyper)
+
+
+@partial(jax.jit, static_argnames="priors")
+def _score(rows: Data, frame: Frame, hypothesis: Hypothesis, found: Posterior, priors: Priors) -> Float[Array, " k"]:
+    """Return the sum of log p(answer | all others) of each hypothesis, by the cavity of each answer's site."""
+
+    def one(rows: Data, hypothesis: Hypothesis, found: Posterior) -> Array:
+        _, variance = posterior.predict(found, rows, hypothesis.parts, rows.features, rows.inputs, priors)
+        # at the estimate itself, of which the linear model is only a tangent
+        weights = linear.weights_of(frame, hypothesis.change)
+        mean = rows.offset + rows.features @ weights
+        mean = mean + posterior.process(found, rows.inputs, rows.inputs, priors, hypothesis.parts)
+        habits = posterior.habits(found.hyper, 1 / SCALE, priors)
+        slope, _ = curvature(mean, variance, rows.answers, habits)
+        cavity = variance / jnp.maximum(1 - variance * found.precision, 0.05)
+        return predictive_log_likelihood(mean - cavity * slope, cavity, rows.answers, habits).sum()
+
+    return each_lane(one)(rows, hypothesis, found)
+
+
+def _with_process(fitted: Fit) -> Fit:
+    """Return fits without the process as fits with one of no amplitude."""
+    never = lambda hyper: hyper.replace(amplitudes=jnp.full_like(hyper.amplitudes, _NEVER))  # noqa: E731
+    hypothesis, found = fitted.hypothesis, fitted.posterior
+    hypothesis = hypothesis.replace(parts=Parts(hypothesis.parts.weights, True), hyper=never(hypothesis.hyper))
+    return fitted.replace(hypothesis=hypothesis, posterior=found.replace(hyper=never(found.hyper)))

@@ -1,0 +1,103 @@
+"""Probability of relative answers: each says in which interval the right action lies, seen from the action asked about.
+
+With t the change from the action asked about to the right one along a cue, `tau` the threshold, `width` the standard
+deviation of what is judged, and a share `lapse` of answers that are about something else (an ordinal probit):
+
+    p(h | t) = (1 - lapse) (Phi((upper(h) - t) / width) - Phi((lower(h) - t) / width)) + lapse / 3
+    more: (tau, inf)    right: [-tau, tau]    less: (-inf, -tau)
+
+At the end of a cue's range "right" also says that the right action would lie beyond the end: the interval of an action
+that cannot be raised by `tau` has no upper end, and likewise below. So a policy that saturates says nothing wrong.
+
+Source: Chu, Ghahramani, "Gaussian processes for ordinal regression", JMLR 2005.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.scipy.special import ndtr
+from jaxtyping import Array, Bool, Float
+
+from cuelearner_jax.spaces import UNSAID
+
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
+
+
+class Answers(struct.PyTreeNode):
+    """Relative answers, and the interval that each names."""
+
+    lower: Float[Array, "n cues"]  # ends of the interval in units of tau: -1, 1 or infinite
+    upper: Float[Array, "n cues"]
+    valid: Bool[Array, "n cues"]  # False: nothing was said of this cue
+
+
+class Habits(NamedTuple):
+    """How a teacher answers, in the unit of the changes."""
+
+    tau: Float[Array, ""]  # an action within this of the right one is called right
+    width: Float[Array, ""]  # standard deviation of a judgement
+    lapse: Float[Array, ""]  # share of answers that are about something else
+
+
+def intervals(
+    answer: Float[Array, "n cues"],
+    valid: Bool[Array, " n"],
+    below: Float[Array, "n cues"],
+    above: Float[Array, "n cues"],
+    tau: Float[Array, ""] | float,
+) -> Answers:
+    """Return the intervals of answers; `below`, `above`: how far each action can be changed before its range ends."""
+    less, more = answer < 0, (answer > 0) & (answer != UNSAID)
+    upper = jnp.where(more, jnp.inf, jnp.where(less, -1.0, jnp.where(above < tau, jnp.inf, 1.0)))
+    lower = jnp.where(less, -jnp.inf, jnp.where(more, 1.0, jnp.where(below < tau, -jnp.inf, -1.0)))
+    return Answers(lower, upper, valid[:, None] & (answer != UNSAID))
+
+
+def log_likelihood(change: Float[Array, "*n cues"], answers: Answers, habits: Habits) -> Float[Array, "*n cues"]:
+    """Return log p(answer | change) of each cue, 0 where nothing was said; leading axes beyond (n, cues) broadcast."""
+    between = _mass(change, answers, habits.tau, habits.width)
+    log_p = jnp.log((1 - habits.lapse) * between + habits.lapse / 3)
+    return jnp.where(answers.valid, log_p, 0.0)
+
+
+def _mass(change: Array, answers: Answers, tau: Array, width: Array) -> Array:
+    def below(end: Array) -> Array:
+        finite = jnp.isfinite(end)
+        inside = ndtr((jnp.where(finite, end, 0.0) * tau - change) / width)
+        return jnp.where(finite, inside, end > 0)
+
+    return below(answers.upper) - below(answers.lower)
+
+
+def expected_log_likelihood(
+    mean: Float[Array, "n cues"], variance: Float[Array, "n cues"], answers: Answers, habits: Habits
+) -> Float[Array, "n cues"]:
+    """Return E[log p(answer | change)] over normally distributed changes, by Gauss-Hermite quadrature."""
+    nodes, shares = jnp.asarray(_NODES, jnp.float32), jnp.asarray(_WEIGHTS, jnp.float32)
+    values = log_likelihood(mean + jnp.sqrt(variance) * nodes[:, None, None], answers, habits)
+    return jnp.tensordot(shares, values, 1)
+
+
+def predictive_log_likelihood(
+    mean: Float[Array, "n cues"], variance: Float[Array, "n cues"], answers: Answers, habits: Habits
+) -> Float[Array, "n cues"]:
+    """Return log E[p(answer | change)] over normally distributed changes."""
+    wide = habits._replace(width=jnp.sqrt(habits.width**2 + variance))
+    return log_likelihood(mean, answers, wide)
+
+
+def curvature(
+    mean: Float[Array, "n cues"], variance: Float[Array, "n cues"], answers: Answers, habits: Habits
+) -> tuple[Float[Array, "n cues"], Float[Array, "n cues"]]:
+    """Return first and second derivative of `expected_log_likelihood` by the mean."""
+
+    def slope(mean: Array) -> Array:
+        return jax.grad(lambda m: expected_log_likelihood(m, variance, answers, habits).sum())(mean)
+
+    return jax.jvp(slope, (mean,), (jnp.ones_like(mean),))

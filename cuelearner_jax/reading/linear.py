@@ -1,0 +1,210 @@
+"""The linear model of a change: what a policy would do if what it sees, and what it does, were changed a little.
+
+    a*(s) = exp(a, scale B(a) beta),   a = undo(theta, pi(undo(theta, o) + M (o - centre)))
+
+`theta` are the unknowns of a family of distortions (`families`), or, where a world declares none, a shift of each entry
+of the observation; `M` mixes the entries on which the policy depends most. The policy is a black box: it is asked at
+both sides of each unknown (`probes`), and `data` makes the central differences of its answers.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from cuelearner_jax.reading.families import Family, undo_action, undo_observation, undo_physics, unknowns_of
+from cuelearner_jax.reading.likelihood import intervals
+from cuelearner_jax.reading.posterior import PRIORS, Data
+from cuelearner_jax.spaces import Space
+
+SCALE = 3.0  # unit of changes of an action, in eps: the size of a usual correction
+STEP = 0.35  # of the central differences of an entry, in its standard deviations
+MIXED = 8  # largest number of entries that may mix
+PARTS = ("seen", "mixed", "shift", "gain")  # groups of weights: of what is seen, and of the action
+LARGEST = 5.0  # standard deviations at which inputs of the process are cut
+
+
+class Frame(struct.PyTreeNode):
+    """Units of the linear model, from the situations asked about."""
+
+    mean: Float[Array, " obs"]
+    deviation: Float[Array, " obs"]  # 1 for an entry that never changes
+    varies: Float[Array, " obs"]  # 1, or 0 for an entry that never changes
+    step: Float[Array, " unknowns"]  # of the differences, and unit of theta; 0 for an entry that never changes
+    mixed: Int[Array, " mixed"]  # entries that may mix; none where a family is given
+
+
+class Change(struct.PyTreeNode):
+    """The estimate of one hypothesis."""
+
+    theta: Float[Array, " unknowns"]
+    mix: Float[Array, "obs obs"]
+    centre: Float[Array, " obs"]
+    action: Float[Array, "cues basis"]  # beta
+
+
+class Labels(NamedTuple):
+    """Relative answers in arrays of a fixed size."""
+
+    obs: Float[Array, "n obs"]
+    action: Float[Array, "n action"]
+    answer: Float[Array, "n cues"]
+    valid: Bool[Array, " n"]
+
+
+def unknowns(family: Family, obs_size: int) -> int:
+    """Return the number of unknowns of what is seen."""
+    return len(unknowns_of(family)) if family else obs_size
+
+
+def no_change(space: Space, family: Family, obs_size: int) -> Change:
+    """Return the estimate that changes nothing."""
+    zeros, basis_size = jnp.zeros(obs_size), 1 + space.size
+    mix = jnp.zeros((obs_size, obs_size)) if not family else jnp.zeros((0, 0))
+    return Change(jnp.zeros(unknowns(family, obs_size)), mix, zeros, jnp.zeros((len(space.cues), basis_size)))
+
+
+def groups(space: Space, family: Family, obs_size: int) -> tuple[int, ...]:
+    """Return the number in `PARTS` of each weight, in the order of `weights_of`."""
+    mixed = 0 if family else min(MIXED, obs_size) ** 2
+    return (0,) * unknowns(family, obs_size) + (1,) * mixed + ((2,) + (3,) * space.size) * len(space.cues)
+
+
+def undone(family: Family, change: Change, obs: Float[Array, "n obs"]) -> Float[Array, "n obs"]:
+    """Return observations as they would be without the change."""
+    if family:
+        return jax.vmap(partial(undo_observation, family, change.theta))(obs)
+    return obs - change.theta + (obs - change.centre) @ change.mix.T
+
+
+def meant(
+    family: Family, theta: Float[Array, " unknowns"], before: Float[Array, "n obs"], action: Float[Array, "n action"]
+) -> Float[Array, "n action"]:
+    """Return what a policy's actions about undone observations `before` mean in the changed world."""
+    if not family:
+        return action
+    action = jax.vmap(partial(undo_physics, family, theta))(before, action)
+    return jax.vmap(partial(undo_action, family, theta))(action)
+
+
+def basis(space: Space, action: Float[Array, "n action"]) -> Float[Array, "n basis"]:
+    """Return 1 and the entries of actions, of the order of one."""
+    return jnp.concatenate([jnp.ones((len(action), 1)), space.even(action)], 1)
+
+
+def apply(
+    space: Space, change: Change, action: Float[Array, "n action"], more: Float[Array, "n cues"], eps: Float[Array, ""]
+) -> Float[Array, "n action"]:
+    """Return actions with beta and `more` (in units of `SCALE` eps) applied."""
+    return space.exp(action, SCALE * eps * (basis(space, action) @ change.action.T + more))
+
+
+def frame_of(
+    family: Family, labels: Labels, step: Float[Array, " unknowns"] | None = None, mixed: Int[Array, " m"] | None = None
+) -> Frame:
+    """Return the units for labels; `step`: of a family's unknowns; `mixed`: entries that may mix (default: none)."""
+    weight = labels.valid / jnp.maximum(labels.valid.sum(), 1)
+    mean = weight @ labels.obs
+    deviation = jnp.sqrt(weight @ (labels.obs - mean) ** 2)
+    varies = deviation > 1e-5 * (1e-3 + jnp.abs(mean))
+    if step is None:
+        step = jnp.where(varies, STEP * deviation, 0.0)
+    mixed = jnp.zeros(0, jnp.int32) if mixed is None else mixed
+    return Frame(mean, jnp.where(varies, deviation, 1.0), varies * 1.0, step, mixed)
+
+
+def probes(family: Family, frame: Frame, change: Change, obs: Float[Array, "n obs"]) -> Float[Array, "k n obs"]:
+    """Return the observations to ask the policy about: as they are, undone, and undone at both sides of each unknown.
+
+    k = 2 + 2 * unknowns.
+    """
+    steps = jnp.diag(frame.step)
+    sides = jnp.concatenate([change.theta[None], change.theta - steps, change.theta + steps])
+    moved = jax.vmap(lambda theta: undone(family, change.replace(theta=theta), obs))(sides)
+    return jnp.concatenate([obs[None], moved])
+
+
+def influence(space: Space, frame: Frame, labels: Labels, actions: Float[Array, "k n action"]) -> Int[Array, " mixed"]:
+    """Return the entries on which the policy's actions depend most, from its answers to `probes`."""
+    size = len(frame.step)
+    slope = space.log(actions[2 : 2 + size], actions[2 + size :])
+    moved = jnp.einsum("n,unc->u", labels.valid * 1.0, slope**2)
+    return jax.lax.top_k(moved, min(MIXED, size))[1]
+
+
+def data(
+    space: Space,
+    family: Family,
+    frame: Frame,
+    change: Change,
+    labels: Labels,
+    asked: Float[Array, "k n obs"],
+    actions: Float[Array, "k n action"],
+    eps: Float[Array, ""],
+) -> Data:
+    """Return the linear model at labels, about an estimate; its weights count from no change.
+
+    Args:
+        space, family, frame, change, labels: the model; `change` is the estimate.
+        asked: `probes` of the labels' observations.
+        actions: what the policy does there.
+        eps: strength of an answer, in the unit of `space.log`.
+    """
+    scale, size = SCALE * eps, len(frame.step)
+    steps = jnp.diag(frame.step)
+    sides = jnp.concatenate([change.theta[None], change.theta - steps, change.theta + steps])
+    whole = jax.vmap(partial(meant, family))(sides, asked[1:], actions[1:])
+    base, slope = whole[0], jnp.moveaxis(space.log(whole[1 : 1 + size], whole[1 + size :]), 0, -1) / (2 * scale)
+    x = features(space, frame, slope, labels.obs, base)
+    cut = size + len(frame.mixed) ** 2
+    offset = space.log(labels.action, base) / scale - x[:, :, :cut] @ weights_of(frame, change)[:cut]
+    below, above = space.room(labels.action)
+    answers = intervals(labels.answer, labels.valid, below, above, PRIORS.tau * eps)
+    return Data(
+        offset, x, inputs(space, frame, labels.obs, actions[0]), answers, groups(space, family, len(frame.mean))
+    )
+
+
+def features(
+    space: Space, frame: Frame, slope: Float[Array, "n cues u"], obs: Float[Array, "n obs"], base: Float[Array, "n a"]
+) -> Float[Array, "n cues p"]:
+    """Return the change of each cue by each weight."""
+    n, cues, _ = slope.shape
+    z = ((obs - frame.mean) / frame.deviation)[:, frame.mixed]
+    mixed = (-slope[:, :, frame.mixed, None] * z[:, None, None, :]).reshape(n, cues, len(frame.mixed) ** 2)
+    own = jnp.einsum("cd,nb->ncdb", jnp.eye(cues), basis(space, base)).reshape(n, cues, -1)
+    return jnp.concatenate([slope, mixed, own], 2)
+
+
+def inputs(
+    space: Space, frame: Frame, obs: Float[Array, "n obs"], action: Float[Array, "n action"]
+) -> Float[Array, "n z"]:
+    """Return what the process sees: the observation, and what the policy does about it."""
+    z = jnp.clip((obs - frame.mean) / frame.deviation, -LARGEST, LARGEST) * frame.varies
+    return jnp.concatenate([z, 2 * space.even(action)], 1)
+
+
+def weights_of(frame: Frame, change: Change) -> Float[Array, " p"]:
+    """Return an estimate as weights of `features`."""
+    step = jnp.where(frame.step > 0, frame.step, 1.0)
+    if not len(frame.mixed):
+        return jnp.concatenate([change.theta / step, change.action.ravel()])
+    theta = change.theta - change.mix @ (frame.mean - change.centre)
+    mix = (change.mix * frame.deviation / step[:, None])[frame.mixed][:, frame.mixed]
+    return jnp.concatenate([theta / step, mix.ravel(), change.action.ravel()])
+
+
+def change_of(frame: Frame, weights: Float[Array, " p"], like: Change) -> Change:
+    """Return the estimate that `weights_of` describes."""
+    size, mixed = len(like.theta), len(frame.mixed)
+    theta, mix, action = jnp.split(weights, (size, size + mixed**2))
+    whole = jnp.zeros_like(like.mix)
+    if mixed:
+        part = mix.reshape(mixed, mixed) * frame.step[frame.mixed][:, None] / frame.deviation[frame.mixed]
+        whole = whole.at[frame.mixed[:, None], frame.mixed[None]].set(part)
+    return Change(theta * frame.step, whole, frame.mean, action.reshape(like.action.shape))

@@ -1,0 +1,80 @@
+"""A policy corrected by what answers said about its world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, describe
+from cuelearner_jax.reading import linear
+from cuelearner_jax.reading.correction import Correction, corrected
+from cuelearner_jax.reading.families import Family, unknowns_of
+from cuelearner_jax.reading.linear import Frame
+from cuelearner_jax.spaces import Space
+from cuelearner_jax.types import EnvState
+
+KIND = "reading"
+
+
+class Read(PolicyNode):
+    """Another policy, corrected; without a change it acts as its base."""
+
+    base: Any  # a policy
+    correction: Correction  # of a block: every leaf with a leading axis of lanes
+    bound: Float[Array, ""]  # largest change along a cue, in the unit of `space.log`; infinite: none
+    space: Space = struct.field(pytree_node=False)
+    family: Family = struct.field(pytree_node=False)  # empty: shifts and mixings of entries
+    named: str = struct.field(pytree_node=False, default="")  # reference of the family's code; empty: declared
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Return the base's actions, corrected."""
+        first = self.base.act(key, states, obs)
+        before = linear.undone(self.family, self.correction.change, obs)
+        action = self.base.act(key, states, before)
+        found = corrected(self.space, self.family, self.correction, obs, before, first, action)
+        return self.space.clip(found, first, self.bound)
+
+    @property
+    def sees(self) -> bool:
+        """Whether the base is asked about other observations than are met."""
+        change = self.correction.change
+        return bool(np.any(np.asarray(change.theta)) or np.any(np.asarray(change.mix)))
+
+    @property
+    def axes(self) -> Read:
+        """Lane axes: each lane has its own base, and its own correction where there is more than one."""
+        lanes = SHARED if jnp.ndim(self.correction.scale) == 0 else BY_LANE
+        return self.replace(base=self.base.axes, correction=lanes, bound=lanes)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the sizes of the correction's arrays, the family's unknowns with their values, and the base."""
+        own = self.correction
+        values = zip(unknowns_of(self.family), np.asarray(own.change.theta).T.tolist(), strict=False)
+        return {
+            "policy": KIND,
+            "guidance": KIND,
+            "changes": [{"name": one.name, "unit": one.unit, "value": value} for one, value in values],
+            "distortions": [one.name for one in self.family],
+            "code": self.named,
+            "labels": int(own.known.shape[-2]),
+            "mixed": int(own.frame.mixed.shape[-1]),
+            "base": describe(self.base),
+        }
+
+
+def unread(
+    base: Any, space: Space, family: Family, obs_size: int, labels: int = 0, mixed: int = 0, named: str = ""
+) -> Read:
+    """Return a policy without a correction, with arrays of the shapes that `describe` tells."""
+    change, zeros = linear.no_change(space, family, obs_size), jnp.zeros
+    z = obs_size + space.size
+    unknowns = linear.unknowns(family, obs_size)
+    frame = Frame(zeros(obs_size), jnp.ones(obs_size), zeros(obs_size), zeros(unknowns), zeros(mixed, jnp.int32))
+    correction = Correction(
+        change, frame, zeros((labels, z)), zeros((labels, len(space.cues))), jnp.ones(z), jnp.float32(0)
+    )
+    return Read(base, correction, jnp.float32(jnp.inf), space, family, named)

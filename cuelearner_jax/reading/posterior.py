@@ -1,0 +1,288 @@
+"""Posterior of what changed: a linear model and a Gaussian process, known through intervals.
+
+    f_c(s) = offset_c(s) + x_c(s) . u + g_c(s),   u_i ~ N(0, size of i),   g_c ~ GP(0, amplitude_c^2 k)
+
+q(u, g) is the normal distribution with the largest evidence bound. It is held as pseudo-measurements: of each answer a
+mean and a precision (`Sites`), from which one Cholesky factor a cue and one of the weights follow. Sizes, amplitudes,
+length scales and the teacher's habits are raised along the same bound by Adam, each under a broad prior, in the same
+iterations.
+
+Source: Khan, Lin, "Conjugate-computation variational inference", AISTATS 2017; Adam et al., "Dual parameterization of
+sparse variational Gaussian processes", NeurIPS 2021; sizes by evidence: MacKay, Neural Computation 1992.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float
+
+from cuelearner_jax.devices import each_lane
+from cuelearner_jax.reading.likelihood import Answers, Habits, curvature, expected_log_likelihood
+
+ITERATIONS = 30
+STEP = 0.15  # Adam's step of logarithms
+DAMPING = 0.5  # share of a new site in each iteration
+LEAST_PRECISION = 1e-3
+
+
+class Data(struct.PyTreeNode):
+    """Answers with the linear model at them; a change of 1 is `linear.SCALE` eps."""
+
+    offset: Float[Array, "n cues"]  # from the action asked about to the policy's
+    features: Float[Array, "n cues p"]
+    inputs: Float[Array, "n z"]  # what the process sees
+    answers: Answers
+    group: tuple[int, ...] = struct.field(pytree_node=False)  # number of the group whose size a weight shares
+
+
+class Parts(struct.PyTreeNode):
+    """Which parts of the model a hypothesis has."""
+
+    weights: Float[Array, " p"]  # 1, or 0 for a weight that the hypothesis lacks
+    process: bool = struct.field(pytree_node=False)  # whether it has the Gaussian process
+
+
+class Hyper(struct.PyTreeNode):
+    """Logarithms of what the evidence decides; at zero each is its prior's middle."""
+
+    groups: Float[Array, " groups"]
+    sizes: Float[Array, " p"]
+    amplitude: Float[Array, " cues"]
+    amplitudes: Float[Array, ""]
+    length: Float[Array, ""]  # of all entries of the observation
+    lengths: Float[Array, " z"]
+    width: Float[Array, ""]
+    lapse: Float[Array, ""]
+    actions: int = struct.field(pytree_node=False)  # entries of an action, the last of the process's inputs
+
+
+class Priors(NamedTuple):
+    """Middles and spreads (of logarithms) of the priors of `Hyper`."""
+
+    size: float = 0.55  # of a weight
+    amplitude: float = 0.5
+    length: float = 1.0  # times the root of the number of inputs
+    tau: float = 0.5  # of eps
+    width: float = 0.5  # of eps
+    lapse: float = 0.05
+    spread_groups: float = 1.5
+    spread_sizes: float = 1.0
+    spread_amplitude: float = 1.0
+    spread_amplitudes: float = 0.5
+    spread_length: float = 1.5
+    spread_lengths: float = 0.7
+    spread_width: float = 0.7
+    spread_lapse: float = 0.7
+
+
+PRIORS = Priors()
+
+
+class Posterior(struct.PyTreeNode):
+    """What the answers say, ready to predict."""
+
+    mean: Float[Array, " p"]  # of the weights
+    root: Float[Array, "p p"]  # covariance = root @ root.T
+    alpha: Float[Array, "n cues"]  # the process is k(., inputs) alpha
+    precision: Float[Array, "n cues"]  # of each answer's pseudo-measurement
+    target: Float[Array, "n cues"]  # mean of it, a change from the action asked about
+    hyper: Hyper
+    bound: Float[Array, ""]  # of the log evidence
+
+
+class _Solved(NamedTuple):
+    mean: Array  # (n, cues) of f
+    variance: Array
+    weights: Array
+    root: Array
+    alpha: Array
+    log_z: Array
+
+
+def habits(hyper: Hyper, eps: Float[Array, ""] | float, priors: Priors) -> Habits:
+    """Return a teacher's habits; `eps`: strength of an answer in the unit of the changes."""
+    lapse = jnp.clip(priors.lapse * jnp.exp(hyper.lapse), 0.005, 0.6)
+    return Habits(jnp.asarray(priors.tau * eps), priors.width * eps * jnp.exp(hyper.width), lapse)
+
+
+def lengths(hyper: Hyper, priors: Priors) -> Float[Array, " z"]:
+    """Return the length scale of each input of the process."""
+    size = len(hyper.lengths)
+    observed = jnp.arange(size) < size - hyper.actions
+    return priors.length * size**0.5 * jnp.exp(hyper.lengths + observed * hyper.length)
+
+
+def correlation(
+    length: Float[Array, " z"], one: Float[Array, "n z"], other: Float[Array, "m z"]
+) -> Float[Array, "n m"]:
+    """Return the correlation of the process at two sets of inputs."""
+    one, other = one / length, other / length
+    square = (one**2).sum(-1)[:, None] + (other**2).sum(-1)[None] - 2 * one @ other.T
+    return jnp.exp(-0.5 * jnp.maximum(square, 0.0))
+
+
+def amplitudes(hyper: Hyper, priors: Priors) -> Float[Array, " cues"]:
+    """Return the standard deviation of the process along each cue."""
+    return priors.amplitude * jnp.exp(hyper.amplitudes + hyper.amplitude)
+
+
+def process(
+    posterior: Posterior,
+    known: Float[Array, "n z"],
+    inputs: Float[Array, "m z"],
+    priors: Priors,
+    parts: Parts | None = None,
+) -> Float[Array, "m cues"]:
+    """Return the mean of the process at `inputs`; `known`: those of the answers."""
+    if parts is not None and not parts.process:
+        return jnp.zeros((len(inputs), posterior.alpha.shape[1]))
+    amplitude = amplitudes(posterior.hyper, priors)
+    return amplitude**2 * (correlation(lengths(posterior.hyper, priors), inputs, known) @ posterior.alpha)
+
+
+def _sizes(hyper: Hyper, parts: Parts, group: Array, priors: Priors) -> Array:
+    return parts.weights * priors.size * jnp.exp(hyper.groups[group] + hyper.sizes)
+
+
+def _solve(hyper: Hyper, parts: Parts, data: Data, precision: Array, target: Array, priors: Priors) -> _Solved:
+    """Return the posterior under pseudo-measurements `target` (n, cues) of f with `precision`."""
+    size = _sizes(hyper, parts, jnp.array(data.group), priors)
+    x = data.features * size  # (n, cues, p)
+    residual = target - data.offset
+    root = jnp.sqrt(precision).T  # (cues, n)
+    hx, hr = root[:, :, None] * jnp.moveaxis(x, 1, 0), root * residual.T
+    logs, hk, back, prior = jnp.zeros(()), None, None, jnp.zeros(residual.shape[1])
+    if parts.process:
+        prior = amplitudes(hyper, priors)
+        known = correlation(lengths(hyper, priors), data.inputs, data.inputs)
+        hx, hr, hk, back, logs = each_lane(partial(_whitened, known))(hx, hr, root, prior)
+        logs = logs.sum()
+    inner = jnp.linalg.cholesky(jnp.eye(len(size)) + jnp.einsum("cnp,cnq->pq", hx, hx))
+    solve = partial(jax.scipy.linalg.solve_triangular, inner, lower=True)
+    vector = solve(jnp.einsum("cnp,cn->p", hx, hr))
+    weights = jax.scipy.linalg.solve_triangular(inner.T, vector, lower=False)  # in units of size
+    left = hr - hx @ weights  # (cues, n)
+    mean, away = data.offset + x @ weights, jnp.moveaxis(x, 1, 0)
+    variance, alpha = (prior**2)[:, None], jnp.zeros_like(residual)
+    if hk is not None and back is not None:
+        alpha = jnp.einsum("cnm,cm->nc", back, left)
+        mean = mean + jnp.einsum("cnm,cn->mc", hk, left)
+        away = away - jnp.einsum("cnm,cnp->cmp", hk, hx)  # (cues, n, p)
+        variance = variance - (hk**2).sum(1)
+    spread = (solve(away.reshape(-1, len(size)).T) ** 2).sum(0).reshape(away.shape[:2])
+    variance = (variance + spread).T
+    log_z = -0.5 * (logs + 2 * jnp.log(jnp.diag(inner)).sum() + (hr**2).sum() - (vector**2).sum())
+    covariance_root = size[:, None] * jax.scipy.linalg.solve_triangular(inner.T, jnp.eye(len(size)), lower=False)
+    return _Solved(mean, jnp.maximum(variance, 1e-8), size * weights, covariance_root, alpha, log_z)
+
+
+def _whitened(
+    known: Array, hx: Array, hr: Array, root: Array, amplitude: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return one cue's features, residuals and covariance, whitened by process and noise; the last maps to `alpha`."""
+    eye = jnp.eye(len(root))
+    half_k = root[:, None] * (amplitude**2 * known)
+    factor = jnp.linalg.cholesky(eye + half_k * root)
+    inverse = jax.scipy.linalg.solve_triangular(factor, eye, lower=True)
+    back = root[:, None] * inverse.T
+    return inverse @ hx, inverse @ hr, inverse @ half_k, back, 2 * jnp.log(jnp.diag(factor)).sum()
+
+
+def _log_prior(hyper: Hyper, parts: Parts, priors: Priors) -> Array:
+    terms = (
+        (hyper.groups, priors.spread_groups),
+        (hyper.sizes * parts.weights, priors.spread_sizes),
+        (hyper.amplitude, priors.spread_amplitude),
+        (hyper.amplitudes, priors.spread_amplitudes),
+        (hyper.length, priors.spread_length),
+        (hyper.lengths, priors.spread_lengths),
+        (hyper.width, priors.spread_width),
+        (hyper.lapse, priors.spread_lapse),
+    )
+    return -0.5 * jnp.stack([((value / spread) ** 2).sum() for value, spread in terms]).sum()
+
+
+def infer(
+    data: Data,
+    parts: Parts,
+    eps: Float[Array, ""],
+    start: Posterior,
+    priors: Priors = PRIORS,
+    iterations: int = ITERATIONS,
+) -> Posterior:
+    """Return the posterior of one hypothesis, and its evidence.
+
+    Args:
+        data: the answers.
+        parts: the hypothesis.
+        eps: strength of an answer, in the unit of the changes.
+        start: where to start: `unread`, or what was read before.
+        priors: broad priors.
+        iterations: number of updates of sites and sizes.
+    """
+    answers = data.answers
+    optimizer = optax.adam(STEP)
+
+    def bound(hyper: Hyper, precision: Array, target: Array) -> tuple[Array, _Solved]:
+        solved = _solve(hyper, parts, data, precision, target, priors)
+        said = expected_log_likelihood(solved.mean, solved.variance, answers, habits(hyper, eps, priors)).sum()
+        fit = 0.5 * (precision * ((target - solved.mean) ** 2 + solved.variance)).sum()
+        return said + fit + solved.log_z + _log_prior(hyper, parts, priors), solved
+
+    def update(carry: tuple, _: None) -> tuple[tuple, None]:
+        hyper, state, precision, target = carry
+        (_, solved), slope = jax.value_and_grad(bound, has_aux=True)(hyper, precision, target)
+        first, second = curvature(solved.mean, solved.variance, answers, habits(hyper, eps, priors))
+        wanted = jnp.where(answers.valid, jnp.maximum(-second, LEAST_PRECISION), 0.0)
+        both = (1 - DAMPING) * precision + DAMPING * wanted
+        natural = (1 - DAMPING) * precision * target + DAMPING * (wanted * solved.mean + first)
+        target = jnp.where(both > 0, natural / jnp.maximum(both, 1e-12), 0.0)
+        changes, state = optimizer.update(jax.tree.map(jnp.negative, slope), state)
+        return (jax.tree.map(jnp.add, hyper, changes), state, both, target), None
+
+    first = (start.hyper, optimizer.init(cast(Any, start.hyper)), start.precision, start.target)
+    (hyper, _, precision, target), _ = jax.lax.scan(update, first, None, iterations)
+    worth, solved = bound(hyper, precision, target)
+    return Posterior(solved.weights, solved.root, solved.alpha, precision, target, hyper, worth)
+
+
+def unread(data: Data, hyper: Hyper) -> Posterior:
+    """Return the posterior before the first iteration."""
+    p = data.features.shape[-1]
+    precision = jnp.where(data.answers.valid, LEAST_PRECISION, 0.0)
+    zero = jnp.zeros(())
+    return Posterior(jnp.zeros(p), jnp.zeros((p, p)), jnp.zeros_like(data.offset), precision, data.offset, hyper, zero)
+
+
+def predict(
+    posterior: Posterior,
+    data: Data,
+    parts: Parts,
+    features: Float[Array, "m cues p"],
+    inputs: Float[Array, "m z"],
+    priors: Priors = PRIORS,
+) -> tuple[Float[Array, "m cues"], Float[Array, "m cues"]]:
+    """Return mean and variance of x . u + g in other situations."""
+    mean, eye = features @ posterior.mean, jnp.eye(len(data.inputs))
+    if not parts.process:
+        return mean, jnp.maximum(((features @ posterior.root) ** 2).sum(-1), 1e-8)
+    hyper, amplitude = posterior.hyper, amplitudes(posterior.hyper, priors)
+    cross = correlation(lengths(hyper, priors), data.inputs, inputs)  # (n, m)
+    known = correlation(lengths(hyper, priors), data.inputs, data.inputs)
+
+    def of_cue(x: Array, train: Array, w: Array, a: Array) -> Array:
+        root = jnp.sqrt(w)
+        factor = jnp.linalg.cholesky(eye + root[:, None] * (a**2 * known) * root)
+        half = partial(jax.scipy.linalg.solve_triangular, factor, lower=True)
+        hk, hx = half(root[:, None] * a**2 * cross), half(root[:, None] * train)
+        return a**2 - (hk**2).sum(0) + (((x - hk.T @ hx) @ posterior.root) ** 2).sum(-1)
+
+    rows = jnp.moveaxis(features, 1, 0), jnp.moveaxis(data.features, 1, 0), posterior.precision.T, amplitude
+    mean = mean + process(posterior, data.inputs, inputs, priors)
+    return mean, jnp.maximum(each_lane(of_cue)(*rows).T, 1e-8)

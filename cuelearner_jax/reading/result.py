@@ -1,0 +1,166 @@
+"""What a reading found, in numbers with intervals and in words.
+
+Entries of the observation that the policy cannot tell apart are told as one: only their sum or difference is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.reading import linear, posterior
+from cuelearner_jax.reading.families import Family, unknowns_of
+from cuelearner_jax.reading.fitting import Fit
+from cuelearner_jax.reading.linear import SCALE
+from cuelearner_jax.spaces import Box, Space
+
+Floats = np.ndarray
+NORMAL = 1.96  # half width of a 95% interval, in standard deviations
+ALIKE = 0.98  # correlation of the effects of two entries that the policy cannot tell apart
+SMALL = 0.25  # effect on actions from which an estimate is told, in eps
+PER_CENT = 100.0
+
+
+class Estimate(NamedTuple):
+    """The estimate of one change after all answers, in its unit."""
+
+    name: str
+    unit: str
+    mean: float
+    low: float  # ends of the 95% interval
+    high: float
+
+    def words(self) -> str:
+        """Describe the estimate in one line."""
+        return f"{self.name}: {self.mean:.4g} [{self.low:.4g}, {self.high:.4g}] {self.unit}"
+
+
+class Result(NamedTuple):
+    """The verdict of a reading."""
+
+    used: bool  # whether the answers show that the corrected policy is better
+    changed: bool  # whether any change explains the answers better than none
+    evidence: float  # log of the product of p(answers | corrected) / p(answers | as it was), each predicted [nats]
+    estimates: tuple[Estimate, ...]
+    depends: float  # typical correction that depends on the situation, in the space's unit; 0: none
+    wrong: float  # share of answers about something else
+    policy: Any  # the corrected policy
+
+    def words(self) -> list[str]:
+        """Describe the result, line by line."""
+        if not self.changed:
+            return ["The answers ask for no change."]
+        lines = [one.words() for one in self.estimates]
+        if self.depends:
+            lines.append(f"beyond that, corrections depend on the situation: {self.depends:.3g} typically")
+        if self.wrong > 0.1:
+            lines.append(f"{self.wrong:.0%} of the answers seem to be about something else")
+        return lines
+
+
+def describe_fit(
+    fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity]
+) -> tuple[tuple[Estimate, ...], float, float]:
+    """Return the estimates that matter, the typical correction that depends on the situation, and the wrong share.
+
+    Args:
+        fitted: one hypothesis.
+        space, family, eps: as for `Reading`; eps in the unit of `space.log`.
+        observation: slices of the observation; empty: entries have numbers alone.
+    """
+    weights = np.asarray(linear.weights_of(fitted.frame, fitted.hypothesis.change), np.float64)
+    root = np.asarray(fitted.posterior.root, np.float64) * np.asarray(fitted.hypothesis.parts.weights)[:, None]
+    x = np.asarray(fitted.data.features, np.float64)
+    valid = np.asarray(fitted.data.answers.valid).any(-1)
+    effect = x[valid].reshape(-1, x.shape[-1])
+    seen = len(fitted.hypothesis.change.theta)
+    names = _names(family, seen, observation)
+    step = np.asarray(fitted.frame.step, np.float64)
+    estimates = _seen(weights[:seen], root[:seen], effect[:, :seen], names, family, step)
+    cues, basis = fitted.hypothesis.change.action.shape
+    own = slice(len(weights) - cues * basis, None)
+    estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
+    hyper = fitted.posterior.hyper
+    priors = posterior.PRIORS
+    inputs = fitted.data.inputs
+    more = np.asarray(posterior.process(fitted.posterior, inputs, inputs, priors))[valid]
+    depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
+    depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
+    wrong = float(posterior.habits(hyper, 1 / SCALE, priors).lapse)
+    return tuple(estimates), depends, wrong
+
+
+def _names(family: Family, count: int, observation: Sequence[Quantity]) -> list[tuple[str, str]]:
+    """Return name and unit of each unknown."""
+    if family:
+        return [(one.name, one.unit) for one in unknowns_of(family)]
+    names = [(f"obs[{number}]", "") for number in range(count)]
+    if len(observation) > 1 and sum(part.size for part in observation) == count:
+        several = lambda part, entry: f"{part.name}[{entry}]" if part.size > 1 else part.name  # noqa: E731
+        names = [(several(part, entry), part.unit) for part in observation for entry in range(part.size)]
+        names = [(name, "" if unit == "1" else unit) for name, unit in names]
+    return names
+
+
+def _seen(
+    mean: Float[Floats, " u"],
+    root: Float[Floats, "u p"],
+    effect: Float[Floats, "n u"],
+    names: list[tuple[str, str]],
+    family: Family,
+    step: Float[Floats, " u"],
+) -> list[Estimate]:
+    """Return changes of what is seen; unknowns of proportional effects are one."""
+    length = np.linalg.norm(effect, axis=0)
+    left = [k for k in np.argsort(-np.abs(mean) * length) if length[k] > 1e-6 and root[k].any()]
+    estimates = []
+    while left:
+        first = left.pop(0)
+        ratio = effect[:, first] @ effect / (length[first] ** 2)
+        alike = [k for k in left if abs(effect[:, first] @ effect[:, k]) > ALIKE * length[first] * length[k]]
+        left = [k for k in left if k not in alike]
+        members = np.array([first, *alike])
+        share = ratio[members]
+        value, deviation = share @ mean[members], float(np.linalg.norm(share @ root[members]))
+        if not _matters(value, deviation, length[first] / math.sqrt(max(len(effect), 1))):
+            continue
+        parts = [("" if not k else " and " if share[k] > 0 else " less ") + names[m][0] for k, m in enumerate(members)]
+        name, unit = "".join(parts), names[first][1]
+        ends = sorted(step[first] * np.array([value - NORMAL * deviation, value + NORMAL * deviation]))
+        estimates.append(
+            Estimate(f"{name} seen aside" if unit != "degrees" else name, unit, step[first] * value, *ends)
+        )
+    return estimates
+
+
+def _matters(value: float, deviation: float, effect: float) -> bool:
+    """Return whether an estimate differs from zero, and changes actions."""
+    return abs(value) > NORMAL * deviation and abs(value) * effect > SMALL / SCALE
+
+
+def _of_action(
+    mean: Float[Floats, " w"], root: Float[Floats, "w p"], effect: Float[Floats, "n w"], space: Space, eps: float
+) -> list[Estimate]:
+    """Return changes of the action: the shift of each cue, and of a box the share of each entry in it."""
+    estimates, basis = [], 1 + space.size
+    typical = np.sqrt((effect**2).mean(0))
+    for place, (value, row) in enumerate(zip(mean, root, strict=True)):
+        cue, term = divmod(place, basis)
+        deviation = float(np.linalg.norm(row))
+        if not _matters(value, deviation, float(typical[place])):
+            continue
+        name, unit = f"action: {space.cues[cue].name}", space.unit
+        factor, start = float(space.to_unit(SCALE * eps, np)), 0.0
+        if term and isinstance(space, Box):
+            factor, unit, start = 2 * SCALE * eps * PER_CENT, "percent", PER_CENT if term - 1 == cue else 0.0
+            name += ": gain" if term - 1 == cue else f": share of {space.cues[term - 1].name}"
+        elif term:
+            name += f", with entry {term} of the action"
+        ends = (start + factor * (value - NORMAL * deviation), start + factor * (value + NORMAL * deviation))
+        estimates.append(Estimate(name, unit, start + factor * value, *ends))
+    return estimates

@@ -1,0 +1,204 @@
+"""What answers about one policy say so far: questions are chosen, answers are read, and a verdict is given.
+
+    reading = Reading(policy, env, eps_deg=2.0, labels=100)
+    reading.learn(obs, actions, answers)    # as often as there are new ones
+    reading.policy(), reading.result()
+
+Before a batch of answers is read, the correction so far and "nothing changed" predict it. The product of the ratios of
+the two is a test martingale: where nothing changed it exceeds 20 with probability 1/20 at most, however often one looks
+(Ville's inequality). From 20 on the correction is used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax import user_code
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import in_space, policy_name, policy_of
+from cuelearner_jax.reading import fitting
+from cuelearner_jax.reading.families import Family
+from cuelearner_jax.reading.fitting import Fit, Reader
+from cuelearner_jax.reading.linear import Labels
+from cuelearner_jax.reading.policy import Read, unread
+from cuelearner_jax.reading.result import Result, describe_fit
+from cuelearner_jax.reading.steps import steps_of
+from cuelearner_jax.spaces import Space
+
+BATCHES = 5  # in which a budget of labels is asked or read
+LEAST_BATCH = 10
+USED = math.log(20)  # log of the test martingale from which a correction is used
+FIRST = 3.0  # spread of the first questions about the policy's actions, in eps
+
+
+class Reading:
+    """The answers about a policy, and what they say.
+
+    Args:
+        policy: a policy, or any function of a batch of observations.
+        family: distortions that may have changed; empty: any entry of the observation may have shifted.
+        space: space of the actions, with cues.
+        eps_deg: strength of an answer, in the space's unit.
+        labels: expected number of labels, for which programs are compiled.
+        observation: slices of the observation, for words.
+
+    Raises:
+        UserError: the space has no cues.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        family: Family,
+        space: Space,
+        eps_deg: float,
+        labels: int,
+        observation: Sequence[Quantity] = (),
+    ) -> None:
+        if not space.cues:
+            raise UserError(f"actions of {space.name} have no order, so no answer says more or less: give them cues")
+        self.base, self.family, self.space = in_space(policy_of(policy), space), family, space
+        self.eps, self.observation = float(space.from_unit(eps_deg)), tuple(observation)
+        self.slots = labels
+        self.rows: Labels | None = None  # all answers so far
+        self.fits: Fit | None = None  # all hypotheses
+        self.fit: Fit | None = None  # the best of them
+        self.evidence = 0.0  # log of the test martingale [nats]
+        self._acts = acts_of(self.base)
+        self._reader: Reader | None = None
+
+    @property
+    def asked(self) -> int:
+        """Number of answers so far."""
+        return 0 if self.rows is None else len(self.rows.obs)
+
+    def questions(
+        self, obs: Float[np.ndarray, "n obs"], count: int, key: PRNGKeyArray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Choose situations and actions to ask about, as wide around the right action as it is unknown.
+
+        Args:
+            obs: situations that the policy meets.
+            count: number of questions.
+            key: key of the choice.
+
+        Returns:
+            Numbers of the situations (count,), and actions (count, action).
+        """
+        k_where, k_action = jax.random.split(key)
+        index = np.asarray(jax.random.choice(k_where, len(obs), (count,), replace=len(obs) < count))
+        rows = jnp.asarray(np.asarray(obs)[index], jnp.float32)
+        if self.fit is None or self._reader is None:
+            base, spread = self._acts(rows), jnp.full((count, len(self.space.cues)), FIRST * self.eps)
+        else:
+            base, spread = self._reader.act(self.fit, rows), self._reader.spread(self.fit, rows)
+        away = jnp.maximum(spread, self.eps / 2) * jax.random.normal(k_action, spread.shape)
+        return index, np.asarray(self.space.exp(base, away))
+
+    def learn(
+        self,
+        obs: Float[np.ndarray, "n obs"],
+        action: Float[np.ndarray, "n action"],
+        answer: Float[np.ndarray, "n cues"],
+    ) -> None:
+        """Read answers -1, 0, 1 or `UNSAID`, after those before were read."""
+        new = [np.asarray(part, np.float32) for part in (obs, action, answer)]
+        if not len(new[0]):
+            return
+        reader = self._reader_of(new[0])
+        if self.fits is not None and self.fit is not None:
+            rows = _padded(new, self._batch(len(new[0])))
+            nothing, best = fitting.pick(self.fits, 0), self.fit
+            ratio = [float(jnp.sum(reader.predict(one, rows)[2])) for one in (best, nothing)]
+            self.evidence += ratio[0] - ratio[1]
+        if self.rows is not None:
+            new = [np.concatenate(both) for both in zip(self.rows[:3], new, strict=True)]
+        self.rows = Labels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]
+        self.slots = max(self.slots, -(-len(new[0]) // self.slots) * self.slots)
+        start = fitting.unfitted(self.space, self.family, new[0].shape[1]) if self.fits is None else None
+        start = fitting.again(self.fits) if start is None and self.fits is not None else start
+        assert start is not None
+        self.fits = reader.read(_padded(new, self.slots), *start)
+        self.fit = fitting.pick(self.fits, int(fitting.best_of(self.fits)))
+
+    def read_in_batches(self, obs: np.ndarray, action: np.ndarray, answer: np.ndarray) -> None:
+        """Read given answers in batches, so that each is predicted before it is read."""
+        size = max(LEAST_BATCH, -(-len(obs) // BATCHES))
+        for start in range(0, len(obs), size):
+            part = slice(start, start + size)
+            self.learn(obs[part], action[part], answer[part])
+
+    def policy(self) -> Read:
+        """Return the policy as corrected so far."""
+        size = sum(part.size for part in self.observation)
+        if self.fit is None:
+            return unread(self.base, self.space, self.family, size)
+        correction = fitting.correction(self.fit, self.eps)
+        return Read(self.base, correction, jnp.float32(jnp.inf), self.space, self.family)
+
+    def result(self) -> Result:
+        """Return the verdict."""
+        if self.fits is None or self.fit is None:
+            return Result(False, False, 0.0, (), 0.0, 0.0, self.policy())
+        number = int(fitting.best_of(self.fits))
+        used = number > 0 and self.evidence >= USED
+        described = describe_fit(self.fit, self.space, self.family, self.eps, self.observation)
+        return Result(used, number > 0, self.evidence, *described, self.policy())
+
+    def act(self, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Return actions of the policy as corrected so far."""
+        return self._acts(obs) if self.fit is None or self._reader is None else self._reader.act(self.fit, obs)
+
+    def _batch(self, count: int) -> int:
+        """Return the number of slots for a batch, so that few programs are compiled."""
+        return max(count, -(-self.slots // BATCHES))
+
+    def _reader_of(self, obs: np.ndarray) -> Reader:
+        if self._reader is None:
+            step = None
+            if self.family:
+                step = steps_of(self.space, self.family, self._acts, jnp.asarray(obs), self.eps)
+            self._reader = Reader(self.space, self.family, self._acts, jnp.float32(self.eps), step)
+        return self._reader
+
+
+def acts_of(policy: Any) -> fitting.Acts:
+    """Return a policy's actions as a function that refuses those that are none. Plain Python is not compiled in."""
+    name = policy_name(policy)
+    run = policy.act if is_python(policy) else partial(_act, policy)
+
+    def acts(obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        actions = run(jax.random.key(0), None, jnp.asarray(obs)) if is_python(policy) else run(obs)
+        actions = jnp.asarray(actions)
+        user_code.check_actions(np.asarray(jnp.isfinite(actions).all()), name)
+        return actions
+
+    return acts
+
+
+def is_python(policy: Any) -> bool:
+    """Return whether plain Python acts. Such a policy may call JAX itself, and would deadlock if compiled in."""
+    while (base := getattr(policy, "base", None)) is not None:
+        policy = base
+    return bool(getattr(policy, "on_host", False))
+
+
+@jax.jit
+def _act(policy: Any, obs: Array) -> Array:
+    return policy.act(jax.random.key(0), None, obs)
+
+
+def _padded(rows: Sequence[np.ndarray], slots: int) -> Labels:
+    """Return rows in `slots` slots, those beyond the last repeating the first row and not valid."""
+    count = len(rows[0])
+    obs, action, answer = (jnp.asarray(np.concatenate([row, np.repeat(row[:1], slots - count, 0)])) for row in rows)
+    return Labels(obs, action, answer, jnp.arange(slots) < count)
