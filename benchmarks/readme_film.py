@@ -130,7 +130,7 @@ def labelled(folder: Path, browser: str, labels: int) -> tuple[list[str], list[S
         TASK,
         POLICY,
         "--guidance",
-        "calibration",
+        "reading",
         "--labels",
         str(labels),
         "--no-practice",
@@ -241,9 +241,7 @@ def film(asked: argparse.Namespace, work: Path) -> None:
     command, shots = labelled(work / "labels", asked.browser, asked.labels)
     commands = [command]
     policy = str(work / "policy")
-    commands.append(
-        ["adapt", POLICY, "--task", TASK, "--guidance", "calibration", "--labels-from", str(work / "labels")]
-    )
+    commands.append(["adapt", POLICY, "--task", TASK, "--guidance", "reading", "--labels-from", str(work / "labels")])
     commands[-1] += ["--labels", str(asked.labels), "--out", policy]
     if main(commands[-1]):
         raise SystemExit("cuelearner adapt failed")

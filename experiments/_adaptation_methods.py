@@ -17,12 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from _finetuning import FineTuning, every
 
-from cuelearner_jax.adaptation import by_calibration as calibration
-from cuelearner_jax.adaptation import by_model
+from cuelearner_jax.adaptation import by_model, by_reading
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import LABELS, Judging, judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, product
-from cuelearner_jax.calibration import UNEXPLAINED, declared_distortions
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.guides import registry as guidances
@@ -32,7 +30,7 @@ from cuelearner_jax.types import Label
 if TYPE_CHECKING:
     from _adaptation import Bench
 
-SHUFFLED = "shuffled"  # a variant of calibration
+SHUFFLED = "shuffled"  # a variant of reading
 UNREWARDED = "unrewarded_"  # columns of the same models where held-out answers judge, in place of episodes
 JUDGED = 500  # environments at most in which it is decided whether a model is used
 Row = dict[str, Any]
@@ -133,25 +131,20 @@ def _kind(name: str) -> Callable[[Bench], Iterator[Row]]:
     return lambda bench: by_labels(guidances.find(bench.piece.settings.get("guidance", name)), bench)
 
 
-def calibrated(bench: Bench) -> Iterator[Row]:
-    """Calibrate by answers, judged on held-out answers. The control `SHUFFLED` uses answers of other rows."""
+def read(bench: Bench) -> Iterator[Row]:
+    """Read answers, which also decide. The control `SHUFFLED` uses answers of other rows."""
     piece, env = bench.piece, bench.env("training")
-    kind, scalars = guidances.find("calibration"), calibration.settling(bench.scalars(), None)
+    kind, scalars = guidances.find("reading"), by_reading.settling(bench.scalars(), None)
     guidance = kind.make(by_model.SIZES, spaces_of(env), None)
     lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (actions_of(env).reach,))
-    of = calibration.Calibrating(guidance, by_model.SIZES, scalars, env, bench.agents, declared_distortions(env))
+    family = declared_distortions(env)
+    of = by_reading.ReadingAdaptation(guidance, by_model.SIZES, scalars, env, bench.agents, family)
     how = Judging(None, by=LABELS)
-    found = calibration.adapt(of, lanes, how, bench.task.make_teacher(bench.world, env))
+    found = by_reading.adapt(of, lanes, how, bench.task.make_teacher(bench.world, env))
     if piece.variant == SHUFFLED:
-        found = calibration.adapt(of, lanes, how, labels=shuffled(found.block.labels))
-    told = {"used": found.judged.used.astype(float), "rewarded_steps": 0.0}
-    unexplained = [result.verdict == UNEXPLAINED for result in found.results]
-    told["unexplained"] = np.array(unexplained, float)
-    for place, estimate in enumerate(found.results[0].estimates):
-        for end in ("mean", "low", "high"):
-            own = [getattr(result.estimates[place], end) for result in found.results]
-            told[f"{estimate.name} {end}"] = np.array(own)
+        found = by_reading.adapt(of, lanes, how, labels=shuffled(found.block.labels))
     which = {"base": bench.seeds[lanes.base], "label_seed": lanes.seed, "labels": lanes.budget}
+    told = {"used": found.judged.used.astype(float), "rewarded_steps": 0.0}
     yield {**which, "steps": 0, **told, **bench.measured(found.policy(bench.env(piece.split)))}
 
 
@@ -174,7 +167,7 @@ METHODS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "teacher": corrected,
     "relative": _kind("relative"),
     "intent": _kind("intent"),
-    "calibration": calibrated,
+    "reading": read,
     "dcoach": coached,
     "residual": by_residuals,
     "finetuning": fine_tuned,

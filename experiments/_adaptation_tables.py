@@ -19,6 +19,7 @@ NAMES = {
     "teacher": "the teacher itself, within the bound",
     "relative": "relative labels",
     "intent": "relative labels, read as intent",
+    "reading": "relative labels, read as intervals",
     "calibration": "relative labels, read as evidence of what changed",
     "residual": "residual, optimal corrections",
     "dcoach": "deep COACH",

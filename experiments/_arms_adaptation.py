@@ -18,7 +18,7 @@ from cuelearner_jax.evaluate import mean_interval
 from cuelearner_jax.guides import registry
 
 CODE = {"reach": "reach", "push": "past", "pick": "pick"}  # names in `cuelearner_envs.arm.scripts`
-EVIDENCE = "calibration"
+EVIDENCE = "reading"
 # World of a table -> skill, scenario, what else; the metric. Where an offset costs nothing no row is.
 CHANGED: dict[str, tuple[str, str, Options, str]] = {
     "reach_turned": ("reach", "turned_camera", {}, "success"),

@@ -271,14 +271,12 @@ def rows_of(about: Row, seeds: Sequence[int], success: Float[np.ndarray, "lanes 
     return [{**about, "seed": seed, "success": round(float(each), 4)} for seed, each in told]
 
 
-def calibrated(
-    opened: Opened, condition: Condition, seeds: Sequence[int], budgets: Sequence[int], count: int
-) -> list[Row]:
-    """Return the rows of calibration of the base; its own evidence decides on a change."""
+def read(opened: Opened, condition: Condition, seeds: Sequence[int], budgets: Sequence[int], count: int) -> list[Row]:
+    """Return the rows of a reading about the base; its own evidence decides on a change."""
     scalars = replace(Scalars(), **{"eps_deg": opened.scalars.eps_deg, **condition.scalars})
     rows: list[Row] = []
     for labels in budgets:
-        how: dict[str, Any] = {"guidance": "calibration", "judge_by": "labels", "labels": labels, "scalars": scalars}
+        how: dict[str, Any] = {"guidance": "reading", "judge_by": "labels", "labels": labels, "scalars": scalars}
         found = [cl.adapt(opened.base, opened.env, opened.teacher, seed=seed, **how).policy for seed in seeds]
         success = np.concatenate([opened.play(Common(policy), count) for policy in found])
         rows += rows_of({"condition": condition.name, "labels": labels}, seeds, success)

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from cuelearner_jax.guides.offset import Offset
 from jaxtyping import Array, Float
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION
 from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.offset import Offset
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.types import Label
 

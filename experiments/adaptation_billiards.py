@@ -21,7 +21,7 @@ from billiards_bootstrapping import SCALES as TRAINING
 BOUNDS_DEG = {"turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3}
 PLAYED = {UNCHANGED: 1.0, **BOUNDS_DEG}
 BUDGETS = (50, 100, 250)
-EVIDENCE = (50, 100)  # of calibration
+EVIDENCE = (50, 100)  # of a reading
 LABEL_SEEDS = 4
 TUNED = (250,)
 BY_LABELS = ("relative", "residual", "dcoach")
@@ -109,8 +109,8 @@ def reported(world: str, bound: float) -> list[Piece]:
         Piece(world, "teacher", minutes=2, settings=best["teacher"], **asked),
         *(Piece(world, method, settings=best[method], **learned) for method in BY_LABELS),
         Piece(world, "relative", "shuffled", settings={**best["relative"], **SHUFFLED}, **learned),
-        Piece(world, "calibration", settings=ASKED, **read),
-        Piece(world, "calibration", "shuffled", settings=ASKED, **read),
+        Piece(world, "reading", settings=ASKED, **read),
+        Piece(world, "reading", "shuffled", settings=ASKED, **read),
         Piece(world, "finetuning", settings=LEARNING, minutes=20, seeds=LABEL_SEEDS, serves=serves, **learns),
     ]
 

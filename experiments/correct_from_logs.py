@@ -95,9 +95,9 @@ def in_rounds(seed: int, guidance: str, folder: Path, control: bool):
     np.savez(folder / "situations.npz", observation=recorded(seed), action=np.clip(off(recorded(seed)), LOW, HIGH))
     task = logs.task_of(folder, low=LOW, high=HIGH)
     scalars = None
-    if control and guidance != "calibration":
+    if control and guidance != "reading":
         scalars = dataclasses.replace(plain_scalars(BOX), answer="shuffled")
-    bound = None if guidance == "calibration" else BOUND
+    bound = None if guidance == "reading" else BOUND
     how: dict[str, Any] = {"labels": LABELS, "guidance": guidance, "judge_by": "labels", "seed": seed}
     return cl.adapt(off, cl.World(task, task.plain()), intended_actions, bound_deg=bound, scalars=scalars, **how)
 
@@ -112,7 +112,7 @@ def correct(guidance: str, questions: str, answers: str, seed: int, folder: Path
             eps = plain_scalars(BOX).eps_deg
             labels = at_random(seed, eps)
             labels = shuffled(labels, seed) if answers == "shuffled" else labels
-            bound = None if guidance == "calibration" else BOUND
+            bound = None if guidance == "reading" else BOUND
             found = cl.correct(off, labels, low=LOW, high=HIGH, eps=eps, guidance=guidance, seed=seed, bound=bound)
     return Row(guidance, questions, answers, seed, error(off, seed), error(found, seed), found.used)
 
@@ -126,10 +126,10 @@ def main(seeds: int = 5, out: Path | None = None) -> list[Row]:
     """
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
-        for guidance in ("relative", "calibration"):
+        for guidance in ("relative", "reading"):
             for questions in ("rounds", "at random"):
                 for answers in ("own", "shuffled"):
-                    if (guidance, questions, answers) == ("calibration", "rounds", "shuffled"):
+                    if (guidance, questions, answers) == ("reading", "rounds", "shuffled"):
                         continue  # calibration asks by what was answered: there is nothing to shuffle beforehand
                     own = [correct(guidance, questions, answers, seed, Path(folder) / "there") for seed in range(seeds)]
                     left = [row.left for row in own]

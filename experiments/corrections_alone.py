@@ -33,10 +33,10 @@ from _corrections import (
     Settings,
     World,
     arm,
-    calibrated,
     grasp,
     halls,
     measure,
+    read,
     without_labels,
 )
 
@@ -61,12 +61,12 @@ WORLDS: Mapping[str, World] = {
 }
 RELATIVE_KINDS = ("relative", "dcoach", "bdcoach", "clic")
 LEARNED = (*RELATIVE_KINDS, "demonstration", "scalar", "clic_shown")
-ADAPTED = ("calibration", "offset", *RELATIVE_KINDS, "demonstration", "scalar")
+ADAPTED = ("reading", *RELATIVE_KINDS, "demonstration", "scalar")
 KINDS: Mapping[str, tuple[str, ...]] = {
     name: ("base", *(ADAPTED if world.adapts else LEARNED)) for name, world in WORLDS.items()
 }
 PIECES = tuple(f"{world}/{kind}" for world, kinds in KINDS.items() for kind in kinds)
-MOST_CALIBRATED = 100  # labels, by one lane after another
+MOST_READ = 100  # labels, by one lane after another
 TUNED_LABELS = {"reach": 250}  # where no kind does anything with 100, the number elsewhere
 
 RATES = {"scalars.feedback_learning_rate": (1e-3, 3e-3)}
@@ -172,10 +172,10 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
             yield without_labels(opened, seeds, scale.episodes)
         return
     conditions = [one for one in CONDITIONS if (one.name,) not in known]
-    if kind == "calibration":
-        for condition in (one for one in conditions if one.name != "shuffled"):  # which calibration refuses
-            budgets = [labels for labels in scale.budgets if labels <= MOST_CALIBRATED]
-            yield calibrated(opened, condition, seeds, budgets, scale.episodes)
+    if kind == "reading":
+        for condition in (one for one in conditions if one.name != "shuffled"):  # which asks by what was answered
+            budgets = [labels for labels in scale.budgets if labels <= MOST_READ]
+            yield read(opened, condition, seeds, budgets, scale.episodes)
         return
     place = WORLDS[world], opened, kind
     if not tuning:
@@ -240,7 +240,7 @@ def chosen(names: Sequence[str], tuning: bool) -> list[str]:
     found = [piece for piece in PIECES if not names or any(f"{piece}/".startswith(f"{name}/") for name in names)]
     if not tuning:
         return found
-    return [one for one in found if not one.endswith(("/base", "/calibration")) and one.split("/")[0] in EPS]
+    return [one for one in found if not one.endswith(("/base", "/reading")) and one.split("/")[0] in EPS]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

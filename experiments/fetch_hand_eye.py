@@ -1,6 +1,6 @@
 """Fetch whose camera stands 3 cm from where the arm believes, corrected by 100 labels of a teacher who sees the truth.
 
-    python experiments/fetch_hand_eye.py --out runs/fetch [--pieces FetchPush-v4/calibration/0] [--resume]
+    python experiments/fetch_hand_eye.py --out runs/fetch [--pieces FetchPush-v4/reading/0] [--resume]
 
 FetchReach and FetchPush of gymnasium_robotics (the extra `gymnasium`), played by scripted policies. A teacher of all
 cues, of the worst one or of one at random answers; no rewarded step is taken: held-out labels judge. Controls: the
@@ -64,7 +64,7 @@ class Condition(NamedTuple):
 
 SCALES = {"smoke": Scale(20, 2), "quick": Scale(50, 20), "paper": Scale(100, 50)}
 CONDITIONS = (*(Condition(says) for says in SAYS), Condition("all", shuffled=True))
-KINDS = ("base", "calibration", "relative", "offset")  # "base": the policy as it was, unchanged and displaced
+KINDS = ("base", "reading", "relative")  # "base": the policy as it was, unchanged and displaced
 SEEDS = range(4)  # of labels, each with its own policy
 PIECES = tuple(f"{environment}/{kind}/{seed}" for environment in SCRIPTS for kind in KINDS for seed in SEEDS)
 
@@ -116,7 +116,7 @@ def _instances(environment: str, offset: tuple[float, ...], count: int) -> list[
 
 def settings(kind: str, says: str, shuffled: bool, space: Any) -> Scalars:
     """Scalars of a kind in the space of Fetch's actions."""
-    if kind == "calibration":
+    if kind == "reading":
         return dataclasses.replace(Scalars(), eps_deg=EPS, says=says)
     answer = "shuffled" if shuffled else "best"
     return dataclasses.replace(plain_scalars(space), eps_deg=EPS, tau_deg=EPS / 20, says=says, answer=answer)
@@ -129,10 +129,10 @@ def adapt(environment: str, kind: str, condition: Condition, labels: int, seed: 
     world, script = world_of(environment), policy_of(jax.jit(SCRIPTS[environment]))
     how: dict[str, Any] = {"guidance": kind, "judge_by": "labels", "seed": seed}
     scalars = settings(kind, condition.says, condition.shuffled, world.actions)
-    if kind != "calibration":
+    if kind != "reading":
         how |= {"sizes": SIZES, "bound_deg": BOUND}
     found = cl.adapt(script, world, onlooker(environment, OFFSET), labels=labels, scalars=scalars, **how)
-    if not condition.shuffled or kind != "calibration":
+    if not condition.shuffled or kind != "reading":
         return found
     given = found.labels
     answer = np.random.default_rng(seed).permutation(np.asarray(given.answer))
@@ -157,8 +157,8 @@ def measure(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Itera
             continue
         policy = adapt(environment, kind, condition, scale.labels, seed)
         told: Row = {"used": policy.used, "judged": [round(value, 4) for value in policy.judged[1:]]}
-        if kind == "calibration":
-            told["estimates"] = [one.words() for one in policy.estimates if one.changed]
+        if kind == "reading":
+            told["estimates"] = [one.words() for one in policy.estimates]
         success = play(environment, policy.policy, OFFSET, episodes)
         row = {"what": kind, "says": condition.says, "shuffled": condition.shuffled, "seed": seed}
         yield {**row, **told, "rewarded_steps": policy.rewarded_steps, "success": success}

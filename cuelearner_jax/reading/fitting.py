@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.reading import linear, posterior
@@ -112,7 +112,8 @@ class Reader:
 
     def read(self, labels: Labels, plain: Hypothesis, smooth: Hypothesis) -> Fit:
         """Return all hypotheses fitted to labels, stacked in the order of `HYPOTHESES`, those with the process last."""
-        frame = self._frame(labels)
+        frame, steady = self._frame(labels)
+        labels = labels._replace(valid=labels.valid & steady)
         first = self._fit(frame, labels, plain)
         best = jnp.argmax(jnp.nan_to_num(first.score, nan=-jnp.inf))
         two = jnp.stack([jnp.zeros_like(best), best])
@@ -124,13 +125,17 @@ class Reader:
     def _ask(self, obs: Float[Array, "*k n obs"]) -> Float[Array, "*k n action"]:
         return self.acts(obs.reshape(-1, obs.shape[-1])).reshape(*obs.shape[:-1], -1)
 
-    def _frame(self, labels: Labels) -> Frame:
-        if self.family:
-            return linear.frame_of(self.family, labels, self.step)
-        frame = linear.frame_of((), labels)
-        change = linear.no_change(self.space, (), labels.obs.shape[-1])
-        actions = self._ask(linear.probes((), frame, change, labels.obs))
-        return linear.frame_of((), labels, None, linear.influence(self.space, frame, labels, actions))
+    def _frame(self, labels: Labels) -> tuple[Frame, Bool[Array, " n"]]:
+        """Return the units of the linear model, and the labels about which the policy answers steadily."""
+        frame = linear.frame_of(self.family, labels, self.step)
+        change = linear.no_change(self.space, self.family, labels.obs.shape[-1])
+        asked = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
+        actions = self._ask(asked)
+        steady = ~linear.jumps(self.space, self.family, frame, change, asked, actions, self.eps).any(-1)
+        if not self.family:
+            mixed = linear.influence(self.space, frame, labels, actions)
+            frame = linear.frame_of((), labels, None, mixed)
+        return frame, steady
 
     def _fit(self, frame: Frame, labels: Labels, hypothesis: Hypothesis) -> Fit:
         """Return stacked hypotheses fitted to labels."""

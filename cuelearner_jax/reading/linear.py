@@ -26,6 +26,7 @@ SCALE = 3.0  # unit of changes of an action, in eps: the size of a usual correct
 STEP = 0.35  # of the central differences of an entry, in its standard deviations
 MIXED = 8  # largest number of entries that may mix
 PARTS = ("seen", "mixed", "shift", "gain")  # groups of weights: of what is seen, and of the action
+JUMP = 4.0  # change of an action, in `SCALE` eps, from which a bend is a jump
 LARGEST = 5.0  # standard deviations at which inputs of the process are cut
 
 
@@ -129,6 +130,35 @@ def probes(family: Family, frame: Frame, change: Change, obs: Float[Array, "n ob
     return jnp.concatenate([obs[None], moved])
 
 
+def jumps(
+    space: Space,
+    family: Family,
+    frame: Frame,
+    change: Change,
+    asked: Float[Array, "k n obs"],
+    actions: Float[Array, "k n action"],
+    eps: Float[Array, ""],
+) -> Bool[Array, "n unknowns"]:
+    """Return where the policy chooses something else, rather than a little more or less, at a side of an unknown.
+
+    A policy that takes the best of far-apart actions does so near ties, where a slope says nothing.
+    """
+    near, far = _sides(space, family, frame, change, asked, actions)
+    largest = jnp.maximum(jnp.abs(near), jnp.abs(far)) / (SCALE * eps)
+    bent = jnp.abs(near + far) > 0.5 * jnp.abs(near - far)
+    return ((largest > JUMP) & bent).any(-1).T
+
+
+def _sides(
+    space: Space, family: Family, frame: Frame, change: Change, asked: Array, actions: Array
+) -> tuple[Float[Array, "u n cues"], Float[Array, "u n cues"]]:
+    """Return the changes from a policy's actions at an estimate to those at both sides of each unknown."""
+    size, steps = len(frame.step), jnp.diag(frame.step)
+    sides = jnp.concatenate([change.theta[None], change.theta - steps, change.theta + steps])
+    whole = jax.vmap(partial(meant, family))(sides, asked[1:], actions[1:])
+    return space.log(whole[0], whole[1 : 1 + size]), space.log(whole[0], whole[1 + size :])
+
+
 def influence(space: Space, frame: Frame, labels: Labels, actions: Float[Array, "k n action"]) -> Int[Array, " mixed"]:
     """Return the entries on which the policy's actions depend most, from its answers to `probes`."""
     size = len(frame.step)
@@ -160,6 +190,7 @@ def data(
     sides = jnp.concatenate([change.theta[None], change.theta - steps, change.theta + steps])
     whole = jax.vmap(partial(meant, family))(sides, asked[1:], actions[1:])
     base, slope = whole[0], jnp.moveaxis(space.log(whole[1 : 1 + size], whole[1 + size :]), 0, -1) / (2 * scale)
+    slope = jnp.where(jumps(space, family, frame, change, asked, actions, eps)[:, None], 0.0, slope)
     x = features(space, frame, slope, labels.obs, base)
     cut = size + len(frame.mixed) ** 2
     offset = space.log(labels.action, base) / scale - x[:, :, :cut] @ weights_of(frame, change)[:cut]

@@ -1,15 +1,12 @@
-"""Calibration by 10 to 100 labels: what answers tell about a changed world, and the policy's gain.
+"""Readings of 10 to 100 labels about changed worlds of billiards and navigation, and the policy's gain.
 
-    python experiments/calibration.py --task billiards --bases RUN
-    python experiments/calibration.py --task navigation --bases docs/data/navigation_agent
-    python experiments/calibration.py --task billiards
+    python experiments/reading.py --task billiards --bases RUN
+    python experiments/reading.py --task navigation --bases docs/data/navigation_agent
+    python experiments/reading.py --task billiards
 
-RUN is the folder of a run of the preset `regulation`; each of its seeds is calibrated. Without it, billiards is played
-by the shipped network, greedily. No rewarded step is spent; the last table compares the policies on episodes that
-nothing was chosen on. Many processes may share the work, and another may compare the policies later:
-
-    python experiments/calibration.py --task billiards --bases RUN --seeds 4 --shard 3 32 --steps 0 --out 3.json
-    python experiments/calibration.py --task billiards --bases RUN --found 1.json 2.json 3.json --out all.json
+RUN is the folder of a run of the preset `regulation`; each of its seeds is corrected. Without it, billiards is played
+by the shipped network, greedily. No rewarded step is spent; the table compares the policies on episodes that nothing
+was chosen on.
 """
 
 from __future__ import annotations
@@ -29,16 +26,14 @@ import numpy as np
 
 from cuelearner_envs.billiards.environment import Balls
 from cuelearner_jax.adaptation.by_model import settling
+from cuelearner_jax.adaptation.by_reading import CHOICE
 from cuelearner_jax.agents.choice import best_near_peaks
-from cuelearner_jax.calibration import Result, calibrate, read_answers
-from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
-from cuelearner_jax.calibration.policy import Calibrated
-from cuelearner_jax.calibration.simulator import simulator_distortion
-from cuelearner_jax.calibration.walk import Walk
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import policy_of
+from cuelearner_jax.reading import Distortion, Reading, Unknown, Walk, declared_distortions, simulator_distortion
+from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.report.statistics import drawn
 from cuelearner_jax.runs.trained import PolicySource, several
 from cuelearner_jax.spaces.directions import evenly_spaced
@@ -133,34 +128,17 @@ def worth(world: World, policy: Any, split: str, steps: int) -> float:
     return float(evaluate_policy(world.shown, policy, episodes(split), ENVS, steps)[name])
 
 
-def to_row(found: Result) -> dict[str, Any]:
-    """A result in plain values; `theta`: the unknowns behind which the policy acts."""
-    estimates = {one.name: [round(number, 5) for number in (one.mean, one.low, one.high)] for one in found.estimates}
-    evidence = {" + ".join(names) or "none": round(value, 2) for names, value in found.evidence.items()}
-    plain = {"verdict": found.verdict, "changes": found.changes, "estimates": estimates, "evidence": evidence}
-    if isinstance(found.policy, Calibrated):
-        plain |= {"theta": np.asarray(found.policy.theta, float).tolist()}
-        plain |= {"family": [one.name for one in found.policy.family]}
-    numbers = {name: getattr(found, name) for name in ("held_out", "confirmed", "refused", "wrong", "apart", "more")}
-    return plain | numbers
-
-
-def found_policy(row: dict[str, Any], base: Any, family: tuple[Distortion, ...]) -> Any:
-    """The policy that a row tells of: the base, or the base behind what was found."""
-    if "theta" not in row:
-        return base
-    own = tuple(one for name in row["family"] for one in family if one.name == name)
-    return Calibrated(base, jnp.asarray(row["theta"], jnp.float32), own)
-
-
-def ready_made(walk: Walk, base: Any, key: Any, labels: int, space: Any, most_deg: float) -> tuple[Any, Any, Any]:
-    """Situations, actions turned at random from the base's by at most so much, and answers: as a file holds them."""
-    k_where, k_turn, k_act, k_answer = jax.random.split(key, 4)
-    states, obs = walk.situations(k_where, base, labels)
-    most = space.from_unit(most_deg)
-    turns = jax.random.uniform(k_turn, (labels, len(space.cues)), minval=-most, maxval=most)
-    actions = jax.vmap(space.exp)(base.act(k_act, states, obs), turns)
-    return obs, actions, walk.answers(k_answer, states, obs, actions)
+def asked(reading: Reading, walk: Walk, seed: int, labels: int) -> None:
+    """Ask so many questions, in batches."""
+    key, size = jax.random.key(seed), max(LEAST_BATCH, -(-labels // BATCHES))
+    for done in range(0, labels, size):
+        key, k_where, k_ask, k_answer = jax.random.split(key, 4)
+        states, obs = walk.situations(k_where, reading.policy(), CHOICE * size)
+        index, action = reading.questions(np.asarray(obs), min(size, labels - done), k_ask)
+        states, obs = jax.tree.map(lambda leaf, index=index: leaf[index], (states, obs))
+        answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
+        there = np.isfinite(answer).any(-1)
+        reading.learn(np.asarray(obs)[there], action[there], answer[there])
 
 
 class Study(NamedTuple):
@@ -187,53 +165,42 @@ class Study(NamedTuple):
         self.made[name] = world, family_of(self.task, self.own, world, name == "tilted_table")
         return self.made[name]
 
-    def calibrated(self, name: str, base: int, seed: int, labels: int) -> dict[str, Any]:
-        """A row: what so many answers tell of a world."""
+    def row(self, name: str, base: int, seed: int, labels: int) -> dict[str, Any]:
+        """Return what so many answers tell of a world, and what the corrected policy earns there."""
         world, family = self.world(name)
-        start, used, walk = time.time(), time.process_time(), Walk(world.env, world.teacher, world.scalars)
-        key = jax.random.fold_in(jax.random.key(seed), labels)
-        space, how = actions_of(world.env), {"eps_deg": float(world.scalars.eps_deg)}
-        if self.asked.ready_made_deg:
-            told = ready_made(walk, self.bases[base], key, labels, space, self.asked.ready_made_deg)
-            found = read_answers(self.bases[base], family, *told, space=space, seed=seed, **how)
-        else:
-            situations, answers = walk.situations, walk.answers
-            found = calibrate(self.bases[base], family, situations, answers, labels, key, space=space, **how)
-        row = {"world": name, "base": base, "labels": labels, "seed": seed, **to_row(found)}
-        row["eps_deg"] = float(world.scalars.eps_deg)
-        row["seconds"] = round(time.time() - start, 1)
-        return {**row, "cpu_seconds": round(time.process_time() - used, 1)}
+        start, walk = time.time(), Walk(world.env, world.teacher, world.scalars)
+        policy, eps = self.bases[base], float(world.scalars.eps_deg)
+        reading = Reading(policy, family, actions_of(world.env), eps, labels, world.env.observation)
+        asked(reading, walk, seed * 1000 + labels, labels)
+        found = reading.result()
+        seconds, better = round(time.time() - start, 1), found.policy if found.used else policy
+        estimates = {
+            one.name: [round(number, 5) for number in (one.mean, one.low, one.high)] for one in found.estimates
+        }
+        return {
+            "world": name, "base": base, "labels": labels, "seed": seed, "eps_deg": eps, "seconds": seconds,
+            "used": found.used, "evidence": round(found.evidence, 2), "estimates": estimates,
+            "depends": found.depends, "wrong": round(found.wrong, 3),
+            "corrected": worth(world, found.policy, self.asked.split, self.asked.steps),
+            "worth": worth(world, better, self.asked.split, self.asked.steps),
+        }  # fmt: skip
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """A row for each world, base, seed and number of labels of this process's share."""
+        """Yield a row for each world and base as it is, then for each seed and number of labels."""
         number, of = self.asked.shard
         seeds = range(self.asked.first_seed, self.asked.first_seed + self.asked.seeds)
         each = list(product(self.bases, seeds))[number - 1 :: of]
         for name in self.worlds:
+            for base in dict.fromkeys(base for base, _ in each):
+                earned = worth(self.world(name)[0], self.bases[base], self.asked.split, self.asked.steps)
+                yield {"world": name, "base": base, "labels": 0, "worth": earned}
             for base, seed in each:
-                yield from (self.calibrated(name, base, seed, labels) for labels in self.asked.labels)
+                yield from (self.row(name, base, seed, labels) for labels in self.asked.labels)
 
     @property
     def worlds(self) -> Sequence[str]:
         """Return the worlds that the command line asks for."""
         return self.asked.worlds or WORLDS[self.task.name]
-
-    def compared(self, rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-        """The rows with the worth of their policies, and of the bases as they are."""
-        for name in dict.fromkeys(row["world"] for row in rows):
-            world, family = self.world(name)
-            own = [row for row in rows if row["world"] == name]
-            plain = [{"world": name, "base": base, "labels": 0} for base in dict.fromkeys(row["base"] for row in own)]
-            unadapted = {}
-            for row in [*plain, *own]:
-                base = row["base"]
-                if row["labels"] and "theta" not in row:
-                    yield {**row, "worth": unadapted[base]}  # the policy as it was
-                    continue
-                policy = found_policy(row, self.bases[base], family)
-                earned = worth(world, policy, self.asked.split, self.asked.steps)
-                unadapted.setdefault(base, earned)
-                yield {**row, "worth": earned}
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -248,38 +215,30 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--eps-deg", type=float, default=0.0, help="strength of an answer (default: the scenario's)")
     parser.add_argument("--mistakes", type=float, default=0.0, help="that an answer is reversed; 0.5: a control")
     parser.add_argument("--bias-deg", type=float, default=0.0, help="of everything that the teacher means")
-    parser.add_argument("--ready-made-deg", type=float, default=0.0, help="questions turned by as much, as in a file")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--shard", type=int, nargs=2, default=(1, 1), metavar=("K", "N"), help="the K-th of N shares")
-    parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation; 0: none")
+    parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation")
     parser.add_argument("--split", choices=("tuning", "validation"), default="tuning", help="of its episodes")
-    parser.add_argument("--found", type=Path, nargs="+", default=[], help="compare the policies of these files")
     parser.add_argument("--out", type=Path, help="write all rows to this JSON file")
     return parser
 
 
 def main() -> None:
-    """Calibrate each base in each world with each number of labels; prints a line each, then the table."""
+    """Correct each base in each world with each number of labels; prints a line each, then the table."""
     parser = arguments()
-    asked = parser.parse_args()
-    number, of = asked.shard
+    given = parser.parse_args()
+    number, of = given.shard
     if not 1 <= number <= of:
         parser.error(f"--shard {number} {of}: give the number of a share, from 1 on, and how many there are")
-    if missing := [file for file in asked.found if not file.is_file()]:
-        parser.error(f"--found {missing[0]}: there is no such file")
-    task = registry.find(asked.task)
-    own, scalars, bases = bases_of(task, asked.bases)
-    study = Study(task, own, scalars, dict(list(bases.items())[: asked.most_bases]), asked, {})
-    found = [
-        row for file in asked.found for row in json.loads(file.read_text())["rows"] if row["world"] in study.worlds
-    ]
+    task = registry.find(given.task)
+    own, scalars, bases = bases_of(task, given.bases)
+    study = Study(task, own, scalars, dict(list(bases.items())[: given.most_bases]), given, {})
     rows: list[dict[str, Any]] = []
-    calibrated = found if asked.found else study.rows()
-    for row in study.compared(list(calibrated)) if asked.steps else calibrated:
+    for row in study.rows():
         rows.append(row)
         print(json.dumps(row), flush=True)
-        if asked.out:
-            asked.out.write_text(json.dumps({**provenance(), "task": asked.task, "rows": rows}, indent=1) + "\n")
+        if given.out:
+            given.out.write_text(json.dumps({**provenance(), "task": given.task, "rows": rows}, indent=1) + "\n")
     table(rows)
 
 
@@ -298,14 +257,11 @@ def mean_worth(rows: list[dict[str, Any]]) -> str:
 
 
 def table(rows: list[dict[str, Any]]) -> None:
-    """Print the mean worth, and how often each verdict was found, by world and number of labels."""
+    """Print the mean worth and how many corrections are used, by world and number of labels."""
     for world, labels in dict.fromkeys((row["world"], row["labels"]) for row in rows):
         own = [row for row in rows if (row["world"], row["labels"]) == (world, labels)]
-        played = [row for row in own if "worth" in row]
-        shown = mean_worth(played) if played else "-"
-        found = [" + ".join(row["changes"]) or row["verdict"] for row in own if "verdict" in row]
-        counts = ", ".join(f"{found.count(one)} x {one}" for one in dict.fromkeys(found))
-        print(f"{world:<16}{labels:>4} labels  {shown}  {counts}")
+        used = sum(row.get("used", False) for row in own)
+        print(f"{world:<20}{labels:>4} labels  {mean_worth(own)}  {used} of {len(own)} used")
 
 
 if __name__ == "__main__":
