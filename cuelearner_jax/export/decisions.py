@@ -126,7 +126,7 @@ def golden_cases(
     steady = apart <= TOLERANCE  # never where an action is not finite
     with np.errstate(all="ignore"):
         for place in range(len(drawn), len(obs)):  # zero is no direction
-            steady[place] &= actions[place].any() and is_steady(traced, obs[place])
+            steady[place] &= traced is not None and actions[place].any() and is_steady(traced, obs[place])
     count, extreme = int(steady[: len(drawn)].sum()), int(steady[len(drawn) :].sum())
     if not count:
         raise UserError(
