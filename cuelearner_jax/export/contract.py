@@ -2,7 +2,7 @@
 
 contract.json    inputs and outputs with units; versions; digests of the other files and of the contract itself
 decision.*       the decision
-golden.npz       observations (cases, obs) and the actions (cases, action) that JAX computed for them
+golden.npz       observations (cases, obs), the last ones extreme, and JAX's actions for them (cases, action)
 decide.py        runs the decision: `runner`, with `operations` in place of their import
 """
 
@@ -72,8 +72,9 @@ def write(
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
         base = getattr(env, "base_size", 0)  # only for a correction alone
         sizes = env.obs_size, actions_of(env).size, base
-        artefact = FORMATS[format].make(policy, trace_policy(policy, env.obs_size), *sizes)
-        golden, cases = golden_cases(policy, drawn()), io.BytesIO()
+        traced = trace_policy(policy, env.obs_size)
+        artefact = FORMATS[format].make(policy, traced, *sizes)
+        golden, cases = golden_cases(policy, drawn(), traced=traced), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {artefact.file: artefact.contents, runner.GOLDEN: cases.getvalue(), "decide.py": decide_source()}
         contract = {
@@ -86,7 +87,7 @@ def write(
             "policy": describe(policy),
             "source": source,
             "golden": {"cases": len(golden.obs), "tolerance": TOLERANCE}
-            | {"drawn": golden.drawn, "steady": golden.steady},
+            | {"drawn": golden.drawn, "steady": golden.steady, "extreme": golden.extreme},
             "files": {name: hashlib.sha256(contents).hexdigest() for name, contents in files.items()},
             **provenance(),
         }

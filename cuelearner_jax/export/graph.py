@@ -20,7 +20,14 @@ from jax.extend import core
 
 from cuelearner_jax.tracing import written_out
 
-KINDS = {"float32": "float32", "int32": "int32", "uint32": "int32", "bool": "bool", "bfloat16": "float32"}
+KINDS = {"float32": "float32", "int32": "int32", "bool": "bool", "bfloat16": "float32"}
+
+
+def kind_of(dtype: Any) -> str:
+    """Return how a graph holds numbers of a type. Raises NotImplementedError for a type that no graph holds."""
+    if str(dtype) not in KINDS:
+        raise NotImplementedError(f"numbers of type {dtype}")
+    return KINDS[str(dtype)]
 
 
 class Value(NamedTuple):
@@ -28,7 +35,7 @@ class Value(NamedTuple):
 
     name: str
     shape: tuple[int, ...]
-    kind: str  # float32, int32 or bool
+    kind: str  # float32, int32 or bool; of a missing operation's output also another type
 
 
 Known = Value | np.ndarray | jax.Array  # a run-time value, or one that is known already
@@ -52,8 +59,9 @@ class Traced(NamedTuple):
 
     graph: Graph
     constants: dict[str, np.ndarray]
-    missing: tuple[str, ...]  # required JAX operations without a rule
+    missing: tuple[str, ...]  # required JAX operations without a rule, or what their rule does not support
     random: bool  # whether the function depends on the key
+    kinds: dict[str, str]  # of values and constants, by name
 
 
 Rule = Callable[["Builder", Any, list[Any]], list[Known]]  # (builder, equation, its inputs) -> its outputs
@@ -71,7 +79,8 @@ def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
     ops, needed = _needed(builder.ops, {builder.name(result)})
     constants = {name: array for name, array in builder.constants.items() if name in needed}
     missing = tuple(sorted({name.removeprefix("missing:") for name in _names(ops) if name.startswith("missing:")}))
-    return Traced(Graph(["obs"], [builder.name(result)], ops), constants, missing, "key" in needed)
+    graph = Graph(["obs"], [builder.name(result)], ops)
+    return Traced(graph, constants, missing, "key" in needed, {"obs": "float32", **builder.kinds})
 
 
 def _needed(ops: list[list[Any]], wanted: set[str]) -> tuple[list[list[Any]], set[str]]:
@@ -105,6 +114,7 @@ class Builder:
         """Start with an empty graph."""
         self.ops: list[list[Any]] = []
         self.constants: dict[str, np.ndarray] = {}
+        self.kinds: dict[str, str] = {}
         self._done_before: dict[str, Value] = {}  # results by operation and inputs
         self._narrow: dict[str, Value] = {}  # by the name of a broadcast value: the value before broadcasting
         self._named: dict[int, tuple[Any, str]] = {}  # by identity; keeping the array reserves its identity
@@ -129,13 +139,15 @@ class Builder:
             return _computed(equation, given, origin)
         if (inner := _called(equation)) is not None:
             return self.inlined(inner.jaxpr, inner.consts, given)
-        drawn = any(isinstance(value, Value) and value.kind == "key" for value in given)
-        if name not in RULES or drawn:
-            return self._missing(equation, given)
+        if name not in RULES:
+            return self._missing(name, equation, given)
         try:
+            for value in given:
+                if isinstance(value, Value):
+                    kind_of(value.kind)
             found = RULES[name](self, equation, given)
-        except NotImplementedError:
-            return self._missing(equation, given)
+        except NotImplementedError as error:
+            return self._missing(str(error), equation, given)
         return [
             self.add("bfloat16", [value], value.shape, value.kind)
             if name in ROUNDED and isinstance(value, Value) and str(var.aval.dtype) == "bfloat16"
@@ -143,16 +155,19 @@ class Builder:
             for value, var in zip(found, equation.outvars, strict=True)
         ]
 
-    def _missing(self, equation: Any, given: list[Known]) -> list[Known]:
-        """Add a placeholder for an operation without a rule, which may turn out not to be needed."""
-        outputs = [self.new(var.aval.shape, KINDS.get(str(var.aval.dtype), "key")) for var in equation.outvars]
+    def _missing(self, what: str, equation: Any, given: list[Known]) -> list[Known]:
+        """Add a placeholder for what no rule supports, which may turn out not to be needed."""
+        dtypes = [str(var.aval.dtype) for var in equation.outvars]
+        outputs = [self.new(v.aval.shape, KINDS.get(d, d)) for v, d in zip(equation.outvars, dtypes, strict=True)]
         known = [value.name for value in given if isinstance(value, Value)]
-        self.ops.append([f"missing:{equation.primitive.name}", known, [value.name for value in outputs], {}])
+        self.ops.append([f"missing:{what}", known, [value.name for value in outputs], {}])
         return list(outputs)
 
     def new(self, shape: tuple[int, ...], kind: str) -> Value:
         """Return a value with a new name."""
-        return Value(f"v{next(self._numbers)}", tuple(shape), kind)
+        value = Value(f"v{next(self._numbers)}", tuple(shape), kind)
+        self.kinds[value.name] = kind
+        return value
 
     def add(self, op: str, inputs: list[Known], shape: tuple[int, ...], kind: str, /, **attributes: Any) -> Value:
         """Add an operation with one output, or reuse an equal earlier one."""
@@ -178,9 +193,8 @@ class Builder:
         if isinstance(value, Value):
             return value.name
         if id(value) not in self._named:
-            name = f"c{len(self._named)}"
-            array = np.asarray(value)
-            self.constants[name] = array.astype(KINDS[str(array.dtype)])
+            kind, name = kind_of(value.dtype), f"c{len(self._named)}"
+            self.constants[name], self.kinds[name] = np.asarray(value).astype(kind), kind
             self._named[id(value)] = (value, name)
         return self._named[id(value)][1]
 
@@ -256,4 +270,5 @@ WIDENING = {
 ROUNDED = {
     *("add", "sub", "mul", "div", "dot_general", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan"),
     *("atan2", "sqrt", "rsqrt", "square", "logistic", "pow", "integer_pow", "reduce_sum", "convert_element_type"),
+    *("cumsum", "reduce_prod"),
 }

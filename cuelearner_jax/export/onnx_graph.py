@@ -31,7 +31,7 @@ def serialize(traced: Traced, obs_size: int, action_size: int, base_size: int = 
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
         raise UserError("--format onnx needs the extra: pip install 'cuelearner-jax[onnx]'") from None
-    writer = _Writer(helper, TensorProto)
+    writer = _Writer(helper, TensorProto, traced.kinds)
     (result,) = traced.graph.outputs
     nodes = writer.nodes(traced.graph.ops, {"obs": "row"}, "")
     nodes.append(helper.make_node("Identity", [writer.names.get(result, result)], ["decided"]))
@@ -61,8 +61,9 @@ def serialize(traced: Traced, obs_size: int, action_size: int, base_size: int = 
 class _Writer:
     """Converts operations to nodes. Names are unique in the whole model, since inner graphs see outer names."""
 
-    def __init__(self, helper: Any, types: Any) -> None:
-        self.helper = helper
+    def __init__(self, helper: Any, types: Any, kinds: dict[str, str]) -> None:
+        self.helper, self._kinds = helper, kinds
+        self.kind = ""  # of the present operation's first input
         self.kinds = {"float32": types.FLOAT, "int32": types.INT32, "bool": types.BOOL}
         self.bfloat16, self.counter = types.BFLOAT16, types.INT64
         self.constants: dict[str, np.ndarray] = {}
@@ -78,14 +79,11 @@ class _Writer:
             given: Any = [self.names.get(name, name) for name in inputs]
             self.names.update({name: name + suffix for name in outputs})
             results = [self.names[name] for name in outputs]
+            self.kind = self._kinds[inputs[0]]
             if op == "while":
                 self._loop(given, results, **attributes)
             elif op == "top_k":
-                k = self.constant(np.array([attributes["k"]], np.int64))
-                self._made.append(
-                    self.helper.make_node("TopK", [given[0], k], [results[0], f"{results[1]}_64"], axis=-1)
-                )
-                self._named("Cast", [f"{results[1]}_64"], results[1], to=self.kinds["int32"])
+                self._highest(given[0], results, **attributes)
             else:
                 last = NODES[op](self, *given, **attributes)
                 self._named("Identity", [last], results[0])
@@ -122,6 +120,27 @@ class _Writer:
         """Cast a value to another type."""
         return self.node("Cast", value, to=self.kinds[kind])
 
+    def _top(self, x: str, k: str) -> tuple[str, str]:
+        """Return the largest entries along the last axis, and their places as integers of 64 bits."""
+        names = [f"n{next(self._numbers)}" for _ in range(2)]
+        self._made.append(self.helper.make_node("TopK", [x, k], names, axis=-1))
+        return names[0], names[1]
+
+    def _highest(self, x: str, results: list[str], k: int) -> None:
+        """Find the k largest entries; -0 comes after 0, as for XLA, which ONNX takes for equal."""
+        if self.kind == "float32":
+            zero = self.node("Equal", x, self.number(0.0))
+            below = self.node("And", zero, self.node("Less", self.node("Reciprocal", x), self.number(0.0)))
+            size = self.node("Slice", self.node("Shape", x), self.whole([-1]), self.whole([1 << 30]))
+            order = self._top(self.node("Neg", self.cast(below, "float32")), size)[1]
+            x = self.node("GatherElements", x, order, axis=-1)
+            largest, places = self._top(x, self.whole([k]))
+            places = self.node("GatherElements", order, places, axis=-1)
+        else:
+            largest, places = self._top(x, self.whole([k]))
+        self._named("Identity", [largest], results[0])
+        self._named("Cast", [places], results[1], to=self.kinds["int32"])
+
     def _loop(self, given: list[str], results: list[str], carried: list[str], kinds: Any, test: Any, body: Any) -> None:
         """Convert a loop: ONNX reads the condition at the end of a pass, this graph at its beginning."""
         first = self.nodes(test["ops"], dict(zip(carried, given, strict=True)), f"_t{next(self._numbers)}")
@@ -151,8 +170,23 @@ def _plain(kind: str, **fixed: Any) -> Callable[..., str]:
     return lambda w, *inputs: w.node(kind, *inputs, **fixed)
 
 
-def _reduced(kind: str) -> Callable[..., str]:
-    return lambda w, x, axes: w.node(kind, x, w.whole(axes), keepdims=0)
+def _sum(w: _Writer, x: str, axes: list[int]) -> str:
+    """Sum; integers with 64 bits, as onnxruntime does not let those of 32 bits wrap."""
+    if w.kind != "int32":
+        return w.node("ReduceSum", x, w.whole(axes), keepdims=0)
+    return w.cast(w.node("ReduceSum", w.node("Cast", x, to=w.counter), w.whole(axes), keepdims=0), "int32")
+
+
+def _extreme(kind: str) -> Callable[..., str]:
+    """Reduce to the largest or smallest entry, or to NaN if one is NaN, which ONNX leaves open."""
+
+    def extreme(w: _Writer, x: str, axes: list[int]) -> str:
+        found = w.node(kind, x, w.whole(axes), keepdims=0)
+        if w.kind != "float32":
+            return found
+        return w.node("Where", _of_bools("ReduceMax")(w, w.node("IsNaN", x), axes), w.number(math.nan), found)
+
+    return extreme
 
 
 def _of_bools(kind: str) -> Callable[..., str]:
@@ -160,18 +194,53 @@ def _of_bools(kind: str) -> Callable[..., str]:
 
 
 def _argument(kind: str) -> Callable[..., str]:
-    return lambda w, x, axis: w.cast(w.node(kind, x, axis=axis, keepdims=0), "int32")
+    """Find the place of the largest or smallest entry, or of the first NaN."""
+
+    def argument(w: _Writer, x: str, axis: int) -> str:
+        found = w.node(kind, x, axis=axis, keepdims=0)
+        if w.kind == "float32":
+            odd = w.node("IsNaN", x)
+            first = w.node("ArgMax", w.cast(odd, "int32"), axis=axis, keepdims=0)
+            found = w.node("Where", _of_bools("ReduceMax")(w, odd, [axis]), first, found)
+        return w.cast(found, "int32")
+
+    return argument
+
+
+def _log1p(w: _Writer, x: str) -> str:
+    """Compute log(1 + x), of small numbers by atanh, which keeps their digits."""
+    ratio = w.node("Div", x, w.node("Add", x, w.number(2.0)))
+    small = w.node("Less", w.node("Abs", x), w.number(0.5))
+    near = w.node("Mul", w.node("Atanh", w.node("Where", small, ratio, w.number(0.0))), w.number(2.0))
+    return w.node("Where", small, near, w.node("Log", w.node("Add", x, w.number(1.0))))
+
+
+def _expm1(w: _Writer, x: str) -> str:
+    """Compute exp(x) - 1 as tanh(x / 2) (exp(x) + 1), which keeps the digits of small numbers."""
+    half = w.node("Tanh", w.node("Mul", x, w.number(0.5)))
+    return w.node("Mul", half, w.node("Add", w.node("Exp", x), w.number(1.0)))
+
+
+def _logistic(w: _Writer, x: str) -> str:
+    """Compute 1 / (1 + exp(-x)): the Sigmoid of onnxruntime is 0 from -18 on."""
+    return w.node("Reciprocal", w.node("Add", w.node("Exp", w.node("Neg", x)), w.number(1.0)))
 
 
 def _atan2(w: _Writer, y: str, x: str) -> str:
     """Compute atan2 from atan, which ONNX has; exact to a few units in the last place."""
     zero = w.number(0.0)
+    both = w.node("And", w.node("IsInf", x), w.node("IsInf", y))  # where only signs count
+    x, y = (w.node("Where", both, w.node("Sign", one), one) for one in (x, y))
+    left, down = (  # the reciprocal tells -0 from 0
+        w.node("Or", w.node("Less", one, zero), w.node("Less", w.node("Reciprocal", one), zero)) for one in (x, y)
+    )
     steep = w.node("Equal", x, zero)
     slope = w.node("Atan", w.node("Div", y, w.node("Where", steep, w.number(1.0), x)))
-    up = w.node("Less", y, zero)
-    turned = w.node("Add", slope, w.node("Where", up, w.number(-math.pi), w.number(math.pi)))
-    straight = w.node("Mul", w.node("Sign", y), w.number(math.pi / 2))
-    return w.node("Where", steep, straight, w.node("Where", w.node("Less", x, zero), turned, slope))
+    half = w.node("Where", down, w.number(-math.pi), w.number(math.pi))
+    turned = w.node("Where", left, w.node("Add", slope, half), slope)
+    level = w.node("Where", left, half, y)
+    straight = w.node("Where", w.node("Equal", y, zero), level, w.node("Mul", w.node("Sign", y), w.number(math.pi / 2)))
+    return w.node("Where", steep, straight, turned)
 
 
 def _finite(w: _Writer, x: str) -> str:
@@ -191,11 +260,11 @@ NODES: dict[str, Callable[..., str]] = {
     **{name.lower(): _plain(name) for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin")},
     **{name.lower(): _plain(name) for name in ("Cos", "Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul")},
     **{name.lower(): _plain(name) for name in ("Div", "Pow", "Max", "Min", "And", "Or", "Xor")},
-    "log1p": lambda w, x: w.node("Log", w.node("Add", x, w.number(1.0))),
-    "expm1": lambda w, x: w.node("Sub", w.node("Exp", x), w.number(1.0)),
+    "log1p": _log1p,
+    "expm1": _expm1,
     "rsqrt": lambda w, x: w.node("Reciprocal", w.node("Sqrt", x)),
     "square": lambda w, x: w.node("Mul", x, x),
-    "logistic": _plain("Sigmoid"),
+    "logistic": _logistic,
     "is_finite": _finite,
     "bfloat16": lambda w, x: w.node("Cast", w.node("Cast", x, to=w.bfloat16), to=w.kinds["float32"]),
     "rem": _plain("Mod", fmod=1),
@@ -216,10 +285,10 @@ NODES: dict[str, Callable[..., str]] = {
     "pad": _padded,
     "take": lambda w, x, places: w.node("Gather", x, places, axis=0),
     "matmul": _plain("MatMul"),
-    "sum": _reduced("ReduceSum"),
-    "prod": _reduced("ReduceProd"),
-    "largest": _reduced("ReduceMax"),
-    "smallest": _reduced("ReduceMin"),
+    "sum": _sum,
+    "prod": lambda w, x, axes: w.node("ReduceProd", x, w.whole(axes), keepdims=0),
+    "largest": _extreme("ReduceMax"),
+    "smallest": _extreme("ReduceMin"),
     "all": _of_bools("ReduceMin"),
     "any": _of_bools("ReduceMax"),
     "argmax": _argument("ArgMax"),

@@ -147,10 +147,18 @@ def _highest(given: str, largest: str, places: str, k: int) -> Run:
 
     def run(values: Values) -> None:
         x = values[given]
-        order = np.argsort(-x, axis=-1, kind="stable")[..., :k].astype(np.int32)
+        order = np.argsort(~_ordinal(x), axis=-1, kind="stable")[..., :k].astype(np.int32)
         values[largest], values[places] = np.take_along_axis(x, order, -1), order
 
     return run
+
+
+def _ordinal(x: np.ndarray) -> np.ndarray:
+    """Return integers in the order that XLA sorts numbers in: -0 before 0, and NaN last."""
+    if x.dtype.kind == "i":
+        return x
+    bits = np.ascontiguousarray(x).view(np.int32)
+    return np.where(np.isnan(x), LAST, bits ^ ((bits >> 31) & LAST))
 
 
 def _rounded(x: np.ndarray) -> np.ndarray:
@@ -171,7 +179,7 @@ def _layer(
         x = np.maximum(one + other, floor).reshape(*weights.shape[:-2], -1, weights.shape[-2])
         return np.matmul(x, weights, out=out)
     rows, row = rows.reshape(-1, width), row.reshape(width)
-    on = np.flatnonzero(rows.max(axis=0) + row > 0)
+    on = np.flatnonzero(~(rows.max(axis=0) + row <= 0))  # NaN counts as on
     x = rows[:, on]
     x += row[on]
     return np.matmul(np.maximum(x, 0, out=x), weights[on], out=out)
@@ -211,6 +219,7 @@ def _quotient(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 ONE = np.float32(1)
 LARGE = 32  # rows
+LAST = np.int32(2**31 - 1)
 
 # For float32, int32 or bool arrays of fixed shapes. Elementwise ones take equal or broadcastable shapes.
 OPERATIONS: dict[str, Callable[..., Any]] = {

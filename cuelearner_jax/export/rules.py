@@ -1,111 +1,33 @@
 """Rules that express each JAX operation by those of `operations.OPERATIONS`: one rule per primitive, by name.
 
 A rule returns one value from (builder, the primitive's parameters, its inputs, shape and type of the output). A rule
-of a primitive with several outputs, or with inner functions, takes the equation.
+of a primitive with several outputs, or with inner functions, takes the equation. Rules of numbers are in `arithmetic`.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import GatherScatterMode, RoundingMethod
+from jax.lax import GatherScatterMode
 
-from cuelearner_jax.export.graph import KINDS, RULES, Builder, Known, Rule, Value
+from cuelearner_jax.export.arithmetic import Shape, chosen, kind_in, one, output, said_by, select, several
+from cuelearner_jax.export.graph import RULES, Builder, Known, Value
 
-SAME = ("neg", "abs", "sign", "floor", "ceil", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan")
-SAME += ("sqrt", "rsqrt", "square", "logistic", "is_finite", "add", "sub", "mul", "div", "rem", "pow", "atan2")
-SAME += ("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor", "not")
-REDUCTIONS = {"sum": "sum", "prod": "prod", "max": "largest", "min": "smallest", "and": "all", "or": "any"}
+__all__ = ["RULES"]
 MOST_UNROLLED = 64  # passes of a scan
 
-Shape = tuple[int, ...]
-Single = Callable[[Builder, dict[str, Any], list[Known], Shape, str], Known]
+one("concatenate")(said_by("concatenate", axis=lambda params: int(params["dimension"])))
+one("copy", "copy_p", "stop_gradient")(lambda b, params, given, shape, kind: given[0])
+several("optimization_barrier")(lambda builder, equation, given: given)
+one("reshape", "squeeze", "expand_dims")(lambda b, params, given, shape, kind: b.reshaped(given[0], shape))
+one("transpose")(lambda b, params, given, shape, kind: b.transposed(given[0], params["permutation"]))
 
 
-def _out(equation: Any, place: int = 0) -> tuple[Shape, str]:
-    aval = equation.outvars[place].aval
-    return tuple(aval.shape), KINDS[str(aval.dtype)]
-
-
-def _one(*names: str) -> Callable[[Single], Single]:
-    """Register a function for primitives with one output."""
-
-    def register(single: Single) -> Single:
-        def rule(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
-            return [single(builder, equation.params, given, *_out(equation))]
-
-        RULES.update(dict.fromkeys(names, rule))
-        return single
-
-    return register
-
-
-def _several(name: str) -> Callable[[Rule], Rule]:
-    """Register the rule of a primitive with several outputs."""
-    return lambda rule: RULES.setdefault(name, rule)
-
-
-def _said_by(op: str, of_bools: str = "", **attributes: Callable[[Any], Any]) -> Single:
-    """Return a rule for one operation (another one for booleans); attributes are functions of the parameters."""
-
-    def single(builder: Builder, params: dict[str, Any], given: list[Known], shape: Shape, kind: str) -> Known:
-        own = {name: told(params) for name, told in attributes.items()}
-        return builder.add(of_bools if of_bools and kind == "bool" else op, given, shape, kind, **own)
-
-    return single
-
-
-for _name in SAME:
-    _one(_name)(_said_by(_name))
-for _name in ("argmax", "argmin"):
-    _one(_name)(_said_by(_name, axis=lambda params: int(params["axes"][0])))
-for _name, _op in REDUCTIONS.items():
-    _one(f"reduce_{_name}")(_said_by(_op, axes=lambda params: list(map(int, params["axes"]))))
-_one("max")(_said_by("max", of_bools="or"))
-_one("min")(_said_by("min", of_bools="and"))
-_one("concatenate")(_said_by("concatenate", axis=lambda params: int(params["dimension"])))
-_one("copy", "copy_p", "optimization_barrier", "stop_gradient")(lambda b, params, given, shape, kind: given[0])
-_one("reshape", "squeeze", "expand_dims")(lambda b, params, given, shape, kind: b.reshaped(given[0], shape))
-_one("transpose")(lambda b, params, given, shape, kind: b.transposed(given[0], params["permutation"]))
-_one("select_n")(lambda b, params, given, shape, kind: _chosen(b, given[0], given[1:], shape, kind))
-
-
-@_one("convert_element_type")
-def _cast(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    (value,) = given
-    assert isinstance(value, Value)
-    return value if value.kind == kind else builder.add("cast", [value], shape, kind, dtype=kind)
-
-
-@_one("integer_pow")
-def _integer_pow(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    return builder.add("pow", [given[0], np.asarray(params["y"], kind)], shape, kind)
-
-
-def _chosen(builder: Builder, which: Known, cases: list[Known], shape: Shape, kind: str) -> Known:
-    """Select the case of a number, or of False and True."""
-    is_bool = which.kind == "bool" if isinstance(which, Value) else which.dtype == bool
-    if is_bool:
-        return builder.add("select", [which, cases[1], cases[0]], shape, kind)
-    found = cases[-1]
-    for number, case in reversed(list(enumerate(cases[:-1]))):
-        here = builder.add("le", [which, np.asarray(number, np.int32)], tuple(which.shape), "bool")
-        found = builder.add("select", [here, case, found], shape, kind)
-    return found
-
-
-@_one("clamp")
-def _clamp(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    low, x, high = given
-    return builder.add("min", [builder.add("max", [x, low], shape, kind), high], shape, kind)
-
-
-@_one("broadcast_in_dim")
+@one("broadcast_in_dim")
 def _broadcast(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     placed = [1] * len(shape)
     for axis, place in enumerate(params["broadcast_dimensions"]):
@@ -114,7 +36,7 @@ def _broadcast(builder: Builder, params: Any, given: list[Known], shape: Shape, 
     return spread if tuple(placed) == shape else builder.add("broadcast", [spread], shape, kind, shape=list(shape))
 
 
-@_one("stack")
+@one("stack")
 def _stack(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     axis = int(params["axis"])
     row = (*shape[:axis], 1, *shape[axis + 1 :])
@@ -137,19 +59,19 @@ def _part(builder: Builder, value: Known, axis: int, first: int, last: int) -> K
     return _cut(builder, value, start, stop)
 
 
-@_one("slice")
+@one("slice")
 def _slice(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     return _cut(builder, given[0], params["start_indices"], params["limit_indices"], params["strides"])
 
 
-@_several("split")
+@several("split")
 def _split(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     ends = np.cumsum([0, *equation.params["sizes"]]).tolist()
     axis = equation.params["axis"]
     return [_part(builder, given[0], axis, *pair) for pair in itertools.pairwise(ends)]
 
 
-@_one("pad")
+@one("pad")
 def _pad(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     value, filling = given
     settings = [tuple(map(int, each)) for each in params["padding_config"]]
@@ -166,7 +88,7 @@ def _taken(builder: Builder, value: Known, places: Known, shape: Shape, kind: st
     return builder.add("take", [builder.reshaped(value, (math.prod(value.shape),)), places], shape, kind)
 
 
-@_one("rev")
+@one("rev")
 def _rev(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     places = np.flip(np.arange(math.prod(shape), dtype=np.int32).reshape(shape), params["dimensions"])
     return _taken(builder, given[0], places.copy(), shape, kind)
@@ -207,7 +129,7 @@ def _summed(builder: Builder, parts: list[Known], shape: Shape) -> Known:
     return total
 
 
-@_one("dynamic_slice")
+@one("dynamic_slice")
 def _dynamic_slice(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     value, *starts = given
     strides = _strides(tuple(value.shape))
@@ -218,7 +140,7 @@ def _dynamic_slice(builder: Builder, params: Any, given: list[Known], shape: Sha
     return _taken(builder, value, _summed(builder, [*parts, _offsets(shape, strides)], shape), shape, kind)
 
 
-@_one("gather")
+@one("gather")
 def _gather(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     """Gather blocks of the operand, one for each row of indices (XLA's Gather)."""
     value, indices = given
@@ -235,7 +157,7 @@ def _gather(builder: Builder, params: Any, given: list[Known], shape: Shape, kin
         first = builder.reshaped(first, (*rows, *[1] * len(block)))
         most = value.shape[axis] - sizes[axis]
         parts.append(_clipped(builder, first, most, strides[axis]))
-        if fills and isinstance(first, Value):
+        if fills and (isinstance(first, Value) or ((first < 0) | (first > most)).any()):
             low = builder.add("lt", [first, np.zeros((), np.int32)], first.shape, "bool")
             high = builder.add("gt", [first, np.asarray(most, np.int32)], first.shape, "bool")
             out = builder.add("or", [low, high], first.shape, "bool")
@@ -248,19 +170,21 @@ def _gather(builder: Builder, params: Any, given: list[Known], shape: Shape, kin
     if missed is not None:
         default = {"float32": np.nan, "int32": np.iinfo(np.int32).min, "bool": True}[kind]
         filling = np.asarray(default if params["fill_value"] is None else params["fill_value"], kind)
-        found = builder.add("select", [missed, filling, found], whole, kind)
+        found = select(builder, missed, filling, found, whole, kind)
     blocks, others = iter(range(len(rows), len(whole))), iter(range(len(rows)))
     order = (next(blocks) if axis in named.offset_dims else next(others) for axis in range(len(shape)))
     return builder.transposed(found, tuple(order))
 
 
-@_one("dot_general")
+@one("dot_general")
 def _dot_general(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     """Express the product as (batch, left, summed) by (batch, summed, right)."""
     left, right = given
     (left_summed, right_summed), (left_batch, right_batch) = params["dimension_numbers"]
     left_free = [a for a in range(len(left.shape)) if a not in (*left_summed, *left_batch)]
     right_free = [a for a in range(len(right.shape)) if a not in (*right_summed, *right_batch)]
+    if not kind_in(left) == kind_in(right) == kind or kind == "bool":
+        raise NotImplementedError("products of booleans or of different types")
     size = lambda value, axes: math.prod(value.shape[a] for a in axes)  # noqa: E731
     batch = (size(left, left_batch),) if left_batch else ()
     m, k, n = size(left, left_free), size(left, left_summed), size(right, right_free)
@@ -269,34 +193,30 @@ def _dot_general(builder: Builder, params: Any, given: list[Known], shape: Shape
     return builder.reshaped(builder.add("matmul", [left, right], (*batch, m, n), kind), shape)
 
 
-@_one("round")
-def _round(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    if params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
-        raise NotImplementedError("rounding halves away from zero")
-    return builder.add("round", given, shape, kind)
-
-
-@_one("cumsum")
+@one("cumsum")
 def _cumsum(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     if params["reverse"]:
         raise NotImplementedError("a cumulative sum from the end")
     return builder.add("cumsum", given, shape, kind, axis=int(params["axis"]))
 
 
-@_several("top_k")
+@several("top_k")
 def _top_k(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
-    found = [builder.new(*_out(equation, place)) for place in (0, 1)]
+    axes, axis = len(given[0].shape), equation.params.get("axis", -1)
+    if kind_in(given[0]) == "bool" or axis not in (-1, axes - 1):
+        raise NotImplementedError("the largest of booleans, or along another axis than the last")
+    found = [builder.new(*output(equation, place)) for place in (0, 1)]
     names = [value.name for value in found]
     builder.ops.append(["top_k", [builder.name(given[0])], names, {"k": equation.params["k"]}])
     return list(found)
 
 
-@_several("while")
+@several("while")
 def _while(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     named = equation.params
     of_test, of_body = named["cond_nconsts"], named["body_nconsts"]
     start = given[of_test + of_body :]
-    carried = [builder.new(*_out(equation, place)) for place in range(len(start))]
+    carried = [builder.new(*output(equation, place)) for place in range(len(start))]
     results = [builder.new(value.shape, value.kind) for value in carried]
     test = builder.branch(named["cond_jaxpr"], given[:of_test], carried)
     body = builder.branch(named["body_jaxpr"], given[of_test : of_test + of_body], carried)
@@ -311,7 +231,7 @@ def _while(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     return list(results)
 
 
-@_several("scan")
+@several("scan")
 def _scan(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     """Unroll a scan; for one observation it has few passes."""
     named = equation.params
@@ -329,7 +249,7 @@ def _scan(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     rows = rows[::-1] if named["reverse"] else rows
     stacked = []
     for place, each in enumerate(zip(*rows, strict=True)):
-        shape, kind = _out(equation, place + carried)
+        shape, kind = output(equation, place + carried)
         parts = [builder.reshaped(value, (1, *value.shape)) for value in each]
         stacked.append(parts[0] if len(parts) == 1 else builder.add("concatenate", parts, shape, kind, axis=0))
     return [*carry, *stacked]
@@ -343,13 +263,13 @@ def _parts(named: Any) -> tuple[int, int]:
     return named["num_consts"], named["num_carry"]
 
 
-@_several("cond")
+@several("cond")
 def _cond(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     """Evaluate every branch and select one result; nothing in a decision has side effects."""
     which, *operands = given
     branches = equation.params["branches"]
     if not isinstance(which, Value):
-        chosen = branches[int(np.clip(int(which), 0, len(branches) - 1))]
-        return builder.inlined(chosen.jaxpr, chosen.consts, operands)
+        branch = branches[int(np.clip(int(which), 0, len(branches) - 1))]
+        return builder.inlined(branch.jaxpr, branch.consts, operands)
     found = [builder.inlined(branch.jaxpr, branch.consts, operands) for branch in branches]
-    return [_chosen(builder, which, list(each), *_out(equation, n)) for n, each in enumerate(zip(*found, strict=True))]
+    return [chosen(builder, which, list(each), *output(equation, n)) for n, each in enumerate(zip(*found, strict=True))]

@@ -133,7 +133,7 @@ class Decision:
         if not difference <= allowed:
             raise ContractError(
                 f"{self.folder} gives other actions here than where it was exported: golden cases differ by "
-                f"{difference:.2g}, more than {allowed:g}; export it anew"
+                f"{difference:.2g}, more than {allowed:g}; export it anew, or with --format stablehlo"
             )
         return difference
 

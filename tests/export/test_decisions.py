@@ -22,6 +22,7 @@ from cuelearner_jax.api.policies import CallablePolicy
 from cuelearner_jax.environment import Quantity, action_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, formats, onnx_graph, operations, runner
+from cuelearner_jax.export.graph import RULES
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, layers, uniform_in
 
@@ -188,7 +189,9 @@ def test_nonsense_in_a_contract_is_refused_in_one_line_wherever_it_stands(tmp_pa
             except runner.ContractError as error:
                 refused += 1
                 assert "\n" not in str(error)
-    words = {"about", "name", "unit", "dtype", "angle", "clip_radius_deg", "drawn", "steady", "needs", "tolerance"}
+    words = {"about", "name", "unit", "dtype", "angle", "clip_radius_deg", "drawn", "steady", "extreme", "needs"} | {
+        "tolerance"
+    }
     assert {way for way in taken if way[-1] not in words} <= {("files", "decide.py")}
     assert refused > 150 / every
 
@@ -234,7 +237,7 @@ def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(fold
         change()
         np.savez(there / "decision.npz", **{**arrays, "graph": np.frombuffer(json.dumps(graph).encode(), np.uint8)})
         edit_contract(there)
-        with pytest.raises(UserError, match=r"cannot be run here|golden cases differ|not give finite numbers"):
+        with pytest.raises(UserError, match=r"cannot be run|cases differ|not give finite numbers|is not a direction"):
             contract.replay_golden_cases(there)
 
 
@@ -340,6 +343,26 @@ def test_golden_cases_are_those_that_rounding_does_not_turn():
     assert len(DRAWN) - 1 <= golden.steady <= len(DRAWN) + 8  # of the twenty near the jump, chance may leave a few
     with pytest.raises(UserError, match="change with the last digits"):
         decisions.golden_cases(policy, drawn[9:11])
+
+
+def test_a_difference_that_no_episode_leads_to_is_noticed_when_the_file_is_written(tmp_path, monkeypatch):
+    """A cast that does not saturate turns only observations above 2^31, and no drawn one is above 1."""
+    policy = Opaque(lambda obs: jnp.where(obs[:, 1:].astype(jnp.int32) > 5, 1.0, -1.0) * jnp.array([[0.6, 0.8]]))
+    told = write(policy, "numpy", tmp_path / "sound")
+    assert told["golden"]["extreme"] > 10
+    with np.load(tmp_path / "sound" / runner.GOLDEN) as golden:
+        extreme = golden["obs"][-told["golden"]["extreme"] :]
+    assert {np.float32(1e10), np.float32(-1e10), np.float32(1e-30), np.float32(0)} <= set(extreme[:, 0].tolist())
+    plain = lambda builder, equation, given: [  # noqa: E731
+        builder.add(
+            "cast", given, given[0].shape, str(equation.params["new_dtype"]), dtype=str(equation.params["new_dtype"])
+        )
+    ]
+    monkeypatch.setitem(RULES, "convert_element_type", plain)
+    for format in ("numpy", "onnx"):
+        with pytest.raises(UserError, match="golden cases differ by"):
+            write(policy, format, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_observations_are_starts_and_what_follows():
