@@ -27,7 +27,8 @@ class Cue:
 
     name: str
     words: tuple[str, str]  # words for more and less: ("counterclockwise", "clockwise"), ("open", "close")
-    keys: tuple[str, str]  # for these words on the labelling page, as browsers call them (`KeyboardEvent.key`)
+    # for these words on the labelling page, as browsers call them (`KeyboardEvent.key`); (): buttons alone
+    keys: tuple[str, ...]
     unit: str  # unit of a change in options and files: "degrees", "shares" (of the cue's range), "steps"
 
 
