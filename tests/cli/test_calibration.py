@@ -8,6 +8,7 @@ import chex
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_runs import next_command
 
 import cuelearner_jax as cl
 from cuelearner_jax.cli import main
@@ -194,9 +195,13 @@ def test_no_change_is_said_and_the_policy_stays(home):
     np.testing.assert_allclose(same(SEEN), SEEN, atol=1e-6)
 
 
-def test_changes_of_ones_own_are_code_that_is_named_again(home, tmp_path, refused):
+def test_changes_of_ones_own_are_code_that_is_named_again(home, tmp_path, capsys):
     out = tmp_path / "twisted"
     assert main([*ASK[:-1], "40", "--changes", "own_askew:changes", "--out", str(out)]) == 0
+    named_again = next_command(capsys.readouterr().out)
+    assert named_again[2:] == [
+        *("--env", "own_askew:TASK", "--base", "own_askew:straight", "--changes", "own_askew:changes")
+    ]
     layer = json.loads((out / "policy.json").read_text())["policy"]
     assert (layer["distortions"], layer["code"]) == (["twist"], "own_askew:changes")
     code = {"task": "own_askew:TASK", "base": own().straight}
@@ -205,8 +210,8 @@ def test_changes_of_ones_own_are_code_that_is_named_again(home, tmp_path, refuse
         cl.load_policy(out, **code)
     with pytest.raises(cl.UserError, match="corrects 'twist', which own_askew:changes lacks"):
         cl.load_policy(out, changes=own().TWIST._replace(name="bend"), **code)
-    measure = ["evaluate", str(out), *TASK, "--base", "own_askew:straight", "--changes", "own_askew:TWIST"]
-    assert main([*measure, "--steps", "400", "--envs", "20"]) == 0
+    for measure in (named_again, [*named_again[:-1], "own_askew:TWIST"]):
+        assert main([*measure, "--steps", "400", "--envs", "20"]) == 0
 
 
 def test_what_calibration_cannot_use_is_refused(home, refused, tmp_path):
