@@ -10,7 +10,7 @@ from typing import Annotated, Any, Generic
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.api import correction
 from cuelearner_jax.cli.parsing import about, out, parse, taken
-from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, subject_of, unprefixed
+from cuelearner_jax.cli.shared_options import Flag, KindsT, Outside, TaskT, kinds_type, subject_of, unprefixed
 from cuelearner_jax.cli.sources import TASK_OPTIONS, code_of, is_code, source_of
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.run_config import PARTS
@@ -24,7 +24,7 @@ from cuelearner_jax.terminal import progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
+class Adapt(AdaptRequest[TaskT, KindsT], Outside, Generic[TaskT, KindsT]):
     """Correct a finished policy by labels about what the policy does in a changed world.
 
     The policy lies in a run folder or a policy folder; or, with --task, it is package.module:NAME, any function of

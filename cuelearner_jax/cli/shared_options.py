@@ -33,6 +33,18 @@ Flag = tyro.conf.FlagCreatePairsOff
 
 
 @dataclass(frozen=True, kw_only=True)
+class Outside:
+    """Options that name code and worlds; `sources` reads them before the others, since they decide what options there
+    are."""
+
+    env: str | None = None
+    """World: a task, or a library's environment, as gymnasium:FetchReach-v4 (--task is another name of this option)."""
+    teacher: str | None = None
+    """Your own teacher: package.module:NAME of a function of observations, a policy or a teacher (default: the
+    task's)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Lane:
     """Choice of a folder's policy, and of its lane."""
 
@@ -80,7 +92,7 @@ def asked_of_source(arguments: list[str], command: str, kind: Any, more: str = "
 
 
 @dataclass(frozen=True)
-class Training(Generic[RunT]):
+class Training(Outside, Generic[RunT]):
     """Options that train and sweep share."""
 
     run: Annotated[RunT, tyro.conf.arg(name="")]  # a RunConfig
