@@ -24,7 +24,7 @@ from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.studies.train import suggested
-from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.task import QUICKSTART, Task, shape_of
 
 TaskT = TypeVar("TaskT")
 RunT = TypeVar("RunT", bound=RunConfig)
@@ -141,12 +141,14 @@ def asked_of_preset(
     `kind` is generic in the run's configuration. `options` returns defaults from what the preset compares.
     """
     task, rest = task_of(arguments, command, kind)
-    name, preset, rest = preset_of(task, rest)
+    name, preset, rest = preset_of(task, rest, QUICKSTART)
     request = suggested(task, preset)
     config, run_type, rest = parts_of(request.config, rest, request.grid.guidance)
     default = kind[run_type](config, out=Path("runs") / f"{task.name}-{name}", **options(request.grid))
     subject = pages.subject_of(typed_name(task), task.name, task)
-    asked = parse(kind[run_type], rest, f"{command} {subject.typed}", default, about(kind, task), subject)
+    asked = parse(
+        kind[run_type], rest, f"{command} {subject.typed}", default, about(kind, task, preset=QUICKSTART), subject
+    )
     if asked.robot is not None and ":" in asked.robot:
         raise UserError(f"--robot is {asked.robot}, but training takes no folder of a robot: give its name alone")
     return task.on(asked.robot), asked
