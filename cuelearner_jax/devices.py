@@ -1,9 +1,10 @@
-"""Share lanes out over devices that work independently, and choose how much a device computes at once."""
+"""Share lanes out over devices that work independently, and choose what a device computes at once, and how."""
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import compress
 from pathlib import Path
@@ -18,6 +19,35 @@ LANES = "lanes"
 LIBRARY_LANES = 16  # lanes of a device, from which on NVIDIA's library is the faster one for matrix products
 SHARED = PartitionSpec()  # the same on every device
 BY_LANE = PartitionSpec(LANES)  # leading axis divided into equal shares
+# JAX's settings that change what a seed draws, or the type of every number. Other values would give other episodes and
+# other networks for the same seed. `debug_nans` fails on NaN that stands for "no value yet".
+NUMERICS = {
+    "default_prng_impl": "threefry2x32",
+    "threefry_partitionable": True,
+    "enable_x64": False,
+    "debug_nans": False,
+}
+
+
+@contextmanager
+def fixed_numerics() -> Iterator[None]:
+    """Compute with `NUMERICS` in this thread, whatever the program or the environment has set."""
+    with ExitStack() as settings:
+        for name, value in NUMERICS.items():
+            settings.enter_context(getattr(jax, name)(value))
+        yield
+
+
+def fix_numerics() -> None:
+    """Compute with `NUMERICS` in all threads, for a program that does nothing else."""
+    for name, value in NUMERICS.items():
+        jax.config.update(f"jax_{name}", value)
+
+
+def numerics() -> str:
+    """Return the settings of random numbers and precision now in force, for the record of a result."""
+    prng, partitionable, double, _ = (getattr(jax.config, f"jax_{name}") for name in NUMERICS)
+    return f"{prng}{'' if partitionable else ' not partitionable'}, {'float64' if double else 'float32'}"
 
 
 class Portions(NamedTuple):

@@ -6,7 +6,8 @@ has is in `Environment`, what it may have in `OptionalMembers`; no module asks f
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -14,10 +15,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import EnvState, Step
 
 OWN = "own"
+KINDS = ("", OWN, "beams", "directions")
+SYMBOLS = (
+    *("m", "cm", "mm", "km", "rad", "deg", "s", "ms", "kg", "g", "N"),
+    *("Nm", "A", "V", "W", "Hz", "Pa", "K", "px", "steps", "%"),
+)
+# 1, or a symbol, perhaps after a number and before more: "m", "5 cm", "rad/s", "m a step", "rad (Euler angles)"
+UNIT = re.compile(rf"1|as given|([0-9.]+ )?({'|'.join(SYMBOLS)})([ /²^·*(].*)?")
 
 
 class Quantity(NamedTuple):
@@ -35,6 +44,19 @@ class Quantity(NamedTuple):
     # sensor turns it, or the point is not known
     origin: tuple[float, float] | None = None
     follows: str = ""  # name of the place from which this difference is taken, and with which it is displaced
+
+
+def checked_quantities(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
+    """Return the slices of an observation. Raises UserError for an unknown unit or kind, which would have no effect."""
+    found = tuple(quantities)
+    for name, _, unit, _, kind, *_ in found:
+        if not UNIT.fullmatch(unit):
+            raise UserError(
+                f"the unit of {name!r} is {unit!r}: give a symbol, as m, rad or m/s, or 1 (known: {', '.join(SYMBOLS)})"
+            )
+        if kind not in KINDS:
+            raise UserError(f"the kind of {name!r} is {kind!r}: give {', '.join(KINDS[1:])}, or none")
+    return found
 
 
 # What `spaces.DIRECTIONS` are, where an environment does not say more by its own `action`.

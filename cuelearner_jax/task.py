@@ -17,7 +17,8 @@ from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.types import EnvState, Policy, Reel, Sketch, Teacher
 
-PAPER = "paper"  # name of the default preset
+PAPER = "paper"  # preset that policies are assumed to be trained with, where no folder says so
+QUICKSTART = "quickstart"  # preset that training starts from where none is named: it takes minutes
 
 # Of a scenario's sizes: the paper's networks and their fitting, in place of the smaller ones that `adapt` else has
 PAPERS_FIT = {name: getattr(GuideSizes, name) for name in ("feedback_layers", "fit_steps", "fit_batch_size")}

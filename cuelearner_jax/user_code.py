@@ -21,6 +21,7 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 
+from cuelearner_jax.devices import fixed_numerics
 from cuelearner_jax.errors import NotFinite, UserError, no_space, user_code_error
 
 P = ParamSpec("P")
@@ -84,11 +85,14 @@ def _at_work() -> Iterator[None]:
 
 
 def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a public function that reports faults of the user's code in one line, with the original as `__cause__`."""
+    """Return a public function that computes with fixed numerics, and reports faults of the user's code in one line.
+
+    The UserError has the original as `__cause__`.
+    """
 
     @functools.wraps(function)
     def wrapped(*arguments: P.args, **named: P.kwargs) -> T:
-        with _at_work():
+        with _at_work(), fixed_numerics():
             try:
                 found = function(*arguments, **named)
             except Exception as error:

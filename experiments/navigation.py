@@ -48,7 +48,7 @@ def commands(out: Path, piece: str, resume: bool, extra: list[str]) -> list[list
     guidance, labels = PIECES[piece]
     options = [text for pair in {"--guidance": guidance, "--labels": labels, **SWEEP}.items() for text in pair]
     going_on = ["--resume"] if resume and (run / "config.json").exists() else []
-    made = [["sweep", "navigation", *options, "--out", str(run), *extra, *going_on]]
+    made = [["sweep", "navigation", "--preset", "paper", *options, "--out", str(run), *extra, *going_on]]
     for name, (policy, style, episodes) in EVALUATIONS.items():
         measured = out / "evaluations" / f"{piece}-{name}.json"
         if not measured.exists() and (policy == "agent" or guidance != "none"):

@@ -88,7 +88,7 @@ def _trails(env, state, actions):
 
 PICTURES = Pictures(None, None, None, None, _sketch, _reel, _trails)  # pyright: ignore[reportArgumentType]
 TASK = Task(
-    "arm",
+    "box_arm",
     "a bandit with actions of a box",
     ArmConfig,
     (Body("arm", "", lambda config, split: Reach(GRIPPER, jnp.float32(config.offset)), pictures=lambda: PICTURES),),

@@ -1,5 +1,7 @@
 """The arguments of tiny runs, and what lies in a folder."""
 
+import re
+import shlex
 import threading
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,3 +64,9 @@ def stopping_at(when=None, evaluating=None):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "interruptible", interruptible)
         yield
+
+
+def next_command(told: str) -> list[str]:
+    """Return the command that the output of `cuelearner adapt` names, without its first word."""
+    (command,) = re.findall(r"\(measure it with: cuelearner (.*)\)", told)
+    return shlex.split(command)

@@ -11,11 +11,11 @@ METHOD, TASKS = "cuelearner_jax", "cuelearner_envs"
 
 # Bottom row first: a module imports from rows below its own and, within its row, from its own package.
 ROWS = [
-    ["errors", "signals", "tracing"],
+    ["errors", "signals", "tracing", "devices"],
     ["user_code"],
     ["types", "spaces", "plugins"],
     ["environment", "pictures"],
-    ["config", "devices", "terminal"],
+    ["config", "terminal"],
     ["storage"],
     ["agents"],
     ["feedback"],

@@ -34,7 +34,7 @@ from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import Common, Guided, in_space
-from cuelearner_jax.spaces import DIRECTIONS, Space
+from cuelearner_jax.spaces import DIRECTIONS, Space, says_something
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import GuidanceModel, Label, Teacher
 
@@ -245,7 +245,7 @@ def settings(
 
 
 def rows_of(labels: Any) -> Label:
-    """Return labels as rows (labels, ...) of finite floats.
+    """Return labels as rows (labels, ...) of finite floats, without those that say nothing of any cue.
 
     Raises UserError unless they are three arrays of one length.
     """
@@ -260,7 +260,10 @@ def rows_of(labels: Any) -> Label:
             "actions (n, action) and answers (n,), or (n, cues) where there are several"
         )
     answer = answer[:, None] if answer.ndim == 1 else answer
-    return Label(obs, action, answer, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
+    said = np.asarray(says_something(answer))
+    if not said.any():
+        raise UserError("labels say nothing of any cue: give labels with answers")
+    return Label(obs[said], action[said], answer[said], np.ones(said.sum(), bool))  # pyright: ignore[reportArgumentType]
 
 
 def divergence_error() -> UserError:

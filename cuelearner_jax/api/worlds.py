@@ -45,6 +45,7 @@ class World:
         """The environment that agents train in: a pytree, see `environment.Environment`."""
         return self.environment("training")
 
+    @user_code.report_user_errors
     def environment(self, split: str) -> Environment:
         """Return the environment of a split: "training", "tuning" or "validation". Raises UserError for other names."""
         return self.task.environment(self.config, arguments.text("split", split, ("training", *SPLITS)))

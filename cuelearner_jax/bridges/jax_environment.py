@@ -24,9 +24,6 @@ from cuelearner_jax.types import Step
 
 State = Any  # a simulator's state: a pytree with the members that this module's docstring names
 UNIT = "as the simulator has it"
-WORDS = ("more", "less")
-# Keys of cues, enough for the 21 entries of a humanoid: those of any box, letters and digits that are left, signs.
-KEYS = (*box.KEYS, "zx", "cv", "bn", "mp", "12", "34", "56", "78", "90", ",.", ";'", "[]", "-=")
 
 
 class Running(struct.PyTreeNode):
@@ -106,7 +103,7 @@ class Layout(NamedTuple):
     def box(self, cues: Sequence[Cue] = ()) -> Box:
         """Return the space [-1, 1]^n of the actions, with a cue an entry: `cues`, or the entry's name."""
         size = len(self.entries)
-        named = tuple(cues) or cues_of(self.entries)
+        named = tuple(cues) or box.plain_cues(self.entries)
         return Box((-1.0,) * size, (1.0,) * size, named)
 
 
@@ -153,17 +150,6 @@ def entries_of(simulator: Any, size: int) -> tuple[str, ...]:
     joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
     named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
     return tuple(named) if all(named) and len(set(named)) == size else plain
-
-
-def cues_of(entries: Sequence[str]) -> tuple[Cue, ...]:
-    """Return a cue for each entry of an action: its name, "more" and "less", and two keys.
-
-    Raises UserError for more entries than there are keys.
-    """
-    if len(entries) > len(KEYS):
-        raise UserError(f"an action has {len(entries)} entries, and keys are for {len(KEYS)}: give `cues`")
-    keys = KEYS[: len(entries)]
-    return tuple(Cue(name, WORDS, (more, less), box.SHARE) for name, (more, less) in zip(entries, keys, strict=True))
 
 
 def space_of(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic
@@ -9,18 +10,21 @@ from typing import Annotated, Any, Generic
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.api import correction
 from cuelearner_jax.cli.parsing import about, out, parse, taken
-from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, subject_of, unprefixed
+from cuelearner_jax.cli.shared_options import Flag, KindsT, Outside, TaskT, kinds_type, subject_of, unprefixed
 from cuelearner_jax.cli.sources import TASK_OPTIONS, code_of, is_code, source_of
 from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import adapt
 from cuelearner_jax.studies.adapt import AdaptRequest, BaseLanes, Subject
+from cuelearner_jax.task import Task
+from cuelearner_jax.tasks import logs
 from cuelearner_jax.terminal import progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
+class Adapt(AdaptRequest[TaskT, KindsT], Outside, Generic[TaskT, KindsT]):
     """Correct a finished policy by labels about what the policy does in a changed world.
 
     The policy lies in a run folder or a policy folder; or, with --task, it is package.module:NAME, any function of
@@ -69,9 +73,19 @@ def run(arguments: list[str]) -> None:
         outcome.write(place)
     for line in adapt.sentences(outcome.found):
         out.print(line)
-    out.print(f"wrote {asked.out} (measure it with: cuelearner evaluate {asked.out})")
+    measure = ["cuelearner", "evaluate", str(asked.out), *_named_again(arguments, source.task, named)]
+    out.print(f"wrote {asked.out} (measure it with: {shlex.join(measure)})", soft_wrap=True)
     if outcome.found.failed.any():
         raise NotFinite("a fit is no longer finite, so its model is not used: lower --scalars.feedback-learning-rate")
+
+
+def _named_again(arguments: list[str], task: Task, code: str | None) -> list[str]:
+    """Return the options that a command about the policy folder needs again: code that no file may have loaded."""
+    world = task.origin or (task.named if (task.named or "").count(":") > 1 else None)
+    options = {"--env": world, "--base": code}
+    again = ("--changes", "--robot", *(f"--{part}" for part in PARTS), *(["--labels-from"] * (task.name == logs.NAME)))
+    options |= {name: taken(arguments, name, "")[0] for name in again}
+    return [word for name, value in options.items() if value for word in (name, value)]
 
 
 def _source(arguments: list[str]) -> tuple[PolicySource, Any, str | None, list[str]]:

@@ -25,7 +25,7 @@ from cuelearner_jax.runs import speed
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.studies.train import preset_kinds
-from cuelearner_jax.task import Task
+from cuelearner_jax.task import QUICKSTART, Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, interruptible, progress_bars
 
@@ -78,7 +78,7 @@ def run(arguments: list[str]) -> None:
     named = any(argument == "--task" or argument.startswith("--task=") for argument in arguments)
     if named or (arguments and not arguments[0].startswith("-")):
         task, rest = task_of(arguments, "bench", Bench)
-        name, preset, rest = preset_of(task, rest)
+        name, preset, rest = preset_of(task, rest, QUICKSTART)
         config, run_type, rest = parts_of(preset.config, rest, preset_kinds(task, preset))
         kind = BenchTask[run_type]  # pyright: ignore[reportInvalidTypeArguments]
         subject = pages.subject_of(typed_name(task), task.name, task)
@@ -87,7 +87,7 @@ def run(arguments: list[str]) -> None:
     else:
         asked = parse(Bench, arguments, "bench")
         tasks = [registry.find(task) for task in registry.BUILT_IN if task not in registry.FAMILIES]
-        works = [(task, "quickstart", task.presets["quickstart"].config) for task in tasks]
+        works = [(task, QUICKSTART, task.presets[QUICKSTART].config) for task in tasks]
     mesh = _check(asked, works)
     rows: list[dict[str, Any]] = []
     # ascending, since a device's peak memory never falls again

@@ -87,8 +87,9 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     if command not in COMMANDS:
         raise UserError(f"unknown command {command!r}{suggestion(command, COMMANDS)}; see cuelearner --help")
-    from cuelearner_jax import user_code
+    from cuelearner_jax import devices, user_code
 
+    devices.fix_numerics()
     user_code.report_user_errors(_file(command).run)(arguments[1:])
     return 0
 

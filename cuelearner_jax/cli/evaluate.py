@@ -12,7 +12,7 @@ from rich.table import Table
 
 from cuelearner_jax.api import correction
 from cuelearner_jax.cli.parsing import out, taken
-from cuelearner_jax.cli.shared_options import TaskT, asked_of_source
+from cuelearner_jax.cli.shared_options import Outside, TaskT, asked_of_source
 from cuelearner_jax.cli.sources import code_of, is_code
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
@@ -27,7 +27,7 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
+class Evaluate(EvaluateRequest[TaskT], Outside, Generic[TaskT]):
     """Measure a policy on validation episodes, or compare two; in any changed world.
 
     The policy is of a run or a policy folder, or a task's teacher, heuristic or chance."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Generic
 
 from cuelearner_jax.cli.parsing import out, taken
-from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asked_of_source
+from cuelearner_jax.cli.shared_options import Flag, Lane, Outside, TaskT, asked_of_source
 from cuelearner_jax.config import digest, to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions
@@ -17,7 +17,7 @@ from cuelearner_jax.runs import trained
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Lane, Generic[TaskT]):
+class Export(Outside, Lane, Generic[TaskT]):
     """Write a policy as a file for a robot, with a contract; --check FOLDER replays one.
 
     The contract tells what goes in and comes out."""

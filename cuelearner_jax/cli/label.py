@@ -37,13 +37,12 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.train import preset_kinds
-from cuelearner_jax.task import PAPER, Task, shape_of
+from cuelearner_jax.task import PAPER, QUICKSTART, Task, shape_of
 from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
 UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
 REACH = 1.5  # distance of questions from an aim, in turns by eps
-PRESET = "quickstart"  # default for questions about uniform actions: its training takes minutes
 PRACTICE = len(controls.PRACTICE)  # number of practice questions
 MOST_LABELS = 100_000
 UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch`, or choose another --robot"
@@ -113,7 +112,7 @@ def run(arguments: list[str]) -> None:
     task, rest = task_named(arguments, "label", Label)
     named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
     finished_policy = named is not None or task.proposed is not None  # whether the labels are to correct a policy
-    usual = PAPER if finished_policy else PRESET
+    usual = PAPER if finished_policy else QUICKSTART
     chosen, preset, rest = preset_of(task, rest, usual)
     kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     scenario, _ = taken(rest, "--scenario", ", ".join(task.scenarios) or "none")

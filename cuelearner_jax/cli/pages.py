@@ -43,7 +43,19 @@ TRAINED = (
 
 PAGES: dict[str, Page] = {
     "train": Page(
-        ("out", "guidance", "labels", "seed", "labels-from", "resume", "overwrite", "tuning", "track"),
+        (
+            "out",
+            "env",
+            "teacher",
+            "guidance",
+            "labels",
+            "seed",
+            "labels-from",
+            "resume",
+            "overwrite",
+            "tuning",
+            "track",
+        ),
         (
             Example("one agent of the small example", "train billiards --preset quickstart --out runs/one"),
             Example(
@@ -60,7 +72,19 @@ PAGES: dict[str, Page] = {
         ),
     ),
     "sweep": Page(
-        ("out", "guidance", "labels", "seeds", "first-seed", "labels-from", "resume", "overwrite", "shard", "cluster"),
+        (
+            "out",
+            "env",
+            "teacher",
+            "guidance",
+            "labels",
+            "seeds",
+            "labels-from",
+            "resume",
+            "overwrite",
+            "shard",
+            "cluster",
+        ),
         (
             Example("guided and unguided agents", "sweep billiards --preset quickstart --out runs/quickstart"),
             Example(
@@ -78,7 +102,18 @@ PAGES: dict[str, Page] = {
         ),
     ),
     "adapt": Page(
-        ("out", "labels", "scenario", "guidance", "bound-deg", "labels-from", "judge-by", "robot", "overwrite"),
+        (
+            "out",
+            "env",
+            "teacher",
+            "labels",
+            "scenario",
+            "guidance",
+            "bound-deg",
+            "labels-from",
+            "judge-by",
+            "overwrite",
+        ),
         (
             Example(
                 "a walker whose lidar is turned",
@@ -105,7 +140,7 @@ PAGES: dict[str, Page] = {
         ),
     ),
     "evaluate": Page(
-        ("policy", "scenario", "compare", "episodes", "steps", "guidance", "robot", "labels-from", "out"),
+        ("env", "policy", "scenario", "compare", "episodes", "steps", "guidance", "robot", "labels-from", "out"),
         (
             Example("a trained walker", f"evaluate {WALKER} --episodes 50"),
             Example("the same in a changed world", f"evaluate {WALKER} --scenario corridor --episodes 50"),

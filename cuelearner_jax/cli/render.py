@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Generic
 
 from cuelearner_jax.cli.parsing import check_numbers, out
-from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asked_of_source
+from cuelearner_jax.cli.shared_options import Flag, Lane, Outside, TaskT, asked_of_source
 from cuelearner_jax.runs import filming
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Lane, Generic[TaskT]):
+class Render(Outside, Lane, Generic[TaskT]):
     """Draw a still and a film of a policy at work, or the picture of a question."""
 
     task: TaskT

@@ -24,12 +24,24 @@ from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.studies.train import suggested
-from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.task import QUICKSTART, Task, shape_of
 
 TaskT = TypeVar("TaskT")
 RunT = TypeVar("RunT", bound=RunConfig)
 KindsT = TypeVar("KindsT")
 Flag = tyro.conf.FlagCreatePairsOff
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outside:
+    """Options that name code and worlds; `sources` reads them before the others, since they decide what options there
+    are."""
+
+    env: str | None = None
+    """World: a task, or a library's environment, as gymnasium:FetchReach-v4 (--task is another name of this option)."""
+    teacher: str | None = None
+    """Your own teacher: package.module:NAME of a function of observations, a policy or a teacher (default: the
+    task's)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +92,7 @@ def asked_of_source(arguments: list[str], command: str, kind: Any, more: str = "
 
 
 @dataclass(frozen=True)
-class Training(Generic[RunT]):
+class Training(Outside, Generic[RunT]):
     """Options that train and sweep share."""
 
     run: Annotated[RunT, tyro.conf.arg(name="")]  # a RunConfig
@@ -129,12 +141,14 @@ def asked_of_preset(
     `kind` is generic in the run's configuration. `options` returns defaults from what the preset compares.
     """
     task, rest = task_of(arguments, command, kind)
-    name, preset, rest = preset_of(task, rest)
+    name, preset, rest = preset_of(task, rest, QUICKSTART)
     request = suggested(task, preset)
     config, run_type, rest = parts_of(request.config, rest, request.grid.guidance)
     default = kind[run_type](config, out=Path("runs") / f"{task.name}-{name}", **options(request.grid))
     subject = pages.subject_of(typed_name(task), task.name, task)
-    asked = parse(kind[run_type], rest, f"{command} {subject.typed}", default, about(kind, task), subject)
+    asked = parse(
+        kind[run_type], rest, f"{command} {subject.typed}", default, about(kind, task, preset=QUICKSTART), subject
+    )
     if asked.robot is not None and ":" in asked.robot:
         raise UserError(f"--robot is {asked.robot}, but training takes no folder of a robot: give its name alone")
     return task.on(asked.robot), asked

@@ -160,6 +160,8 @@ def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> Pol
                 f"{folder} acts on observations of {before.obs_size} entries with actions of "
                 f"{actions_of(before).size}, {known.named} has {now.obs_size} and {actions_of(now).size}: name another"
             )
+        if known.named == f"{known.name}:{getattr(source.config.task, 'environment', '')}":
+            return dataclasses.replace(source, task=known)  # with the folder's settings of this environment
         world = dataclasses.replace(source.config, task=known.plain())
         source = dataclasses.replace(source, task=known, config=world)
     return source

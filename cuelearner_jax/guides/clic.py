@@ -42,7 +42,7 @@ from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.spaces import Box, is_answered
+from cuelearner_jax.spaces import Box, is_answered, says_something
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 SHARPNESS = 10.0  # weight of the observation model against the policy
@@ -206,7 +206,7 @@ class Clic(Guide):
 
     def informative(self, labels: Label) -> Bool[Array, " slots"]:
         """Return which labels name any cue."""
-        return is_answered(labels.answer).any(-1) if len(self.spaces.actions.cues) > 1 else jnp.ones_like(labels.valid)
+        return says_something(labels.answer)
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars

@@ -73,7 +73,7 @@ def _spare(space: Space, keys: tuple[str, ...] | str) -> tuple[str, ...]:
 
 def _keys_of(space: Space, cue: Cue) -> tuple[tuple[str, ...], ...]:
     """Return all keys for "more" and all keys for "less" of a cue."""
-    return tuple((*_cases(key), *_spare(space, BESIDE.get(key, ""))) for key in cue.keys)
+    return tuple((*_cases(key), *_spare(space, BESIDE.get(key, ""))) for key in cue.keys) or ((), ())
 
 
 def _of_cue(number: int, space: Space, one_cue: bool) -> tuple[Control, ...]:

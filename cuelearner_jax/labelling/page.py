@@ -52,13 +52,14 @@ class Page:
         script = script.replace("</", "<\\/")  # an unescaped "</" would end the script
         ui.add_head_html(f"<script>{script}</script>")
         rows = len(self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0  # of cues to choose from
-        with ui.element("main").classes("label-page").style(f"--rows: {rows}"):
-            with ui.column().classes("w-full gap-2"):
+        with ui.element("main").classes("label-page many" if rows else "label-page").style(f"--rows: {rows}"):
+            with ui.column().classes("asking w-full gap-2"):
                 self._practice()
                 ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")
                 self._asked = ui.label(controls.question(self.form, self.space)).classes("big")
                 self._note = ui.label().classes("note")
                 self._scene = ui.html("", sanitize=False).classes("stage")
+            with ui.column().classes("answering w-full gap-2"):
                 self._answers()
             with ui.element("aside").classes("side"):
                 self._side()
@@ -93,7 +94,7 @@ class Page:
         self._pressable, self._picks = [], {}
         for number, cue in enumerate(self.space.cues):
             if about := [control for control in own if control.cue == number]:
-                # one row per cue, so that all rows are visible without scrolling
+                # a row per cue, beside the picture, which has the height and most of the width
                 with ui.element("div").classes("cue"):
                     ui.label(cue.name)
                     with ui.element("div").classes("answers"):

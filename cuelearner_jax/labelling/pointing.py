@@ -56,9 +56,9 @@ def ways_of(space: Space, sketch: Sketch) -> tuple[Direction | None, ...]:
 
 
 def answers_drawn(sketch: Sketch, ways: Sequence[Direction | None], controls: Sequence[Control]) -> list[str]:
-    """Draw an arrow with key and words for each control about a cue that has a direction on the screen.
+    """Draw an arrow with its key for each control about a cue that has a direction on the screen.
 
-    The arrows are placed near the edge, to leave the middle of the picture free.
+    The arrows are placed near the edge, to leave the middle of the picture free. Their words stand on the buttons.
     """
     drawn, lanes = [], {}
     for control in controls:
@@ -82,21 +82,16 @@ def _at_edge(sketch: Sketch, angle: float, lane: int, control: Control) -> str:
     x, y = math.cos(math.radians(angle)), -math.sin(math.radians(angle))
     middle = middle[0] - y * across, middle[1] + x * across
     at = sketch._replace(foot=middle, turn=0.0)
-    out = room(at, angle) - length - 3.0 * size
+    out = room(at, angle) - length - 2.5 * size
     foot = middle[0] + x * out, middle[1] + y * out
     at = at._replace(foot=foot, reach=(0.0, length))
-    anchor = "end" if x > 0.5 else "start" if x < -0.5 else "middle"
-    words = (
-        f'<text class="cue-words" x="{foot[0] - x * 0.8 * size:.3f}" y="{foot[1] - y * 1.6 * size:.3f}" '
-        f'text-anchor="{anchor}" font-size="{1.8 * size:.3f}" stroke-width="{0.3 * size:.3f}">'
-        f"{html.escape(control.words)}</text>"
-    )
     drawn = arrow(at, angle, control.colour, key=control.shown, larger=LARGER)
     touched = (
         f'<circle class="touched" cx="{foot[0] + x * length:.3f}" cy="{foot[1] + y * length:.3f}" r="{length:.3f}"/>'
     )
     name = html.escape(control.name)
-    return f'<g class="said {control.colour}" data-name="{name}">{touched}{drawn}{words}</g>'
+    title = f"<title>{html.escape(control.words)}</title>"
+    return f'<g class="said {control.colour}" data-name="{name}">{title}{touched}{drawn}</g>'
 
 
 def from_foot(sketch: Sketch, ways: Sequence[Direction | None], shares: np.ndarray, name: str) -> str:

@@ -15,7 +15,7 @@ from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.asking import label_slots
-from cuelearner_jax.devices import BY_LANE, lane_mesh, place
+from cuelearner_jax.devices import BY_LANE, fixed_numerics, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import Tell, ignore_progress, rollout_lanes
 from cuelearner_jax.guides.base import Guide
@@ -116,6 +116,7 @@ class LaneGroup:
         """Apply `work` to every block; a CPU works on as many blocks at once as it has cores."""
         if jax.default_backend() != "cpu" or len(blocks[0]) == 1:
             return [work(*entries) for entries in zip(*blocks, strict=True)]
+        work = fixed_numerics()(work)  # JAX's settings are a thread's own
         with ThreadPoolExecutor(CORES) as pool:
             return list(pool.map(lambda *entries: jax.block_until_ready(work(*entries)), *blocks))
 

@@ -8,7 +8,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.box import Box
 from cuelearner_jax.spaces.choices import Choices
 from cuelearner_jax.spaces.directions import DIRECTIONS, check_directions
-from cuelearner_jax.spaces.space import KNOWN, UNSAID, Cue, Space, is_answered
+from cuelearner_jax.spaces.space import KNOWN, UNSAID, Cue, Space, is_answered, says_something
 from cuelearner_jax.spaces.words import cues_from
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "cues_from",
     "from_json",
     "is_answered",
+    "says_something",
 ]
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import jax
@@ -14,7 +16,9 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.space import Cue, Space, Vectors, numbers
 
 SHARE = "shares"
-KEYS = ("qa", "ed", "rf", "tg", "yh", "uj", "ik", "ol")  # words of the cues where a box is given none
+WORDS = ("more", "less")
+# Keys of the first cues where none are given; cues beyond these have buttons alone.
+KEYS = ("qa", "ed", "rf", "tg", "yh", "uj", "ik", "ol", "zx", "cv", "bn", "mp", "12", "34", "56", "78", "90")
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ class Box(Space):
         low, high = numbers("low", self.low), numbers("high", self.high)
         if len(low) != len(high) or any(b <= a for a, b in zip(low, high, strict=True)):
             raise UserError(f"low is {low} and high is {high}: give as many of both, each high above its low")
-        cues = tuple(self.cues) or _plain_cues(len(low))
+        cues = tuple(self.cues) or plain_cues([f"entry {number}" for number in range(1, len(low) + 1)])
         if len(cues) != len(low):
             raise UserError(f"{len(cues)} cues for {len(low)} entries: give one cue an entry")
         if wrong := [cue.name for cue in cues if cue.unit != SHARE]:
@@ -127,12 +131,7 @@ def _row(values: Any, like: Vectors) -> Float[Array, "... action"]:
     return jnp.broadcast_to(jnp.asarray(values, jnp.float32), jnp.shape(like))
 
 
-def _plain_cues(size: int) -> tuple[Cue, ...]:
-    if size > len(KEYS):
-        raise UserError(
-            f"a box of {size} entries has no cues of its own: give `cues`, one an entry, each with two keys"
-        )
-    return tuple(
-        Cue(f"entry {number}", ("more", "less"), (keys[0], keys[1]), SHARE)
-        for number, keys in enumerate(KEYS[:size], start=1)
-    )
+def plain_cues(names: Sequence[str]) -> tuple[Cue, ...]:
+    """Return a cue for each entry of an action: its name, "more" and "less", and two keys while there are any."""
+    pairs = zip_longest(names, KEYS[: len(names)], fillvalue="")
+    return tuple(Cue(name, WORDS, tuple(keys), SHARE) for name, keys in pairs)

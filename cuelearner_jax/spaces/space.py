@@ -18,6 +18,7 @@ from cuelearner_jax.errors import UserError
 
 Vectors = Float[Array, "... action"] | Float[np.ndarray, "... action"]  # accepted arrays; results are JAX's arrays
 Amount = Float[Array, "..."] | Float[np.ndarray, "..."] | float
+Answers = Float[Array, "... cues"] | Float[np.ndarray, "... cues"]
 UNSAID = 2.0  # entry of a relative answer for a cue that the answer does not name
 
 
@@ -27,7 +28,8 @@ class Cue:
 
     name: str
     words: tuple[str, str]  # words for more and less: ("counterclockwise", "clockwise"), ("open", "close")
-    keys: tuple[str, str]  # for these words on the labelling page, as browsers call them (`KeyboardEvent.key`)
+    # for these words on the labelling page, as browsers call them (`KeyboardEvent.key`); (): buttons alone
+    keys: tuple[str, ...]
     unit: str  # unit of a change in options and files: "degrees", "shares" (of the cue's range), "steps"
 
 
@@ -167,13 +169,18 @@ def _for_cues(amount: Amount) -> Array:
     return amount[..., None] if amount.ndim else amount
 
 
-def is_answered(answer: Float[Array, "... cues"]) -> Bool[Array, "... cues"]:
+def is_answered(answer: Answers) -> Bool[Array, "... cues"]:
     """Return which cues a relative answer names: (..., cues) bool.
 
     "Not said" is a finite number (`UNSAID`): NaN means that a teacher failed, JSON knows no NaN, and answers that hold
     a NaN do not equal themselves.
     """
-    return answer != UNSAID
+    return jnp.asarray(answer) != UNSAID
+
+
+def says_something(answer: Answers) -> Bool[Array, "..."]:
+    """Return which relative answers name a cue. With one cue, all do: silence is not an answer there."""
+    return is_answered(answer).any(-1) | (answer.shape[-1] == 1)
 
 
 def numbers(name: str, given: Any) -> tuple[float, ...]:

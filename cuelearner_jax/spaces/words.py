@@ -17,7 +17,8 @@ HELD = {"left": "a", "right": "d"}  # letter keys that stand for these arrows to
 def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple[Cue, ...]:
     """Return cues by their words, each with its own keys.
 
-    Keys are arrows for left, right, up and down, or else a letter of the word that is free.
+    Keys are arrows for left, right, up and down, or else a letter of the word that is free. A cue for which no keys
+    are left has none.
 
     Args:
         words: "left,right;up,down", or pairs of words; the first of a pair asks for more of an entry, the second for
@@ -41,13 +42,11 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
             key = ARROWS.get(word.lower())
             if key is None or key in taken:
                 letters = (letter for letter in word.lower() if letter.isascii() and letter.isalpha())
-                free = (letter for letter in (*letters, spare, *"".join(KEYS), *"zxcvbnmws") if letter not in taken)
+                free = (letter for letter in (*letters, spare, *"".join(KEYS), *"ws") if letter not in taken)
                 key = next(free, "")
-            if not key:
-                raise UserError(f"{len(pairs)} cues need more keys than there are: give at most {len(KEYS)}")
             taken.add(key)
             keys.append(key)
-        cues.append(Cue(names[number] if names else " or ".join(pair), pair, (keys[0], keys[1]), unit))
+        cues.append(Cue(names[number] if names else " or ".join(pair), pair, tuple(keys) if all(keys) else (), unit))
     return tuple(cues)
 
 

@@ -31,7 +31,7 @@ REMEDIES = {  # the remedy in the message about a damaged file, after its path
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
     "teacher": "is damaged: restore it, or train the teacher anew",
     "policy": "is damaged: restore it, or adapt the policy anew",
-    "due": "is damaged: restore it, or delete the folder that it is in and give --resume",
+    "due": "is damaged: restore it, or move the folder that it is in away and give --resume",
 }
 
 Values = dict[str, Any]

@@ -52,7 +52,7 @@ SCHEMA = tables.Schema(
     required=("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash"),
     strings=("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command"),
     integers=("labels", "seed", "step"),
-    remedy="is damaged: restore it, or delete its folder and give --resume, which trains these lanes anew",
+    remedy="is damaged: restore it, or move its folder away and give --resume, which trains these lanes anew",
 )
 GUIDES = tables.Schema(
     stem="guide",
@@ -93,7 +93,7 @@ def check_complete(
     first = ", ".join(f"{name} {value}" for name, value in zip(columns, wrong[0], strict=True))
     raise UserError(
         f"{path} {'lacks' if wanted - found else 'has too many'} rows: {len(wrong)}, the first of {first}; restore it, "
-        f"or delete {folder} and give --resume, which trains these lanes anew"
+        f"or move {folder} away and give --resume, which trains these lanes anew"
     )
 
 

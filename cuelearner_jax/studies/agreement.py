@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax import user_code
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import mean_interval
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.policies import policy_name
-from cuelearner_jax.spaces import Space, is_answered
+from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.types import Label
 
 Share = tuple[float, float, float]  # estimate, and the ends of its 95% interval
@@ -49,7 +50,7 @@ def _told(share: Share) -> str:
 
 
 def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = None) -> Agreement:
-    """Return the share of answers that a policy agrees with.
+    """Return the share of answers that a policy agrees with. Labels that say nothing of any cue do not count.
 
     Args:
         policy: the acting policy, see `types.Policy`, called with observations only.
@@ -59,13 +60,13 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
         base: the policy before its correction; None: unknown.
 
     Raises:
-        UserError: a policy returns something other than actions.
+        UserError: a policy returns something other than actions, or no label says anything.
     """
-    told = (
-        np.asarray(is_answered(jnp.asarray(rows.answer))) if len(space.cues) > 1 else np.ones(rows.answer.shape, bool)
-    )
-    count = np.maximum(told.sum(-1), 1)
-    share = lambda agreed: (agreed & told).sum(-1) / count  # noqa: E731
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(says_something(rows.answer))], rows)
+    if not len(rows.obs):
+        raise UserError("labels say nothing of any cue: give labels with answers")
+    told = np.asarray(is_answered(rows.answer)) if len(space.cues) > 1 else np.ones(rows.answer.shape, bool)
+    share = lambda agreed: (agreed & told).sum(-1) / told.sum(-1)  # noqa: E731
     own = share(_says(policy, rows, space, eps) == rows.answer)
     before = None if base is None else share(_says(base, rows, space, eps) == rows.answer)
     less = None if before is None else _interval(own - before)

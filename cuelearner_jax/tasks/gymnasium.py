@@ -27,7 +27,7 @@ from cuelearner_jax.bridges.gymnasium.instances import Running
 from cuelearner_jax.bridges.gymnasium.layout import Actions, actions_of
 from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
 from cuelearner_jax.config import Schedule, Sizes
-from cuelearner_jax.environment import Quantity
+from cuelearner_jax.environment import Quantity, checked_quantities
 from cuelearner_jax.errors import UserError, format_value, user_code_error
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.run_config import RunConfig
@@ -92,7 +92,7 @@ class GymnasiumConfig:
                 "fills them"
             )
         known = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
-        return tuple(
+        return checked_quantities(
             Quantity(name, size, unit, known.get(name, ""), kind) for name, size, unit, kind in zip(*rows, strict=True)
         )
 
@@ -274,7 +274,7 @@ def task_from(
         cue_names=names,
         succeeds=succeeds,
     )
-    config.space  # noqa: B018 (raises for cues that do not fit)
+    _ = config.space, config.observation  # raises for cues, units or kinds that do not fit
     return dataclasses.replace(
         GYMNASIUM,
         about=f"Gymnasium's {name}",
@@ -350,11 +350,13 @@ def _named(
     """Return the slices with names and units that the caller, or this package, knows."""
     if given is not None:
         try:
-            found = tuple(one if isinstance(one, Quantity) else Quantity(*one) for one in given)
+            rest = list(Quantity("", 0, ""))[3:]  # said by a whole Quantity alone
+            found = tuple(one if isinstance(one, Quantity) else Quantity._make([*one, *rest]) for one in given)
             total = sum(quantity.size for quantity in found)
         except TypeError as error:
             raise UserError(
-                f'observation is {format_value(given)}: give (name, entries, unit) for each slice, as ("goal", 3, "m")'
+                f'observation is {format_value(given)}: give (name, entries, unit) for each slice, as ("goal", 3, "m") '
+                'or cuelearner_jax.environment.Quantity("goal", 3, "m", kind="own")'
             ) from error
         wanted = sum(quantity.size for quantity in slices)
         if total != wanted:

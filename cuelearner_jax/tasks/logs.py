@@ -90,8 +90,8 @@ def space_of(config: LogsConfig) -> Space:
     unit = STEPS if config.actions == "choices" else SHARE
     cues = cues_from(config.cues, config.cue_names, unit) if config.cues else ()
     if cues and config.keys:
-        pairs = [tuple(pair.split(",")) for pair in config.keys]
-        if len(pairs) != len(cues) or not all(len(pair) == 2 and all(pair) for pair in pairs):
+        pairs = [tuple(pair.split(",")) if pair else () for pair in config.keys]
+        if len(pairs) != len(cues) or not all(not pair or (len(pair) == 2 and all(pair)) for pair in pairs):
             raise UserError(f"task.keys is {config.keys}: give two keys for each cue, as q,a")
         cues = tuple(dataclasses.replace(cue, keys=pair) for cue, pair in zip(cues, pairs, strict=True))
     return Choices(len(config.low), *cues) if config.actions == "choices" else Box(config.low, config.high, cues)

@@ -99,6 +99,19 @@ def test_agreement_counts_what_was_said_alone():
     assert cl.agreement(wanted, swapped, eps=EPS, space=SPACE).policy[0] == 0.0
 
 
+def test_labels_that_say_nothing_do_not_count():
+    of = asked(40, seed=6)
+    silent = of._replace(answer=np.full_like(of.answer, cl.UNSAID))
+    both = cl.Labels(*map(np.concatenate, zip(of, silent, strict=True)))
+    assert cl.agreement(off, both, eps=EPS, space=SPACE) == cl.agreement(off, of, eps=EPS, space=SPACE)
+    sizes = GuideSizes(feedback_layers=(8,), fit_steps=20, fit_batch_size=8)
+    fitted = [cl.fit_feedback(given, space=SPACE, sizes=sizes, scalars=FAST).labels for given in (of, both)]
+    np.testing.assert_array_equal(*(model.answer for model in fitted))
+    for use in (lambda: cl.agreement(off, silent, eps=EPS, space=SPACE), lambda: cl.fit_feedback(silent, space=SPACE)):
+        with pytest.raises(cl.UserError, match="say nothing of any cue: give labels with answers"):
+            use()
+
+
 def test_it_is_saved_and_loaded_with_the_code_of_its_base(better, tmp_path):
     better.save(tmp_path / "better")
     again = cl.load_policy(tmp_path / "better", base=off)

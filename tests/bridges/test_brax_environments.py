@@ -12,7 +12,6 @@ from brax.envs.wrappers import training
 
 from cuelearner_jax import loop
 from cuelearner_jax.bridges.brax import from_brax, to_brax
-from cuelearner_jax.bridges.jax_environment import cues_of
 from cuelearner_jax.environment import Environment, actions_of, offers, symmetries_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -124,9 +123,6 @@ def test_actions_are_the_whole_box_or_directions_where_the_caller_says_what_they
     assert actions_of(from_brax(Field(), lambda direction: direction)) == DIRECTIONS
     named = from_brax(envs.get_environment("halfcheetah")).actions  # by its model
     assert [cue.name for cue in named.cues] == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
-    assert len({key for cue in cues_of(["joint"] * 21) for key in cue.keys}) == 42  # a humanoid's
-    with pytest.raises(UserError, match="22 entries, and keys are for 21: give `cues`"):
-        cues_of(["joint"] * 22)
 
 
 def test_observations_in_a_dictionary_are_one_vector_with_named_slices():

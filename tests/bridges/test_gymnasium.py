@@ -255,6 +255,15 @@ def test_spaces_that_are_not_served_are_told_in_one_line(seen, does, told):
         ({"env": Adder, "max_steps": 6, "observation": [("total", 3, "m")]}, "names 3 entries, and .*Adder has 2"),
         ({"env": Adder, "max_steps": 6, "observation": [3]}, "give .name, entries, unit. for each slice"),
         ({"env": Adder, "max_steps": 6, "units": {"totl": "m"}}, "units names 'totl'"),
+        (
+            {"env": Adder, "max_steps": 6, "units": {"observation": "metres"}},
+            "unit of 'observation' is 'metres': give a symbol, as m",
+        ),
+        ({"env": Adder, "max_steps": 6, "observation": [("total", 2, "m", "own")]}, 'Quantity.*kind="own"'),
+        (
+            {"env": Adder, "max_steps": 6, "observation": [Quantity("total", 2, "m", kind="mine")]},
+            "kind of 'total' is 'mine': give own, beams, directions, or none",
+        ),
         ({"env": Adder, "max_steps": 6, "start": np.zeros(2)}, "arguments of .* cannot be kept in a file"),
         ({"env": Adder, "max_steps": 6, "strat": 2}, "raised TypeError"),
         ({"env": lambda: 3, "max_steps": 6}, "gave a int without 'reset'"),

@@ -243,7 +243,8 @@ def explained(command, out, err):
     """What is told of a command."""
     assert err == ""
     if command in ("train", "sweep", "evaluate", "render"):
-        assert "(--preset; paper where none is given)" in out
+        default = "quickstart" if command in ("train", "sweep") else "paper"
+        assert f"(--preset; {default} where none is given)" in out
         assert re.search(
             r"\):\n  paper +.*\n  regulation +.*\n  shaped +.*\n  easy +.*\n  quickstart  .*minutes on 2 cores\)\n", out
         )

@@ -7,7 +7,7 @@ import numpy as np
 import probes
 import pytest
 from gymnasium_worlds import reach, toward
-from small_runs import stopping_at
+from small_runs import next_command, stopping_at
 
 import cuelearner_jax as cl
 from cuelearner_jax.bridges.gymnasium import pool
@@ -85,15 +85,13 @@ def test_an_interrupted_training_goes_on_bitwise(run, tmp_path):
 APART = {"wall_s", "commit", "command", "folder", "run"}
 
 
-@pytest.mark.long
 def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
     out = tmp_path / "better"
     command = ["adapt", "gymnasium_worlds:beside", "--env", REACH, "--teacher", "gymnasium_worlds:toward"]
     assert main([*command, "--labels", "20", *SMALL, "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert "success on tuning episodes" in told  # where there is one, success judges
-    command = ["evaluate", str(out), "--env", REACH, "--base", "gymnasium_worlds:beside", "--episodes", "4"]
-    assert main([*command, "--task.processes", "1"]) == 0
+    assert main([*next_command(told), "--episodes", "4"]) == 0  # with the folder's number of processes
 
 
 def test_python_and_the_command_line_agree(tmp_path):

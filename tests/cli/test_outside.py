@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from cuelearner_jax.cli import main
+from cuelearner_jax.cli import main, sweep
+from cuelearner_jax.cli.shared_options import asked_of_preset
 from cuelearner_jax.storage import results
 from cuelearner_jax.tasks import registry
 
@@ -135,3 +136,20 @@ def test_help_names_what_there_is_to_choose_from(capsys):
             ("relative", "a model of"),
         ):
             assert re.search(rf"^  {name} +{about}", told, re.MULTILINE)
+
+
+def test_training_starts_from_the_preset_of_minutes_where_none_is_named():
+    task = registry.find("billiards")
+    asked = asked_of_preset(["billiards", "--schedule.eval-envs", "4"], "sweep", sweep.Sweep, sweep._options)[1]
+    assert asked.out.name == "billiards-quickstart"
+    assert asked.run.schedule.total_steps == task.presets["quickstart"].config.schedule.total_steps
+
+
+@pytest.mark.parametrize("command", ["train", "sweep", "adapt", "evaluate", "render", "export"])
+def test_help_says_how_a_world_and_a_teacher_of_ones_own_are_named(command, capsys):
+    for whole in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            main([command, "billiards", whole])
+        told = capsys.readouterr().out
+        named = ("--env", "--teacher") if whole == "--help-all" or command in ("train", "sweep", "adapt") else ()
+        assert all(f"  {option} " in told for option in named), told

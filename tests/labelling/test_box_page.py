@@ -101,7 +101,16 @@ def test_what_a_page_cannot_ask_is_refused():
     twice = Box((0.0, 0.0), (1.0, 1.0), (Cue("a", ("more", "less"), ("q", "x"), "shares"),) * 2)
     with pytest.raises(UserError, match="the key 'Q' stands for two answers"):
         controls.check(RELATIVE, twice)
-    controls.check(RELATIVE, Box((0.0,) * 8, (1.0,) * 8))  # cues that no task named have keys of their own
+
+
+def test_cues_for_which_no_keys_are_left_have_buttons_alone():
+    hand = Box((0.0,) * 26, (1.0,) * 26)
+    controls.check(RELATIVE, hand)
+    for one_cue in (False, True):
+        known = controls.controls(RELATIVE, hand, one_cue)
+        about = [control for control in known.values() if control.cue == 25]
+        assert [control.words for control in about if control.words in ("more", "less")] == ["more", "less"]
+        assert not any(control.keys for control in about)
 
 
 def test_agreement_counts_the_cues_of_which_both_say_something():

@@ -39,12 +39,12 @@ def folder(tmp_path):
 
 
 def arrows(svg):
-    """Name -> angle on the screen [deg, counterclockwise] and words of each cue's arrow in a picture."""
+    """Name -> angle on the screen [deg, counterclockwise], key and title of each cue's arrow in a picture."""
     found = {}
     for part in svg.split('<g class="said ')[1:]:
         name, drawn = re.match(r'\w+" data-name="([^"]+)">', part)[1], part
         x1, y1, x2, y2 = map(float, re.search(r'x1="(\S+)" y1="(\S+)" x2="(\S+)" y2="(\S+)"', drawn).groups())
-        words = re.findall(r">([^<>]+)</text>", drawn)
+        words = re.findall(r">([^<>]+)</(?:text|title)>", drawn)[::-1]
         found[name] = round(np.degrees(np.arctan2(y1 - y2, x2 - x1))), *words
     return found
 
@@ -70,7 +70,7 @@ def test_cues_are_arrows_where_their_words_point_with_keys_and_words():
         "pick-1-less": (0, "→", "right"),
         "pick-2-more": (90, "↑", "up"),
         "pick-2-less": (-90, "↓", "down"),
-    }  # to open points nowhere: its words stand beside the picture
+    }  # to open points nowhere: its words stand beside the picture, as all words do
     assert {name[:5] for name in arrows(drawn(box(CUES), one_cue=True))} == {"only-"}
     assert arrows(drawn(box("higher,lower"))) == {"+1": (90, "H", "higher"), "-1": (-90, "L", "lower")}
     assert arrows(drawn(box("right,left")))["+1"][0] == 0  # more may be to the right

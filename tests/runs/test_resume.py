@@ -434,7 +434,7 @@ def test_rows_that_were_lost_before_the_checkpoint_are_missed(stopped, tmp_path,
 def test_a_table_that_was_lost_is_missed_and_its_lanes_can_be_trained_anew(stopped, whole, tmp_path):
     out = copied(stopped, tmp_path)
     (out / "relative" / results.JSONL).unlink()
-    refused(out, "or delete .*relative and give --resume, which trains these lanes anew")
+    refused(out, "or move .*relative away and give --resume, which trains these lanes anew")
     shutil.rmtree(out / "relative")  # as the message says
     run(out, resume=True)
     assert_same_run(out, whole)

@@ -11,8 +11,10 @@ import pytest
 from box_task import EPS, SCALARS, SMALL, Reach
 from flax import struct
 
+import cuelearner_jax as cl
 from cuelearner_jax import asking
 from cuelearner_jax.agents import ddqn
+from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
@@ -28,7 +30,7 @@ from cuelearner_jax.feedback.answers import (
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.spaces import UNSAID, Box, Cue, from_json
+from cuelearner_jax.spaces import UNSAID, Box, Cue, cues_from, from_json
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.testing import check_environment
 from cuelearner_jax.types import Label
@@ -106,7 +108,6 @@ def test_a_file_describes_a_box(box):
         (((0.0,), (float("inf"),)), "finite number"),
         (((0.0,), (1.0,), (Cue("a", ("more", "less"), ("q", "a"), "degrees"),)), "has the unit 'degrees'"),
         (((0.0, 0.0), (1.0, 1.0), (Cue("a", ("more", "less"), ("q", "a"), "shares"),)), "one cue an entry"),
-        (((0.0,) * 9, (1.0,) * 9), "give `cues`"),
     ],
 )
 def test_bounds_and_cues_that_fit_no_box_are_refused(given, said):
@@ -253,3 +254,33 @@ def test_a_teacher_is_blamed_by_the_rules_of_their_space():
     asking.blame(env, Saying(jnp.zeros(3)), guide)
     with pytest.raises(UserError, match="teacher Saying gave actions that are not finite"):
         asking.blame(env, Saying(jnp.array([0.0, jnp.nan, 0.0])), guide)
+
+
+@pytest.mark.parametrize("size", [9, 14, 28])
+def test_boxes_of_bimanual_arms_and_hands_need_no_cues_and_no_keys(size):
+    plain = Box((-1.0,) * size, (1.0,) * size)
+    assert [cue.name for cue in plain.cues][::8] == [f"entry {number}" for number in range(1, size + 1, 8)]
+    named = Box(plain.low, plain.high, cues_from(";".join(f"more{entry},less{entry}" for entry in range(size))))
+    for box in (plain, named):
+        keys = [key for cue in box.cues for key in cue.keys]
+        assert len(keys) == len(set(keys)) > 16
+        assert from_json(box.to_json()) == box
+        np.testing.assert_allclose(box.exp(*map(jnp.asarray, (box.low, np.ones(size)))), box.high)
+
+
+def test_a_policy_of_26_entries_is_corrected_by_labels_alone_and_its_folder_read(tmp_path):
+    random, size = np.random.default_rng(0), 26
+    best = random.uniform(-0.5, 0.5, (60, size))
+    actions = best + 0.2 + random.uniform(-0.2, 0.2, best.shape)
+    labels = cl.Labels(best, actions, np.sign(best - actions))
+    sizes = GuideSizes(frame="action", feedback_layers=(8,), fit_steps=20, fit_batch_size=8)
+    policy = cl.correct(shifted, labels, low=[-1] * size, high=[1] * size, bound=0.25, sizes=sizes)
+    policy.save(tmp_path / "hand")
+    again = cl.load_policy(tmp_path / "hand", base=shifted)
+    assert again.actions == policy.actions
+    np.testing.assert_array_equal(again(best), policy(best))
+
+
+def shifted(obs):
+    """A policy that is wrong by a constant."""
+    return obs + 0.2
