@@ -59,8 +59,8 @@ def intervals(
     return Answers(lower, upper, valid[:, None] & (answer != UNSAID))
 
 
-def log_likelihood(change: Float[Array, "*n cues"], answers: Answers, habits: Habits) -> Float[Array, "*n cues"]:
-    """Return log p(answer | change) of each cue, 0 where nothing was said; leading axes beyond (n, cues) broadcast."""
+def log_likelihood(change: Float[Array, "n cues"], answers: Answers, habits: Habits) -> Float[Array, "n cues"]:
+    """Return log p(answer | change) of each cue, 0 where nothing was said."""
     between = _mass(change, answers, habits.tau, habits.width)
     log_p = jnp.log((1 - habits.lapse) * between + habits.lapse / 3)
     return jnp.where(answers.valid, log_p, 0.0)
@@ -80,7 +80,7 @@ def expected_log_likelihood(
 ) -> Float[Array, "n cues"]:
     """Return E[log p(answer | change)] over normally distributed changes, by Gauss-Hermite quadrature."""
     nodes, shares = jnp.asarray(_NODES, jnp.float32), jnp.asarray(_WEIGHTS, jnp.float32)
-    values = log_likelihood(mean + jnp.sqrt(variance) * nodes[:, None, None], answers, habits)
+    values = jax.vmap(lambda node: log_likelihood(mean + node * jnp.sqrt(variance), answers, habits))(nodes)
     return jnp.tensordot(shares, values, 1)
 
 

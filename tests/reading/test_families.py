@@ -8,7 +8,10 @@ from known_worlds import BOX, STEP_DEG, Yard, aims, changed, grips, situations
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_jax.calibration.families import (
+from cuelearner_jax.environment import OWN, Quantity
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.reading.families import (
     Distortion,
     Unknown,
     check_family,
@@ -17,17 +20,14 @@ from cuelearner_jax.calibration.families import (
     undo_observation,
     unknowns_of,
 )
-from cuelearner_jax.calibration.policy import Calibrated
-from cuelearner_jax.environment import OWN, Quantity
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import policy_of
+from cuelearner_jax.reading.policy import unread
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import from_angle, rotate
 
 
 def test_an_environment_declares_what_can_have_changed():
     names = [distortion.name for distortion in declared_distortions(Yard())]
-    assert names == ["ball and 1 more: shift", "lidar: turn", "wind: turn", "direction: change"]
+    assert names == ["ball and 1 more: shift", "ball and 1 more: gain", "lidar: turn", "wind: turn"]
     units = [
         (unknown.name, unknown.unit)
         for unknown in unknowns_of(declared_distortions(make_environment(BilliardsConfig())))
@@ -35,21 +35,20 @@ def test_an_environment_declares_what_can_have_changed():
     assert units == [
         ("cue ball: place and 3 more: shift x", "m"),
         ("cue ball: place and 3 more: shift y", "m"),
-        ("direction: turn", "degrees"),
+        ("cue ball: place and 3 more: gain", "percent"),
     ]
     assert [distortion.name for distortion in declared_distortions(Navigation(worlds=None))] == [  # pyright: ignore
         "lidar: turn",
         "goal: direction: turn",
-        "direction: change",
     ]
 
 
 @pytest.mark.parametrize(("space", "policy"), [(DIRECTIONS, aims), (BOX, grips)])
 def test_without_a_change_the_policy_stays_what_it_was(space, policy):
-    family = declared_distortions(Yard(space), gains=True)
+    family = declared_distortions(Yard(space))
     _, obs = situations(jax.random.key(0), None, 8)
     base = policy_of(jax.jit(policy)).replace(actions=space)
-    corrected = Calibrated(base, jnp.zeros(len(unknowns_of(family))), family)
+    corrected = unread(base, space, family, obs.shape[1])
     np.testing.assert_array_equal(corrected.act(jax.random.key(0), None, obs), base.act(jax.random.key(0), None, obs))
 
 
@@ -125,11 +124,9 @@ def test_beams_between_two_are_interpolated_and_nothing_is_seen_beyond_the_last(
 
 
 def test_an_action_leads_where_the_policy_meant_it_to():
-    (turn,) = [one for one in declared_distortions(Yard()) if one.acts]
-    given = undo_action((turn,), jnp.array([30.0]), from_angle(1.0))
-    np.testing.assert_allclose(rotate(given, jnp.deg2rad(30.0)), from_angle(1.0), atol=1e-6)
-    faulty = [one for one in declared_distortions(Yard(), teacher_bias=True) if one.acts]
-    np.testing.assert_array_equal(undo_action(tuple(faulty), jnp.array([30.0]), from_angle(1.0)), from_angle(1.0))
+    turn = Distortion("turn", (Unknown("turn", "degrees"),), acts=lambda theta, a: rotate(a, -jnp.deg2rad(theta[0])))
+    action = undo_action((turn,), jnp.array([30.0]), from_angle(1.0))
+    np.testing.assert_allclose(rotate(action, jnp.deg2rad(30.0)), from_angle(1.0), atol=1e-6)
 
 
 def test_families_that_make_no_sense_are_refused():
