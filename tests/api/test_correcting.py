@@ -119,9 +119,9 @@ def test_it_can_be_corrected_again(better, tmp_path):
 
 
 @pytest.mark.long
-def test_a_constant_change_is_found_by_calibration():
+def test_a_constant_change_is_found_by_a_reading():
     labels = asked(150, reach=0.1)
-    found = cl.correct(off, labels, low=LOW, high=HIGH, eps=EPS, guidance="calibration")
+    found = cl.correct(off, labels, low=LOW, high=HIGH, eps=EPS)
     assert found.used
     assert error(found) < 0.25 * ERROR
     assert "shares" in found.words[0]
