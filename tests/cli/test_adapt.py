@@ -213,14 +213,14 @@ def defaults_of(capsys, *options):
 def test_a_scenario_says_how_unless_another_kind_is_asked_for(home, capsys):
     assert defaults_of(capsys, "--scenario", "told") == ["demonstration", "labels", "40", "7"]
     kind, by, a_round, passes = defaults_of(capsys)
-    assert (kind, by, a_round, passes) == ("reading", "reward", "10", "50")
+    assert (kind, by, a_round, passes) == ("reading", "labels", "10", "50")
     assert defaults_of(capsys, "--scenario", "told", "--guidance", "dcoach") == ["dcoach", "labels", a_round, passes]
 
 
 def test_a_scenario_says_which_bounds_are_tried_unless_labels_decide(home, capsys):
     for options, shown in (([], "(default: 0.5 0.25)"), (["--judge-by", "labels"], "(default: )")):
         with pytest.raises(SystemExit):
-            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *options, "--help-all"])
+            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *FIT, *options, "--help-all"])
         told = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
         assert shown in told[told.index("--judge-bounds") : told.index("--overwrite")]
 
@@ -307,7 +307,7 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
 def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
     refused(["adapt", "own_turned:straight", *new], "needs a task to act in: give one, for instance --task", tmp_path)
-    plain = ["adapt", "own_turned:straight", *TASK, *new]
+    plain = ["adapt", "own_turned:straight", *TASK, *new, "--guidance", "relative"]
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
     refused([*plain, "--bound-deg", "200"], "bound_deg is 200: give a number above 0 and up to 180", tmp_path)
     refused([*plain, "--bound-deg", "0.3"], "say nothing within a bound of 0.3: give a smaller", tmp_path)
