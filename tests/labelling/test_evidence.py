@@ -20,7 +20,7 @@ SETTINGS = {
     "config": CONFIG,
     "labels": 30,
 }
-LINE = re.compile(r"action: direction: (\S+) \[(\S+), (\S+)\] degrees")
+LINE = re.compile(r"action: turn: (\S+) \[(\S+), (\S+)\] degrees")
 
 
 def estimate(status):
@@ -36,7 +36,7 @@ def test_the_estimate_narrows_the_page_shows_it_the_policy_follows_and_a_restart
 
     async def acts(user, pages):
         await user.should_see("estimate 2, of 20 labels")
-        await user.should_see("action: direction: ")
+        await user.should_see("action: turn: ")
         await user.should_see("the corrected policy")
 
     session = opened(**SETTINGS)
