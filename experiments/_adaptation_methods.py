@@ -25,6 +25,7 @@ from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Corrected
+from cuelearner_jax.reading import declared_distortions
 from cuelearner_jax.types import Label
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def by_residuals(bench: Bench) -> Iterator[Row]:
     """The correction itself, learned from optimal actions, in units of the bound."""
     settings = {"scalars.eps_deg": bench.piece.bound_deg, "scalars.tau_max_deg": bench.piece.bound_deg}
     settings |= {"scalars.k_max": 3, **bench.piece.settings}
-    kind = residual.OFFSET if "guidance" in settings else residual.KIND
+    kind = residual.KIND
     yield from by_labels(kind, bench._replace(piece=bench.piece._replace(settings=settings)))
 
 

@@ -38,7 +38,7 @@ SIZES = GuideSizes(
     feedback_layers=(64, 64), labels_per_round=A_ROUND, fit_steps=300, fit_batch_size=32, question_every=5
 )
 CORRECTIONS: Mapping[str, Kind] = {  # what a kind is where a finished policy is corrected
-    "demonstration": _residual.OFFSET,
+    "demonstration": _residual.KIND,
     "dcoach": _coach.KIND,
     "bdcoach": _coach.BATCH,
     "clic": _energy.KIND,

@@ -8,15 +8,11 @@ more passes correct what it has made of the action, about which questions are fr
 `scalars.refined_fraction`).
 
 It is a kind of guidance, so the program of adaptation runs it as it runs relative feedback; on the command line it is
-named as `_residual:KIND`, or `_residual:OFFSET` to see how far an action has been turned, with this folder on the path
-of Python.
+named as `_residual:KIND`, with this folder on the path of Python.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from cuelearner_jax.guides.offset import Offset
 from jaxtyping import Array, Float
 
 from cuelearner_jax.config import GuideScalars
@@ -39,9 +35,4 @@ class Residual(_Shown, Relative):
     """Residual learning."""
 
 
-class ResidualOffset(_Shown, Offset):
-    """Residual learning that sees how far an action has been turned."""
-
-
 KIND = Kind("residual", "the correction itself, from optimal actions", Residual, form=DEMONSTRATION, colour="#D55E00")
-OFFSET = replace(KIND, name="residual-offset", guide=ResidualOffset, sees_base=True)

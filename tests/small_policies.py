@@ -6,15 +6,17 @@ import jax
 import numpy as np
 import probes
 
-from cuelearner_jax.adaptation.by_calibration import Calibrating, Evidence
 from cuelearner_jax.adaptation.by_model import AdaptationResult
+from cuelearner_jax.adaptation.by_reading import Evidence, ReadingAdaptation
 from cuelearner_jax.adaptation.judging import Judgement
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, begin
-from cuelearner_jax.calibration.families import declared_distortions, unknowns_of
 from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Common
+from cuelearner_jax.reading import declared_distortions
+from cuelearner_jax.reading.policy import unread
 from cuelearner_jax.runs import adapted
 from cuelearner_jax.storage import policy_folders
 
@@ -37,18 +39,19 @@ def agent():
     return Agent(functions.init(jax.random.key(4))[0], functions, ENV)
 
 
-def write(folder, overwrite=False, origin="run", calibrated=False):
+def write(folder, overwrite=False, origin="run", read=False):
     """Write the folder; `origin`: what policy.json says was adapted."""
-    kind, family = ("calibration", (declared_distortions(ENV),)) if calibrated else ("relative", ())
+    kind, family = ("reading", (declared_distortions(ENV),)) if read else ("relative", ())
     guidance = guidances.make(kind, SIZES, ENV)
-    of = (Calibrating if calibrated else Adaptation)(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), *family)
+    of = (ReadingAdaptation if read else Adaptation)(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), *family)
     worth = np.zeros(2), np.ones(2), np.ones(2, bool), np.full(2, 45.0)
     judged = Judgement("reward", *worth, difference=np.ones((2, 3)), rewarded_steps=np.zeros(2, int))
     block = begin(of, LANES)
-    if calibrated:
+    if read:
+        nothing = unread(None, actions_of(ENV), of.family, ENV.obs_size).correction
+        both = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), nothing)
         yes = np.ones(2, bool)
-        theta = np.zeros((2, len(unknowns_of(of.family))), np.float32)
-        block = Evidence(LANES.base, theta, block.labels, block.asked, block.bound, yes, ~yes)
+        block = Evidence(LANES.base, both, block.labels, block.asked, block.bound, yes, ~yes)
     found = AdaptationResult(of, LANES, block, judged, [])
     with policy_folders.place_of(folder, overwrite) as place:
         adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})

@@ -25,7 +25,7 @@ ROWS = [
     ["task"],
     ["policies"],
     ["asking", "evaluate"],
-    ["calibration"],
+    ["reading"],
     ["export"],
     ["loop"],
     ["adaptation"],

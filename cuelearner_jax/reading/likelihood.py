@@ -8,6 +8,7 @@ deviation of what is judged, and a share `lapse` of answers that are about somet
 
 At the end of a cue's range "right" also says that the right action would lie beyond the end: the interval of an action
 that cannot be raised by `tau` has no upper end, and likewise below. So a policy that saturates says nothing wrong.
+"More" of such an action cannot be done and is read as "right", so that probabilities are at most 1 together.
 
 Source: Chu, Ghahramani, "Gaussian processes for ordinal regression", JMLR 2005.
 """
@@ -53,14 +54,15 @@ def intervals(
     tau: Float[Array, ""] | float,
 ) -> Answers:
     """Return the intervals of answers; `below`, `above`: how far each action can be changed before its range ends."""
-    less, more = answer < 0, (answer > 0) & (answer != UNSAID)
-    upper = jnp.where(more, jnp.inf, jnp.where(less, -1.0, jnp.where(above < tau, jnp.inf, 1.0)))
-    lower = jnp.where(less, -jnp.inf, jnp.where(more, 1.0, jnp.where(below < tau, -jnp.inf, -1.0)))
+    least, most = below < tau, above < tau
+    less, more = (answer < 0) & ~least, (answer > 0) & (answer != UNSAID) & ~most
+    upper = jnp.where(more | (most & ~less), jnp.inf, jnp.where(less, -1.0, 1.0))
+    lower = jnp.where(less | (least & ~more), -jnp.inf, jnp.where(more, 1.0, -1.0))
     return Answers(lower, upper, valid[:, None] & (answer != UNSAID))
 
 
-def log_likelihood(change: Float[Array, "*n cues"], answers: Answers, habits: Habits) -> Float[Array, "*n cues"]:
-    """Return log p(answer | change) of each cue, 0 where nothing was said; leading axes beyond (n, cues) broadcast."""
+def log_likelihood(change: Float[Array, "n cues"], answers: Answers, habits: Habits) -> Float[Array, "n cues"]:
+    """Return log p(answer | change) of each cue, 0 where nothing was said."""
     between = _mass(change, answers, habits.tau, habits.width)
     log_p = jnp.log((1 - habits.lapse) * between + habits.lapse / 3)
     return jnp.where(answers.valid, log_p, 0.0)
@@ -80,7 +82,7 @@ def expected_log_likelihood(
 ) -> Float[Array, "n cues"]:
     """Return E[log p(answer | change)] over normally distributed changes, by Gauss-Hermite quadrature."""
     nodes, shares = jnp.asarray(_NODES, jnp.float32), jnp.asarray(_WEIGHTS, jnp.float32)
-    values = log_likelihood(mean + jnp.sqrt(variance) * nodes[:, None, None], answers, habits)
+    values = jax.vmap(lambda node: log_likelihood(mean + node * jnp.sqrt(variance), answers, habits))(nodes)
     return jnp.tensordot(shares, values, 1)
 
 

@@ -80,7 +80,7 @@ def undone(family: Family, change: Change, obs: Float[Array, "n obs"]) -> Float[
     """Return observations as they would be without the change."""
     if family:
         return jax.vmap(partial(undo_observation, family, change.theta))(obs)
-    return obs - change.theta + (obs - change.centre) @ change.mix.T
+    return obs - change.theta[None] + (obs - change.centre[None]) @ change.mix.T
 
 
 def meant(
@@ -111,7 +111,7 @@ def frame_of(
     """Return the units for labels; `step`: of a family's unknowns; `mixed`: entries that may mix (default: none)."""
     weight = labels.valid / jnp.maximum(labels.valid.sum(), 1)
     mean = weight @ labels.obs
-    deviation = jnp.sqrt(weight @ (labels.obs - mean) ** 2)
+    deviation = jnp.sqrt(weight @ (labels.obs - mean[None]) ** 2)
     varies = deviation > 1e-5 * (1e-3 + jnp.abs(mean))
     if step is None:
         step = jnp.where(varies, STEP * deviation, 0.0)
@@ -124,8 +124,8 @@ def probes(family: Family, frame: Frame, change: Change, obs: Float[Array, "n ob
 
     k = 2 + 2 * unknowns.
     """
-    steps = jnp.diag(frame.step)
-    sides = jnp.concatenate([change.theta[None], change.theta - steps, change.theta + steps])
+    steps, theta = jnp.diag(frame.step), change.theta[None]
+    sides = jnp.concatenate([theta, theta - steps, theta + steps])
     moved = jax.vmap(lambda theta: undone(family, change.replace(theta=theta), obs))(sides)
     return jnp.concatenate([obs[None], moved])
 
@@ -186,8 +186,8 @@ def data(
         eps: strength of an answer, in the unit of `space.log`.
     """
     scale, size = SCALE * eps, len(frame.step)
-    steps = jnp.diag(frame.step)
-    sides = jnp.concatenate([change.theta[None], change.theta - steps, change.theta + steps])
+    steps, theta = jnp.diag(frame.step), change.theta[None]
+    sides = jnp.concatenate([theta, theta - steps, theta + steps])
     whole = jax.vmap(partial(meant, family))(sides, asked[1:], actions[1:])
     base, slope = whole[0], jnp.moveaxis(space.log(whole[1 : 1 + size], whole[1 + size :]), 0, -1) / (2 * scale)
     slope = jnp.where(jumps(space, family, frame, change, asked, actions, eps)[:, None], 0.0, slope)
@@ -206,7 +206,7 @@ def features(
 ) -> Float[Array, "n cues p"]:
     """Return the change of each cue by each weight."""
     n, cues, _ = slope.shape
-    z = ((obs - frame.mean) / frame.deviation)[:, frame.mixed]
+    z = ((obs - frame.mean[None]) / frame.deviation[None])[:, frame.mixed]
     mixed = (-slope[:, :, frame.mixed, None] * z[:, None, None, :]).reshape(n, cues, len(frame.mixed) ** 2)
     own = jnp.einsum("cd,nb->ncdb", jnp.eye(cues), basis(space, base)).reshape(n, cues, -1)
     return jnp.concatenate([slope, mixed, own], 2)
@@ -216,7 +216,7 @@ def inputs(
     space: Space, frame: Frame, obs: Float[Array, "n obs"], action: Float[Array, "n action"]
 ) -> Float[Array, "n z"]:
     """Return what the process sees: the observation, and what the policy does about it."""
-    z = jnp.clip((obs - frame.mean) / frame.deviation, -LARGEST, LARGEST) * frame.varies
+    z = jnp.clip((obs - frame.mean[None]) / frame.deviation[None], -LARGEST, LARGEST) * frame.varies[None]
     return jnp.concatenate([z, 2 * space.even(action)], 1)
 
 
@@ -226,7 +226,7 @@ def weights_of(frame: Frame, change: Change) -> Float[Array, " p"]:
     if not len(frame.mixed):
         return jnp.concatenate([change.theta / step, change.action.ravel()])
     theta = change.theta - change.mix @ (frame.mean - change.centre)
-    mix = (change.mix * frame.deviation / step[:, None])[frame.mixed][:, frame.mixed]
+    mix = (change.mix * frame.deviation[None] / step[:, None])[frame.mixed][:, frame.mixed]
     return jnp.concatenate([theta / step, mix.ravel(), change.action.ravel()])
 
 
@@ -236,6 +236,6 @@ def change_of(frame: Frame, weights: Float[Array, " p"], like: Change) -> Change
     theta, mix, action = jnp.split(weights, (size, size + mixed**2))
     whole = jnp.zeros_like(like.mix)
     if mixed:
-        part = mix.reshape(mixed, mixed) * frame.step[frame.mixed][:, None] / frame.deviation[frame.mixed]
+        part = mix.reshape(mixed, mixed) * frame.step[frame.mixed][:, None] / frame.deviation[frame.mixed][None]
         whole = whole.at[frame.mixed[:, None], frame.mixed[None]].set(part)
     return Change(theta * frame.step, whole, frame.mean, action.reshape(like.action.shape))

@@ -122,7 +122,7 @@ def correlation(
     length: Float[Array, " z"], one: Float[Array, "n z"], other: Float[Array, "m z"]
 ) -> Float[Array, "n m"]:
     """Return the correlation of the process at two sets of inputs."""
-    one, other = one / length, other / length
+    one, other = one / length[None], other / length[None]
     square = (one**2).sum(-1)[:, None] + (other**2).sum(-1)[None] - 2 * one @ other.T
     return jnp.exp(-0.5 * jnp.maximum(square, 0.0))
 
@@ -142,7 +142,7 @@ def process(
     """Return the mean of the process at `inputs`; `known`: those of the answers."""
     if parts is not None and not parts.process:
         return jnp.zeros((len(inputs), posterior.alpha.shape[1]))
-    amplitude = amplitudes(posterior.hyper, priors)
+    amplitude = amplitudes(posterior.hyper, priors)[None]
     return amplitude**2 * (correlation(lengths(posterior.hyper, priors), inputs, known) @ posterior.alpha)
 
 
@@ -153,7 +153,7 @@ def _sizes(hyper: Hyper, parts: Parts, group: Array, priors: Priors) -> Array:
 def _solve(hyper: Hyper, parts: Parts, data: Data, precision: Array, target: Array, priors: Priors) -> _Solved:
     """Return the posterior under pseudo-measurements `target` (n, cues) of f with `precision`."""
     size = _sizes(hyper, parts, jnp.array(data.group), priors)
-    x = data.features * size  # (n, cues, p)
+    x = data.features * size[None, None]  # (n, cues, p)
     residual = target - data.offset
     root = jnp.sqrt(precision).T  # (cues, n)
     hx, hr = root[:, :, None] * jnp.moveaxis(x, 1, 0), root * residual.T
@@ -188,7 +188,7 @@ def _whitened(
     """Return one cue's features, residuals and covariance, whitened by process and noise; the last maps to `alpha`."""
     eye = jnp.eye(len(root))
     half_k = root[:, None] * (amplitude**2 * known)
-    factor = jnp.linalg.cholesky(eye + half_k * root)
+    factor = jnp.linalg.cholesky(eye + half_k * root[None])
     inverse = jax.scipy.linalg.solve_triangular(factor, eye, lower=True)
     back = root[:, None] * inverse.T
     return inverse @ hx, inverse @ hr, inverse @ half_k, back, 2 * jnp.log(jnp.diag(factor)).sum()
@@ -278,7 +278,7 @@ def predict(
 
     def of_cue(x: Array, train: Array, w: Array, a: Array) -> Array:
         root = jnp.sqrt(w)
-        factor = jnp.linalg.cholesky(eye + root[:, None] * (a**2 * known) * root)
+        factor = jnp.linalg.cholesky(eye + root[:, None] * (a**2 * known) * root[None])
         half = partial(jax.scipy.linalg.solve_triangular, factor, lower=True)
         hk, hx = half(root[:, None] * a**2 * cross), half(root[:, None] * train)
         return a**2 - (hk**2).sum(0) + (((x - hk.T @ hx) @ posterior.root) ** 2).sum(-1)

@@ -140,7 +140,7 @@ def _seen(
 
 def _matters(value: float, deviation: float, effect: float) -> bool:
     """Return whether an estimate differs from zero, and changes actions."""
-    return abs(value) > NORMAL * deviation and abs(value) * effect > SMALL / SCALE
+    return bool(abs(value) > NORMAL * deviation and abs(value) * effect > SMALL / SCALE)
 
 
 def _of_action(

@@ -33,7 +33,7 @@ ROOM_LEFT = 1 << 20  # space for a checkpoint's metadata, beyond its arrays [byt
 DIGESTS = "digests"
 # Remedies in the message about a checkpoint that cannot be read.
 OTHERS = "it is of another configuration, or of another version of the program: use that one, or start a new run"
-DAMAGED = "it is damaged; delete its folder to return to the checkpoint before it, or start a new run"
+DAMAGED = "it is damaged; move its folder away to return to the checkpoint before it, or start a new run"
 FORBIDDEN = "check the permissions of its files, nothing was changed"
 
 

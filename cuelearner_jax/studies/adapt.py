@@ -94,7 +94,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     """Label file to use instead of asking the teacher."""
     judge_by: str = "reward"
     """What decides whether the correction is used: a metric on tuning episodes, or held-out answers (labels). A model
-    that makes the policy worse than it was is not used."""
+    that is not shown to make the policy better is not used."""
     judge_episodes: int = 50
     """Largest number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
     judge_every: int = 0
@@ -369,7 +369,7 @@ def sentences(found: AdaptationResult) -> list[str]:
         if judged.by == judging.LABELS:
             worth, worse = f"predicts {after} of held-out answers, always 'already right' {before}", "fewer than that"
         else:
-            worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "worse than before"
+            worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "not shown to be better"
             worth += f" ({_worth(judged.difference[own], judged.rewarded_steps[own])})"
         lines.append(f"{budget} labels within {bound:g} {unit}: {worth}")
         if narrowed := sorted(

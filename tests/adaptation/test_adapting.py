@@ -30,7 +30,7 @@ RELATIVE = guidances.make("relative", SIZES, ENV)
 OBS = directions.evenly_spaced(4)
 SHIFTS = (-25.0, 40.0)  # by which the base policies miss the best direction [deg]
 MESH = lane_mesh(jax.local_devices()[:1])
-JUDGING = Judging(ENV, num_envs=20, steps=200)
+JUDGING = Judging(ENV, num_envs=20, steps=10)
 
 
 class Shifted(PolicyNode):
@@ -88,17 +88,19 @@ def test_a_constant_shift_is_recovered_to_within_eps():
     policy = found().policy(ENV)
     for lane in np.flatnonzero((LANES.budget == 80) & (LANES.bound_deg == 60)):
         assert errors(policy, lane).max() < SCALARS.eps_deg
-    assert found().judged.used.all()
-    np.testing.assert_array_equal(found().judged.before, 0.0)
     judged = found().judged
+    np.testing.assert_array_equal(judged.used, judged.after > 0.2)  # a lane that may not go far enough is no better
+    np.testing.assert_array_equal(judged.before, 0.0)
     assert judged.after[(LANES.budget == 80) & (LANES.bound_deg == 60)].min() == 1.0
     np.testing.assert_allclose(judged.difference[:, 0], judged.after - judged.before, atol=1e-6)
     assert (judged.difference[:, 1] <= judged.difference[:, 0]).all()
-    assert set(judged.rewarded_steps.tolist()) == {2 * JUDGING.steps}  # before and after
+    assert set(judged.rewarded_steps.tolist()) == {2 * 20 * JUDGING.steps}  # before and after
 
 
 def test_the_bound_is_never_exceeded():
-    policy, labels = found().policy(ENV), found().labels
+    fitted = found().block.guide
+    block = found().block.replace(guide=fitted.replace(model=fitted.model.replace(fitted=jnp.ones(8, bool))))
+    policy, labels = of().policy(block), found().labels  # used or not
     for lane, bound in enumerate(LANES.bound_deg):
         base = Shifted(jnp.array(SHIFTS[LANES.base[lane]]))
         moved = apart(acted(base, OBS), acted(policy.lane(lane), OBS))
@@ -111,9 +113,7 @@ def test_the_bound_is_never_exceeded():
         assert away[:10].max() < 1e-3  # the first round is about its own actions
         assert away[10:].max() > 4.0  # later ones about refined ones
     # However wild the model.
-    wild = found().block.replace(
-        guide=found().block.guide.replace(model=jax.tree.map(_blown, found().block.guide.model))
-    )
+    wild = block.replace(guide=block.guide.replace(model=jax.tree.map(_blown, block.guide.model)))
     policy = of().policy(wild)
     everywhere = directions.evenly_spaced(100)
     for lane, bound in enumerate(LANES.bound_deg):
@@ -149,7 +149,7 @@ def test_the_curve_says_what_policies_were_worth_on_the_way():
     curve = found().curve
     assert [row["asked"].max() for row in curve] == list(range(0, 90, 10))
     np.testing.assert_array_equal(curve[0]["reward"], found().judged.before)
-    np.testing.assert_array_equal(curve[-1]["reward"], found().judged.after)
+    np.testing.assert_allclose(curve[-1]["reward"], found().judged.after, atol=0.1)  # on other episodes
     assert curve[-1]["asked"].tolist() == LANES.budget.tolist()
 
 
@@ -190,19 +190,21 @@ def test_without_a_simulator_held_out_answers_decide():
 
 @pytest.mark.long
 def test_a_bound_is_narrowed_where_that_is_worth_more():
-    """Wrong answers about a policy that is right already: within half of the window it stays right."""
+    """The same answer always, about a policy that is 2 degrees outside of the window."""
     lanes = product(1, (0,), (40,), (60.0,))
-    base = Common(Shifted(jnp.array(0.0)))
+    base = Common(Shifted(jnp.array(-8.0)))
     wide, narrow = (
-        by_model.adapt(of(base), lanes, dataclasses.replace(JUDGING, bounds=shares), labels=own_labels(0.0, 40))
+        by_model.adapt(of(base), lanes, dataclasses.replace(JUDGING, bounds=shares), labels=own_labels(-8.0, 40))
         for shares in ((), (0.5, 0.05))
     )
-    assert (wide.judged.before[0], wide.judged.after[0], wide.judged.used[0]) == (1.0, 0.0, False)
+    assert (wide.judged.before[0], wide.judged.after[0], wide.judged.used[0]) == (0.0, 0.0, False)
     assert wide.judged.within_deg.tolist() == pytest.approx([60.0])
     assert (narrow.judged.after[0], narrow.judged.used[0]) == (1.0, True)
     assert narrow.judged.within_deg.tolist() == pytest.approx([3.0])
-    assert (narrow.judged.rewarded_steps[0], wide.judged.rewarded_steps[0]) == (4 * JUDGING.steps, 2 * JUDGING.steps)
-    assert errors(narrow.policy(ENV), 0) == pytest.approx(3.0, abs=0.01)
+    episodes = 3 * 20 + 2 * 10, 2 * 20  # the three bounds, then pairs until the test decides
+    spent = narrow.judged.rewarded_steps[0], wide.judged.rewarded_steps[0]
+    assert spent == tuple(count * JUDGING.steps for count in episodes)
+    assert errors(narrow.policy(ENV), 0) == pytest.approx(5.0, abs=0.01)
 
 
 def quarter(obs):

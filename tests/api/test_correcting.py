@@ -20,6 +20,7 @@ CUES = "left,right;up,down;open,close"
 OFFSET = np.array([0.02, -0.015, 0.2], np.float32)  # a tenth of the ranges or so
 EPS = 0.04
 SIZES = GuideSizes(frame="action", feedback_layers=(32, 32), fit_steps=200, fit_batch_size=32)
+NETWORK = {"guidance": "relative", "sizes": SIZES}
 FAST = dataclasses.replace(Scalars(), eps_deg=EPS, tau_deg=0.002, tau_max_deg=1.0, feedback_learning_rate=0.01)
 
 
@@ -61,7 +62,7 @@ def error(policy, obs=OTHERS):
 def better():
     """Corrected by 150 labels."""
     how = {"cues": CUES, "low": np.array(LOW), "high": list(HIGH), "eps": EPS, "bound": 0.2}
-    return cl.correct(off, asked(150), sizes=SIZES, scalars=FAST, **how)
+    return cl.correct(off, asked(150), scalars=FAST, **NETWORK, **how)
 
 
 def test_a_corrected_policy_is_nearer_to_what_people_have_in_mind(better):
@@ -123,7 +124,7 @@ def test_it_is_saved_and_loaded_with_the_code_of_its_base(better, tmp_path):
 
 
 def test_it_can_be_corrected_again(better, tmp_path):
-    how = {"eps": EPS, "bound": 0.1, "sizes": SIZES, "scalars": FAST}
+    how = {"eps": EPS, "bound": 0.1, "scalars": FAST, **NETWORK}
     again = cl.correct(better, asked(60, seed=3), **how)
     again.save(tmp_path / "again")
     np.testing.assert_allclose(cl.load_policy(tmp_path / "again", base=off)(OTHERS), again(OTHERS), atol=1e-6)
@@ -132,9 +133,9 @@ def test_it_can_be_corrected_again(better, tmp_path):
 
 
 @pytest.mark.long
-def test_a_constant_change_is_found_by_calibration():
+def test_a_constant_change_is_found_by_a_reading():
     labels = asked(150, reach=0.1)
-    found = cl.correct(off, labels, low=LOW, high=HIGH, eps=EPS, guidance="calibration")
+    found = cl.correct(off, labels, low=LOW, high=HIGH, eps=EPS)
     assert found.used
     assert error(found) < 0.25 * ERROR
     assert "shares" in found.words[0]
@@ -148,7 +149,7 @@ def test_labels_of_a_file_say_their_own_space_and_strength(tmp_path):
     label_files.write_file(
         tmp_path / "labels.parquet", label_files.LabelFile({"name": "arm"}, "relative", space, EPS, seeds, rows), "more"
     )
-    found = cl.correct(off, tmp_path, bound=0.2, sizes=SIZES)
+    found = cl.correct(off, tmp_path, bound=0.2, **NETWORK)
     assert found.actions == space
     with pytest.raises(cl.UserError, match="says its own space of actions: leave out low"):
         cl.correct(off, tmp_path, low=LOW, high=HIGH)
@@ -164,7 +165,7 @@ def test_directions_are_corrected_too():
     ahead = lambda obs: obs / np.linalg.norm(obs, axis=-1, keepdims=True)  # noqa: E731
     actions = ahead(obs)
     labels = cl.Labels(obs, actions, np.ones(60, np.float32))
-    found = cl.correct(ahead, labels, space=DIRECTIONS, bound=30.0, eps=5.0, sizes=SIZES)
+    found = cl.correct(ahead, labels, space=DIRECTIONS, bound=30.0, eps=5.0, **NETWORK)
     turned = np.asarray(DIRECTIONS.log(jnp.asarray(actions), jnp.asarray(found(obs))))
     assert turned.mean() > 0.05
 
@@ -172,7 +173,7 @@ def test_directions_are_corrected_too():
 def test_bounds_that_are_not_given_are_told():
     labels = asked(30)
     with pytest.warns(UserWarning, match="bounds of the actions are their range"):
-        found = cl.correct(off, labels, eps=EPS, bound=0.2, sizes=SIZES)
+        found = cl.correct(off, labels, eps=EPS, bound=0.2, **NETWORK)
     np.testing.assert_allclose(found.actions.low, labels.action.min(0))
 
 
@@ -201,5 +202,5 @@ def test_bounds_that_are_not_given_are_told():
 def test_what_makes_no_sense_is_told_in_one_line(changed, told):
     usual = {"policy": off, "labels": asked(20), "cues": CUES, "low": LOW, "high": HIGH, "eps": EPS, "bound": 0.2}
     with pytest.raises(cl.UserError, match=told) as error:
-        cl.correct(**{**usual, "sizes": SIZES, **changed})
+        cl.correct(**{**usual, **NETWORK, **changed})
     assert "\n" not in str(error.value)

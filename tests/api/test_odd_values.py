@@ -114,7 +114,7 @@ def test_a_teacher_of_something_else_is_refused(teacher):
 def test_no_more_bounds_are_tried_than_anyone_can_wait_for():
     shares = np.linspace(0.01, 0.99, 100_000)
     with pytest.raises(cl.UserError, match="judge_bounds has 100,000 shares, each played by itself: give at most 16"):
-        cl.adapt(POLICY, WORLD, TEACHER, labels=5, sizes=SIZES, judge_bounds=shares)
+        cl.adapt(POLICY, WORLD, TEACHER, labels=5, guidance="relative", sizes=SIZES, judge_bounds=shares)
 
 
 def test_a_policy_of_another_world_is_refused():
@@ -124,7 +124,7 @@ def test_a_policy_of_another_world_is_refused():
     ):
         for call in (
             lambda policy=policy: cl.ask(policy, WORLD, TEACHER, labels=5, sizes=SIZES),
-            lambda policy=policy: cl.adapt(policy, WORLD, TEACHER, labels=5, sizes=SIZES),
+            lambda policy=policy: cl.adapt(policy, WORLD, TEACHER, labels=5, guidance="relative", sizes=SIZES),
             lambda policy=policy: cl.export_policy(policy, "nowhere", WORLD, "numpy"),
         ):
             with pytest.raises(cl.UserError, match=says):

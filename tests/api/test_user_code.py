@@ -54,7 +54,7 @@ class Told(struct.PyTreeNode):
 
 
 def adapted(policy, teacher=TEACHER):
-    how = {"labels": 10, "sizes": SIZES, "scalars": probes.SCALARS, "judge_episodes": 4}
+    how = {"labels": 10, "sizes": SIZES, "scalars": probes.SCALARS, "judge_episodes": 4, "guidance": "relative"}
     return cl.adapt(policy, WORLD, teacher, **how)
 
 
@@ -137,7 +137,7 @@ def test_what_raises_while_it_is_compiled_is_named_with_its_cause():
     assert isinstance(error.__cause__, TypeError)
     place = Failing.Window()
     error = one_line(
-        lambda: cl.adapt(Scaled(1.0), place, TEACHER, sizes=SIZES),
+        lambda: cl.adapt(Scaled(1.0), place, TEACHER, sizes=SIZES, guidance="relative"),
         "^environment Failing.Window.step raised ZeroDivisionError: no floor here",
     )
     assert isinstance(error.__cause__, ZeroDivisionError)

@@ -67,7 +67,16 @@ def failing(obs):
     raise RuntimeError("out of ink")
 '''
 TASK = ["--task", "own_turned:TASK"]
-FIT = ["--sizes.feedback-layers", "32", "--sizes.fit-steps", "200", "--sizes.fit-batch-size", "32"]
+FIT = [
+    "--guidance",
+    "relative",
+    "--sizes.feedback-layers",
+    "32",
+    "--sizes.fit-steps",
+    "200",
+    "--sizes.fit-batch-size",
+    "32",
+]
 FIT += ["--scalars.feedback-learning-rate", "0.005"]
 CODE = ["adapt", "own_turned:straight", *TASK, "--scenario", "aslant", *FIT, "--judge-episodes", "20"]
 EVALUATE = ["--steps", "2000", "--envs", "20"]  # as many as are judged on, so that one program does both
@@ -204,14 +213,14 @@ def defaults_of(capsys, *options):
 def test_a_scenario_says_how_unless_another_kind_is_asked_for(home, capsys):
     assert defaults_of(capsys, "--scenario", "told") == ["demonstration", "labels", "40", "7"]
     kind, by, a_round, passes = defaults_of(capsys)
-    assert (kind, by, a_round, passes) == ("relative", "reward", "10", "50")
+    assert (kind, by, a_round, passes) == ("reading", "labels", "10", "50")
     assert defaults_of(capsys, "--scenario", "told", "--guidance", "dcoach") == ["dcoach", "labels", a_round, passes]
 
 
 def test_a_scenario_says_which_bounds_are_tried_unless_labels_decide(home, capsys):
     for options, shown in (([], "(default: 0.5 0.25)"), (["--judge-by", "labels"], "(default: )")):
         with pytest.raises(SystemExit):
-            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *options, "--help-all"])
+            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *FIT, *options, "--help-all"])
         told = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
         assert shown in told[told.index("--judge-bounds") : told.index("--overwrite")]
 
@@ -219,12 +228,12 @@ def test_a_scenario_says_which_bounds_are_tried_unless_labels_decide(home, capsy
 def test_what_is_adapted_saved_and_loaded_acts_bitwise_alike(home, tmp_path):
     world = cl.World(registry.resolve("own_turned:TASK"), importlib.import_module("own_turned").Config(offset_deg=25.0))
     code = importlib.import_module("own_turned").COMPILED
-    settings = {"eps_deg": 5.0, "judge_episodes": 20}
+    settings = {"eps_deg": 5.0, "judge_episodes": 20, "guidance": "relative"}
     better = cl.adapt(code, world, cl.teacher_of(world), labels=80, **settings)
     assert better.used
     assert better.judged == ("reward", 0.0, 1.0)
-    assert (better.difference, better.rewarded_steps) == ((1.0, 1.0, 1.0), 2 * 20 * 100)
-    assert "difference +1 [+1, +1]; 4,000 rewarded steps)" in sentences(better.outcome.found)[0]
+    assert (better.difference, better.rewarded_steps) == ((1.0, 1.0, 1.0), 2 * 10 * 100)
+    assert "difference +1 [+1, +1]; 2,000 rewarded steps)" in sentences(better.outcome.found)[0]
     assert len(better.labels.obs) == 80
     better.save(tmp_path / "better")
     with pytest.raises(cl.UserError, match="is not empty: give --overwrite"):
@@ -266,8 +275,10 @@ def test_a_model_that_makes_it_worse_is_not_used_and_said_to_be(home):
     world = cl.World(registry.resolve("own_turned:TASK"), importlib.import_module("own_turned").Config(offset_deg=5.0))
     code = importlib.import_module("own_turned").straight
     labels = cl.Labels(SEEN, SEEN, np.ones(len(SEEN)))  # all true: more to the left; and silent on what lies there
-    with pytest.warns(UserWarning, match="worse than before, so the model is not used"):
-        kept = cl.adapt(code, world, labels=labels, bound_deg=180.0, eps_deg=5.0, judge_episodes=20)
+    with pytest.warns(UserWarning, match="not shown to be better, so the model is not used"):
+        kept = cl.adapt(
+            code, world, labels=labels, bound_deg=180.0, eps_deg=5.0, judge_episodes=20, guidance="relative"
+        )
     assert not kept.used
     assert kept.judged[1] == 1.0
     assert kept.judged[2] < 0.5
@@ -276,15 +287,14 @@ def test_a_model_that_makes_it_worse_is_not_used_and_said_to_be(home):
 
 def test_a_bound_is_learned_and_kept(home, tmp_path):
     """The same labels, followed by no more than a fiftieth of the bound."""
-    world = cl.World(registry.resolve("own_turned:TASK"), importlib.import_module("own_turned").Config(offset_deg=5.0))
+    world = cl.World(registry.resolve("own_turned:TASK"), importlib.import_module("own_turned").Config(offset_deg=10.0))
     code, labels = importlib.import_module("own_turned").straight, cl.Labels(SEEN, SEEN, np.ones(len(SEEN)))
-    settings = {"labels": labels, "bound_deg": 180.0, "eps_deg": 5.0, "judge_episodes": 20}
+    settings = {"labels": labels, "bound_deg": 180.0, "eps_deg": 5.0, "judge_episodes": 20, "guidance": "relative"}
     near = cl.adapt(code, world, judge_bounds=(0.02,), **settings)
     assert near.used
-    assert near.judged == ("reward", 1.0, 1.0)
+    assert near.judged == ("reward", 0.0, 1.0)
     (line,) = sentences(near.outcome.found)
-    zero = "difference +0 [+0, +0], which includes 0; 6,000 rewarded steps"
-    assert line.endswith(f"1 before, 1 after ({zero}), used within 3.6 degrees")
+    assert line.endswith("0 before, 1 after (difference +1 [+1, +1]; 6,000 rewarded steps), used within 3.6 degrees")
     moved = np.degrees(np.arccos(np.clip((near(SEEN) * SEEN).sum(-1), -1, 1)))
     np.testing.assert_allclose(moved, 3.6, atol=0.1)
     near.save(tmp_path / "near")
@@ -297,7 +307,7 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
 def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
     refused(["adapt", "own_turned:straight", *new], "needs a task to act in: give one, for instance --task", tmp_path)
-    plain = ["adapt", "own_turned:straight", *TASK, *new]
+    plain = ["adapt", "own_turned:straight", *TASK, *new, "--guidance", "relative"]
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
     refused([*plain, "--bound-deg", "200"], "bound_deg is 200: give a number above 0 and up to 180", tmp_path)
     refused([*plain, "--bound-deg", "0.3"], "say nothing within a bound of 0.3: give a smaller", tmp_path)

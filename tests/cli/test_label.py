@@ -86,7 +86,7 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--again", "nothing"], "no label file at nothing"),
         (["--questions", "near_aims"], "--questions is near_aims, but wandering has no aims in this world"),
         (["--scalars.eps-deg", "-1"], "eps_deg"),
-        (["--guidance", "calibration"], "calibration asks about a policy: name one after the task"),
+        (["--guidance", "reading"], "reading asks about a policy: name one after the task"),
     ],
 )
 def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypatch):
@@ -163,22 +163,22 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
     for pair in (["--task.style", "corridor"], ["--task.preferred-side", "left"], ["--scalars.eps-deg", "10.0"]):
         assert words[words.index(pair[0]) + 1] == pair[1]
     policy = [*POLICY, "--scenario", "turned_lidar", "--out", str(tmp_path)]
-    asked, _, commands = asked_for(monkeypatch, "navigation", *policy)
+    asked, _, commands = asked_for(monkeypatch, "navigation", *policy, "--guidance", "relative")
     words = shlex.split(commands.following(7))
     assert words[:5] == ["cuelearner", "adapt", *POLICY, "--scenario", "turned_lidar"]
     assert "--task.lidar-rotation-deg" not in words
     assert asked.labels == 500
-    asked, _, commands = asked_for(monkeypatch, "navigation", *policy, "--guidance", "calibration")
+    asked, _, commands = asked_for(monkeypatch, "navigation", *policy)
     assert (asked.labels, asked.bound_deg, asked.scalars.eps_deg) == (100, None, 2.0)
     words = shlex.split(commands.following(7))
-    assert words[words.index("--guidance") + 1] == "calibration"
+    assert words[words.index("--guidance") + 1] == "reading"
 
 
-def test_calibration_is_planned_with_what_may_have_changed(refused, tmp_path, monkeypatch):
+def test_a_reading_is_planned_with_what_may_have_changed(refused, tmp_path, monkeypatch):
     pytest.importorskip("nicegui")
-    asks = [OWN, "page_task:left_of", "--guidance", "calibration"]
+    asks = [OWN, "page_task:left_of"]
     found, plan, _ = asked_for(monkeypatch, *asks, "--out", str(tmp_path))
-    assert [one.name for one in plan.family] == ["direction: change"]
+    assert plan.family == ()
     assert found.sizes.labels_per_round == 10
     monkeypatch.chdir(tmp_path)
     for option, value in (("--bound-deg", "20"), ("--sizes.fit-steps", "7"), ("--scalars.k-max", "7")):

@@ -119,14 +119,8 @@ PEERS = (("1", "all", 0.7), ("3", "one", 0.9), ("7", "all", 0.9), ("gears", "all
     [
         ("relative", "3", "one", 0.4),
         ("relative", "gears", "all", 0.1),
-        ("offset", "3", "worst", 0.2),
         long("relative", "1", "all", 0.2),
         long("relative", "7", "all", 0.3),
-        long("offset", "1", "all", 0.15),
-        long("offset", "3", "all", 0.1),
-        long("offset", "3", "one", 0.2),
-        long("offset", "7", "one", 0.3),
-        long("offset", "gears", "all", 0.1),
         long("dcoach", "1", "all", 0.9),
         long("dcoach", "7", "all", 0.9),
         long("dcoach", "gears", "all", 0.8),
@@ -192,7 +186,7 @@ def test_lessons_of_one_cue_count_whole():
     assert float(squared_errors(lesson, jnp.array([[3.0]]))[0]) == 9.0
 
 
-@pytest.mark.parametrize("kind", ["relative", "offset", "dcoach", "bdcoach", "clic", "clic_shown", "calibration"])
+@pytest.mark.parametrize("kind", ["relative", "dcoach", "bdcoach", "clic", "clic_shown", "reading"])
 def test_a_kind_of_cues_refuses_choices_without_an_order_in_one_line(kind):
     with pytest.raises(UserError, match="have no order: give them one") as refusal:
         registry.make(kind, SIZES, Anywhere(FRUIT))

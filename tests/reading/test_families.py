@@ -1,0 +1,141 @@
+"""What an environment declares can have changed: each change is undone exactly, and none leaves everything alone."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from known_worlds import BOX, STEP_DEG, Yard, aims, changed, grips, situations
+
+from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
+from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_jax.environment import OWN, Quantity
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.reading.families import (
+    Distortion,
+    Unknown,
+    check_family,
+    declared_distortions,
+    undo_action,
+    undo_observation,
+    unknowns_of,
+)
+from cuelearner_jax.reading.policy import unread
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import from_angle, rotate
+
+
+def test_an_environment_declares_what_can_have_changed():
+    names = [distortion.name for distortion in declared_distortions(Yard())]
+    assert names == ["ball and 1 more: shift", "ball and 1 more: gain", "lidar: turn", "wind: turn"]
+    units = [
+        (unknown.name, unknown.unit)
+        for unknown in unknowns_of(declared_distortions(make_environment(BilliardsConfig())))
+    ]
+    assert units == [
+        ("cue ball: place and 3 more: shift x", "m"),
+        ("cue ball: place and 3 more: shift y", "m"),
+        ("cue ball: place and 3 more: gain", "percent"),
+    ]
+    assert [distortion.name for distortion in declared_distortions(Navigation(worlds=None))] == [  # pyright: ignore
+        "lidar: turn",
+        "goal: direction: turn",
+    ]
+
+
+@pytest.mark.parametrize(("space", "policy"), [(DIRECTIONS, aims), (BOX, grips)])
+def test_without_a_change_the_policy_stays_what_it_was(space, policy):
+    family = declared_distortions(Yard(space))
+    _, obs = situations(jax.random.key(0), None, 8)
+    base = policy_of(jax.jit(policy)).replace(actions=space)
+    corrected = unread(base, space, family, obs.shape[1])
+    np.testing.assert_array_equal(corrected.act(jax.random.key(0), None, obs), base.act(jax.random.key(0), None, obs))
+
+
+@pytest.mark.parametrize(
+    ("name", "theta", "change"),
+    [
+        ("ball and 1 more: shift", (0.05, -0.03), {"shift": (0.05, -0.03)}),
+        ("lidar: turn", (2 * STEP_DEG,), {"lidar_deg": 2 * STEP_DEG}),
+        ("lidar: turn", (-STEP_DEG,), {"lidar_deg": -STEP_DEG}),
+        ("wind: turn", (25.0,), {"wind_deg": 25.0}),
+    ],
+)
+def test_a_change_of_the_sensors_is_undone(name, theta, change):
+    family = tuple(one for one in declared_distortions(Yard()) if one.name == name)
+    _, obs = situations(jax.random.key(0), None, 8)
+    before = jax.vmap(lambda row: undo_observation(family, jnp.array(theta), row))(obs)
+    np.testing.assert_allclose(before, changed(obs, **change), atol=1e-5)
+
+
+class Table:
+    """Two places that a camera tells, the difference of one from the hand, and the hand's own place."""
+
+    actions = BOX
+    observation = (
+        Quantity("cup", 3, "m", origin=(1.0, 2.0)),
+        Quantity("hand", 3, "m", kind=OWN),
+        Quantity("cup less hand", 3, "m", follows="cup"),
+        Quantity("plate", 2, "m", origin=(1.0, 2.0)),
+    )
+
+
+def test_places_turn_about_their_origin_and_differences_follow():
+    (turn,) = [one for one in declared_distortions(Table()) if one.name.endswith("turn")]
+    assert turn.name == "cup and 1 more: turn"
+    assert [(unknown.unit, unknown.most) for unknown in turn.unknowns] == [("degrees", 180.0)]
+    # Turned by 90 degrees, a cup 1 m ahead of the origin is seen 1 m to its left, and the plate 2 m behind the origin.
+    shown = jnp.array([1.0, 3.0, 0.5, 0.2, 0.3, 0.4, 0.8, 2.7, 0.1, 1.0, 0.0])
+    before = undo_observation((turn,), jnp.array([90.0]), shown)
+    np.testing.assert_allclose(before, [2, 2, 0.5, 0.2, 0.3, 0.4, 1.8, 1.7, 0.1, -1, 2], atol=1e-6)
+    np.testing.assert_array_equal(undo_observation((turn,), jnp.zeros(1), shown), shown)
+
+
+@pytest.mark.parametrize(
+    ("slices", "said"),
+    [
+        (
+            (Quantity("cup", 1, "m", origin=(0.0, 0.0)),),
+            "'cup' has an origin but is not a place: give x and y in metres",
+        ),
+        (
+            (Quantity("cup", 3, "1", origin=(0.0, 0.0)),),
+            "'cup' has an origin but is not a place: give x and y in metres",
+        ),
+        (
+            (Quantity("way", 3, "m", follows="cup"),),
+            "'way' follows 'cup', which is not a slice of the observation: name one",
+        ),
+    ],
+)
+def test_slices_that_cannot_turn_are_refused(slices, said):
+    table = Table()
+    table.observation = slices
+    with pytest.raises(UserError, match=said):
+        declared_distortions(table)
+
+
+def test_beams_between_two_are_interpolated_and_nothing_is_seen_beyond_the_last():
+    (lidar,) = [one for one in declared_distortions(Navigation(worlds=None)) if one.name == "lidar: turn"]  # pyright: ignore
+    obs = jnp.zeros(280).at[:271].set(jnp.arange(271.0))
+    before = undo_observation((lidar,), jnp.array([1.5]), obs)
+    np.testing.assert_allclose(before[:4], [0.0, 0.0, 0.5, 1.5])  # turned by 1.5 beams: beam 2 is at 0.5
+    assert before[270] == 268.5
+
+
+def test_an_action_leads_where_the_policy_meant_it_to():
+    turn = Distortion("turn", (Unknown("turn", "degrees"),), acts=lambda theta, a: rotate(a, -jnp.deg2rad(theta[0])))
+    action = undo_action((turn,), jnp.array([30.0]), from_angle(1.0))
+    np.testing.assert_allclose(rotate(action, jnp.deg2rad(30.0)), from_angle(1.0), atol=1e-6)
+
+
+def test_families_that_make_no_sense_are_refused():
+    one = Distortion("tilt", (Unknown("tilt", "degrees"),), sees=lambda theta, obs: obs)
+    for family, message in (
+        ([], "changes is empty"),
+        ([one._replace(unknowns=())], "no unknowns"),
+        ([one._replace(sees=None)], "changes nothing"),
+        ([one, one], "name of two distortions"),
+    ):
+        with pytest.raises(UserError, match=message):
+            check_family(family)
