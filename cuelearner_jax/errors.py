@@ -91,7 +91,7 @@ def format_value(value: Any) -> str:
     return text if text.isprintable() and len(text) <= 120 else f"a {type(value).__name__}"
 
 
-def user_code_error(named: str, error: Exception) -> UserError:
+def user_code_error(named: str, error: BaseException) -> UserError:
     """Return the UserError for an exception of the user's own code: the code's name and the exception.
 
     Args:
