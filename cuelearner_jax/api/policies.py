@@ -17,7 +17,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import LARGEST_FLOAT
-from cuelearner_jax.environment import Quantity, actions_of
+from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name
 from cuelearner_jax.policies.foreign import ONNX
@@ -51,7 +51,7 @@ class CallablePolicy:
 
     def __post_init__(self) -> None:
         """Raise UserError for an object that does not act, or a bad description of observations."""
-        arguments.policy("policy", self.policy)
+        object.__setattr__(self, "policy", in_space(arguments.policy("policy", self.policy), self.actions))
         if not all(isinstance(part, Quantity) for part in arguments.several("observation", self.observation, "slices")):
             raise arguments.argument_error("observation", self.observation, "slices, as a world's observation has them")
         arguments.flag("asks", self.asks)
@@ -107,13 +107,9 @@ def entries_of(policy: Any) -> int:
 
 def as_policy_in(given: Any, env: Any) -> Policy:
     """Return `as_policy` for a world. Raises UserError for a policy that cannot act there."""
-    policy, seen = as_policy(given), entries_of(given)
-    own = sum(quantity.size for quantity in getattr(env, "observation", ()))
-    if seen and own and seen != own:
-        raise UserError(
-            f"the policy's observations have {seen} entries, this world's {own}: give a world with "
-            f"observations of {seen} entries"
-        )
+    policy = as_policy(given)
+    if isinstance(given, CallablePolicy) and given.observation:
+        check_layout("the policy", given.observation, given.actions, env)
     policy = in_space(policy, actions_of(env))
     user_code.acts_in("policy", policy, env)
     return policy

@@ -10,7 +10,7 @@ from cuelearner_jax import plugins
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.pages import HELP, HELP_ALL
 from cuelearner_jax.cli.parsing import explain, taken
-from cuelearner_jax.environment import actions_of
+from cuelearner_jax.environment import actions_of, check_layout
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.policies import policy_of, teaching
 from cuelearner_jax.policies.foreign import ONNX
@@ -155,12 +155,8 @@ def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> Pol
         what = "a run" if source.grid else "a policy"
         raise UserError(f"{folder} is {what} of {source.task.name}, not of {known.name}: leave out --task")
     if known is not None and known.named:
-        before, now = (shape_of(known, config) for config in (source.config.task, known.plain()))
-        if (before.obs_size, actions_of(before).size) != (now.obs_size, actions_of(now).size):
-            raise UserError(
-                f"{folder} acts on observations of {before.obs_size} entries with actions of "
-                f"{actions_of(before).size}, {known.named} has {now.obs_size} and {actions_of(now).size}: name another"
-            )
+        before = shape_of(known, source.config.task)
+        check_layout(f"{folder}", before.observation, actions_of(before), shape_of(known, known.plain()))
         world = dataclasses.replace(source.config, task=known.plain())
         source = dataclasses.replace(source, task=known, config=world)
     return source

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cuelearner_jax.environment import action_words
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.spaces import Space
 
@@ -140,7 +141,7 @@ class _Predicting(Foreign):
 
     def check(self, space: Space) -> None:
         """Raise UserError where the model's actions have other bounds, or other choices, than the space."""
-        own, wanted = _actions(getattr(self.given, "action_space", None)), _actions(space)
+        own, wanted = action_words(getattr(self.given, "action_space", None)), action_words(space)
         if own and wanted and own != wanted:
             raise UserError(
                 f"policy {self.__qualname__} gives actions {own}, this world takes actions {wanted}: give a world with "
@@ -172,16 +173,6 @@ def _values(space: Any, rows: Float[np.ndarray, "n entries"]) -> np.ndarray:
         parts = np.split(rows, np.cumsum(counts)[:-1], axis=1)
         rows = np.stack([part.argmax(1) for part in parts], 1) + np.ravel(getattr(space, "start", 0))
     return rows.reshape(len(rows), *space.shape).astype(space.dtype)
-
-
-def _actions(space: Any) -> str:
-    """Return a space of actions, of ours or of Gymnasium, in words; empty for one that is neither box nor choices."""
-    if count := getattr(space, "count", getattr(space, "n", None)):
-        return f"that are one of {count} choices"
-    if not hasattr(space, "low"):
-        return ""
-    low, high = (", ".join(f"{value:g}" for value in np.ravel(bound).tolist()) for bound in (space.low, space.high))
-    return f"between ({low}) and ({high})"
 
 
 class _Onnx(Foreign):
