@@ -84,8 +84,8 @@ class Opaque(PolicyNode):
                     f"{policy_name(self)} gave zero or not finite numbers in place of actions, in {count} situations"
                 )
             return chosen
-        except UserError as error:
-            user_code.leave(policy_name(self), error)
+        except BaseException as error:  # one that left the compiled program would be an error of XLA's
+            user_code.leave(error)
             return nothing
 
     def _called(self, rows: np.ndarray) -> np.ndarray:
