@@ -20,7 +20,7 @@ from cuelearner_jax.config import LARGEST_FLOAT
 from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name
-from cuelearner_jax.policies.foreign import ONNX
+from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space
@@ -92,7 +92,7 @@ def as_policy(given: Any, name: str = "policy") -> Policy:
 
     Raises UserError, which says the argument's name, for what is none of them.
     """
-    if isinstance(given, str | os.PathLike) and not str(given).endswith(ONNX):
+    if isinstance(given, str | os.PathLike) and not str(given).endswith(FILES):
         try:
             given = load_policy(os.fspath(given))
         except UserError as error:

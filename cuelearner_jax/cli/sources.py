@@ -13,7 +13,7 @@ from cuelearner_jax.cli.parsing import explain, taken
 from cuelearner_jax.environment import actions_of, check_layout
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.policies import policy_of, teaching
-from cuelearner_jax.policies.foreign import ONNX
+from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders, whole
@@ -116,10 +116,19 @@ def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
     found, rest = [], arguments
     for option in TASK_OPTIONS:
         given, rest = taken(rest, option, choices)
-        found += [] if given is None else [given]
+        if given is not None:
+            found.append(_environment(given) if option == "--env" else given)
     if len(found) > 1:
         raise UserError(f"the task is named twice, {found[0]!r} and {found[1]!r}: name it once")
     return (found or [None])[0], rest
+
+
+def _environment(given: str) -> str:
+    """Return the name of a task; code that is no task is an environment of Gymnasium's kind."""
+    is_outside = plugins.REFERENCE.fullmatch(given) and given.partition(":")[0] not in registry.FAMILIES
+    if is_outside and not isinstance(plugins.load(given, object, "an environment"), Task):
+        return f"gymnasium:{given}"
+    return given
 
 
 def _taught(task: Task, reference: str | None) -> Task:
@@ -134,15 +143,15 @@ def _taught(task: Task, reference: str | None) -> Task:
 
 
 def is_code(named: str) -> bool:
-    """Return whether a word names a policy that is code: package.module:NAME, or a file in ONNX."""
-    if shipped.is_shipped(named):
+    """Return whether a word names a policy that is code: package.module:NAME, or a file of another library."""
+    if shipped.is_shipped(named) or Path(named).is_dir():
         return False
-    return named.endswith(ONNX) or (bool(plugins.REFERENCE.fullmatch(named)) and not Path(named).exists())
+    return named.endswith(FILES) or ".py:" in named or bool(plugins.REFERENCE.fullmatch(named))
 
 
 def code_of(reference: str) -> Any:
     """Return the policy of `package.module:NAME` or of a file in ONNX. Raises UserError if there is none."""
-    return policy_of(reference if reference.endswith(ONNX) else plugins.load(reference, object, "a policy"))
+    return policy_of(reference if reference.endswith(FILES) else plugins.load(reference, object, "a policy"))
 
 
 def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> PolicySource:

@@ -20,6 +20,13 @@ from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.spaces import Space
 
 ONNX = ".onnx"
+# Files that only their library reads, running code in them if they hold some: how a module of the user's loads one.
+LOADERS = {
+    ".zip": "from stable_baselines3 import PPO; POLICY = PPO.load({!r})  # or another class",
+    ".pt": "import torch; POLICY = torch.jit.load({!r})",
+    ".pth": "import torch; POLICY = torch.jit.load({!r})",
+}
+FILES = (ONNX, *LOADERS)
 RECURRENT = {"RNN", "GRU", "LSTM", "RNNCell", "GRUCell", "LSTMCell"}  # parts of PyTorch with a memory
 ACTIONS = ("action", "actions")  # names of an output, where a file in ONNX has several
 REAL = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16}
@@ -55,10 +62,17 @@ def function_of(given: Any) -> Foreign | None:
             ONNX.
 
     Raises:
-        UserError: a file in ONNX that cannot be run, or has other inputs and outputs.
+        UserError: a file in ONNX that cannot be run, or has other inputs and outputs; a file of `LOADERS`.
     """
     if isinstance(given, str | os.PathLike):
-        return _Onnx(Path(given)) if str(given).endswith(ONNX) else None
+        path = Path(given)
+        if path.suffix in LOADERS:
+            line = LOADERS[path.suffix].format(str(given))
+            raise UserError(
+                f"reading {given} may run code in it, so a module of yours reads it: write `{line}` into "
+                "my_policy.py, and give my_policy:POLICY (module:NAME; in Python, the loaded policy)"
+            )
+        return _Onnx(path) if path.suffix == ONNX else None
     owner = getattr(given, "__self__", None)
     if _predicts(owner) and getattr(given, "__name__", "") == "predict":
         given = owner

@@ -92,7 +92,8 @@ def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
     assert main([*command, "--labels", "20", *SMALL, "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert "success on tuning episodes" in told  # where there is one, success judges
-    command = ["evaluate", str(out), "--env", REACH, "--base", "gymnasium_worlds:beside", "--episodes", "4"]
+    env = ["--env", "gymnasium_worlds:reach"]  # code of one's own needs no family's name there
+    command = ["evaluate", str(out), *env, "--base", "gymnasium_worlds:beside", "--episodes", "4"]
     assert main([*command, "--task.processes", "1"]) == 0
 
 
@@ -133,6 +134,9 @@ def test_an_environment_without_a_limit_of_steps_gets_one_that_is_told(capsys):
         (["label", REACH, "--out", "labels"], "cannot be drawn"),
         (["evaluate", REACH, "--teacher", "gymnasium_worlds:nobody", "--policy", "teacher"], "has no 'nobody'"),
         (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
+        (["adapt", "model.zip", "--env", REACH], "my_policy.py, and give my_policy:POLICY (module:NAME"),
+        (["adapt", "policy.pt", "--env", REACH], "write `import torch; POLICY = torch.jit.load('policy.pt')` into"),
+        (["adapt", "./mine.py:policy", "--env", REACH], "give mine:policy (module:NAME), in the file's folder"),
         (
             ["evaluate", REACH, "--policy", "uniform", "--task.arguments", "[]"],
             "task.arguments is '[]': give arguments",

@@ -296,6 +296,8 @@ def test_files_in_onnx_that_do_not_fit_are_told(stored, tmp_path):
     (tmp_path / "damaged.onnx").write_bytes(b"no model")
     with pytest.raises(UserError, match="cannot be run by onnxruntime"):
         policy_of(tmp_path / "damaged.onnx")
+    with pytest.raises(UserError, match=r"reading .*model.zip may run code in it.* give my_policy:POLICY"):
+        policy_of(tmp_path / "model.zip")
     path = stored()
     assert "takes observations of 3 entries, these have 2" in fault(path, OBS[:, :2])
     assert "not finite" in fault(stored(matrix=np.full((3, 2), np.nan)))
