@@ -109,8 +109,10 @@ def _tried(name: str, verb: str, env: Any, function: Any) -> None:
     states, obs = jax.eval_shape(lambda: jax.vmap(env.reset)(own[None]))
     try:
         jax.eval_shape(function, own, states, obs)
-    except UserError:
-        raise
+    except UserError as error:
+        if name in str(error):
+            raise
+        raise type(error)(f"{name}: {error}") from error.__cause__
     except Exception as error:
         raise_in_one_line(error)
         raise UserError(

@@ -15,8 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.worlds import World, a_world
-from cuelearner_jax.config import LARGEST_FLOAT
+from cuelearner_jax.api.worlds import World
 from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name
@@ -50,13 +49,8 @@ class CallablePolicy:
     world: World | None = None  # world in which it was corrected, or loaded for; None: not known
 
     def __post_init__(self) -> None:
-        """Raise UserError for an object that does not act, or a bad description of observations."""
+        """Make a policy of an object that acts. Raises UserError for any other."""
         object.__setattr__(self, "policy", in_space(arguments.policy("policy", self.policy), self.actions))
-        if not all(isinstance(part, Quantity) for part in arguments.several("observation", self.observation, "slices")):
-            raise arguments.argument_error("observation", self.observation, "slices, as a world's observation has them")
-        arguments.flag("asks", self.asks)
-        if self.trained is not None:
-            arguments.instance("trained", self.trained, RunConfig, "a RunConfig")
 
     @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
@@ -154,17 +148,9 @@ def load_policy(
         UserError: no such folder, lane or policy.
     """
     path = shipped.folder_of(str(arguments.path("folder", folder)))
-    arguments.optional(arguments.text, "policy", policy, trained.POLICIES)
-    arguments.optional(arguments.text, "guidance", guidance)
-    labels = arguments.optional(arguments.budget, "labels", labels, 0)
-    # The bound is up to the reach of actions, which the folder says.
-    arguments.optional(arguments.number, "bound_deg", bound_deg, LARGEST_FLOAT, "a number above 0")
-    seed = arguments.optional(arguments.seed, "seed", seed)
     code = None if base is None else as_policy(base, "base")
     if isinstance(task, str):
-        task = registry.resolve(arguments.text("task", task))
-    arguments.optional(arguments.instance, "task", task, Task, "a task, or its name")
-    arguments.optional(a_world, "world", world)
+        task = registry.resolve(task)
     whole.check_not_aside(path)
     if not path.exists():
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
@@ -174,7 +160,6 @@ def load_policy(
     changed = world.config if world else source.config.task
     source.check(name, changed)
     shape = shape_of(known, changed)
-    bound_deg = arguments.optional(arguments.amount, "bound_deg", bound_deg, actions_of(shape))
     found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
     where = world or World(known, changed)
     taught = trained.POLICIES[name].taught
