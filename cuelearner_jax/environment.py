@@ -7,12 +7,13 @@ has is in `Environment`, what it may have in `OptionalMembers`; no module asks f
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
@@ -27,6 +28,7 @@ SYMBOLS = (
 )
 # 1, or a symbol, perhaps after a number and before more: "m", "5 cm", "rad/s", "m a step", "rad (Euler angles)"
 UNIT = re.compile(rf"1|as given|([0-9.]+ )?({'|'.join(SYMBOLS)})([ /²^·*(].*)?")
+UNKNOWN_UNIT = "as given"  # of slices that another library names
 
 
 class Quantity(NamedTuple):
@@ -223,6 +225,46 @@ def action_of(env: Any) -> Quantity:
     return getattr(
         env, "action", DIRECTION if space == DIRECTIONS else Quantity("action", space.size, "1", space.about)
     )
+
+
+def action_words(space: Any) -> str:
+    """Return a space of actions, of ours or of Gymnasium, in words; empty for one of Gymnasium's that ours has not."""
+    if count := getattr(space, "count", getattr(space, "n", None)):
+        return f"that are one of {count} choices"
+    if not hasattr(space, "low"):
+        return getattr(space, "about", "")
+    bounds = np.array([space.low, space.high]).reshape(2, -1).tolist()
+    low, high = (", ".join(f"{value:g}" for value in bound) for bound in bounds)
+    return f"between ({low}) and ({high})"
+
+
+def check_layout(whose: str, observation: Sequence[Quantity], actions: Space, env: Any) -> None:
+    """Raise UserError where a world has another layout of observations or actions than a policy was made for.
+
+    Names and units of slices are compared where both sides come from the same sort of source: either both give units,
+    or neither.
+
+    Args:
+        whose: the policy in the message, for instance "the run".
+        observation, actions: the layout that the policy was made for.
+        env: the world, or what `task.shape_of` gives for it.
+    """
+    wanted = "give the world that it was made for, or options that keep its observations and actions"
+    known, now = _entries(observation), _entries(env.observation)
+    if len(known) != len(now):
+        raise UserError(f"{whose} observes {len(known)} entries, this world has {len(now)}: {wanted}")
+    for number, (own, other) in enumerate(zip(known, now, strict=True), 1):
+        if own and other and own != other and (own[1] == UNKNOWN_UNIT) == (other[1] == UNKNOWN_UNIT):
+            seen, there = (f"{name!r} ({unit})" for name, unit in (own, other))
+            raise UserError(f"{whose} observes {seen} as entry {number}, this world has {there}: {wanted}")
+    if (own := action_words(actions)) != (other := action_words(actions_of(env))):
+        raise UserError(f"{whose} gives actions {own}, this world takes actions {other}: {wanted}")
+
+
+def _entries(observation: Sequence[Quantity]) -> list[tuple[str, str] | None]:
+    """Return the name and unit of the slice of each entry; None where the whole is one slice without a name."""
+    unnamed = [one.name for one in observation] == ["observation"]
+    return [None if unnamed else (one.name, one.unit) for one in observation for _ in range(one.size)]
 
 
 class Spaces(NamedTuple):

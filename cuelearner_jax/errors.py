@@ -34,6 +34,10 @@ class UserError(Exception):
         super().__init__(one_line(" ".join(str(message).splitlines())))
 
 
+class UserCodeError(UserError):
+    """An exception of the user's own code, which is its `__cause__`. The command line prints that traceback too."""
+
+
 class NotFinite(Exception):
     """A result stopped being finite. The message is one line that says which result, and what was kept.
 
@@ -94,8 +98,8 @@ def format_value(value: Any) -> str:
     return text if text.isprintable() and len(text) <= 120 else f"a {type(value).__name__}"
 
 
-def user_code_error(named: str, error: Exception) -> UserError:
-    """Return the UserError for an exception of the user's own code: the code's name and the exception.
+def user_code_error(named: str, error: BaseException) -> UserCodeError:
+    """Return the error for an exception of the user's own code: the code's name and the exception.
 
     Args:
         named: name of the code, for instance "policy my_policy".
@@ -105,7 +109,7 @@ def user_code_error(named: str, error: Exception) -> UserError:
         words = " ".join(str(error).split())[:200]
     except Exception:  # the exception's own text fails
         words = ""
-    return UserError(f"{named} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
+    return UserCodeError(f"{named} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
 
 
 def format_numbers(numbers: Iterable[float]) -> str:

@@ -6,6 +6,7 @@ import importlib
 import os
 import re
 import sys
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from cuelearner_jax.errors import UserError, suggestion
@@ -26,6 +27,9 @@ def load(reference: str, kind: type[T], called: str) -> T:
     Raises:
         UserError: no such module or name, the module does not import, or the object is something else.
     """
+    if ".py:" in reference:
+        file, _, name = reference.rpartition(".py:")
+        raise UserError(f"{reference} is a file: give {Path(file).name}:{name} (module:NAME), in the file's folder")
     if not REFERENCE.fullmatch(reference):
         raise UserError(f"{reference!r} does not name {called}: give package.module:NAME, for instance my_code:MINE")
     module_name, _, name = reference.partition(":")

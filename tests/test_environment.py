@@ -1,6 +1,7 @@
 """What an environment may offer beside what it must, and what follows from its named slices."""
 
 import math
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +11,17 @@ import pytest
 
 from cuelearner_jax.bridges.brax import from_brax, to_brax
 from cuelearner_jax.environment import (
+    UNKNOWN_UNIT,
     Features,
+    Quantity,
     actions_of,
+    check_layout,
     offers,
     random_symmetries,
     spaces_of,
     symmetries_of,
 )
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Box
 from cuelearner_jax.spaces.directions import difference, evenly_spaced, rotate
 from cuelearner_jax.task import shape_of
@@ -51,6 +56,36 @@ def test_an_observation_has_as_many_entries_as_its_slices_together(name):
     assert obs.shape == (env.obs_size,)
     assert len({quantity.name for quantity in slices}) == len(slices)
     assert all(quantity.name and quantity.unit and quantity.size > 0 for quantity in slices)
+
+
+TRAINED = (Quantity("gripper", 2, "m"), Quantity("goal", 2, "m"))
+GIVEN = tuple(quantity._replace(unit=UNKNOWN_UNIT) for quantity in TRAINED)
+
+
+def layout(*observation, actions=DIRECTIONS):
+    return SimpleNamespace(observation=observation, actions=actions)
+
+
+@pytest.mark.parametrize(
+    ("known", "env", "says"),
+    [
+        (TRAINED, layout(*TRAINED[::-1]), r"the run observes 'gripper' \(m\) as entry 1, this world has 'goal' \(m\)"),
+        (GIVEN, layout(*GIVEN[::-1]), "the run observes 'gripper' "),
+        (TRAINED, layout(TRAINED[0], Quantity("goal", 2, "mm")), r"as entry 3, this world has 'goal' \(mm\)"),
+        (TRAINED, layout(*TRAINED[:1]), "observes 4 entries, this world has 2"),
+        (TRAINED, layout(*TRAINED, actions=Box((-1.0, -1.0), (1.0, 1.0))), r"takes actions between \(-1, -1\) and"),
+    ],
+)
+def test_a_world_of_another_layout_is_refused(known, env, says):
+    with pytest.raises(UserError, match=says):
+        check_layout("the run", known, DIRECTIONS, env)
+
+
+def test_a_layout_is_compared_as_far_as_it_is_known():
+    unnamed = (Quantity("observation", 4, UNKNOWN_UNIT),)
+    for known, env in ((TRAINED, layout(*unnamed)), (unnamed, layout(*TRAINED)), (TRAINED, layout(*GIVEN))):
+        check_layout("the run", known, DIRECTIONS, env)
+    check_layout("the run", TRAINED, Box((-1.0,), (1.0,)), layout(*TRAINED, actions=Box((-1.0,), (1.0,))))
 
 
 # What is optional.

@@ -49,6 +49,10 @@ def test_what_is_no_reference_is_told_its_form(folder, reference):
     refused(reference, "does not name a table: give package.module:NAME")
 
 
+def test_a_file_is_named_as_its_module():
+    refused("./sub/mine.py:OAK", r"give mine:OAK \(module:NAME\)")
+
+
 def test_a_missing_module_is_to_be_installed_or_run_beside(folder):
     refused(
         "nowhere_to_be_found:OAK",

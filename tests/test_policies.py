@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from functools import cache
 
 import chex
@@ -34,6 +35,7 @@ from cuelearner_jax.policies import (
     describe,
     lanes_in,
     layers,
+    policy_of,
 )
 from cuelearner_jax.spaces import directions
 
@@ -180,25 +182,67 @@ def test_a_function_rolls_out_the_same_in_jax_and_on_the_host():
     assert float(one) == pytest.approx(float(other), abs=1e-6)
 
 
-@pytest.mark.parametrize("on_host", [False, True])
 @pytest.mark.parametrize(
     ("function", "shape"),
     [
-        (lambda obs: obs[..., :1], r"\(40, 1\)"),
-        (lambda obs: obs[:3], r"\(3, 2\)"),
-        (lambda obs: obs[:, 0], r"\(40,\)"),
-        (lambda obs: obs[None], r"\(1, 40, 2\)"),
+        (lambda obs: obs[..., :1], "(40, 1)"),
+        (lambda obs: obs[:3], "(3, 2)"),
+        (lambda obs: obs[:, 0], "(40,)"),
+        (lambda obs: obs[None], "(1, 40, 2)"),
     ],
 )
-def test_a_wrong_shape_is_refused_in_one_line(on_host, function, shape):
-    policy = Opaque(function, on_host=on_host)
-    says = rf"policy <lambda> returned actions of shape {shape} for 40 observations: return \(40, 2\)"
+def test_a_wrong_shape_is_refused_in_one_line(function, shape):
+    says = f"policy <lambda> returned actions of shape {shape} for 40 observations: return (40, 2)"
     for call in (act, jax.jit(lambda policy: policy.act(KEY, OBS, OBS))):
-        with pytest.raises(UserError, match=says) as refusal:
-            call(policy)
-        assert "\n" not in str(refusal.value)
+        with pytest.raises(UserError, match=re.escape(says)):
+            call(Opaque(function))
+        with pytest.raises(UserError, match=r"policy <lambda> returned actions of shape .* return \((1|32), 2\)"):
+            call(Opaque(function, on_host=True))
     with pytest.raises(UserError, match="for 10 observations"):
-        rollout(Opaque(lambda obs: obs[:, :1], on_host=on_host), ENV, KEY, 10, 20)
+        rollout(Opaque(lambda obs: obs[:, :1]), ENV, KEY, 10, 20)
+
+
+def stacked():
+    """A policy with a memory: the difference to the observation before, the first time the observation itself."""
+    before = []
+
+    def differences(obs):
+        before.append(obs)
+        return obs - before[-2][:1] if len(before) > 1 else obs
+
+    return differences
+
+
+@pytest.mark.parametrize(
+    ("function", "why"),
+    [
+        (lambda obs: obs + np.random.normal(size=obs.shape), "another action when it is asked again"),
+        (
+            lambda obs: np.eye(2)[(np.random.random(len(obs)) < 0.5).astype(int)],
+            "another action when it is asked again",
+        ),
+        (stacked(), "another action when it is asked again"),
+        (lambda obs: obs - 0.1 * obs.mean(0), "another action in a batch of 32"),
+        (lambda obs: (obs, obs), "gives a state beside its actions"),
+    ],
+)
+def test_a_policy_that_does_not_repeat_itself_is_refused(function, why):
+    with pytest.raises(UserError, match=why):
+        act(Opaque(function, on_host=True))
+
+
+def test_rounding_in_another_batch_is_no_fault_and_extras_are_left_out():
+    function = lambda obs: (obs * (1 + 1e-3 * (len(obs) == 1)), {"log_prob": 0.0})  # noqa: E731
+    np.testing.assert_allclose(act(Opaque(function, on_host=True)), OBS, atol=1e-6)
+
+
+def test_a_function_of_more_than_observations_is_refused_with_the_call_that_would_do():
+    def policy(obs, key):  # as brax makes it
+        return obs, {"key": key}
+
+    for given in (policy, jax.jit(policy)):
+        with pytest.raises(UserError, match=r"takes obs, key: give .* jax.jit\(lambda obs: policy\(obs, key\)\[0\]"):
+            policy_of(given)
 
 
 # Teachers.

@@ -124,7 +124,7 @@ def adapt(
     """Correct a finished policy by labels about its actions in a (changed) world, as `cuelearner adapt` does.
 
     Labels are asked for in rounds, about actions refined by the model so far (DAgger), within a bound of the policy's
-    own. A model that is not shown to make the policy better, on tuning episodes of the world, is not used, with a warning.
+    own. A correction that is not shown to make the policy better is not used, with a warning.
     Arguments that are left out follow the world's scenario, else the defaults of `cuelearner adapt`.
 
     Args:

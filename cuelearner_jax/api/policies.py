@@ -15,12 +15,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.worlds import World, a_world
-from cuelearner_jax.config import LARGEST_FLOAT
-from cuelearner_jax.environment import Quantity, actions_of
+from cuelearner_jax.api.worlds import World
+from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name
-from cuelearner_jax.policies.foreign import ONNX
+from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space
@@ -49,13 +48,8 @@ class CallablePolicy:
     world: World | None = None  # world in which it was corrected, or loaded for; None: not known
 
     def __post_init__(self) -> None:
-        """Raise UserError for an object that does not act, or a bad description of observations."""
-        arguments.policy("policy", self.policy)
-        if not all(isinstance(part, Quantity) for part in arguments.several("observation", self.observation, "slices")):
-            raise arguments.argument_error("observation", self.observation, "slices, as a world's observation has them")
-        arguments.flag("asks", self.asks)
-        if self.trained is not None:
-            arguments.instance("trained", self.trained, RunConfig, "a RunConfig")
+        """Make a policy of an object that acts. Raises UserError for any other."""
+        object.__setattr__(self, "policy", in_space(arguments.policy("policy", self.policy), self.actions))
 
     @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
@@ -91,7 +85,7 @@ def as_policy(given: Any, name: str = "policy") -> Policy:
 
     Raises UserError, which says the argument's name, for what is none of them.
     """
-    if isinstance(given, str | os.PathLike) and not str(given).endswith(ONNX):
+    if isinstance(given, str | os.PathLike) and not str(given).endswith(FILES):
         try:
             given = load_policy(os.fspath(given))
         except UserError as error:
@@ -106,13 +100,9 @@ def entries_of(policy: Any) -> int:
 
 def as_policy_in(given: Any, env: Any) -> Policy:
     """Return `as_policy` for a world. Raises UserError for a policy that cannot act there."""
-    policy, seen = as_policy(given), entries_of(given)
-    own = sum(quantity.size for quantity in getattr(env, "observation", ()))
-    if seen and own and seen != own:
-        raise UserError(
-            f"the policy's observations have {seen} entries, this world's {own}: give a world with "
-            f"observations of {seen} entries"
-        )
+    policy = as_policy(given)
+    if isinstance(given, CallablePolicy) and given.observation:
+        check_layout("the policy", given.observation, given.actions, env)
     policy = in_space(policy, actions_of(env))
     user_code.acts_in("policy", policy, env)
     return policy
@@ -157,17 +147,9 @@ def load_policy(
         UserError: no such folder, lane or policy.
     """
     path = shipped.folder_of(str(arguments.path("folder", folder)))
-    arguments.optional(arguments.text, "policy", policy, trained.POLICIES)
-    arguments.optional(arguments.text, "guidance", guidance)
-    labels = arguments.optional(arguments.budget, "labels", labels, 0)
-    # The bound is up to the reach of actions, which the folder says.
-    arguments.optional(arguments.number, "bound_deg", bound_deg, LARGEST_FLOAT, "a number above 0")
-    seed = arguments.optional(arguments.seed, "seed", seed)
     code = None if base is None else as_policy(base, "base")
     if isinstance(task, str):
-        task = registry.resolve(arguments.text("task", task))
-    arguments.optional(arguments.instance, "task", task, Task, "a task, or its name")
-    arguments.optional(a_world, "world", world)
+        task = registry.resolve(task)
     if not path.exists():
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
     find = lambda name: task if task and task.name == name else registry.find(name)  # noqa: E731
@@ -176,7 +158,6 @@ def load_policy(
     changed = world.config if world else source.config.task
     source.check(name, changed)
     shape = shape_of(known, changed)
-    bound_deg = arguments.optional(arguments.amount, "bound_deg", bound_deg, actions_of(shape))
     found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
     where = world or World(known, changed)
     taught = trained.POLICIES[name].taught

@@ -17,13 +17,12 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space, box
 from cuelearner_jax.types import Step
 
 State = Any  # a simulator's state: a pytree with the members that this module's docstring names
-UNIT = "as the simulator has it"
 
 
 class Running(struct.PyTreeNode):
@@ -98,7 +97,7 @@ class Layout(NamedTuple):
     @property
     def observation(self) -> tuple[Quantity, ...]:
         """Return the slices as an environment has them."""
-        return tuple(Quantity(name, size, UNIT) for name, size in zip(self.slices, self.sizes, strict=True))
+        return tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in zip(self.slices, self.sizes, strict=True))
 
     def box(self, cues: Sequence[Cue] = ()) -> Box:
         """Return the space [-1, 1]^n of the actions, with a cue an entry: `cues`, or the entry's name."""

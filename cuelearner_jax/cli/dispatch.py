@@ -17,6 +17,7 @@ import ast
 import importlib
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -28,7 +29,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 from cuelearner_jax import __version__
 from cuelearner_jax.cli import pages
 from cuelearner_jax.cli.pages import HELP
-from cuelearner_jax.errors import NotFinite, UserError, machine_message, suggestion
+from cuelearner_jax.errors import NotFinite, UserCodeError, UserError, machine_message, suggestion
 from cuelearner_jax.signals import Interrupted
 
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, its option classes by command name.
@@ -48,6 +49,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()  # flush here, where a missing reader is handled
     except UserError as error:
         _tell(f"error: {error}")
+        if isinstance(error, UserCodeError) and (cause := error.__cause__) is not None:
+            from cuelearner_jax.user_code import user_traceback
+
+            traceback.print_exception(cause.with_traceback(user_traceback(cause) or cause.__traceback__))
         return 2
     except (Interrupted, NotFinite) as error:
         _tell(str(error))

@@ -10,10 +10,10 @@ from cuelearner_jax import plugins
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.pages import HELP, HELP_ALL
 from cuelearner_jax.cli.parsing import explain, taken
-from cuelearner_jax.environment import actions_of
+from cuelearner_jax.environment import actions_of, check_layout
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.policies import policy_of, teaching
-from cuelearner_jax.policies.foreign import ONNX
+from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders
@@ -115,10 +115,19 @@ def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
     found, rest = [], arguments
     for option in TASK_OPTIONS:
         given, rest = taken(rest, option, choices)
-        found += [] if given is None else [given]
+        if given is not None:
+            found.append(_environment(given) if option == "--env" else given)
     if len(found) > 1:
         raise UserError(f"the task is named twice, {found[0]!r} and {found[1]!r}: name it once")
     return (found or [None])[0], rest
+
+
+def _environment(given: str) -> str:
+    """Return the name of a task; code that is no task is an environment of Gymnasium's kind."""
+    is_outside = plugins.REFERENCE.fullmatch(given) and given.partition(":")[0] not in registry.FAMILIES
+    if is_outside and not isinstance(plugins.load(given, object, "an environment"), Task):
+        return f"gymnasium:{given}"
+    return given
 
 
 def _taught(task: Task, reference: str | None) -> Task:
@@ -133,15 +142,15 @@ def _taught(task: Task, reference: str | None) -> Task:
 
 
 def is_code(named: str) -> bool:
-    """Return whether a word names a policy that is code: package.module:NAME, or a file in ONNX."""
-    if shipped.is_shipped(named):
+    """Return whether a word names a policy that is code: package.module:NAME, or a file of another library."""
+    if shipped.is_shipped(named) or Path(named).is_dir():
         return False
-    return named.endswith(ONNX) or (bool(plugins.REFERENCE.fullmatch(named)) and not Path(named).exists())
+    return named.endswith(FILES) or ".py:" in named or bool(plugins.REFERENCE.fullmatch(named))
 
 
 def code_of(reference: str) -> Any:
     """Return the policy of `package.module:NAME` or of a file in ONNX. Raises UserError if there is none."""
-    return policy_of(reference if reference.endswith(ONNX) else plugins.load(reference, object, "a policy"))
+    return policy_of(reference if reference.endswith(FILES) else plugins.load(reference, object, "a policy"))
 
 
 def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> PolicySource:
@@ -154,12 +163,8 @@ def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> Pol
         what = "a run" if source.grid else "a policy"
         raise UserError(f"{folder} is {what} of {source.task.name}, not of {known.name}: leave out --task")
     if known is not None and known.named:
-        before, now = (shape_of(known, config) for config in (source.config.task, known.plain()))
-        if (before.obs_size, actions_of(before).size) != (now.obs_size, actions_of(now).size):
-            raise UserError(
-                f"{folder} acts on observations of {before.obs_size} entries with actions of "
-                f"{actions_of(before).size}, {known.named} has {now.obs_size} and {actions_of(now).size}: name another"
-            )
+        before = shape_of(known, source.config.task)
+        check_layout(f"{folder}", before.observation, actions_of(before), shape_of(known, known.plain()))
         if known.named == f"{known.name}:{getattr(source.config.task, 'environment', '')}":
             return dataclasses.replace(source, task=known)  # with the folder's settings of this environment
         world = dataclasses.replace(source.config, task=known.plain())

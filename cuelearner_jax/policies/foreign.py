@@ -15,9 +15,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cuelearner_jax.environment import action_words
 from cuelearner_jax.errors import UserError, format_value
+from cuelearner_jax.spaces import Space
 
 ONNX = ".onnx"
+# Files that only their library reads, running code in them if they hold some: how a module of the user's loads one.
+LOADERS = {
+    ".zip": "from stable_baselines3 import PPO; POLICY = PPO.load({!r})  # or another class",
+    ".pt": "import torch; POLICY = torch.jit.load({!r})",
+    ".pth": "import torch; POLICY = torch.jit.load({!r})",
+}
+FILES = (ONNX, *LOADERS)
+RECURRENT = {"RNN", "GRU", "LSTM", "RNNCell", "GRUCell", "LSTMCell"}  # parts of PyTorch with a memory
 ACTIONS = ("action", "actions")  # names of an output, where a file in ONNX has several
 REAL = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16}
 
@@ -32,6 +42,9 @@ class Foreign:
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
         """Return actions for observations."""
         raise NotImplementedError
+
+    def check(self, space: Space) -> None:
+        """Raise UserError where the policy is known to give other actions than those of a space."""
 
     # The same object is the same policy: programs that call it are compiled once.
     def __eq__(self, other: object) -> bool:
@@ -49,10 +62,17 @@ def function_of(given: Any) -> Foreign | None:
             ONNX.
 
     Raises:
-        UserError: a file in ONNX that cannot be run, or has other inputs and outputs.
+        UserError: a file in ONNX that cannot be run, or has other inputs and outputs; a file of `LOADERS`.
     """
     if isinstance(given, str | os.PathLike):
-        return _Onnx(Path(given)) if str(given).endswith(ONNX) else None
+        path = Path(given)
+        if path.suffix in LOADERS:
+            line = LOADERS[path.suffix].format(str(given))
+            raise UserError(
+                f"reading {given} may run code in it, so a module of yours reads it: write `{line}` into "
+                "my_policy.py, and give my_policy:POLICY (module:NAME; in Python, the loaded policy)"
+            )
+        return _Onnx(path) if path.suffix == ONNX else None
     owner = getattr(given, "__self__", None)
     if _predicts(owner) and getattr(given, "__name__", "") == "predict":
         given = owner
@@ -86,51 +106,87 @@ class _Torch(Foreign):
         torch = sys.modules["torch"]
         weights = next((own for own in self.given.parameters() if own.is_floating_point()), None)
         where = {"device": weights.device, "dtype": weights.dtype} if weights is not None else {"dtype": torch.float32}
+        act = getattr(self.given, "act_inference", self.given)  # rsl_rl's name for the deterministic action
         with self._alone:
-            modes = [(part, part.training) for part in self.given.modules()]
-            self.given.eval()
+            # Frozen modules have no mode, and exported ones refuse `eval`.
+            modes = [(part, part.training) for part in self.given.modules() if hasattr(part, "training")]
             try:
+                for part, _ in modes:
+                    part.training = False
                 with torch.no_grad():
-                    found = self.given(torch.as_tensor(np.array(obs), **where))
+                    found = act(torch.as_tensor(np.array(obs), **where))
             finally:
                 for part, mode in modes:
                     part.training = mode
-        first: Any = found[0] if isinstance(found, tuple | list) and found else found
-        return first.detach().to("cpu", torch.float32).numpy() if isinstance(first, torch.Tensor) else found
+        if isinstance(found, tuple | list) and found:
+            kinds = {getattr(part, "original_name", type(part).__name__) for part in self.given.modules()}
+            if kinds & RECURRENT:
+                raise memory_error(f"policy {self.__qualname__}")
+            found = found[0]
+        is_tensor = isinstance(found, torch.Tensor)
+        return found.detach().to("cpu", torch.float32).numpy() if is_tensor else found  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class _Predicting(Foreign):
-    """A model's deterministic `predict`, with dictionaries where the model observes dictionaries."""
+    """A model's deterministic `predict` of observations as its own space has them, normalised as in its training."""
 
     def __init__(self, given: Any) -> None:
         super().__init__(given, _reference(given))
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
-        """Return actions for observations."""
-        return self.given.predict(self._arranged(np.array(obs)), deterministic=True)[0]
-
-    def _arranged(self, rows: np.ndarray) -> Any:
-        """Return rows as the model's observation space has them; flattened dictionaries in the order of their keys."""
+        """Return actions for observations. Raises UserError for observations of another size, or a memory."""
         space = self.given.observation_space
-        parts = getattr(space, "spaces", None)
-        if isinstance(parts, dict):
-            sizes = [int(np.prod(part.shape)) for part in parts.values()]
-            self._check(rows, sum(sizes))
-            cut = np.split(rows, np.cumsum(sizes)[:-1], axis=1)
-            return {
-                name: values.reshape(len(rows), *part.shape).astype(part.dtype)
-                for (name, part), values in zip(parts.items(), cut, strict=True)
-            }
-        shape = getattr(space, "shape", None) or ()
-        self._check(rows, int(np.prod(shape)))
-        return rows.reshape(len(rows), *shape).astype(getattr(space, "dtype", np.float32))
-
-    def _check(self, rows: np.ndarray, size: int) -> None:
-        if rows.shape[1] != size:
+        parts = getattr(space, "spaces", {"": space})  # a dictionary's, in the order of its keys
+        ends = np.cumsum([_width(part) for part in parts.values()])
+        if obs.shape[1] != ends[-1]:
             raise UserError(
-                f"policy {self.__qualname__} takes observations of {size} entries, these have {rows.shape[1]}: give "
+                f"policy {self.__qualname__} takes observations of {ends[-1]} entries, these have {obs.shape[1]}: give "
                 "the observations that it was trained on"
             )
+        cut = np.split(np.array(obs), ends[:-1], axis=1)
+        values = {name: _values(part, rows) for (name, part), rows in zip(parts.items(), cut, strict=True)}
+        seen: Any = values if hasattr(space, "spaces") else values[""]
+        if (normalized := getattr(self.given, "get_vec_normalize_env", lambda: None)()) is not None:
+            seen = normalized.normalize_obs(seen)
+        action, state = self.given.predict(seen, deterministic=True)
+        if state is not None:
+            raise memory_error(f"policy {self.__qualname__}")
+        return action
+
+    def check(self, space: Space) -> None:
+        """Raise UserError where the model's actions have other bounds, or other choices, than the space."""
+        own, wanted = action_words(getattr(self.given, "action_space", None)), action_words(space)
+        if own and wanted and own != wanted:
+            raise UserError(
+                f"policy {self.__qualname__} gives actions {own}, this world takes actions {wanted}: give a world with "
+                "the policy's actions, or a function that converts them"
+            )
+
+
+def memory_error(whose: str) -> UserError:
+    """Return the UserError for a policy that gives a state beside its actions."""
+    return UserError(
+        f"{whose} gives a state beside its actions, and policies are asked without a memory: give one that depends on "
+        "the observation alone, or a function that returns actions alone"
+    )
+
+
+def _counts(space: Any) -> list[int]:
+    """Return the numbers of values of a `Discrete` or `MultiDiscrete` space, which vectors hold one-hot; else none."""
+    return np.ravel(space.nvec if hasattr(space, "nvec") else space.n if hasattr(space, "start") else ()).tolist()
+
+
+def _width(space: Any) -> int:
+    """Return the number of entries of a space's values in a vector of observations."""
+    return int(sum(_counts(space)) or np.prod(space.shape))
+
+
+def _values(space: Any, rows: Float[np.ndarray, "n entries"]) -> np.ndarray:
+    """Return the values of a space that its entries in observations hold."""
+    if counts := _counts(space):
+        parts = np.split(rows, np.cumsum(counts)[:-1], axis=1)
+        rows = np.stack([part.argmax(1) for part in parts], 1) + np.ravel(getattr(space, "start", 0))
+    return rows.reshape(len(rows), *space.shape).astype(space.dtype)
 
 
 class _Onnx(Foreign):
@@ -161,6 +217,8 @@ class _Onnx(Foreign):
             raise UserError(f"{path} has the outputs {', '.join(named)}: give a policy with one, or one called action")
         self._name, self._kind, self._output = inputs[0].name, REAL[inputs[0].type], named[0]
         self._rows, self._size = inputs[0].shape
+        if isinstance(self._rows, int) and self._rows != 1:
+            raise UserError(f"{path} takes batches of {self._rows} only: export it with batches of any size")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Onnx) and self.given == other.given
@@ -176,11 +234,8 @@ class _Onnx(Foreign):
                 "observations that it was made for"
             )
         rows = np.ascontiguousarray(obs).astype(self._kind)
-        fixed = self._rows if isinstance(self._rows, int) else 0  # a batch of another size is run row by row
-        if fixed in (0, len(rows)):
+        if self._rows != 1:
             return self._run(rows)
-        if fixed != 1:
-            raise UserError(f"{self.reference} takes batches of {fixed} only: export it with batches of any size")
         return np.concatenate([self._run(rows[number : number + 1]) for number in range(len(rows))])
 
     def _run(self, rows: np.ndarray) -> np.ndarray:

@@ -16,8 +16,13 @@ from cuelearner_jax import types, user_code
 from cuelearner_jax.errors import UserError, format_value, user_code_error
 from cuelearner_jax.policies import foreign
 from cuelearner_jax.policies.node import PolicyNode
-from cuelearner_jax.spaces import DIRECTIONS, Choices, Space
+from cuelearner_jax.spaces import DIRECTIONS, Box, Choices, Space
 from cuelearner_jax.types import EnvState
+
+TRIED = 32  # observations in the largest batch with which a function is tried
+# Largest differences of equal actions, as shares of an entry's range: asked again, and in two batches, whose sums are
+# rounded in another order (two bits of bfloat16).
+REPEATED, BATCHED = 1e-4, 0.005
 
 
 class Opaque(PolicyNode):
@@ -34,14 +39,36 @@ class Opaque(PolicyNode):
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the function's actions. Raises UserError if they have another shape."""
         if self.on_host:
-            # Called once while tracing, so that a wrong shape is reported before anything is compiled.
+            # Tried while tracing, so that a fault is reported before anything is compiled.
             with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
-                self._called(np.zeros(obs.shape, obs.dtype))
+                self._try(obs.shape[-1])
             shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
             chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
         else:
             chosen = self._checked(self.function(obs), obs.shape[0], jnp.asarray)
         return self.actions.retract(self.actions.only_actions(chosen))
+
+    def _try(self, size: int) -> None:
+        """Raise UserError for a function that does not repeat its actions, or whose actions depend on the batch.
+
+        Two observations are asked about in turn, each alone, and then among others: `TRIED` in all.
+        """
+        rows = np.random.default_rng(0).random((TRIED, size), np.float32)
+        alone = np.concatenate([self._called(rows[place : place + 1]) for place in (0, 1, 0, 1)])
+        self._compare(alone[:2], alone[2:], REPEATED, "when it is asked again")
+        among = self._called(rows)
+        self._compare(among, self._called(rows), REPEATED, "when it is asked again")
+        self._compare(alone[:2], among[:2], BATCHED, f"in a batch of {TRIED}")
+
+    def _compare(self, actions: np.ndarray, others: np.ndarray, most: float, when: str) -> None:
+        """Raise UserError for actions (..., action) that differ by more than a share `most` of an entry's range."""
+        entries = np.subtract(self.actions.high, self.actions.low) if isinstance(self.actions, Box) else 1.0
+        apart = np.abs(np.asarray(self.actions.retract(actions)) - np.asarray(self.actions.retract(others)))
+        if (apart > most * entries).any():
+            raise UserError(
+                f"{policy_name(self)} does not repeat itself: the same observation gets another action {when}; give a "
+                "policy without memory and sampling, as model.predict(obs, deterministic=True)"
+            )
 
     def _called_back(self, obs: Any) -> np.ndarray:
         """Return the function's actions; NaN once it has failed, which `user_code` reports after the program."""
@@ -57,8 +84,8 @@ class Opaque(PolicyNode):
                     f"{policy_name(self)} gave zero or not finite numbers in place of actions, in {count} situations"
                 )
             return chosen
-        except UserError as error:
-            user_code.leave(policy_name(self), error)
+        except BaseException as error:  # one that left the compiled program would be an error of XLA's
+            user_code.leave(error)
             return nothing
 
     def _called(self, rows: np.ndarray) -> np.ndarray:
@@ -66,24 +93,29 @@ class Opaque(PolicyNode):
         flat = rows.reshape(-1, rows.shape[-1])
         try:
             chosen = self.function(flat)
-        except Exception as error:
+        except UserError:
+            raise
+        except (Exception, SystemExit) as error:
             raise user_code_error(policy_name(self), error) from error
         return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
 
     def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
         """Return the function's result as an array of real numbers.
 
-        Of a pair (actions, policy state), as models of Stable-Baselines3 return, the actions are taken. Whole numbers
-        in a space of choices are numbers of choices.
+        Of a pair of actions and None (models of Stable-Baselines3), or a dictionary (of brax), the actions are taken.
+        Whole numbers in a space of choices are numbers of choices.
         """
         wanted = (rows, self.actions.size)
         if isinstance(chosen, tuple) and len(chosen) == 2 and (chosen[1] is None or np.ndim(chosen[0]) == 2):
+            if not isinstance(chosen[1], dict | None):
+                raise foreign.memory_error(policy_name(self))
             chosen = chosen[0]
         try:
             found = as_array(chosen)
-        except (TypeError, ValueError) as error:
+        except Exception as error:  # PyTorch's own kinds too
+            why = " ".join(str(error).split())[:200]
             raise UserError(
-                f"{policy_name(self)} returned {format_value(chosen)}: return an array of shape {wanted}"
+                f"{policy_name(self)} returned {format_value(chosen)} ({why}): return an array of shape {wanted}"
             ) from error
         if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
             raise UserError(f"{policy_name(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
@@ -124,8 +156,15 @@ def _called(code: Any) -> str:
 
 
 def in_space(policy: Any, space: Space) -> Any:
-    """Return a policy whose bare function gets this space of actions, if it was given without one."""
-    return policy.replace(actions=space) if isinstance(policy, Opaque) else policy
+    """Return a policy whose bare function gets this space of actions, if it was given without one.
+
+    Raises UserError for a model of another library that is known to give other actions.
+    """
+    if not isinstance(policy, Opaque):
+        return policy
+    if isinstance(policy.function, foreign.Foreign):
+        policy.function.check(space)
+    return policy.replace(actions=space)
 
 
 def policy_of(given: Any) -> Any:
@@ -139,15 +178,15 @@ def policy_of(given: Any) -> Any:
     Raises:
         UserError: the object is none of these, or a policy that is not a pytree.
     """
-    if (function := foreign.function_of(given)) is not None:
-        return Opaque(function, on_host=True)
-    if callable(given) and not (hasattr(given, "act") and not isinstance(given, type)) and _takes_nothing(given):
+    function = foreign.function_of(given)
+    if function is None and not (hasattr(given, "act") and not isinstance(given, type)) and _required(given) == []:
         try:
             given = given()
-        except Exception as error:
-            raise user_code_error(f"policy {getattr(given, '__qualname__', given)}", error) from error
-        if (function := foreign.function_of(given)) is not None:
-            return Opaque(function, on_host=True)
+        except (Exception, SystemExit) as error:
+            raise user_code_error(f"policy {_called(given)}", error) from error
+        function = foreign.function_of(given)
+    if function is not None:
+        return Opaque(function, on_host=True)
     if hasattr(given, "act"):
         if any(leaf is given for leaf in jax.tree.leaves(given)):
             kind = type(given).__name__
@@ -155,23 +194,25 @@ def policy_of(given: Any) -> Any:
                 f"a {kind} has `act` but is not a pytree: make it a flax.struct.PyTreeNode, or give a function"
             )
         return given
-    if isinstance(given, jax.stages.Wrapped):
-        return Opaque(given)
     if callable(given) and not isinstance(given, type):
-        return Opaque(given, on_host=True)
+        if len(more := _required(given) or ()) > 1:
+            raise UserError(
+                f"policy {_called(given)} takes {', '.join(more)}: give a function of observations alone, for instance "
+                f"jax.jit(lambda obs: policy(obs, {', '.join(more[1:])})[0])"
+            )
+        return Opaque(given, on_host=not isinstance(given, jax.stages.Wrapped))
     raise UserError(
         f"{format_value(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
         "model of Stable-Baselines3 or a file in ONNX, or load one"
     )
 
 
-def _takes_nothing(given: Callable[..., Any]) -> bool:
-    """Return whether an object can be called without arguments."""
+def _required(given: Any) -> list[str] | None:
+    """Return the names of the arguments that an object cannot be called without; None: not known, or any number."""
     try:
         parameters = inspect.signature(given).parameters.values()
-    except (TypeError, ValueError):  # compiled code has no signature
-        return False
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return all(one.default is not one.empty for one in parameters if one.kind not in variable) and not any(
-        one.kind in variable for one in parameters
-    )
+    except (TypeError, ValueError):  # not callable, or compiled code
+        return None
+    if any(one.kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD) for one in parameters):
+        return None
+    return [one.name for one in parameters if one.default is one.empty]

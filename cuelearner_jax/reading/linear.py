@@ -137,7 +137,7 @@ def jumps(
     change: Change,
     asked: Float[Array, "k n obs"],
     actions: Float[Array, "k n action"],
-    eps: Float[Array, ""],
+    eps: Float[Array, ""] | float,
 ) -> Bool[Array, "n unknowns"]:
     """Return where the policy chooses something else, rather than a little more or less, at a side of an unknown.
 

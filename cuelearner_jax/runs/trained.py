@@ -11,7 +11,7 @@ import numpy as np
 
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.arbiters.protocol import Finishes
-from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
+from cuelearner_jax.environment import actions_of, check_layout, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import (
@@ -176,11 +176,7 @@ class PolicySource:
             return
         what = "run" if self.grid else "policy"
         known = shape_of(self.task, self.config.task)
-        if (size := known.obs_size) != after.obs_size:
-            raise UserError(
-                f"the {what}'s observations have {size} entries, this world's have "
-                f"{after.obs_size}: keep the options that set the observation's size"
-            )
+        check_layout(f"the {what}", known.observation, actions_of(known), after)
         if policy in ("agent", "corrected") and not isinstance(arbiter_of(self.config), Finishes):
             return
         chosen = next((value for name, value in lanes.items() if name.endswith("guidance") and value), None)

@@ -27,7 +27,7 @@ from cuelearner_jax.bridges.gymnasium.instances import Running
 from cuelearner_jax.bridges.gymnasium.layout import Actions, actions_of
 from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
 from cuelearner_jax.config import Schedule, Sizes
-from cuelearner_jax.environment import Quantity, checked_quantities
+from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, checked_quantities
 from cuelearner_jax.errors import UserError, format_value, user_code_error
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.run_config import RunConfig
@@ -41,7 +41,6 @@ NUM_ENVS = 8
 UNLIMITED = 1_000  # steps of an episode, where neither environment nor caller gives a limit
 TRIED = 100  # steps of an episode, to find out whether the environment reports success
 MOST_PROCESSES = 256
-UNKNOWN_UNIT = "as given"
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ class Broken:
 NO_NUMBERS = (None, "3", b"3", [1], {}, 1j, np.zeros(2), object())
 NO_WHOLE = (*NO_NUMBERS[1:], 0.5, True, NAN, INF, -1, HUGE)
 NO_SEEDS = tuple(value for value in NO_WHOLE if not isinstance(value, list))
-NO_AMOUNTS = (*NO_NUMBERS[1:], NAN, INF, -1.0, 0.0, True, HUGE)
-NO_ANGLES = (*NO_AMOUNTS, 181.0)
+NO_ANGLES = (*NO_NUMBERS[1:], NAN, INF, -1.0, 0.0, True, HUGE, 181.0)
 NO_NAMES = (3, b"agent", ["none"], ESCAPE, "", True)
 NO_PATHS = (None, 3, b"runs", "", "a\0b", [], True, 0.5)
 NO_WORLDS = (None, 3, "navigation", cl.World, TASK, probes.WindowConfig(), [])
@@ -139,14 +138,7 @@ TABLE = {
     acted: {"obs": (*NO_ROWS, np.zeros(3), np.zeros((4, 3))), "key": NO_KEYS[:4]},
     loaded: {
         "folder": (*NO_PATHS, "nowhere", __file__),
-        "policy": (*NO_NAMES, "agnt"),
-        "guidance": NO_NAMES,
-        "labels": NO_WHOLE,
-        "bound_deg": NO_AMOUNTS,  # how far actions reach is known once the folder is read
-        "seed": NO_WHOLE,
         "base": NO_POLICIES[1:],
-        "task": (3, b"navigation", "navigaton", [], WORLD),
-        "world": NO_WORLDS[1:],
     },
     adapted: {
         "policy": NO_POLICIES,

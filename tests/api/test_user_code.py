@@ -129,23 +129,53 @@ class Failing:
 
 
 def test_what_raises_while_it_is_compiled_is_named_with_its_cause():
-    error = one_line(
-        lambda: adapted(Scaled(1.0), Failing.Teacher()), "^teacher Failing.Teacher.best_action raised KeyErr"
-    )
+    error = one_line(lambda: adapted(Scaled(1.0), Failing.Teacher()), "^Failing.Teacher.best_action raised KeyErr")
     assert isinstance(error.__cause__, KeyError)
-    error = one_line(lambda: cl.CallablePolicy(Failing.Policy())(SEEN), "^policy Failing.Policy.act raised TypeError")
+    error = one_line(lambda: cl.CallablePolicy(Failing.Policy())(SEEN), "^Failing.Policy.act raised TypeError")
     assert isinstance(error.__cause__, TypeError)
     place = Failing.Window()
     error = one_line(
         lambda: cl.adapt(Scaled(1.0), place, TEACHER, sizes=SIZES, guidance="relative"),
-        "^environment Failing.Window.step raised ZeroDivisionError: no floor here",
+        "^Failing.Window.step raised ZeroDivisionError: no floor here",
     )
     assert isinstance(error.__cause__, ZeroDivisionError)
 
 
-def test_the_command_line_says_it_in_one_line(monkeypatch, capsys):
+def test_a_function_without_a_description_is_measured():
+    found = cl.measure(cl.CallablePolicy(lambda obs: obs), WORLD, steps=40, envs=4)
+    assert found.metrics["reward"].shape == (1,)
+
+
+@pytest.mark.parametrize("end", [SystemExit("enough"), KeyboardInterrupt()])
+@pytest.mark.parametrize("at", [1, 7])  # in the first call, and within a compiled program
+def test_a_policy_that_ends_the_process_is_named(end, at):
+    calls = []
+
+    def leaving(obs):
+        calls.append(obs)
+        if len(calls) >= at:
+            raise end
+        return obs
+
+    if isinstance(end, SystemExit):
+        one_line(lambda: cl.CallablePolicy(leaving)(SEEN), "policy .*leaving raised SystemExit: enough")
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            cl.CallablePolicy(leaving)(SEEN)
+
+
+def test_a_refusal_of_the_package_within_a_policy_is_told_as_it_is():
+    def asking(obs):
+        raise cl.UserError("give another")
+
+    assert str(one_line(lambda: cl.CallablePolicy(asking)(SEEN), "give another")) == "give another"
+
+
+def test_the_command_line_says_it_in_one_line_above_the_users_own_traceback(monkeypatch, capsys):
     failing = SimpleNamespace(run=functools.partial(Failing.Window().step, None, None))
     monkeypatch.setattr(dispatch, "_file", lambda command: failing)
     assert dispatch.main(["train"]) == 2
-    told = capsys.readouterr().err.split()
-    assert " ".join(told).startswith("error: environment Failing.Window.step raised ZeroDivisionError")
+    first, second, place, *_, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("error: Failing.Window.step raised ZeroDivisionError: no floor here")
+    assert (second, last) == ("Traceback (most recent call last):", "here")
+    assert place.split(", ")[0].endswith('test_user_code.py"')

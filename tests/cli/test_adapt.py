@@ -304,6 +304,14 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
         cl.adapt(code, world, judge_bounds=(2.0,), **settings)
 
 
+def test_the_traceback_of_a_policy_that_fails_stands_below_the_line(tmp_path, capsys):
+    assert main(["adapt", "own_turned:failing", *TASK, "--out", str(tmp_path / "new")]) == 2
+    first, *below = capsys.readouterr().err.splitlines()
+    assert first == "error: own_turned:failing: policy failing raised RuntimeError: out of ink: mend it first"
+    assert "own_turned.py" in below[1]
+    assert below[-1] == "RuntimeError: out of ink"
+
+
 def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
     refused(["adapt", "own_turned:straight", *new], "needs a task to act in: give one, for instance --task", tmp_path)
@@ -321,7 +329,6 @@ def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     refused([*plain, "--base.seeds", "3"], "own_turned:straight is not a folder: leave it out", tmp_path)
     refused([*plain, "--labels-from", tmp_path / "no.parquet"], "no label file at", tmp_path)
     refused(["adapt", "own_turned:narrow", *TASK, *new], "returned actions of shape (1, 1)", tmp_path)
-    refused(["adapt", "own_turned:failing", *TASK, *new], "failing raised RuntimeError: out of ink: mend", tmp_path)
     refused(["adapt", "own_turned:OWN", *TASK, *new], "has no 'OWN'", tmp_path)
     refused(["adapt", "own_turned:TASK", *TASK, *new], "a Task is no policy", tmp_path)
     refused([*CODE, "--out", adapted], "is not empty: give --overwrite", adapted)

@@ -131,6 +131,9 @@ def test_an_environment_without_a_limit_of_steps_gets_one_that_is_told(capsys):
         (["label", REACH, "--out", "labels"], "cannot be drawn"),
         (["evaluate", REACH, "--teacher", "gymnasium_worlds:nobody", "--policy", "teacher"], "has no 'nobody'"),
         (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
+        (["adapt", "model.zip", "--env", REACH], "my_policy.py, and give my_policy:POLICY (module:NAME"),
+        (["adapt", "policy.pt", "--env", REACH], "write `import torch; POLICY = torch.jit.load('policy.pt')` into"),
+        (["adapt", "./mine.py:policy", "--env", REACH], "give mine:policy (module:NAME), in the file's folder"),
         (
             ["evaluate", REACH, "--policy", "uniform", "--task.arguments", "[]"],
             "task.arguments is '[]': give arguments",
@@ -143,6 +146,8 @@ def test_wrong_commands_are_refused_in_one_line(command, says, refused, tmp_path
     refused(command, says, tmp_path)
 
 
-def test_a_policy_of_another_size_is_refused(run, refused):
-    says = "acts on observations of 6 entries with actions of 3, gymnasium:CartPole-v1 has 4 and 2: name another"
+def test_a_policy_of_another_layout_is_refused(run, refused):
+    says = "observes 6 entries, this world has 4: give the world that it was made for"
     refused(["evaluate", run, "--env", "gymnasium:CartPole-v1"], says, run)
+    says = "gives actions between (-1, -1, -1) and (1, 1, 1), this world takes actions between (-2, -1, -1)"
+    refused(["evaluate", run, "--task.low", "-2", "-1", "-1"], says, run)

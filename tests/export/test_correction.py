@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cuelearner_jax.calibration import Distortion, Unknown
 
 import cuelearner_jax as cl
-from cuelearner_jax.calibration import Distortion, Unknown
 from cuelearner_jax.config import GuideSizes, Scalars
 
 LOW, HIGH = (-0.1, -1.0), (0.1, 1.0)

@@ -425,7 +425,7 @@ def test_from_python(tmp_path):
     decide = cl.load_exported(tmp_path / "out")
     np.testing.assert_allclose(decide(np.array([0.6, 0.8])), [0.8, 0.6], atol=1e-6)
     narrow = CallablePolicy(policy.policy, (Quantity("other", 3, "1"),))
-    with pytest.raises(UserError, match="have 3 entries, this world's 2"):
+    with pytest.raises(UserError, match="the policy observes 3 entries, this world has 2"):
         cl.export_policy(narrow, tmp_path / "other", world)
     with pytest.raises(UserError, match="cannot be read"):
         cl.load_exported(tmp_path / "other")

@@ -34,6 +34,9 @@ def torch():
     return pytest.importorskip("torch")
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+
+
 def network(torch, outputs=2, dtype=None):
     """A small network with dropout, which acts at random unless it is in evaluation mode."""
     torch.manual_seed(0)
@@ -84,8 +87,72 @@ def test_faults_of_modules_are_told(torch):
             return obs[:, :2] / 0 * 0
 
     assert "not finite" in fault(Broken())
-    assert "returned actions of shape (5, 3) for 5 observations: return (5, 2)" in fault(network(torch, 3))
+    assert "returned actions of shape (1, 3) for 1 observations: return (1, 2)" in fault(network(torch, 3))
     assert "RuntimeError" in fault(network(torch), OBS[:, :2])
+
+
+def deployed(torch, how):
+    """A module as it is deployed, without training mode or `eval`, and its actions."""
+    module = network(torch).eval()
+    script = torch.jit.script(module)
+    if how == "exported":
+        many = ({0: torch.export.Dim("n")},)
+        return module, torch.export.export(module, (torch.zeros(2, 3),), dynamic_shapes=many).module()
+    return module, torch.jit.freeze(script) if how == "frozen" else torch.jit.optimize_for_inference(script)
+
+
+@pytest.mark.parametrize("how", ["frozen", "optimised", "exported"])
+def test_deployed_modules_act(how, torch):
+    module, given = deployed(torch, how)
+    np.testing.assert_allclose(acted(given), acted(module), atol=1e-6)
+
+
+def test_a_module_of_rsl_rl_acts_by_act_inference(torch):
+    class ActorCritic(torch.nn.Module):
+        def forward(self):
+            raise NotImplementedError
+
+        def act_inference(self, obs):
+            return obs[:, :2] / 2
+
+    np.testing.assert_allclose(acted(ActorCritic()), OBS[:, :2] / 2)
+
+
+def test_a_tensor_with_gradients_is_refused_with_its_cause(torch):
+    module = network(torch)
+    assert "requires grad" in fault(lambda obs: module(torch.as_tensor(obs)))
+
+
+class TestModulesWithAMemory:
+    """The hidden state is a buffer, as IsaacLab exports it, or returned beside the action."""
+
+    def test_a_hidden_state_in_the_module_is_refused(self, torch):
+        class Memory(torch.nn.Module):
+            def __init__(self):
+                super().__init__()
+                torch.manual_seed(0)
+                self.cell, self.out = torch.nn.GRUCell(3, 8), torch.nn.Linear(8, 2)
+                self.register_buffer("hidden", torch.zeros(1, 8))
+
+            def forward(self, obs):
+                self.hidden[:] = self.cell(obs, self.hidden)[:1]
+                return self.out(self.hidden.expand(len(obs), 8))
+
+        assert "does not repeat itself" in fault(Memory())
+        assert "does not repeat itself" in fault(torch.jit.script(Memory()))
+
+    def test_a_hidden_state_beside_the_action_is_refused(self, torch):
+        class Actor(torch.nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.rnn = torch.nn.GRU(3, 2)
+
+            def forward(self, obs):
+                action, hidden = self.rnn(obs[None])
+                return action[0], hidden
+
+        for given in (Actor(), torch.jit.script(Actor())):
+            assert "gives a state beside its actions" in fault(given)
 
 
 def test_a_module_is_the_same_policy_each_time(torch):
@@ -117,59 +184,70 @@ def env_of(gymnasium, space, actions):
     return One()
 
 
+def model_of(kind, policy, env, **more):
+    """An untrained model."""
+    size = {"buffer_size": 10} if kind.__name__ in ("SAC", "DQN") else {"n_steps": 2, "batch_size": 2}
+    return kind(policy, env, policy_kwargs={"net_arch": [8]}, seed=0, device="cpu", **size, **more)
+
+
 def test_a_model_of_stable_baselines3_acts_deterministically(gymnasium):
-    from stable_baselines3 import SAC
+    from stable_baselines3 import PPO
 
     box = gymnasium.spaces.Box
-    model = SAC(
-        "MlpPolicy",
-        env_of(gymnasium, box(-1, 1, (3,)), box(-1, 1, (2,))),
-        policy_kwargs={"net_arch": [8]},
-        seed=0,
-        device="cpu",
-        buffer_size=10,
-    )
+    model = model_of(PPO, "MlpPolicy", env_of(gymnasium, box(-1, 1, (3,)), box(-1, 1, (2,))))
     wanted = model.predict(OBS, deterministic=True)[0]
     for given in (model, model.predict, model.policy, lambda obs: model.predict(obs, deterministic=True)):
         np.testing.assert_allclose(acted(given), wanted, atol=1e-6)
-    assert "takes observations of 3 entries, these have 2" in fault(model, OBS[:, :2])
+    assert fault(model, OBS[:, :2]).startswith("policy PPO takes observations of 3 entries, these have 2")
+    assert "does not repeat itself" in fault(lambda obs: model.predict(obs, deterministic=False))
+    with pytest.raises(UserError, match=r"gives actions between \(-1, -1\) and \(1, 1\), this world takes .* \(2, 1\)"):
+        acted(model, space=Box((-1.0, -1.0), (2.0, 1.0)))
+
+
+def test_a_model_sees_observations_normalised_as_in_its_training(gymnasium):
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    box = gymnasium.spaces.Box
+    env = VecNormalize(DummyVecEnv([lambda: env_of(gymnasium, box(4, 5, (3,)), box(-1, 1, (2,)))]))
+    model = model_of(PPO, "MlpPolicy", env).learn(20)
+    wanted = model.predict(env.normalize_obs(OBS), deterministic=True)[0]
+    assert np.abs(wanted - model.predict(OBS, deterministic=True)[0]).max() > 0.01
+    np.testing.assert_allclose(acted(model), wanted, atol=1e-6)
+
+
+def test_a_recurrent_model_is_refused(gymnasium):
+    contrib, box = pytest.importorskip("sb3_contrib"), gymnasium.spaces.Box
+    env = env_of(gymnasium, box(-1, 1, (3,)), box(-1, 1, (2,)))
+    assert "gives a state beside its actions" in fault(model_of(contrib.RecurrentPPO, "MlpLstmPolicy", env))
 
 
 def test_a_model_of_dictionaries_takes_rows_in_the_order_of_its_keys(gymnasium):
     from stable_baselines3 import PPO
 
-    box = gymnasium.spaces.Box
-    seen = gymnasium.spaces.Dict({"pose": box(-1, 1, (2,)), "goal": box(-1, 1, (1,))})
-    model = PPO(
-        "MultiInputPolicy",
-        env_of(gymnasium, seen, box(-1, 1, (2,))),
-        policy_kwargs={"net_arch": [8]},
-        seed=0,
-        n_steps=2,
-        batch_size=2,
-        device="cpu",
-    )
-    sizes = {name: part.shape[0] for name, part in model.observation_space.spaces.items()}
-    ends = np.cumsum(list(sizes.values()))
-    rows = {name: OBS[:, end - size : end] for (name, size), end in zip(sizes.items(), ends, strict=True)}
-    np.testing.assert_allclose(acted(model), model.predict(rows, deterministic=True)[0], atol=1e-6)
-
-
-def test_choices_may_be_given_by_their_places(gymnasium):
-    from stable_baselines3 import PPO
-
     spaces = gymnasium.spaces
-    model = PPO(
-        "MlpPolicy",
-        env_of(gymnasium, spaces.Box(-1, 1, (3,)), spaces.Discrete(4)),
-        policy_kwargs={"net_arch": [8]},
-        seed=0,
-        n_steps=2,
-        batch_size=2,
-        device="cpu",
-    )
-    found = acted(model, space=Choices(4))
-    np.testing.assert_array_equal(found, np.eye(4)[model.predict(OBS, deterministic=True)[0]])
+    seen = {"pose": spaces.Box(-1, 1, (2,)), "goal": spaces.Box(-1, 1, (1,)), "tool": spaces.Discrete(3)}
+    model = model_of(PPO, "MultiInputPolicy", env_of(gymnasium, spaces.Dict(seen), spaces.Box(-1, 1, (2,))))
+    tools = np.array([0, 2, 1, 1, 0])
+    values = {"pose": OBS[:, :2], "goal": OBS[:, 2:], "tool": tools}
+    rows = np.concatenate([np.eye(3)[tools] if key == "tool" else values[key] for key in model.observation_space], 1)
+    np.testing.assert_allclose(acted(model, rows), model.predict(values, deterministic=True)[0], atol=1e-6)
+
+
+def test_a_model_takes_places_from_rows_and_gives_choices_by_their_places(gymnasium):
+    from stable_baselines3 import DQN, PPO
+
+    spaces, places = gymnasium.spaces, np.arange(5)
+    env = env_of(gymnasium, spaces.Discrete(5), spaces.Discrete(4))
+    for model in (model_of(DQN, "MlpPolicy", env), model_of(PPO, "MlpPolicy", env)):
+        found = acted(model, np.eye(5, dtype=np.float32), Choices(4))
+        np.testing.assert_array_equal(found, np.eye(4)[model.predict(places, deterministic=True)[0]])
+    with pytest.raises(UserError, match="that are one of 4 choices, this world takes actions that are one of 3"):
+        acted(model, np.eye(5, dtype=np.float32), Choices(3))
+    env = env_of(gymnasium, spaces.MultiDiscrete([2, 3]), spaces.Discrete(4))
+    model = model_of(PPO, "MlpPolicy", env)
+    found = acted(model, np.float32([[0, 1, 1, 0, 0]]), Choices(4))
+    np.testing.assert_array_equal(found, np.eye(4)[model.predict(np.array([[1, 0]]), deterministic=True)[0]])
 
 
 @pytest.fixture
@@ -195,7 +273,7 @@ def stored(tmp_path):
     return write
 
 
-@pytest.mark.parametrize("rows", ["n", 1, 5])
+@pytest.mark.parametrize("rows", ["n", 1])
 def test_a_file_in_onnx_acts(rows, stored):
     path = stored(rows)
     np.testing.assert_allclose(acted(path), OBS[:, :2])
@@ -211,11 +289,15 @@ def test_files_in_onnx_that_do_not_fit_are_told(stored, tmp_path):
         policy_of(stored(outputs=("mean", "value")))
     with pytest.raises(UserError, match=r"has the inputs obs tensor\(float\)"):
         policy_of(stored(inputs=("obs", "mask")))
+    with pytest.raises(UserError, match="takes batches of 5 only"):
+        policy_of(stored(rows=5))
     with pytest.raises(UserError, match="there is no file"):
         policy_of(tmp_path / "absent.onnx")
     (tmp_path / "damaged.onnx").write_bytes(b"no model")
     with pytest.raises(UserError, match="cannot be run by onnxruntime"):
         policy_of(tmp_path / "damaged.onnx")
+    with pytest.raises(UserError, match=r"reading .*model.zip may run code in it.* give my_policy:POLICY"):
+        policy_of(tmp_path / "model.zip")
     path = stored()
     assert "takes observations of 3 entries, these have 2" in fault(path, OBS[:, :2])
     assert "not finite" in fault(stored(matrix=np.full((3, 2), np.nan)))

@@ -94,10 +94,6 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
     def _vector(self) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((self.obs_size,), jnp.float32)
 
-    @property
-    def _whose(self) -> str:
-        return f"environment {self.source.name}"
-
     def _reset_here(self, seed: Any) -> tuple[np.ndarray, np.ndarray]:
         """Reset on the host: any leading axes."""
         seeds = np.asarray(seed)
@@ -134,7 +130,7 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
             try:
                 went = pool_of(self.source).carry_out([one for one in requests if one is not None])
             except UserError as error:
-                user_code.leave(self._whose, error)
+                user_code.leave(error)
             else:
                 columns = zip(*went, strict=True)
                 parts = obs, final_obs, reward, terminated, truncated, success, total

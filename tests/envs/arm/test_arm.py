@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cuelearner_jax.calibration import declared_distortions
+from cuelearner_jax.calibration.families import undo_observation
 from PIL import Image
 
 from cuelearner_envs.arm import drawing, physics, recording
@@ -15,8 +17,6 @@ from cuelearner_envs.arm.config import ArmConfig
 from cuelearner_envs.arm.environment import ACTIONS, Camera
 from cuelearner_envs.arm.places import BASE, HOME
 from cuelearner_envs.arm.scripts import act
-from cuelearner_jax.calibration import declared_distortions
-from cuelearner_jax.calibration.families import undo_observation
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.tasks.arm import ARM, observation_of
 from cuelearner_jax.testing import check_task
