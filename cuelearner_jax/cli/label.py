@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shlex
 import webbrowser
 from collections.abc import Callable
@@ -35,6 +36,7 @@ from cuelearner_jax.policies import NearAims, in_space, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.signals import removed
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.train import preset_kinds
@@ -322,10 +324,15 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
     from cuelearner_jax.labelling.opening import Opening
     from cuelearner_jax.labelling.session import Session
 
+    leads_there = asked.out / "open.html"  # command lines, unlike this file, can be read by every user of the machine
+
     def open_page(address: str) -> None:
         out.print(f"open {address}")
         if asked.open:
-            webbrowser.open(address)
+            leads_there.unlink(missing_ok=True)
+            with os.fdopen(os.open(leads_there, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}">\n')
+            webbrowser.open(leads_there.absolute().as_uri())
 
     def tell(words: str) -> None:
         console.print(f"{words} ...")
@@ -333,7 +340,7 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
     def make(tell: Callable[[str], None]) -> Session:
         return Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0)
 
-    with Opening(make, stopping.set, tell) as opening:
+    with Opening(make, stopping.set, tell) as opening, removed(leads_there):
         opening.wait_for_files()
         return server.serve(opening, f"label {plan.task.name}", port, stopping, open_page, commands)
 
