@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import os
 import shlex
 import webbrowser
 from collections.abc import Callable
@@ -319,10 +321,15 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
     from cuelearner_jax.labelling.opening import Opening
     from cuelearner_jax.labelling.session import Session
 
+    leads_there = asked.out / "open.html"  # command lines, unlike this file, can be read by every user of the machine
+
     def open_page(address: str) -> None:
         out.print(f"open {address}")
         if asked.open:
-            webbrowser.open(address)
+            leads_there.unlink(missing_ok=True)
+            with os.fdopen(os.open(leads_there, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}">\n')
+            webbrowser.open(leads_there.absolute().as_uri())
 
     def tell(words: str) -> None:
         console.print(f"{words} ...")
@@ -330,7 +337,8 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
     def make(tell: Callable[[str], None]) -> Session:
         return Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0)
 
-    with Opening(make, stopping.set, tell) as opening:
+    with Opening(make, stopping.set, tell) as opening, contextlib.ExitStack() as end:
+        end.callback(leads_there.unlink, missing_ok=True)
         opening.wait_for_files()
         return server.serve(opening, f"label {plan.task.name}", port, stopping, open_page, commands)
 

@@ -43,19 +43,7 @@ TRAINED = (
 
 PAGES: dict[str, Page] = {
     "train": Page(
-        (
-            "out",
-            "env",
-            "teacher",
-            "guidance",
-            "labels",
-            "seed",
-            "labels-from",
-            "resume",
-            "overwrite",
-            "tuning",
-            "track",
-        ),
+        ("out", "env", "teacher", "guidance", "labels", "seed", "labels-from", "resume", "tuning", "track"),
         (
             Example("one agent of the small example", "train billiards --preset quickstart --out runs/one"),
             Example(
@@ -72,19 +60,7 @@ PAGES: dict[str, Page] = {
         ),
     ),
     "sweep": Page(
-        (
-            "out",
-            "env",
-            "teacher",
-            "guidance",
-            "labels",
-            "seeds",
-            "labels-from",
-            "resume",
-            "overwrite",
-            "shard",
-            "cluster",
-        ),
+        ("out", "env", "teacher", "guidance", "labels", "seeds", "labels-from", "resume", "shard", "cluster"),
         (
             Example("guided and unguided agents", "sweep billiards --preset quickstart --out runs/quickstart"),
             Example(
@@ -102,18 +78,7 @@ PAGES: dict[str, Page] = {
         ),
     ),
     "adapt": Page(
-        (
-            "out",
-            "env",
-            "teacher",
-            "labels",
-            "scenario",
-            "guidance",
-            "bound-deg",
-            "labels-from",
-            "judge-by",
-            "overwrite",
-        ),
+        ("out", "env", "teacher", "labels", "scenario", "guidance", "bound-deg", "labels-from", "judge-by"),
         (
             Example(
                 "a walker whose lidar is turned",

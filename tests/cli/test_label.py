@@ -70,6 +70,24 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
     assert label_files.history(tmp_path / "labels" / label_files.JSONL) == []
 
 
+def test_a_browser_is_told_a_file_that_others_cannot_read(tmp_path, monkeypatch):
+    pytest.importorskip("nicegui")
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/told.new\nmv {tmp_path}/told.new {tmp_path}/told\n')
+    browser.chmod(0o700)
+    monkeypatch.setenv("BROWSER", str(browser))
+    leads_there = tmp_path / "labels/open.html"
+    with served(tmp_path / "labels", "--open") as (process, address):
+        while not (tmp_path / "told").exists():
+            time.sleep(0.05)
+        assert (tmp_path / "told").read_text().split() == [leads_there.as_uri()]
+        assert f"url={address}" in leads_there.read_text()
+        assert leads_there.stat().st_mode & 0o777 == 0o600
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    assert not leads_there.exists()
+
+
 @pytest.mark.parametrize(
     ("more", "says"),
     [
