@@ -217,14 +217,15 @@ class PairedTest:
 def differences(pair: tuple[dict[str, np.ndarray], ...], by: str) -> np.ndarray:
     """Return how much better each episode (lanes, episodes) of the second policy was, in [-1, 1].
 
-    Values of a share, as success, count as they are; others in units of the first policy's largest value in the batch.
+    Values of a share, as success, count as they are; others in units of the largest value of both policies in the
+    batch, since a unit of one policy alone would favour the other where neither is better.
     Where a share is equal, the returns decide, with half of the weight.
     """
     before, after = pair
 
     def relative(name: str) -> np.ndarray:
-        unit = np.maximum(np.nanmax(np.abs(before[name]), axis=-1, keepdims=True), 1e-9)
-        return np.nan_to_num(np.clip((after[name] - before[name]) / unit, -1, 1))
+        largest = np.nanmax(np.abs(np.concatenate([before[name], after[name]], -1)), axis=-1, keepdims=True)
+        return np.nan_to_num(np.clip((after[name] - before[name]) / np.maximum(largest, 1e-9), -1, 1))
 
     if by in SHARES:
         d = np.nan_to_num(after[by]) - np.nan_to_num(before[by])

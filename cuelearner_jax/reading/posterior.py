@@ -255,7 +255,7 @@ def infer(
 def unread(data: Data, hyper: Hyper) -> Posterior:
     """Return the posterior before the first iteration."""
     p = data.features.shape[-1]
-    precision = jnp.where(data.answers.valid, LEAST_PRECISION, 0.0)
+    precision = jnp.where(data.answers.valid, jnp.full_like(data.offset, LEAST_PRECISION), 0.0)  # not weakly typed
     zero = jnp.zeros(())
     return Posterior(jnp.zeros(p), jnp.zeros((p, p)), jnp.zeros_like(data.offset), precision, data.offset, hyper, zero)
 

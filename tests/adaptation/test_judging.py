@@ -29,3 +29,8 @@ def test_a_tie_is_never_used():
 
 def test_of_policies_that_are_as_good_one_in_twenty_at_most_is_accepted():
     assert judged(0.6, 0.6, lanes=2000).better.mean() <= 0.05
+    random, test = np.random.default_rng(0), PairedTest(2000)
+    for _ in range(50):  # returns that are seldom large
+        one, other = ({"return": random.lognormal(size=(2000, 10))} for _ in range(2))
+        test.add(differences((one, other), "return"))
+    assert test.better.mean() <= 0.05

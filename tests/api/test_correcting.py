@@ -133,6 +133,7 @@ def test_it_can_be_corrected_again(better, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.long
 def test_a_constant_change_is_found_by_a_reading():
     labels = asked(150, reach=0.1)
     found = cl.correct(off, labels, low=LOW, high=HIGH, eps=EPS)
