@@ -120,7 +120,14 @@ class Opaque(PolicyNode):
         if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
             raise UserError(f"{policy_name(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
         if isinstance(self.actions, Choices) and found.shape == (rows,) and getattr(found.dtype, "kind", "") in "iu":
-            return as_array(found[:, None] == np.arange(self.actions.size)).astype(np.float32)
+            inside = (found >= 0) & (found < self.actions.size)
+            if isinstance(inside, np.ndarray) and not inside.all():
+                raise UserError(
+                    f"{policy_name(self)} chose {found[~inside][0]}: give the number of a choice, 0 to "
+                    f"{self.actions.size - 1}, whatever number the environment starts from"
+                )
+            one_hot = as_array(found[:, None] == np.arange(self.actions.size)).astype(np.float32)
+            return one_hot if isinstance(inside, np.ndarray) else jnp.where(inside[:, None], one_hot, jnp.nan)
         if found.shape != wanted:
             raise UserError(
                 f"{policy_name(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"

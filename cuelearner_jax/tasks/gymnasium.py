@@ -9,6 +9,7 @@ folder imports no code beyond that of Gymnasium's own registry.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -16,14 +17,15 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax import plugins
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
-from cuelearner_jax.bridges.gymnasium.instances import SUCCESS as TELLS
-from cuelearner_jax.bridges.gymnasium.instances import Running
+from cuelearner_jax.bridges.gymnasium.instances import Running, success_in
 from cuelearner_jax.bridges.gymnasium.layout import Actions, actions_of
 from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
 from cuelearner_jax.config import Schedule, Sizes
@@ -39,7 +41,7 @@ from cuelearner_jax.terminal import console
 FAMILY = "gymnasium"
 NUM_ENVS = 8
 UNLIMITED = 1_000  # steps of an episode, where neither environment nor caller gives a limit
-TRIED = 100  # steps of an episode, to find out whether the environment reports success
+TRIED = 1_000  # most steps of an episode, to find out whether the environment reports success
 MOST_PROCESSES = 256
 
 
@@ -198,12 +200,19 @@ GYMNASIUM = Task(
 
 
 def task_of(name: str) -> Task:
-    """Return the task of an environment: an id of Gymnasium's registry, or package.module:NAME, which is imported.
+    """Return the task of an environment: an id of Gymnasium's registry, module:id, or package.module:NAME.
+
+    The module is imported.
 
     Call this only with names from a caller or the command line, never from a file. Raises UserError if the environment
     is not available.
     """
-    return task_from(plugins.load(name, object, "an environment") if REFERENCE.fullmatch(name) else name, called=name)
+    if REFERENCE.fullmatch(name):
+        return task_from(plugins.load(name, object, "an environment"), called=name)
+    module, _, own = name.rpartition(":")
+    if module:  # Gymnasium's own way to name an id that a package registers
+        plugins.load(f"{module}:__name__", str, "a module that registers environments")
+    return task_from(own, called=own)
 
 
 def task_from(
@@ -243,12 +252,13 @@ def task_from(
         max_steps = registry_spec(name).max_episode_steps
     text = _kept(name, arguments or {})
     source = Source(name, text, max_steps or 0, 1, factory=factory)
-    actions, slices, limit, succeeds = _seen(source)
+    actions, slices, limit, succeeds, ends = _seen(source)
     if not max_steps and not limit:
-        note(
-            f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,} (give "
-            "--task.max-steps, or max_steps in Python, for another limit)"
-        )
+        if not ends:
+            note(
+                f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,} (give "
+                "--task.max-steps, or max_steps in Python, for another limit)"
+            )
         limit = UNLIMITED
     fetch = fetch_layout.layout_of(name) if factory is None else None
     slices = _named(name, slices, observation or fetch, units or {})
@@ -300,9 +310,9 @@ def _called(code: Any) -> str:
     return f"{getattr(inner, '__module__', '')}:{getattr(inner, '__qualname__', type(inner).__name__)}"
 
 
-def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
-    """Return an environment's layout: actions, slices of an observation, limit of steps (0: none), and whether it
-    reports success within an episode."""
+def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
+    """Return an environment's layout: actions, slices of an observation, limit of steps (0: none), whether it reports
+    success within an episode, and whether that episode ended by itself."""
     whose, when, succeeds = f"environment {source.name}", "in its first reset,", False
     try:
         env = source.make()
@@ -311,27 +321,38 @@ def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
     except Exception as error:
         raise user_code_error(f"{whose}, while it was made,", error) from error
     try:
+        if hasattr(env, "num_envs"):
+            raise UserError(
+                f"{whose} is a vector of {env.num_envs} environments: give a function that makes a single one"
+            )
         actions = actions_of(whose, env.action_space)
         one = Running(env, source.name)
         slices = [Quantity(leaf.name, leaf.size, UNKNOWN_UNIT) for leaf in one.leaves if leaf.size]
         if not slices:
             raise UserError(f"{whose}: an observation has no entries: give one with some")
         limit = _limit(env)
-        one.reset(0)
+        first, ended, cut = one.reset(0), False, False
         env.action_space.seed(0)
         for number in range(1, 1 + min(limit or TRIED, TRIED)):
             when = f"in step {number} of its first episode,"
             _, _, ended, cut, info = env.step(env.action_space.sample())
-            succeeds = succeeds or any(name in info for name in TELLS)
-            if ended or cut or succeeds:
+            succeeds = succeeds or success_in(source.name, info) is not None
+            if ended or cut:
                 break
+        when = "in a second reset with the same seed,"
+        if not np.array_equal(first, one.reset(0)):
+            raise UserError(
+                f"{whose} does not repeat itself: with the same seed, its reset gives another observation after an "
+                "episode: leave out wrappers that remember, such as NormalizeObservation"
+            )
     except UserError:
         raise
     except Exception as error:
         raise user_code_error(f"{whose}, {when}", error) from error
     finally:
-        env.close()
-    return actions, slices, limit, succeeds
+        with contextlib.suppress(Exception):  # what closing raises is no fault of the episodes
+            env.close()
+    return actions, slices, limit, succeeds, bool(ended or cut)
 
 
 def _limit(env: Any) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 from cuelearner_jax.bridges.gymnasium.layout import NoVector, action_maker, actions_of, flatten, leaves_of
 from cuelearner_jax.errors import UserError, user_code_error
 
-SUCCESS = ("success", "is_success")  # names in `info`
+SUCCESS = ("success", "is_success", "succeed")  # names in `info`
 PLACE_BYTES = 8
 
 
@@ -55,6 +55,17 @@ class Shot(NamedTuple):
     seed: int  # seed of the episode
     actions: np.ndarray  # (steps, action) from its beginning
     first: int  # number of the first step that is filmed
+
+
+def success_in(whose: str, info: dict[str, Any]) -> bool | None:
+    """Return what `info` says of success; None: nothing. Raises UserError where that is neither true nor false."""
+    name = next((name for name in SUCCESS if info.get(name) is not None), None)
+    if name is None:
+        return None
+    value = np.asarray(info[name])
+    if value.size != 1 or value.dtype.kind not in "biuf" or not np.isfinite(value).all():
+        raise UserError(f"environment {whose} says info[{name!r}] = {info[name]!r}: give True, False or None")
+    return bool(value.ravel()[0])
 
 
 class Running:
@@ -96,7 +107,7 @@ class Running:
             raise UserError(f"environment {self.whose} gave a reward of {reward} in {when}: mend it first")
         terminated = bool(terminated)
         truncated = (bool(truncated) or self.steps >= max_steps) and not terminated
-        success = next((float(info[name]) for name in SUCCESS if name in info), 0.0)
+        success = float(success_in(self.whose, info) or 0.0)
         self.total += reward
         told = struct.pack("<d??d", reward, terminated, truncated, success)
         parts = self.place + action.tobytes() + obs.tobytes() + told

@@ -13,6 +13,7 @@ import numpy as np
 from cuelearner_jax.errors import UserError
 
 IMAGE_AXES = 3
+LARGEST = 1e30  # a bound from here on is none: float32's own largest number, say
 
 
 class Leaf(NamedTuple):
@@ -130,8 +131,14 @@ def actions_of(whose: str, space: Any) -> Actions:
     if kind != "Box":
         raise UserError(f"{whose}: its actions are a {kind}: wrap the environment so that they are a Box or Discrete")
     low, high = np.ravel(space.low).astype(float), np.ravel(space.high).astype(float)
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        number = int(np.flatnonzero(~(np.isfinite(low) & np.isfinite(high)))[0]) + 1
+    if (fixed := np.flatnonzero(low == high)).size:
+        raise UserError(
+            f"{whose}: entry {fixed[0] + 1} of its actions can only be {low[fixed[0]]:g}: wrap it so that the entry is "
+            "left out"
+        )
+    ends = (np.abs(low) < LARGEST) & (np.abs(high) < LARGEST)
+    if not ends.all():
+        number = int(np.flatnonzero(~ends)[0]) + 1
         raise UserError(
             f"{whose}: entry {number} of its actions has no bounds: wrap it, for instance in "
             "gymnasium.wrappers.RescaleAction"
@@ -145,4 +152,6 @@ def action_maker(space: Any) -> Callable[[np.ndarray], Any]:
         start = int(space.start)
         return lambda vector: int(vector.argmax()) + start
     shape, dtype = space.shape, space.dtype
+    if np.issubdtype(dtype, np.integer):
+        return lambda vector: np.round(vector).reshape(shape).astype(dtype)
     return lambda vector: vector.reshape(shape).astype(dtype)

@@ -48,7 +48,10 @@ class Source:
             named[DRAWN] = "rgb_array"
         if self.factory is not None:
             return partial(make_from_code, self.factory, named)
-        return partial(make_registered, self.name, named, self.max_steps)
+        import gymnasium
+
+        spec = gymnasium.registry.get(self.name)  # of the caller's own registry, which another process lacks
+        return partial(make_registered, self.name, named, self.max_steps, spec)
 
     def arguments_of_instances(self) -> tuple[Any, ...]:
         """Return the arguments of `Instances`."""
@@ -123,9 +126,16 @@ def registry_spec(name: str) -> Any:
         ) from error
 
 
-def make_registered(name: str, arguments: dict[str, Any], max_steps: int) -> Any:
-    """Return an environment of Gymnasium's registry. Raises UserError for an id that is not there."""
-    spec = registry_spec(name)
+def make_registered(name: str, arguments: dict[str, Any], max_steps: int, spec: Any = None) -> Any:
+    """Return an environment of Gymnasium's registry, or of a specification that this process's registry lacks.
+
+    Raises UserError for an id that is not there.
+    """
+    try:
+        spec = registry_spec(name)
+    except UserError:
+        if spec is None:
+            raise
     import gymnasium
 
     limited = {"max_episode_steps": max_steps} if max_steps else {}
