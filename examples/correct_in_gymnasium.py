@@ -55,7 +55,7 @@ def error(policy, count=500):
     return float(np.linalg.norm(policy(obs) - right(obs), axis=1).mean())
 
 
-def main(labels=200, guidance="offset", seed=0):
+def main(labels=200, guidance="reading", seed=0):
     """Errors of the policy, of the corrected one, and of the control."""
     slices = [("thing", 3, "m"), ("hand", 3, "m")]
     world = cl.from_gymnasium(

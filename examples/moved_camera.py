@@ -1,6 +1,6 @@
 """An arm whose camera was moved: the policy, and a person's idea of the right motion. See the README.
 
-    cuelearner label gymnasium:FetchReach-v4 examples.moved_camera:moved --guidance calibration --out labels/reach
+    cuelearner label gymnasium:FetchReach-v4 examples.moved_camera:moved --out labels/reach
 
 FetchReach's goal is seen 8 cm too far left, so the arm stops beside every goal. `reach` sees the true goal.
 """

@@ -41,7 +41,7 @@ LABELS = 60
 SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=1000, fit_batch_size=32, labels_per_round=10)
 TEACHERS = {"scalar": {"scalar_within_deg": 0.06}}  # a share of the range: how near an action is called good
 ARBITERS = ("prior",)
-FEEDBACK = ("relative", "intent", "offset", "calibration", "demonstration", "scalar", "dcoach", "bdcoach", "clic")
+FEEDBACK = ("relative", "intent", "reading", "demonstration", "scalar", "dcoach", "bdcoach", "clic")
 SHOWN = (*FEEDBACK, "clic_shown", "heuristic", *ARBITERS)
 
 

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cuelearner_jax.calibration import Distortion, Unknown
 
 import cuelearner_jax as cl
 from cuelearner_jax.config import GuideSizes, Scalars
@@ -36,7 +35,7 @@ def labels():
 def better():
     """Corrected by these."""
     how = {"low": LOW, "high": HIGH, "eps": EPS, "bound": 0.2, "sizes": SIZES, "scalars": SCALARS}
-    return cl.correct(base, labels(), cues="left,right;open,close", **how)
+    return cl.correct(base, labels(), cues="left,right;open,close", guidance="relative", **how)
 
 
 @pytest.mark.parametrize("format", ["onnx", "numpy", "stablehlo"])
@@ -83,7 +82,7 @@ def test_of_a_saved_policy_it_needs_no_base(better, tmp_path):
 def test_a_policy_of_jax_functions_is_exported_whole_from_its_folder(tmp_path):
     own = jax.jit(lambda obs: jnp.stack([0.05 * obs[:, 0], jnp.tanh(obs[:, 1])], -1))
     how = {"low": LOW, "high": HIGH, "eps": EPS, "bound": 0.2, "sizes": SIZES, "scalars": SCALARS}
-    better = cl.correct(own, labels(), **how)
+    better = cl.correct(own, labels(), guidance="relative", **how)
     cl.export_policy(better, tmp_path / "whole", format="numpy")
     np.testing.assert_allclose(cl.load_exported(tmp_path / "whole")(OTHERS), better(OTHERS), atol=1e-5)
     with pytest.raises(Exception, match="holds a whole policy: leave out the base action"):
@@ -113,10 +112,14 @@ def test_a_whole_policy_takes_no_base_action_and_code_can_be_in_no_file(better, 
         cl.export_correction(cl.CallablePolicy(better.policy.base), tmp_path / "no", world=better.world)
 
 
-def test_a_correction_that_asks_its_base_anew_cannot_stand_alone(better, tmp_path):
-    from cuelearner_jax.calibration import Calibrated
-
-    seen = Distortion("shift", (Unknown("shift", "m"),), sees=lambda theta, obs: obs - theta)
-    policy = Calibrated(better.policy.base, np.zeros(1, np.float32), (seen,))
-    with pytest.raises(cl.UserError, match=r"asks its base about other observations \(shift\)"):
-        cl.export_correction(dataclasses.replace(better, policy=policy), tmp_path / "out")
+def test_a_reading_is_exported_whole_and_alone_unless_its_base_sees_something_else(better, tmp_path):
+    own = jax.jit(lambda obs: jnp.stack([0.05 * obs[:, 0], jnp.tanh(obs[:, 1])], -1))
+    read = cl.correct(own, labels(), low=LOW, high=HIGH, eps=EPS)
+    for format in ("numpy", "onnx"):
+        cl.export_policy(read, tmp_path / format, format=format)
+        np.testing.assert_allclose(cl.load_exported(tmp_path / format)(OTHERS), read(OTHERS), atol=1e-5)
+    change = read.policy.correction.change
+    aside = read.policy.correction.replace(change=change.replace(theta=change.theta + 0.1))
+    policy = read.policy.replace(correction=aside)
+    with pytest.raises(cl.UserError, match="asks its base about other observations"):
+        cl.export_correction(dataclasses.replace(read, policy=policy), tmp_path / "out")

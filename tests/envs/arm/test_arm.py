@@ -7,8 +7,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from cuelearner_jax.calibration import declared_distortions
-from cuelearner_jax.calibration.families import undo_observation
 from PIL import Image
 
 from cuelearner_envs.arm import drawing, physics, recording
@@ -18,6 +16,8 @@ from cuelearner_envs.arm.environment import ACTIONS, Camera
 from cuelearner_envs.arm.places import BASE, HOME
 from cuelearner_envs.arm.scripts import act
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.reading import declared_distortions
+from cuelearner_jax.reading.families import undo_observation
 from cuelearner_jax.tasks.arm import ARM, observation_of
 from cuelearner_jax.testing import check_task
 
@@ -86,9 +86,9 @@ def test_a_declared_family_names_the_turn_and_the_offset(skill):
     state, true = plain.reset(jax.random.key(3))
     family = declared_distortions(world)
     names = [one.name for one in family]
-    assert [name.rpartition(": ")[2] for name in names] == ["shift", "turn", "change"]
+    assert [name.rpartition(": ")[2] for name in names] == ["shift", "gain", "turn"]
     # The camera turns first, then shifts; a family undoes in the other order.
-    found = undo_observation(family[:2], jnp.array([0.01, -0.02, 0.03, 10.0]), world.observe(state))
+    found = undo_observation((family[0], family[2]), jnp.array([0.01, -0.02, 0.03, 10.0]), world.observe(state))
     assert np.abs(world.observe(state) - true).max() > 0.05
     assert np.allclose(found, true, atol=1e-5)
 
