@@ -154,7 +154,7 @@ def _sides(
 ) -> tuple[Float[Array, "u n cues"], Float[Array, "u n cues"]]:
     """Return the changes from a policy's actions at an estimate to those at both sides of each unknown."""
     size, steps = len(frame.step), jnp.diag(frame.step)
-    sides = jnp.concatenate([change.theta[None], change.theta - steps, change.theta + steps])
+    sides = jnp.concatenate([change.theta[None], change.theta[None] - steps, change.theta[None] + steps])
     whole = jax.vmap(partial(meant, family))(sides, asked[1:], actions[1:])
     return space.log(whole[0], whole[1 : 1 + size]), space.log(whole[0], whole[1 + size :])
 
