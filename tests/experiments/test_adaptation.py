@@ -49,7 +49,6 @@ def bench_of(modules, study, piece):
 
 # What README and docs/results/adaptation.md report of a world, and the scale at which it was run.
 REPORTED = {
-    **{("billiards", f"{world}/relative"): "paper" for world in ("turned_strike", "shifted_balls", "tilted_table")},
     **{("navigation", f"corridor_{side}/intent-180"): "paper" for side in ("left", "right")},
     ("navigation", "turned_lidar/relative-narrowed"): "paper",
     ("navigation", "rooms/intent-180-look-ahead"): "cpu",

@@ -35,17 +35,17 @@ def page():
 
 def test_every_kind_compares_as_many_settings(study):
     for world in study.EPS:
-        for kind in set(study.KINDS[world]) - {"base", "calibration", "offset"}:
+        for kind in set(study.KINDS[world]) - {"base", "reading"}:
             settings = study.settings_of(world, kind)
             assert len({tuple(one.items()) for one in settings}) == (8 if world in study.FITTED else 4), (world, kind)
     for world, chosen in study.CHOSEN.items():
         assert set(chosen) <= set(study.KINDS[world])
 
 
-def test_the_peers_are_in_every_world_and_calibration_where_a_change_is_named(study):
+def test_the_peers_are_in_every_world_and_reading_where_a_change_is_named(study):
     for world, kinds in study.KINDS.items():
         assert {"base", "relative", "demonstration", "scalar", "dcoach", "bdcoach", "clic"} <= set(kinds)
-        assert ("calibration" in kinds) == study.WORLDS[world].adapts
+        assert ("reading" in kinds) == study.WORLDS[world].adapts
 
 
 def test_one_cue_a_label_means_nothing_where_there_is_one_cue(study):
@@ -80,15 +80,6 @@ def test_labels_that_match_the_reference_are_read_between_budgets(page):
     assert page.ratio_words(page.ratio(slow, reference)) == "above 2.50 [2.50, no bound]"
     fast = page.Curve((25, 100, 250), np.array([[0.7, 0.8, 0.9]] * 4))
     assert page.ratio_words(page.ratio(fast, reference)) == "below 0.25 [0.00, 0.25]"
-
-
-def test_the_page_is_what_was_recorded(page, tmp_path):
-    curves, text = page.read(DATA), PAGE.read_text(encoding="utf-8")
-    assert page.section(curves, DATA, PAGE) in text
-    page.write_text_csv(tmp_path / "labels.csv", *page.table(curves))
-    page.write_all(curves, tmp_path / "success.csv")
-    for name in ("labels.csv", "success.csv"):
-        assert (tmp_path / name).read_bytes() == (DATA / name).read_bytes()
 
 
 def test_a_condition_that_was_interrupted_is_measured_anew(study):

@@ -81,8 +81,8 @@ def test_the_scripts_do_what_they_say():
 def test_pieces_are_named_and_unknown_ones_refused(study, capsys):
     assert study.main(["--list"]) == 0
     told = capsys.readouterr().out.split()
-    assert len(told) == 2 * 4 * 4
-    assert "FetchPush-v4/calibration/3" in told
+    assert len(told) == 2 * 3 * 4
+    assert "FetchPush-v4/reading/3" in told
     assert np.linalg.norm(study.OFFSET) == pytest.approx(0.03)
     with pytest.raises(SystemExit):
         study.main(["--pieces", "FetchSlide-v4/base/0"])
