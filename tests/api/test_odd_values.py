@@ -106,7 +106,7 @@ TEACHERS = [Odd(None), Odd("east"), Odd((1j, 0.0)), Odd(((1.0,), ())), NoPytree(
 
 @pytest.mark.parametrize("teacher", [*TEACHERS, cl.teacher_of(OF_BILLIARDS)], ids=lambda one: type(one).__name__)
 def test_a_teacher_of_something_else_is_refused(teacher):
-    with pytest.raises(cl.UserError, match="teacher|Billiards.heuristic raised"):
+    with pytest.raises(cl.UserError, match=r"teacher|Billiards.heuristic raised"):
         cl.ask(POLICY, WORLD, teacher, labels=5, sizes=SIZES)
 
 
@@ -119,7 +119,7 @@ def test_no_more_bounds_are_tried_than_anyone_can_wait_for():
 def test_a_policy_of_another_world_is_refused():
     for policy, says in (
         (OF_BILLIARDS, "this world has 2: give the world"),
-        (Heuristic(TABLE.env), "Billiards.heuristic raised|^policy cannot act in this wo"),
+        (Heuristic(TABLE.env), r"Billiards.heuristic raised|^policy cannot act in this wo"),
     ):
         for call in (
             lambda policy=policy: cl.ask(policy, WORLD, TEACHER, labels=5, sizes=SIZES),
