@@ -127,7 +127,6 @@ CHOSEN: Mapping[str, Mapping[str, Settings]] = {
     },
     # No setting of deep COACH reached a goal there: its first.
     "turned": {
-        "offset": {**SLOW, "scalars.eps_deg": 0.1, "sizes.fit_steps": 300},
         "relative": {**SLOW, "scalars.eps_deg": 0.05, "sizes.fit_steps": 900},
         "dcoach": {**SLOW, "scalars.eps_deg": 0.05, "replay_steps": 5},
         "bdcoach": {**SLOW, "scalars.eps_deg": 0.05, "batch_steps": 5},

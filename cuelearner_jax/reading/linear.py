@@ -156,7 +156,7 @@ def _sides(
     size, steps = len(frame.step), jnp.diag(frame.step)
     sides = jnp.concatenate([change.theta[None], change.theta[None] - steps, change.theta[None] + steps])
     whole = jax.vmap(partial(meant, family))(sides, asked[1:], actions[1:])
-    return space.log(whole[0], whole[1 : 1 + size]), space.log(whole[0], whole[1 + size :])
+    return space.log(whole[:1], whole[1 : 1 + size]), space.log(whole[:1], whole[1 + size :])
 
 
 def influence(space: Space, frame: Frame, labels: Labels, actions: Float[Array, "k n action"]) -> Int[Array, " mixed"]:

@@ -53,4 +53,4 @@ def _undone(family: Family, thetas: Array, obs: Array) -> Array:
 @partial(jax.jit, static_argnames=("space", "family"))
 def _moved(space: Space, family: Family, thetas: Array, before: Array, actions: Array) -> Array:
     whole = jax.vmap(partial(linear.meant, family))(thetas, before, actions)
-    return jnp.abs(space.log(whole[0], whole[1:])).max(-1)
+    return jnp.abs(space.log(whole[:1], whole[1:])).max(-1)
