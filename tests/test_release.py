@@ -27,7 +27,7 @@ def test_one_version_stands_everywhere():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert re.search(r"^version: (.*)$", citation, re.M)[1] == cl.__version__
     date = re.search(r'^date-released: "(.*)"$', citation, re.M)[1]
-    first = re.search(r"^## .*$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)[0]
+    first = re.search(r"^## \[.*$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)[0]
     assert first == f"## [{cl.__version__}] - {date}"
 
 

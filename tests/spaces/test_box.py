@@ -274,7 +274,7 @@ def test_a_policy_of_26_entries_is_corrected_by_labels_alone_and_its_folder_read
     actions = best + 0.2 + random.uniform(-0.2, 0.2, best.shape)
     labels = cl.Labels(best, actions, np.sign(best - actions))
     sizes = GuideSizes(frame="action", feedback_layers=(8,), fit_steps=20, fit_batch_size=8)
-    policy = cl.correct(shifted, labels, low=[-1] * size, high=[1] * size, bound=0.25, sizes=sizes)
+    policy = cl.correct(shifted, labels, low=[-1] * size, high=[1] * size, guidance="relative", bound=0.25, sizes=sizes)
     policy.save(tmp_path / "hand")
     again = cl.load_policy(tmp_path / "hand", base=shifted)
     assert again.actions == policy.actions
