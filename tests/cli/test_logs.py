@@ -27,7 +27,8 @@ def narrow(obs):
     return obs[:, :2]
 """
 EPS = 0.05
-SMALL = ("--guidance", "relative", "--sizes.feedback-layers", "8", "--sizes.fit-steps", "20", "--sizes.fit-batch-size", "20")
+SIZES = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20", "--sizes.fit-batch-size", "20")
+SMALL = ("--guidance", "relative", *SIZES)
 
 
 @pytest.fixture(scope="module")
