@@ -36,6 +36,7 @@ EPS_TURN = float(np.deg2rad(9.0))  # of directions [rad]
 PLAYED = 10  # episodes between two batches of questions, from which situations are drawn
 JUDGED, REPORTED = 50, 20  # episodes of the sequential test, and of the results
 FAULTS = {"": (0.0, False), "20% wrong": (0.2, False), "one cue a label": (0.0, True)}
+IN_FAMILY = ("nothing", "constant", "gain", "mixing", "seen_shift", "two")
 FAULTY = ("constant", "seen_shift")  # errors that teachers with faults are tried with
 
 
@@ -125,14 +126,16 @@ def begun(world: Any, labels: int) -> Asked:
     return Asked(blank, plain, smooth, fit, fit, jnp.zeros(()))
 
 
-def played(world: Any, fit: Fit) -> dict[str, jax.Array]:
-    """Return success and return of episodes: of the policy as it was, corrected, unchanged, and of the teacher."""
+def played(world: Any, before: Any, after: Any) -> dict[str, jax.Array]:
+    """Return success and return of episodes: of the policy as it was, corrected, unchanged, and of the teacher.
+
+    `before`, `after`: policies of one observation.
+    """
 
     def several(key: jax.Array, count: int, world: Any, act: Any, **how: Any) -> tuple[jax.Array, jax.Array]:
         *_, total, done = jax.vmap(lambda key: zoo.rollout(key, world, act, **how))(jax.random.split(key, count))
         return done * 1.0, total
 
-    before, after = (acts_of(world, fit, jnp.array(corrects)) for corrects in (False, True))
     ways = {
         "before": (JUDGED + REPORTED, world, before),
         "after": (JUDGED + REPORTED, world, after),
@@ -147,6 +150,19 @@ def played(world: Any, fit: Fit) -> dict[str, jax.Array]:
     return found
 
 
+def covered(world: Any, state: Asked) -> jax.Array:
+    """Return the share of right actions that lie within their 95% interval, in situations of other episodes."""
+    robot, reader = world.robot, reader_of(world.robot)
+    obs, states, *_ = jax.vmap(lambda key: zoo.rollout(key, world, acts_of(world, state.fit, jnp.array(False))))(
+        jax.random.split(jax.random.key(79), PLAYED)
+    )
+    obs, states = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[::5], (obs, states))
+    right = to_even(robot, jax.vmap(lambda state: zoo.right(world, state))(states))
+    away = jnp.abs(reader.space.log(reader.act(state.fit, obs), right))
+    # answers say no more than that the right action is within half of `eps`
+    return (away <= 1.96 * reader.spread(state.fit, obs) + reader.eps / 2).mean()
+
+
 @partial(jax.jit, static_argnames="labels")
 def _begun(worlds: Any, labels: int) -> Asked:
     return each_lane(lambda world: begun(world, labels))(worlds)
@@ -159,37 +175,59 @@ def _batch(worlds: Any, state: Asked, keys: Any, number: Any, wrong: Any, one_cu
 
 
 @jax.jit
-def _played(worlds: Any, fits: Fit) -> dict[str, jax.Array]:
-    return each_lane(played)(worlds, fits)
+def _played(worlds: Any, states: Asked) -> dict[str, jax.Array]:
+    def one(world: Any, state: Asked) -> dict[str, jax.Array]:
+        before, after = (acts_of(world, state.fit, jnp.array(corrects)) for corrects in (False, True))
+        return {**played(world, before, after), "covered": covered(world, state)}
+
+    return each_lane(one)(worlds, states)
 
 
-def measure(robots: Any, cells: list[Cell], labels: int) -> list[dict[str, Any]]:
-    """Return a row a cell."""
+def worlds_of(robots: Any, cells: list[Cell]) -> tuple[Any, jax.Array]:
+    """Return the worlds of cells, stacked, and their keys."""
     rows = jnp.array([cell.robot for cell in cells]), jnp.array([cell.error for cell in cells])
     own = jax.tree.map(lambda leaf: leaf[rows[0]], robots)
     root = jax.random.key(5)
     keys = jax.vmap(lambda robot, error: jax.random.fold_in(jax.random.fold_in(root, robot), error))(*rows)
     worlds = jax.vmap(zoo.changed)(keys, own, rows[1])
-    keys = jax.vmap(jax.random.fold_in)(keys, jnp.array([cell.seed for cell in cells]))
+    return worlds, jax.vmap(jax.random.fold_in)(keys, jnp.array([cell.seed for cell in cells]))
+
+
+def measure(robots: Any, cells: list[Cell], labels: int) -> list[dict[str, Any]]:
+    """Return a row a cell."""
+    worlds, keys = worlds_of(robots, cells)
     wrong, one_cue = (jnp.array(column) for column in zip(*(FAULTS[cell.fault] for cell in cells), strict=True))
     state = _begun(worlds, labels)
     for number in range(BATCHES):
         each = jax.vmap(lambda key, number=number: jax.random.fold_in(key, number))(keys)
         state = _batch(worlds, state, each, jnp.array(number), wrong, one_cue)
-    values = jax.tree.map(np.asarray, _played(worlds, state.fit))
+    values = jax.tree.map(np.asarray, _played(worlds, state))
     evidence = np.asarray(state.evidence)
     judged = [
         {end: values[f"{name} {end}"][:, :JUDGED] for end in ("success", "return")} for name in ("before", "after")
     ]
     test = PairedTest(len(cells))
     test.add(differences((judged[0], judged[1]), "success"))
-    means = {name: each[:, -REPORTED:].mean(1) for name, each in values.items()}
+    decided = {
+        "evidence": evidence, "used_by_labels": evidence >= USED, "used_by_test": test.better,
+        "covered": values.pop("covered"),
+    }  # fmt: skip
+    return rows_of(robots, cells, {**decided, **means_of(values)})
+
+
+def means_of(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the means of the episodes that are reported, of what `played` returns."""
+    return {name: each[:, -REPORTED:].mean(1) for name, each in values.items()}
+
+
+def rows_of(robots: Any, cells: list[Cell], columns: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Return a row a cell, from what was measured of all."""
+    tasks, neural = np.asarray(robots.task), np.asarray(robots.neural)
     return [
         {
-            "cues": int(robots.cues), "task": zoo.TASKS[int(own.task[place])], "neural": bool(own.neural[place]),
+            "cues": int(robots.cues), "task": zoo.TASKS[int(tasks[cell.robot])], "neural": bool(neural[cell.robot]),
             "robot": cell.robot, "error": zoo.ERRORS[cell.error], "fault": cell.fault, "seed": cell.seed,
-            "evidence": float(evidence[place]), "used_by_labels": bool(evidence[place] >= USED),
-            "used_by_test": bool(test.better[place]), **{name: float(each[place]) for name, each in means.items()},
+            **{name: column[place].item() for name, column in columns.items()},
         }
         for place, cell in enumerate(cells)
     ]  # fmt: skip
@@ -200,8 +238,8 @@ def cells_of(robots: int, seeds: int) -> list[Cell]:
     faults = lambda error: FAULTS if zoo.ERRORS[error] in FAULTY else ("",)  # noqa: E731
     return [
         Cell(robot, error, fault, seed)
-        for robot in range(robots)
         for seed in range(seeds)
+        for robot in range(robots)
         for error in range(len(zoo.ERRORS))
         for fault in faults(error)
     ]
@@ -246,6 +284,29 @@ def table(rows: list[dict[str, Any]]) -> None:
     for name in ("test", "labels"):
         back = shares(rows, rules[name])
         print(f"judged by {name}: loss back {np.median(back):.2f}, worst tenth {np.quantile(back, 0.1):.2f}")
+    inside = [row["covered"] for row in rows if row["error"] in IN_FAMILY and not row["fault"]]
+    print(f"right actions within their 95% intervals, where the change is in the family: {np.mean(inside):.3f}")
+
+
+def group(cues: int, count: int, split: str) -> Any:
+    """Return a group of robots, stacked."""
+    draw = jax.jit(zoo.robots, static_argnames=("cues", "count", "split"))
+    return draw(jax.random.key(0), cues=cues, count=count, split=split)
+
+
+def measured(file: Path, cells: list[Cell], at_once: int, measure: Any) -> list[dict[str, Any]]:
+    """Measure cells in parts, and write after each; a file that is there is gone on with."""
+    rows = pq.read_table(file).to_pylist() if file.exists() else []
+    file.parent.mkdir(parents=True, exist_ok=True)
+    for first in range(len(rows), len(cells), at_once):
+        part = cells[first : first + at_once]
+        padded = part + [part[-1]] * (at_once - len(part))  # one program serves all parts
+        rows += measure(padded)[: len(part)]
+        print(f"{file.stem}: {len(rows)} of {len(cells)} cells", flush=True)
+        about = {f"cuelearner.{name}": str(value) for name, value in provenance().items()}
+        whole = pa.Table.from_pylist(rows).replace_schema_metadata(about)
+        pq.write_table(whole, file, compression="zstd")
+    return rows
 
 
 def main() -> None:
@@ -263,18 +324,9 @@ def main() -> None:
     if asked.table:
         table([row for file in sorted(asked.table.glob("*.parquet")) for row in pq.read_table(file).to_pylist()])
         return
-    draw = jax.jit(zoo.robots, static_argnames=("cues", "count", "split"))
-    robots = draw(jax.random.key(0), cues=asked.cues, count=asked.robots, split=asked.split)
-    cells, rows = cells_of(asked.robots, asked.seeds), []
-    asked.out.mkdir(parents=True, exist_ok=True)
-    for first in range(0, len(cells), asked.at_once):
-        part = cells[first : first + asked.at_once]
-        padded = part + [part[-1]] * (asked.at_once - len(part))  # one program serves all parts
-        rows += measure(robots, padded, asked.labels)[: len(part)]
-        print(f"{len(rows)} of {len(cells)} cells", flush=True)
-        about = {f"cuelearner.{name}": str(value) for name, value in provenance().items()}
-        whole = pa.Table.from_pylist(rows).replace_schema_metadata(about)
-        pq.write_table(whole, asked.out / f"{asked.split}_{asked.cues}.parquet", compression="zstd")
+    robots = group(asked.cues, asked.robots, asked.split)
+    cells, file = cells_of(asked.robots, asked.seeds), asked.out / f"{asked.split}_{asked.cues}.parquet"
+    rows = measured(file, cells, asked.at_once, lambda part: measure(robots, part, asked.labels))
     table(rows)
 
 
