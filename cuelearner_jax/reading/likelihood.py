@@ -1,7 +1,7 @@
 """Probability of relative answers: each says in which interval the right action lies, seen from the action asked about.
 
-An ordinal probit. t is the change from the action asked about to the right one along a cue, `tau` the threshold,
-`width` the standard deviation of what is judged, and `lapse` the share of answers that are about something else:
+An ordinal probit: t is the change from the action asked about to the right one along a cue, and `tau` the threshold.
+`width` is the standard deviation of what is judged, and `lapse` the share of answers that are about something else.
 
     p(h | t) = (1 - lapse) (Phi((upper(h) - t) / width) - Phi((lower(h) - t) / width)) + lapse / 3
     more: (tau, inf)    right: [-tau, tau]    less: (-inf, -tau)

@@ -120,12 +120,11 @@ def _seen(
     left = [k for k in np.argsort(-np.abs(mean) * length) if length[k] > 1e-6 and root[k].any()]
     estimates = []
     while left:
-        first = left.pop(0)
-        ratio = effect[:, first] @ effect / (length[first] ** 2)
-        alike = [k for k in left if abs(effect[:, first] @ effect[:, k]) > ALIKE * length[first] * length[k]]
+        largest = left[0]
+        alike = [k for k in left if abs(effect[:, largest] @ effect[:, k]) >= ALIKE * length[largest] * length[k]]
         left = [k for k in left if k not in alike]
-        members = np.array([first, *alike])
-        share = ratio[members]
+        first, members = min(alike), np.sort(alike)
+        share = effect[:, first] @ effect[:, members] / (length[first] ** 2)
         value, deviation = share @ mean[members], float(np.linalg.norm(share @ root[members]))
         if not _matters(value, deviation, length[first] / math.sqrt(max(len(effect), 1))):
             continue

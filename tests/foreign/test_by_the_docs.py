@@ -65,9 +65,6 @@ assert not {"jax", "cuelearner_jax"} & set(sys.modules)
 RANGE = np.array(recorded.HIGH) - np.array(recorded.LOW)
 OFFSET = 0.12 * RANGE * np.array([1, -1, 1])  # by how much a person wants another action than the policy's
 EPS = 0.05
-SMALL = ("--sizes.feedback-layers", "32", "32", "--sizes.fit-steps", "200")
-FAST = ("--scalars.feedback-learning-rate", "0.01")
-QUICK = (*SMALL, "--sizes.fit-batch-size", "32")
 
 
 @pytest.fixture
@@ -122,7 +119,7 @@ def on_page(folder, wanted, count):
 
     space = Box(recorded.LOW, recorded.HIGH)
     bounds = ["--task.low", *map(str, recorded.LOW), "--task.high", *map(str, recorded.HIGH)]
-    how = [*bounds, *QUICK, *FAST, "--scalars.eps-deg", str(EPS), "--bound-deg", "0.25", "--no-practice"]
+    how = [*bounds, "--scalars.eps-deg", str(EPS), "--no-practice"]
     assert COMMANDS["label"][COMMANDS["label"].index("--labels") + 1] == str(count)
     ask = lambda obs, action: told(space, wanted, obs[None], action[None])[0]  # noqa: E731
     assert labelled([*COMMANDS["label"][1:], *how], ask) == folder
@@ -138,7 +135,7 @@ def test_the_commands_of_the_page_correct_a_policy_of_pytorch(labels, place, tmp
     else:
         on_page(folder, wanted, 150)
     in_file(Path("labels/others"), policy, wanted, 60, 1)
-    assert main([*COMMANDS["adapt"], *QUICK, *FAST]) == 0
+    assert main(COMMANDS["adapt"]) == 0
     capsys.readouterr()
     assert main(COMMANDS["evaluate"]) == 0
     told = capsys.readouterr().out
