@@ -11,9 +11,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions
 from cuelearner_jax.agents.registry import AGENTS
-from cuelearner_jax.arbiters import episodes
-from cuelearner_jax.arbiters.protocol import ArbiterOptions
-from cuelearner_jax.arbiters.registry import ARBITERS
+from cuelearner_jax.arbiters import ARBITERS, Arbiter, Episodes
 from cuelearner_jax.config import Scalars, Schedule, Sizes, check_guide, check_multiple, check_part
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -24,7 +22,7 @@ from cuelearner_jax.spaces import Box
 
 TaskT = TypeVar("TaskT")
 AgentT = TypeVar("AgentT", bound=AgentOptions)
-ArbiterT = TypeVar("ArbiterT", bound=ArbiterOptions)
+ArbiterT = TypeVar("ArbiterT", bound=Arbiter)
 KindsT = TypeVar("KindsT")
 
 GROUPS: Mapping[str, type] = {"sizes": Sizes, "scalars": Scalars, "schedule": Schedule}
@@ -50,7 +48,7 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
     schedule: Schedule = dataclasses.field(default_factory=Schedule)
     agent: AgentT = dataclasses.field(default_factory=ddqn.Config)  # pyright: ignore[reportAssignmentType]
     """Options of the agent."""
-    arbiter: ArbiterT = dataclasses.field(default_factory=episodes.Config)  # pyright: ignore[reportAssignmentType]
+    arbiter: ArbiterT = dataclasses.field(default_factory=Episodes)  # pyright: ignore[reportAssignmentType]
     """Options of the arbiter."""
     kinds: KindsT = dataclasses.field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     """Options of kinds by their names; a kind that is not there has its defaults."""

@@ -12,7 +12,7 @@ import numpy as np
 from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import episodes
+from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
@@ -101,7 +101,7 @@ def describe(
 
 def defaults(task: Task) -> dict[str, Any]:
     """Return the default of every field, for config.json files written before the field existed."""
-    groups = {"task": task.config, **run_config.GROUPS, "agent": ddqn.Config, "arbiter": episodes.Config}
+    groups = {"task": task.config, **run_config.GROUPS, "agent": ddqn.Config, "arbiter": Episodes}
     return {name: configuration.defaults(kind) for name, kind in groups.items()}
 
 

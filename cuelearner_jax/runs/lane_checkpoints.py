@@ -10,10 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.compute as pc
 
-from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import Clock, TrainState, start_clock
-from cuelearner_jax.policies import acting_state
 from cuelearner_jax.runs.grid import run_key
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import formats, label_files, results
@@ -23,10 +21,10 @@ from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
 DUE = "due.json"  # columns of a stretch whose evaluation was interrupted, beside the checkpoint at its end
 
 
-def items(blocks: list[TrainState], clock: Clock, wall: float, arbiter: Arbiter) -> dict[str, Any]:
+def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
     """Return a run's state as checkpoint items; acting needs only the first, the last gives the cut of lanes."""
     return {
-        "policy": [acting_state(arbiter, block.agent.params, block.guide.model, block.arbiter) for block in blocks],
+        "policy": [{"params": block.agent.params, "guidance": block.guide.model} for block in blocks],
         "rest": [
             block.replace(agent=block.agent.replace(params=None), guide=block.guide.replace(model=None), failed=None)
             for block in blocks
@@ -59,7 +57,7 @@ def _shapes(group: LaneGroup, saved: Checkpoints) -> tuple[dict[str, Any], dict[
     """
     clock, count, size = _clock(saved, len(group.seeds))
     cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
-    return clock, items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0, group.arbiter)
+    return clock, items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
 
 
 def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainState], Clock, float]:
@@ -144,7 +142,7 @@ def restore_policies(folder: Path, like: Any, lanes: int, run: str) -> tuple[dic
 
     Args:
         folder: the folder of one kind of guidance.
-        like: shapes of what one lane acts with (`policies.acting_state`).
+        like: shapes of what one lane acts with: {"params": the agent's, "guidance": the guide's model}.
         lanes: number of lanes.
         run: the key of the run and kind (`grid.run_key`).
 

@@ -13,14 +13,13 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import PRNGKeyArray
 
-from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import BY_LANE, fixed_numerics, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import Tell, ignore_progress, rollout_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Clock, TrainState
-from cuelearner_jax.policies import PolicyBlock, arbiter_of
+from cuelearner_jax.policies import PolicyBlock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.program import Program, make_program
@@ -43,11 +42,6 @@ class LaneGroup:
         self.program: Program = make_program(
             config, guidance, env, self.largest_budget, self.mesh, lanes=self.cut.shape[1] // self.mesh.size
         )
-
-    @property
-    def arbiter(self) -> Arbiter:
-        """The arbiter of all lanes."""
-        return arbiter_of(self.config)
 
     @property
     def rounds(self) -> int:

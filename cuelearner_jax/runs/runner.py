@@ -35,7 +35,6 @@ class Runner:
         self,
         group: LaneGroup,
         examined: Environment,
-        judged: Environment | None,
         order: Order,
         described: dict[str, Any],
         stopping: threading.Event,
@@ -43,9 +42,9 @@ class Runner:
     ) -> None:
         """Prepare without starting.
 
-        `described`: contents of config.json. `stopping`: set by Ctrl-C. For `examined` and `judged` see `Training`.
+        `described`: contents of config.json. `stopping`: set by Ctrl-C. For `examined` see `Training`.
         """
-        self.training = Training(group, examined, order.split, self._end_if_asked, judged)
+        self.training = Training(group, examined, order.split, self._end_if_asked)
         self.group, self.order, self.described = group, order, described
         self.stopping, self.bars = stopping, bars
         self.name = group.guidance.name
@@ -106,7 +105,7 @@ class Runner:
 
     def _save(self, saved: Checkpoints) -> None:
         now = self.training
-        saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall, self.group.arbiter))
+        saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
 
     def _interrupted(self, where: str = "") -> Interrupted:
         return Interrupted(

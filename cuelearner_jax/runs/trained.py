@@ -10,19 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, check_layout, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import (
+    Agent,
     Corrected,
     Guided,
     Heuristic,
     Policy,
     Taught,
-    arbiter_of,
     asked_from,
-    final_policy,
     uniform_in,
 )
 from cuelearner_jax.run_config import RunConfig
@@ -91,7 +89,7 @@ def make(
         assert adapted is not None
         return adapted.policy(view) if name == "adapted" else adapted.base(view)
     assert lanes is not None
-    agent = final_policy(config, lanes.guidance, view, lanes.step, lanes.policies)
+    agent = Agent(lanes.policies["params"], config.agent_in(view), view)
     if name == "agent":
         return agent
     if name == "corrected":
@@ -177,7 +175,7 @@ class PolicySource:
         what = "run" if self.grid else "policy"
         known = shape_of(self.task, self.config.task)
         check_layout(f"the {what}", known.observation, actions_of(known), after)
-        if policy in ("agent", "corrected") and not isinstance(arbiter_of(self.config), Finishes):
+        if policy in ("agent", "corrected"):
             return
         chosen = next((value for name, value in lanes.items() if name.endswith("guidance") and value), None)
         if not self._weighs_aims((chosen,) if isinstance(chosen, str) else chosen):
