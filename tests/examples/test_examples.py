@@ -21,8 +21,7 @@ from PIL import Image
 from cuelearner_jax import loop
 from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.registry import AGENTS
-from cuelearner_jax.arbiters.protocol import Arbiter, Outcome
-from cuelearner_jax.arbiters.registry import ARBITERS
+from cuelearner_jax.arbiters import ARBITERS, Arbiter, Outcome
 from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -251,17 +250,16 @@ def test_the_soft_agent_learns_the_soft_values_of_a_chain():
 
 def test_the_late_arbiter_leaves_the_first_steps_to_the_agent():
     late = importlib.import_module("examples.late_arbiter")
-    options = late.Config(after=2, probability=1.0)
-    arbiter = options.make(False)
+    arbiter = late.Config(after=2, probability=1.0)
     assert isinstance(arbiter, Arbiter)
     state, guided = arbiter.init(2), []
     for done in ([0, 1], [0, 0], [1, 0], [0, 0], [0, 0]):
-        outcome = Outcome(jnp.zeros(2), jnp.array(done, bool), jnp.array(True))
-        state = arbiter.follow(state, options, probes.SCALARS, outcome, jax.random.key(0))
+        outcome = Outcome(jnp.zeros(2), jnp.array(done, bool), jnp.array(True), False)
+        state = arbiter.follow(state, outcome, probes.SCALARS, jax.random.key(0))
         guided.append(arbiter.guided(state).tolist())
     assert guided == [[False, False], [False, False], [False, True], [False, True], [True, True]]
     outcome = outcome._replace(done=jnp.ones(2, bool))
-    assert not arbiter.follow(state, late.Config(2, 0.0), probes.SCALARS, outcome, jax.random.key(0)).chosen.any()
+    assert not late.Config(2, 0.0).follow(state, outcome, probes.SCALARS, jax.random.key(0)).chosen.any()
 
 
 def test_the_soft_agent_does_not_see_from_the_action():

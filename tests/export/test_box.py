@@ -54,7 +54,6 @@ def test_a_decision_in_a_box_is_the_policys_within_its_bound(folder, format):
         decide.angle(DRAWN[0])
 
 
-
 def test_the_contract_names_the_cues_of_the_space(folder):
     told = json.loads((folder / "numpy" / runner.CONTRACT).read_text())["action"]
     assert (told["name"], told["size"], told["about"]) == ("reach", 3, "a vector of the box")

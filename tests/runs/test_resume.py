@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from small_runs import stopping_at
 
-from cuelearner_jax.arbiters import paced
+from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -41,7 +41,7 @@ CONFIG = probes.config(
     sizes=SMALL,
     scalars={"discount": 0.5, "silence_probability": 0.05},
     agent=SMALL_AGENT,
-    arbiter=paced.Config(lead=0.0),
+    arbiter=Paced(lead=0.0),
     schedule={"total_steps": 96, "guidance_until": 64, "eval_every": 16, "checkpoint_every": 32},
 )
 GRID = Grid(("relative", "none"), seeds=(3, 5), labels=(35, 60))  # 6 rounds; 4 lanes in 2 blocks of 2
@@ -102,7 +102,7 @@ def newest(out, kind, grid=GRID):
     """The newest checkpoint's arrays and number."""
     env = TASK.environment(CONFIG.task)
     group = lanes.LaneGroup(CONFIG, env, guidances.make(kind, CONFIG.sizes, env), grid)
-    like = items(group.shapes_of(group.cut), jax.eval_shape(start_clock), 0.0, group.arbiter)
+    like = items(group.shapes_of(group.cut), jax.eval_shape(start_clock), 0.0)
     key = run_key(formats.read("config", out / "config.json"), kind)
     with checkpoints(out / kind / "checkpoints", read_only=True, run=key) as saved:
         found = saved.restore(like)
@@ -201,8 +201,8 @@ def test_a_checkpoint_whose_lanes_had_another_state_is_refused_before_anything_i
     before = probes.files_of(out)
     of_now = lane_checkpoints.items
 
-    def of_a_newer_program(blocks, clock, wall, arbiter):
-        made = of_now(blocks, clock, wall, arbiter)
+    def of_a_newer_program(blocks, clock, wall):
+        made = of_now(blocks, clock, wall)
         return {**made, "rest": [block.replace(arbiter=(block.arbiter, block.failed)) for block in made["rest"]]}
 
     monkeypatch.setattr(lane_checkpoints, "items", of_a_newer_program)
