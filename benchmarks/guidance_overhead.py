@@ -17,10 +17,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from _measuring import Labelled
+from _measuring import Labelled, learning
 
 from cuelearner_jax.arbiters import Episodes
-from cuelearner_jax.runs.speed import learning
 from cuelearner_jax.tasks.billiards import BILLIARDS
 
 

@@ -43,7 +43,7 @@ class RunLanes:
 
 
 def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid, tuple[Piece, ...]]:
-    """Open the run in a folder, or the sweep whose shards lie below it (`--shard`, `--cluster`).
+    """Open the run in a folder, or the sweep whose shards lie below it (`--shard`).
 
     Returns the task, the configuration, the grid of all shards, and the folders. `find`: see `grid.load`.
 

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _measuring import Timed
 from pendulum import STEPS, Pendulum, Swing, seen
 
 from cuelearner_jax.agents import sac
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.speed import Timed
 from cuelearner_jax.testing import check_environment
 
 ENV = Pendulum(jnp.array(STEPS))

@@ -66,12 +66,10 @@ def test_bad_arguments_are_refused(refused, tmp_path, command, says):
 
 WITH_OUT = [
     QUICK,
-    [*QUICK, "--cluster", "slurm", "--shards", "2"],
     ["train", "billiards"],
     ["evaluate", "billiards"],
     ["render", "billiards"],
     ["report", "docs/data/navigation"],
-    ["bench"],
 ]
 
 

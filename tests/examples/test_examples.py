@@ -6,7 +6,10 @@ import importlib
 import json
 import re
 import shlex
+import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from importlib.abc import Loader, MetaPathFinder
 from importlib.util import spec_from_loader
 from pathlib import Path
@@ -392,3 +395,19 @@ def test_the_shots_that_the_page_on_billiards_shows_are_won(capsys):
     assert re.search(r"(\d+) of 3600 directions win", printed)
     assert told["shot"].pocketed.tolist() == [False, False, False, True]
     assert float(told["shot"].duration) == pytest.approx(3.1, abs=0.05)
+
+
+def test_slurm_gets_one_command_a_piece_which_saves_when_its_job_ends(tmp_path):
+    pytest.importorskip("submitit")
+    piece = importlib.import_module("examples.slurm_sweep").Piece(["billiards", "--out", "runs/a"], 2, 16)
+    assert piece.command[-6:] == ["sweep", "billiards", "--out", "runs/a", "--shard", "2/16"]
+    saves = f"trap 'touch {tmp_path}/saved; exit 143' TERM; touch {tmp_path}/up; while :; do sleep 0.05; done"
+    piece.command = ["sh", "-c", saves]
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(piece)
+        while not (tmp_path / "up").exists():
+            time.sleep(0.05)
+        assert piece.checkpoint().function is piece
+        assert (tmp_path / "saved").exists()
+        with pytest.raises(subprocess.CalledProcessError):
+            done.result()
