@@ -16,7 +16,7 @@ from jaxtyping import PRNGKeyArray
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import BY_LANE, fixed_numerics, lane_mesh, place
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.evaluate import Tell, ignore_progress, rollout_lanes
+from cuelearner_jax.evaluate import rollout_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Clock, TrainState
 from cuelearner_jax.policies import PolicyBlock
@@ -60,19 +60,6 @@ class LaneGroup:
         earlier, now, every = self.asked(before), self.asked(rounds), self.config.schedule.guide_eval_every
         due = now == self.budgets
         return (now > earlier) & (due | (now % every == 0) if every else due)
-
-    def looks(self, rounds: int, given: bool) -> list[tuple[int, int, int]]:
-        """Return (seed, budget, labels asked for) of each evaluation of a guide alone, up to a number of rounds.
-
-        `given`: whether labels were taken from a file at once, instead of asked for.
-        """
-        made = [(0, rounds)] if given else [(number - 1, number) for number in range(1, rounds + 1)]
-        found = []
-        for before, after in made:
-            due = self.examined(after, before)
-            columns = (self.seeds, self.budgets, self.asked(after))
-            found += zip(*(column[due].tolist() for column in columns), strict=True)
-        return found
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return (seeds, budgets) of each block; the last block is padded with repeats, whose results are dropped."""
@@ -158,16 +145,12 @@ class LaneGroup:
         num_envs: int,
         steps: int,
         blocks: list[TrainState],
-        tell: Tell = ignore_progress,
     ) -> dict[str, np.ndarray]:
-        """Return metrics (lanes,) of a policy of each block on the same episodes.
-
-        One device reports progress by `tell` between stretches; several devices evaluate in one stretch.
-        """
+        """Return metrics (lanes,) of a policy of each block on the same episodes."""
         mesh = self.mesh if self.mesh.size > 1 else None
 
         def measured(block: TrainState) -> dict[str, Any]:
-            return rollout_lanes(env, policy_of(block), key, num_envs, steps, tell, mesh).means
+            return rollout_lanes(env, policy_of(block), key, num_envs, steps, mesh=mesh).means
 
         return self.columns(self.each(measured, blocks))
 

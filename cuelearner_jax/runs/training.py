@@ -13,7 +13,7 @@ import numpy as np
 from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.environment import Environment, view_of
-from cuelearner_jax.evaluate import Tell, episodes, ignore_progress
+from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import Agent, Guided, PolicyBlock, asked_from
 from cuelearner_jax.runs.lanes import LaneGroup
@@ -24,23 +24,21 @@ from cuelearner_jax.types import Label, Params, Teacher
 class Training:
     """The state of a group of lanes in training, and its next stretches.
 
-    Between two stretches `clock`, `blocks` and `wall` are the whole state; after an interrupted evaluation also `due`.
+    Between two stretches `clock`, `blocks` and `wall` are the whole state.
     """
 
-    def __init__(self, group: LaneGroup, examined: Environment, split: str, tell: Tell = ignore_progress) -> None:
+    def __init__(self, group: LaneGroup, examined: Environment, split: str) -> None:
         """Start at the beginning.
 
         Args:
             group: the lanes.
             examined, split: environment and episodes of evaluations, see `evaluate.SPLITS`.
-            tell: called while evaluations run; an exception from it ends them.
         """
-        self.group, self.split, self.tell = group, split, tell
+        self.group, self.split = group, split
         self.examined = place(group.mesh, examined, SHARED)
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
         self.wall = 0.0  # seconds of labelling and training so far
-        self.due: dict[str, np.ndarray] | None = None  # columns of the newest stretch, until its evaluation is done
         # round of the newest evaluation of guides, and its result
         self._guides: tuple[int, dict[str, np.ndarray]] | None = None
 
@@ -48,11 +46,9 @@ class Training:
         """Start fresh lanes."""
         self.blocks = self.group.start()
 
-    def go_on(
-        self, blocks: list[TrainState], clock: Clock, wall: float, due: dict[str, np.ndarray] | None = None
-    ) -> None:
+    def go_on(self, blocks: list[TrainState], clock: Clock, wall: float) -> None:
         """Continue from a saved state."""
-        self.blocks, self.wall, self.due = blocks, wall, due
+        self.blocks, self.wall = blocks, wall
         self.clock = place(self.group.mesh, clock, SHARED)
 
     @property
@@ -133,15 +129,12 @@ class Training:
         if self.step == 0:
             yield {**self.evaluation(), **self.guide_alone()}
         iterations = schedule.eval_every // group.config.sizes.num_envs
-        while not self.done or self.due is not None:
-            if self.due is None:
-                started = time.perf_counter()
-                self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
-                self.wall += time.perf_counter() - started
-                self.due = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
-            row = {**self.evaluation(), **self._of_finite(self.due)}
-            self.due = None
-            yield row
+        while not self.done:
+            started = time.perf_counter()
+            self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
+            self.wall += time.perf_counter() - started
+            trained = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
+            yield {**self.evaluation(), **self._of_finite(trained)}
 
     def evaluation(self) -> dict[str, Any]:
         """Return the columns of one evaluation of all agents: scalars, or (lanes,) with NaN for failed lanes."""
@@ -180,7 +173,7 @@ class Training:
         schedule = self.group.config.schedule
         key = episodes(self.split)
         size = (schedule.eval_envs, schedule.eval_steps)
-        found = self.group.evaluate(policy_of, self.examined, key, *size, self.blocks, self.tell)
+        found = self.group.evaluate(policy_of, self.examined, key, *size, self.blocks)
         return self._of_finite(found)
 
     def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

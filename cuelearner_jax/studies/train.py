@@ -21,7 +21,6 @@ from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import Grid, defaults, seeds_of
-from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order, Plan, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
@@ -69,9 +68,6 @@ def run(order: Order) -> None:
         with claimed(order.out), interruptible() as stopping:
             # Nobody else can change it any more.
             check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(order.task))
-            for group in made.groups if order.resume else ():
-                described = formats.read("config", order.out / CONFIG)
-                check_standing(group, order.out / group.guidance.name, described, given=plan.labels is not None)
             prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
             # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
             described = formats.read("config", order.out / CONFIG)
