@@ -132,9 +132,7 @@ def to_json(config: RunConfig) -> dict[str, Any]:
 def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
     """Return the configuration of JSON values; code that a file names is never loaded.
 
-    Raises:
-        UserError: an unknown field, or a part that is not known here.
-        TypeError, KeyError: the values make no sense.
+    Raises UserError for an unknown field or part, or a value of another type.
     """
     shared = {name: configuration.from_json(kind, values[name]) for name, kind in GROUPS.items()}
     parts = {name: part_from_json(known, values[name]) for name, known in PARTS.items()}
@@ -152,8 +150,6 @@ def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
 
     Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
     """
-    if not isinstance(values, dict | None):
-        raise TypeError(f"options of a kind of guidance must be an object of names and values, not {values!r}")
     kind = guidances.find_or_none(name)
     if values is None or kind is None:
         return values

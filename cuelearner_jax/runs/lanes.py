@@ -86,13 +86,6 @@ class LaneGroup:
             return len(self.seeds)
         return -(-len(self.seeds) // CORES)
 
-    @property
-    def at_once(self) -> int:
-        """Lanes that a device works on at the same time; on a CPU one of each block."""
-        if jax.default_backend() == "cpu":
-            return min(CORES, len(self.cut)) if self.mesh.size == 1 else 1
-        return self.cut.shape[1] // self.mesh.size
-
     def each(self, work: Callable[..., T], *blocks: list[Any]) -> list[T]:
         """Apply `work` to every block; a CPU works on as many blocks at once as it has cores."""
         if jax.default_backend() != "cpu" or len(blocks[0]) == 1:

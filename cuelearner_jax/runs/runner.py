@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.runs.failures import LISTED, variant_name
+from cuelearner_jax.runs.failures import named
 from cuelearner_jax.runs.grid import config_hash, run_key
 from cuelearner_jax.runs.lane_checkpoints import items, restore_blocks
 from cuelearner_jax.runs.lanes import LaneGroup
@@ -117,16 +117,13 @@ class Runner:
             raise Interrupted(f"stopped at step {step} of {self.name}; go on with the same command and --resume")
 
     def _tell_failed(self, when: str) -> None:
-        """Print a line for each newly failed lane, or for the first ones if there are many."""
-        found, group = np.flatnonzero(self.training.failed & ~self.failed), self.group
-        for lane in found[:LISTED]:
-            variant = variant_name(self.name, int(group.budgets[lane]))
+        """Print a line if lanes have newly failed."""
+        found, group = self.training.failed & ~self.failed, self.group
+        if found.any():
+            names = named(group.seeds[found], group.budgets[found])
             console.print(
-                f"{variant}: the lane of seed {group.seeds[lane]} is no longer finite {when}: kept at its last finite "
-                "state and marked as failed"
+                f"{self.name}: {names} no longer finite {when}: kept at the last finite state, marked as failed"
             )
-        if len(found) > LISTED:
-            console.print(f"{self.name}: so are {len(found) - LISTED} more lanes")
         self.failed = self.training.failed
 
     def _label(
@@ -136,11 +133,12 @@ class Runner:
         teacher: Teacher | None,
         labels: label_files.LabelFile | None,
     ) -> None:
-        """Take the labels of a file, or ask the teacher for missing ones; write the label file."""
-        now = self.training
-        if now.labelled and self._has_labels():
-            return
-        if not now.labelled:
+        """Take the labels of a file, or ask the teacher for missing ones; write the label file.
+
+        A kill may have torn the file, so it is written anew whenever a run goes on.
+        """
+        now, asks = self.training, not self.training.labelled
+        if asks:
             bar = self.bars.add_task(f"{self.name}: labels", total=self.group.rounds, note="", completed=now.round)
             if labels is not None:
                 now.take(labels)
@@ -156,18 +154,14 @@ class Runner:
                         self._save(saved)
                     self._stop_if_asked(saved)
         self._write_labels()
-        self._save(saved)
+        if asks:
+            self._save(saved)
 
     def _examine(self, guides: TableWriter, before: int) -> None:
         """Write the evaluations of guides that are due after the rounds since `before`."""
         row = self.training.guides(before)
         if row is not None:
             guides.append(**row)
-
-    def _has_labels(self) -> bool:
-        """Whether the label file is there as a whole, and of this run; a kill may have torn the file."""
-        path = self.folder / label_files.PARQUET
-        return label_files.readable(path) and label_files.read(path).run in (None, self.key)
 
     def _write_labels(self) -> None:
         form, config = self.group.guidance.form, self.group.config
