@@ -163,7 +163,7 @@ def test_what_is_no_run_is_refused(refused, copy, tmp_path, command):
 
 
 def test_a_lane_that_is_not_there_is_refused(refused, copy, tmp_path):
-    refused(["render", copy, "--seed", "7", "--out", tmp_path / "new"], "the run has seeds 2000, 2001", tmp_path)
+    refused(["render", copy, "--seed", "7", "--out", tmp_path / "new"], "there are seeds 2000, 2001", tmp_path)
     refused(["render", copy, "--labels", "7", "--guidance", "relative"], "labels 10, 20", tmp_path)
 
 
