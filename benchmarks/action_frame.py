@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 from _flops import step_operations
+from _measuring import Timed, learning
 from scaling import REPLAY
 
 from cuelearner_jax.agents import view
 from cuelearner_jax.environment import spaces_of
-from cuelearner_jax.runs.speed import Timed, learning
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 

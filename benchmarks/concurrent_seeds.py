@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from _measuring import Timed, learning, state_bytes
 
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.speed import Timed, learning, state_bytes
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks.navigation import NAVIGATION
 

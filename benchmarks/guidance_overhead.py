@@ -17,10 +17,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from _measuring import Labelled
+from _measuring import Labelled, learning
 
-from cuelearner_jax.arbiters import episodes
-from cuelearner_jax.runs.speed import learning
+from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.tasks.billiards import BILLIARDS
 
 
@@ -50,7 +49,7 @@ def main() -> None:
         labels = 2 * config.sizes.labels_per_round  # enough for a fitted model; the time of a round is scaled up below
         capacity = min(config.agent.replay_capacity, 100_000)
         agent, sizes = dataclasses.replace(config.agent, replay_capacity=capacity), config.sizes
-        half = episodes.Config()  # of all episodes guided
+        half = Episodes()  # of all episodes guided
         measured = learning(dataclasses.replace(config, agent=agent, arbiter=half), guided=True)
         runs = {kind: Run(kind, measured, arguments.seeds, labels) for kind in ("none", "relative")}
         steps = arguments.steps or (1000 if name == "quickstart" else 20)

@@ -14,10 +14,10 @@ import json
 from pathlib import Path
 
 import jax
+from _measuring import measure_training
 from scaling import REPLAY
 
 from cuelearner_jax import devices
-from cuelearner_jax.runs.speed import measure
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 
@@ -41,7 +41,9 @@ def main() -> None:
     for lanes in asked.lanes:
         found = {}
         for way, devices.LIBRARY_LANES in WAYS.items():
-            found[way] = measure(config, lambda: task.environment(config.task), lanes, asked.seconds, mesh)["ms_a_step"]
+            found[way] = measure_training(config, lambda: task.environment(config.task), lanes, asked.seconds, mesh)[
+                "ms_a_step"
+            ]
         rows.append({"task": asked.task, "lanes": lanes, **found})
         print(f"{lanes:>6}  " + "  ".join(f"{value:>14.4f}" for value in found.values()), flush=True)
         if asked.out:

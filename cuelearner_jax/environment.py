@@ -167,10 +167,6 @@ class OptionalMembers(Protocol):
         """
         ...
 
-    def rule(self, obs: Float[Array, " obs"]) -> Float[Array, " aims"]:
-        """Return the log-weights of the aims by a hand-written rule: the baseline of labels about aims."""
-        ...
-
 
 class Described:
     """Mixin that derives members from the environment's `observation`."""

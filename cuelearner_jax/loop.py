@@ -22,16 +22,7 @@ from cuelearner_jax import asking
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions, draws_sorts
 from cuelearner_jax.agents.replay import Memory, RingBuffer, buffer_for, count_guided, stored_step
-from cuelearner_jax.arbiters.protocol import (
-    Arbiter,
-    ArbiterOptions,
-    Chooses,
-    HasCritic,
-    LaneParts,
-    Outcome,
-    make_arbiter,
-    offer_of,
-)
+from cuelearner_jax.arbiters import Arbiter, Outcome
 from cuelearner_jax.asking import GuideState, Stream, label_slots
 from cuelearner_jax.config import Scalars, Schedule, Sizes, static
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
@@ -41,9 +32,7 @@ from cuelearner_jax.policies import asked_from
 from cuelearner_jax.run_config import RunConfig, Settings
 from cuelearner_jax.types import EnvState, Label, Params, Step, Teacher
 
-Parts = tuple[AgentOptions, ArbiterOptions, bool]  # options with None for floats; whether targets bootstrap
-
-APART = 1 << 30  # folded into a key whose other uses count from 0
+Parts = tuple[AgentOptions, Arbiter, bool]  # options with None for floats; whether targets bootstrap
 
 
 class AgentState(struct.PyTreeNode):
@@ -62,7 +51,7 @@ class TrainState(struct.PyTreeNode):
 
     agent: AgentState
     guide: GuideState
-    arbiter: Any  # in which environments the guide's action is executed; see `arbiters.protocol`
+    arbiter: Any  # in which environments the guide's action is executed; see `arbiters`
     key: PRNGKeyArray
     failed: Bool[
         Array, ""
@@ -105,7 +94,7 @@ class Lane(NamedTuple):
     sizes: Sizes
     guidance: Guide
     learner: AgentFunctions
-    arbiter: Arbiter
+    arbiter: Arbiter  # with None for floats
     buffer: RingBuffer
     bootstraps: bool  # whether targets use the next observation (discount above 0)
     largest_budget: int
@@ -128,14 +117,11 @@ class Lane(NamedTuple):
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, self.sizes.num_envs))
         capacity = self.learner.options.replay_capacity
         guided = jnp.zeros((capacity, 1), jnp.int32) if self.counts_guided else None
-        arbiter = self.arbiter.init(self.sizes.num_envs)
-        if isinstance(self.arbiter, HasCritic):
-            arbiter = self.arbiter.with_critic(arbiter, self.learner.init(jax.random.fold_in(k_agent, APART)))
         guide = asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes)
         return TrainState(
             agent=AgentState(params, training, self.buffer.empty(capacity), env_state, obs, guided),
             guide=guide.replace(stored=self.buffer.empty(slots)) if self.stores else guide,
-            arbiter=arbiter,
+            arbiter=self.arbiter.init(self.sizes.num_envs),
             key=key,
             failed=jnp.array(False),
         )
@@ -200,37 +186,13 @@ class Lane(NamedTuple):
             lambda: actions_of(env).sample(key, (self.sizes.num_envs,)),
             lambda: self.learner.explore(env, settings.agent, agent.params, agent.obs, key),
         )
-        if isinstance(self.arbiter, Chooses):
-            refined = self._chosen(self.arbiter, env, settings, clock, state, base, key)
-            return ActStep(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
-        guided = self.arbiter.guided(state.arbiter)
+        guided = settings.arbiter.guided(state.arbiter)
         refined: Refinement = jax.lax.cond(
             guides(clock, schedule),
             lambda: self.guidance.act(state.guide.model, env, agent.obs, base, guided, settings.scalars),
             lambda: no_refinement(base),
         )
         return ActStep(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
-
-    def _chosen(
-        self,
-        arbiter: Chooses,
-        env: Environment,
-        settings: Settings,
-        clock: Clock,
-        state: TrainState,
-        base: Float[Array, "num_envs action"],
-        key: PRNGKeyArray,
-    ) -> Refinement:
-        """Return what an arbiter chooses in place of the agent's own actions, until the cut-off."""
-        agent, schedule, model = state.agent, settings.schedule, state.guide.model
-        steps = jnp.asarray(schedule.learned_from(clock.step), jnp.float32)
-        known = LaneParts(env, self.learner, agent.params, self.guidance, model, settings.scalars, steps)
-        learns, own = clock.step >= schedule.random_steps, jax.random.fold_in(key, APART)
-        return jax.lax.cond(
-            clock.step < schedule.guidance_until,
-            lambda: arbiter.choose(state.arbiter, settings.arbiter, known, agent.obs, base, learns, own),
-            lambda: no_refinement(base),
-        )
 
     def absorb(
         self, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray, acted: ActStep, step: Step
@@ -240,8 +202,8 @@ class Lane(NamedTuple):
         `step` (num_envs, ...) is the result of the actions. The caller keeps the environments' states.
         """
         agent, done = state.agent, step.terminated | step.truncated
-        outcome = Outcome(step.reward, done, guides(clock, settings.schedule))
-        arbiter = self.arbiter.follow(state.arbiter, settings.arbiter, settings.scalars, outcome, key)
+        outcome = Outcome(step.reward, done, guides(clock, settings.schedule), self.bootstraps)
+        arbiter = settings.arbiter.follow(state.arbiter, outcome, settings.scalars, key)
         stored = jax.vmap(partial(stored_step, bootstraps=self.bootstraps))(acted.remembered, acted.actions, step)
         agent = agent.replace(replay=self.buffer.add(agent.replay, clock.step, stored), obs=step.obs)
         if agent.guided is not None:
@@ -263,13 +225,11 @@ class Lane(NamedTuple):
         if (stored := state.guide.stored) is not None:
             labelled = Memory(env, self.buffer, stored, state.guide.asked, 1, self.bootstraps)
             memory = memory._replace(labelled=labelled)
-        offer = offer_of(self.arbiter, self.guidance, state.guide.model, env, settings.scalars, guides(clock, schedule))
-        offered = {} if offer is None else {"other": offer}
 
         def update(learned: tuple[Any, Any], key: PRNGKeyArray, index: Array) -> tuple[tuple[Any, Any], Any]:
             count, own = clock.update + index + 1, jax.random.fold_in(key, index)
             params, training, loss, norm = self.learner.update(
-                env, settings.agent, settings.scalars, count, *learned, memory, own, **offered
+                env, settings.agent, settings.scalars, count, *learned, memory, own
             )
             return (params, training), (loss, norm)
 
@@ -278,19 +238,13 @@ class Lane(NamedTuple):
             learned, (losses, norms) = jax.lax.scan(one, learned, jnp.arange(self.sizes.num_envs))
             return learned, losses.mean(), all_finite((losses, norms))
 
-        def updated(learned: tuple[Any, Any], key: PRNGKeyArray) -> tuple[tuple[Any, Any], Array, Array]:
-            return jax.lax.cond(
-                filled >= schedule.learn_after,
-                lambda: updates(learned, key),
-                lambda: (learned, jnp.zeros(()), jnp.array(True)),
-            )
-
-        (params, training), loss, finite = updated((agent.params, agent.training), key)
-        state = state.replace(agent=agent.replace(params=params, training=training))
-        if isinstance(self.arbiter, HasCritic):
-            critic, _, also = updated(self.arbiter.critic(state.arbiter), jax.random.fold_in(key, APART))
-            finite, state = finite & also, state.replace(arbiter=self.arbiter.with_critic(state.arbiter, critic))
-        return state.replace(failed=state.failed | ~finite), {"loss": loss}
+        (params, training), loss, finite = jax.lax.cond(
+            filled >= schedule.learn_after,
+            lambda: updates((agent.params, agent.training), key),
+            lambda: ((agent.params, agent.training), jnp.zeros(()), jnp.array(True)),
+        )
+        agent = agent.replace(params=params, training=training)
+        return state.replace(agent=agent, failed=state.failed | ~finite), {"loss": loss}
 
 
 def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:
@@ -313,5 +267,4 @@ def lane_of(sizes: Sizes, parts: Parts, guidance: Guide, largest_budget: int, en
     agent, arbiter, bootstraps = parts
     learner = agent.make(sizes.frame, spaces_of(env), bootstraps)
     buffer = buffer_for(env, bootstraps)
-    made = make_arbiter(arbiter, agent, bootstraps)
-    return Lane(sizes, guidance, learner, made, buffer, bootstraps, largest_budget)
+    return Lane(sizes, guidance, learner, arbiter, buffer, bootstraps, largest_budget)

@@ -58,11 +58,11 @@ def load(reference: str, kind: type[T], called: str) -> T:
 
 
 class PartRegistry(Generic[T]):
-    """A registry of option classes that make parts of one sort (agents, say), by `NAME` or package.module:NAME."""
+    """A registry of option classes of parts of one sort (agents, say), by `NAME` or package.module:NAME."""
 
-    def __init__(self, sort: str, *built_in: type[T]) -> None:
-        """`sort`: the word for such a part in messages."""
-        self._sort, self._found = sort, {kind.NAME: kind for kind in built_in}  # pyright: ignore[reportAttributeAccessIssue]
+    def __init__(self, sort: str, needs: str, *built_in: type[T]) -> None:
+        """`sort`: the word for such a part in messages. `needs`: the function that such a class must have."""
+        self._sort, self._needs, self._found = sort, needs, {kind.NAME: kind for kind in built_in}  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def known(self) -> tuple[type[T], ...]:
@@ -91,6 +91,7 @@ class PartRegistry(Generic[T]):
         if ":" not in text:
             return self.find(text)
         kind: Any = load(text, type, f"options of the {self._sort}")
-        if not hasattr(kind, "NAME") or not callable(getattr(kind, "make", None)):
-            raise UserError(f"{text} is not an {self._sort}: give a class of options with NAME, ABOUT and make")
+        if not hasattr(kind, "NAME") or not callable(getattr(kind, self._needs, None)):
+            wanted = f"a class of options with NAME, ABOUT and {self._needs}"
+            raise UserError(f"{text} is not an {self._sort}: give {wanted}")
         return self.register(kind)

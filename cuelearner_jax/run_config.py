@@ -11,9 +11,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions
 from cuelearner_jax.agents.registry import AGENTS
-from cuelearner_jax.arbiters import episodes
-from cuelearner_jax.arbiters.protocol import ArbiterOptions
-from cuelearner_jax.arbiters.registry import ARBITERS
+from cuelearner_jax.arbiters import ARBITERS, Arbiter, Episodes
 from cuelearner_jax.config import Scalars, Schedule, Sizes, check_guide, check_multiple, check_part
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -24,7 +22,7 @@ from cuelearner_jax.spaces import Box
 
 TaskT = TypeVar("TaskT")
 AgentT = TypeVar("AgentT", bound=AgentOptions)
-ArbiterT = TypeVar("ArbiterT", bound=ArbiterOptions)
+ArbiterT = TypeVar("ArbiterT", bound=Arbiter)
 KindsT = TypeVar("KindsT")
 
 GROUPS: Mapping[str, type] = {"sizes": Sizes, "scalars": Scalars, "schedule": Schedule}
@@ -50,7 +48,7 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
     schedule: Schedule = dataclasses.field(default_factory=Schedule)
     agent: AgentT = dataclasses.field(default_factory=ddqn.Config)  # pyright: ignore[reportAssignmentType]
     """Options of the agent."""
-    arbiter: ArbiterT = dataclasses.field(default_factory=episodes.Config)  # pyright: ignore[reportAssignmentType]
+    arbiter: ArbiterT = dataclasses.field(default_factory=Episodes)  # pyright: ignore[reportAssignmentType]
     """Options of the arbiter."""
     kinds: KindsT = dataclasses.field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     """Options of kinds by their names; a kind that is not there has its defaults."""
@@ -134,9 +132,7 @@ def to_json(config: RunConfig) -> dict[str, Any]:
 def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
     """Return the configuration of JSON values; code that a file names is never loaded.
 
-    Raises:
-        UserError: an unknown field, or a part that is not known here.
-        TypeError, KeyError: the values make no sense.
+    Raises UserError for an unknown field or part, or a value of another type.
     """
     shared = {name: configuration.from_json(kind, values[name]) for name, kind in GROUPS.items()}
     parts = {name: part_from_json(known, values[name]) for name, known in PARTS.items()}
@@ -154,8 +150,6 @@ def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
 
     Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
     """
-    if not isinstance(values, dict | None):
-        raise TypeError(f"options of a kind of guidance must be an object of names and values, not {values!r}")
     kind = guidances.find_or_none(name)
     if values is None or kind is None:
         return values

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import paced
+from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.bridges.brax import from_brax
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment
 from cuelearner_jax.config import Scalars, Schedule, Sizes
@@ -92,7 +92,7 @@ TASK = Task(
                     learning_rate=0.003,
                     polyak=0.05,
                 ),
-                paced.Config(),
+                Paced(),
             ),
             seeds=2,
         )

@@ -13,26 +13,8 @@ from typing import Annotated, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
-from cuelearner_jax.arbiters.episodes import redraw
-from cuelearner_jax.arbiters.protocol import Outcome
+from cuelearner_jax.arbiters import Arbiter, Outcome, redraw
 from cuelearner_jax.config import SHARE, Bounds, Scalars, part
-
-
-@part
-class Config:
-    """Options of a late guide. The probability is traced; another `after` compiles again."""
-
-    NAME: ClassVar[str] = "late"
-    ABOUT: ClassVar[str] = "the guide takes over episodes that the agent has begun"
-
-    after: Annotated[int, Bounds(0)] = 5
-    """Steps at the beginning of an episode that are always the agent's own."""
-    probability: Annotated[float, SHARE] = 0.5
-    """Probability that the guide takes over an episode that lasts longer."""
-
-    def make(self, bootstraps: bool) -> Late:
-        """Return the arbiter."""
-        return Late(self.after)
 
 
 class Running(NamedTuple):
@@ -42,10 +24,17 @@ class Running(NamedTuple):
     steps: Int[Array, " num_envs"]  # since the episode began
 
 
-class Late(NamedTuple):
-    """The arbiter's functions (`arbiters.protocol.Arbiter`)."""
+@part
+class Config(Arbiter):
+    """A late guide. The probability is traced; another `after` compiles again."""
 
-    after: int
+    NAME: ClassVar[str] = "late"
+    ABOUT: ClassVar[str] = "the guide takes over episodes that the agent has begun"
+
+    after: Annotated[int, Bounds(0)] = 5
+    """Steps at the beginning of an episode that are always the agent's own."""
+    probability: Annotated[float, SHARE] = 0.5
+    """Probability that the guide takes over an episode that lasts longer."""
 
     def init(self, num_envs: int) -> Running:
         """Return the state of first episodes, which stay the agent's own."""
@@ -55,7 +44,7 @@ class Late(NamedTuple):
         """Return in which environments the guide acts next."""
         return state.chosen & (state.steps >= self.after)
 
-    def follow(self, state: Running, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray) -> Running:
+    def follow(self, state: Running, outcome: Outcome, scalars: Scalars, key: PRNGKeyArray) -> Running:
         """Count a step, and draw for the episodes that begin."""
-        chosen = redraw(key, state.chosen, outcome.done, options.probability)
+        chosen = redraw(key, state.chosen, outcome.done, self.probability)
         return Running(chosen, jnp.where(outcome.done, 0, state.steps + 1))

@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 from cuelearner_envs import svg
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import paced
+from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.pictures import palette_of, write_film
@@ -350,7 +350,7 @@ TASK = Task(
                     learning_rate=0.003,
                     polyak=0.05,
                 ),
-                paced.Config(),
+                Paced(),
             ),
             guidance=("none", "relative"),
             labels=(100,),

@@ -43,7 +43,7 @@ LABELS, FETCH_LABELS, SEEDS, EPISODES = 100, 200, 8, 200
 JUDGED = 20  # episodes that judge where held-out answers cannot
 FETCH_BUDGET = 500  # of the agents that act in Fetch
 FETCHED = {
-    "reach": "own_policy",
+    "reach": "stored",
     "push_free": "stored",
     "pick": "stored",
 }  # runs whose finished policies are the agents alone

@@ -91,7 +91,7 @@ def draw_billiards(stem: Path) -> None:
     ):
         found = interval_of(efficiency("regulation", run, kind, labels), "mean_ratio")
         assert found is not None
-        bars.append(Bar(name, found, colour_of("rule" if kind.startswith("perfect") else kind)))
+        bars.append(Bar(name, found, "#882255" if kind.startswith("perfect") else colour_of(kind)))
     with matplotlib.rc_context(STYLE):
         figure = new_figure(11, 3.8)
         left, right = figure.subplots(1, 2)

@@ -5,9 +5,7 @@
     python experiments/arms.py --out FOLDER --pieces push --minutes 9      # on an accelerator; again to go on
 
 A piece of training is a sweep with a folder of its own, resumed where it stands. Every method trains the same `sac`.
-`by_value` has critics choose between the agent's action and the guide's, while acting and in the targets of learning;
-`acting` while acting alone. Controls are `shuffled` (labels with each other's answers), the script as a
-guide without labels, and `alone`. `rlpd` fits a policy to as many demonstrations; half of all episodes are that
+The control is `alone`. `rlpd` fits a policy to as many demonstrations; half of all episodes are that
 policy's, and so is half of every minibatch. In `stored` each label corrects the step that is executed, and these steps
 are half of every minibatch; with demonstrations this is RLPD (Ball et al., 2023). In `corrections` the agent never
 learns: what counts is the guide of uniform actions. Worlds `reach_in_fetch` and `push_in_fetch` train in Fetch itself.
@@ -45,7 +43,6 @@ from _pieces import (
     within,
 )
 
-from cuelearner_jax.arbiters import by_value
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import results
@@ -88,11 +85,7 @@ FETCH_WORLDS: dict[str, Options] = {
     "push_in_fetch": {**steps(480_000, 24_000), "task.skill": "push", **IN_FETCH},
 }
 PLAIN_RUNS = ("alone", "stored", "stored_random")  # without a guide whose every action is refined
-BY_VALUE: Options = {"arbiter": "by_value"}
-ACTING: Options = {"arbiter.in-targets": False}
-OWN_POLICY: Options = {"arbiter.in-policy": False}  # the finished policy is the agent's, which a folder can keep
 EPISODES: Options = {"arbiter": "episodes"}
-SHUFFLED: Options = {"scalars.answer": "shuffled"}
 ENSEMBLE: Options = {"agent.critics": 10}
 STORED: Options = {"preset": "corrected"}
 # The agent only ever acts at random. Half of the episodes are guided, as questions are then asked there too.
@@ -113,17 +106,11 @@ ONE: Options = {"scalars.says": "one"}
 def variants(world: str, options: Options) -> list[Piece]:
     """Return the variants compared in one world."""
     minutes = 3 if world.startswith("reach") else 9
-    valued, plain, alone = {**options, **BY_VALUE}, {**options, **EPISODES}, {**options, **UNLEARNED}
+    plain, alone = {**options, **EPISODES}, {**options, **UNLEARNED}
     stored = {**options, **STORED}
     rows: list[tuple[str, str, tuple[int, ...], Options, str]] = [
         ("alone", "none", (), plain, "SAC alone"),
         ("alone_10", "none", (), {**plain, **ENSEMBLE}, "SAC alone, ten critics"),
-        ("by_value", "relative", BUDGETS, valued, "labels, compared by value"),
-        ("acting", "relative", BUDGETS, {**valued, **ACTING}, "labels, compared by value where the agent acts"),
-        ("own_policy", "relative", (500,), {**valued, **OWN_POLICY}, "labels in training alone, for Fetch"),
-        ("by_value", "demonstration", BUDGETS, valued, "demonstrations, compared by value"),
-        ("by_value", "heuristic", (), valued, "control: the script without labels"),
-        ("shuffled", "relative", BUDGETS, {**valued, **SHUFFLED}, "control: shuffled answers"),
         ("rlpd", "demonstration", BUDGETS, {**plain, **ENSEMBLE}, "a policy of them in the replay"),
         *(("stored", kind, BUDGETS, stored, "corrected steps in the replay") for kind in ("relative", "demonstration")),
         ("stored_random", "relative", (500,), {**stored, **RANDOM}, "control: answers at random in the replay"),
@@ -197,9 +184,8 @@ SCALES = {
 def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
     """Return the results of the trained pieces so far: a row per variant and evaluation, over its seeds."""
     found = []
-    for piece, arbiter, row, own in evaluations(out, pieces):
-        judged = len(by_value.ARMS) * arbiter.get("judge_steps", 0) if piece.kinds != ("none",) else 0
-        paid = row["step"] + judged + (row["labels"] if piece.options["preset"] == "corrected" else 0)
+    for piece, _, row, own in evaluations(out, pieces):
+        paid = row["step"] + (row["labels"] if piece.options["preset"] == "corrected" else 0)
         told = {**row, **spread([one["success"] for one in own]), "rewarded_steps": paid}
         found.append({**told, "each": {one["seed"]: one["success"] for one in own}})
     return found

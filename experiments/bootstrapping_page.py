@@ -12,7 +12,6 @@ For every world with runs in the data (WORLD/RUN/PIECE, as the two experiments o
 from __future__ import annotations
 
 import argparse
-import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -36,7 +35,6 @@ from _pages import (
     read_csv,
     rendered,
     viewer_link,
-    write_csv,
 )
 from _pieces import LABEL_EFFICIENCY, Experiment, folder_at, report_command, reported
 
@@ -68,6 +66,7 @@ RUNS = {
     "page": "labelling page, 10% wrong",
 }
 PERFECT = "perfect"  # kinds whose names begin so take the shipped teacher's shots
+PERFECT_COLOUR = "#882255"
 CONTROLS = ("random", "paced-random", "shuffled", "paced-shuffled")
 TABLES = {
     "efficiency": "all budgets",
@@ -176,8 +175,8 @@ def short_table(rows: Sequence[Row], place: Place, level: float, shared: int) ->
 
 
 def colour(kind: str) -> str:
-    """Return the colour of a guidance; the teacher's own shots have that of a rule."""
-    return colour_of("rule" if kind.startswith(PERFECT) else kind)
+    """Return the colour of a guidance; the teacher's own shots have their own."""
+    return PERFECT_COLOUR if kind.startswith(PERFECT) else colour_of(kind)
 
 
 def draw_world(rows: Sequence[Row], place: Place, shared: int, stem: Path) -> None:
@@ -190,9 +189,7 @@ def draw_world(rows: Sequence[Row], place: Place, shared: int, stem: Path) -> No
         hollow = kind == "none" or row["run"] in CONTROLS
         found = interval_of(row, "mean")
         assert found is not None
-        bars.append(
-            Bar(named(row, labels=True), found, colour_of("rule" if kind.startswith(PERFECT) else kind), hollow)
-        )
+        bars.append(Bar(named(row, labels=True), found, colour(kind), hollow))
     with matplotlib.rc_context(STYLE):
         figure = new_figure(8, 0.9 + 0.3 * len(bars))
         axes = figure.subplots()
@@ -299,30 +296,6 @@ def findings(data: Path) -> str:
     return markdown(["guidance", "measured", "with guidance", "without"], rows)
 
 
-# Names of docs/data/prior_NAME.json.
-PRIOR_STUDIES = ("start", "ruled", "regulation", "regulation_controls", "easy", "easy_brief", "halls")
-PRIOR = {"any_aim": "all aims alike, no labels", "rule": "a rule by hand, no labels", "intent": "100 `intent` labels"}
-
-
-def prior(data: Path, page: Path) -> str:
-    """Return the table of choices by labels alone, before training; write the CSV file of all recorded rows."""
-    files = {name: data / f"prior_{name}.json" for name in PRIOR_STUDIES}
-    told = {name: json.loads(file.read_text())["rows"] for name, file in files.items()}
-    columns = ["world", "run", "guidance", "labels", "step", "seeds", "rewarded_steps", "mean", "low", "high"]
-    cells = [[name, *(str(row[column]) for column in columns)] for name, rows in told.items() for row in rows]
-    table = data.parent / "tables" / "prior.csv"
-    write_csv(table, ["study", *columns], cells)
-    shown = {}
-    for row in told["start"]:
-        if row["labels"] in (0, 100):
-            name = PRIOR[row["guidance"]] + (", shuffled answers" if row["run"] == "shuffled" else "")
-            shown.setdefault(name, {})[row["world"]] = f"{row['mean']:.3f}"
-    order = sorted(shown, key=[*PRIOR.values(), f"{PRIOR['intent']}, shuffled answers"].index)
-    rows = [[name, shown[name]["regulation"], shown[name]["easy"]] for name in order]
-    made = markdown(["reward a shot before training", "`regulation`", "`easy`"], rows)
-    return f"{made}\n\nTable: {viewer_link('all rows with intervals', table, page)}."
-
-
 def missing_lines(report: str) -> list[str]:
     """Return the lines of a report about runs that are missing or not complete; none where all are complete."""
     lines = report.partition(MISSING)[2].partition("\n## ")[0].split("\n")
@@ -351,8 +324,6 @@ def main() -> int:
         sections[place.mark] = section(place, asked.data, asked.page)
     if draw_overview(asked.data, asked.data / "overview"):
         sections["findings"] = findings(asked.data)
-    if (asked.data.parent / "prior_start.json").exists():
-        sections["prior"] = prior(asked.data.parent, asked.page)
     asked.page.write_text(rendered(asked.page.read_text(encoding="utf-8"), sections), encoding="utf-8")
     print(f"wrote {asked.page}: {', '.join(sections) or 'nothing new'}")
     return 0

@@ -40,9 +40,8 @@ EPS, BOUND = 0.08, 0.32  # of an answer, and of corrections: shares of the range
 LABELS = 60
 SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=1000, fit_batch_size=32, labels_per_round=10)
 TEACHERS = {"scalar": {"scalar_within_deg": 0.06}}  # a share of the range: how near an action is called good
-ARBITERS = ("prior",)
 FEEDBACK = ("relative", "intent", "reading", "demonstration", "scalar", "dcoach", "bdcoach", "clic")
-SHOWN = (*FEEDBACK, "clic_shown", "heuristic", *ARBITERS)
+SHOWN = (*FEEDBACK, "clic_shown", "heuristic")
 
 
 def right(situation: Any) -> Any:
@@ -96,7 +95,6 @@ class Content:
     form: str  # of the answers; empty: there are none
     labels: Any
     after: np.ndarray
-    background: np.ndarray | None = None  # (heights, situations): what chooses among actions, if anything does
 
 
 SITUATIONS, ROWS = np.linspace(-1, 1, 161, dtype=np.float32)[:, None], np.linspace(-1, 1, 121, dtype=np.float32)
@@ -115,28 +113,13 @@ def corrected(kind: str) -> tuple[Any, Any]:
 
 
 def content_of(kind: str) -> Content:
-    """Return the content of the picture of a kind or of an arbiter."""
+    """Return the content of the picture of a kind."""
     if kind == "heuristic":
         return Content("", None, np.full(len(SITUATIONS), 0.1))
-    if kind in ARBITERS:
-        return prior()
     better, labels = corrected(kind)
     form = registry.find(kind).form
     assert form is not None
     return Content(form.name, labels, np.asarray(better(SITUATIONS))[:, 0])
-
-
-def prior() -> Content:
-    """Values that like two heights equally, and labels that choose among them."""
-    _, labels = corrected("relative")
-    keep = np.asarray(labels.valid, bool)
-    given = cl.Labels(labels.obs[keep], labels.action[keep], labels.answer[keep])
-    fitted = cl.fit_feedback(given, space=HEIGHTS, eps_deg=EPS, sizes=SIZES, seed=1)
-    heights, guide = jnp.asarray(ROWS)[:, None], fitted.guidance
-    likely = jax.vmap(lambda obs: guide.log_p(fitted.model, Line(), obs, heights, fitted.scalars))(SITUATIONS)
-    two = jnp.minimum(jnp.abs(ROWS - right(SITUATIONS)), jnp.abs(ROWS - right(SITUATIONS) + 0.75))
-    values = -two + 0.1 * np.asarray(likely)
-    return Content("relative", labels, ROWS[np.argmax(np.asarray(values), 1)], np.asarray(-two).T)
 
 
 def plot(what: Content, kind: str) -> Figure:
@@ -146,8 +129,6 @@ def plot(what: Content, kind: str) -> Figure:
     figure = Figure(figsize=(4.2, 2.5), layout="constrained", facecolor="none")
     axes = figure.subplots()
     axes.set_facecolor("none")
-    if what.background is not None:
-        axes.contourf(SITUATIONS[:, 0], ROWS, what.background, levels=6, cmap="Greys", alpha=0.25)
     axes.plot(SITUATIONS, before(SITUATIONS), ":", color=GREY, linewidth=1.6, label="before")
     axes.plot(SITUATIONS, right(SITUATIONS), "--", color=GREY, linewidth=1.6, label="right")
     if kind == "intent":

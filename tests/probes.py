@@ -83,9 +83,6 @@ class Aimed(Window):
     def turns(self):
         return jnp.array((-1.0, 0.6, 2.5, -2.2))[jnp.array(self.order)]
 
-    def rule(self, obs):
-        return -2.0 * jnp.abs(self.turns)  # the second, then the first, ...
-
     def aims(self, obs):
         turns = self.turns
         found = from_angle(jnp.arctan2(obs[1], obs[0])[None] + turns)

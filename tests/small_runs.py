@@ -40,22 +40,15 @@ def listing(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 @contextmanager
-def stopping_at(when=None, evaluating=None):
-    """Ctrl-C at the given look at the event: each round of labels and each stretch of steps looks once.
-
-    `evaluating`: from that look on of those that evaluations take, each several times.
-    """
+def stopping_at(when):
+    """Ctrl-C at the given look at the event: each round of labels and each stretch of steps looks once."""
 
     class Event(threading.Event):
-        looks = evaluations = 0
+        looks = 0
 
         def is_set(self):
             Event.looks += 1
             return Event.looks == when
-
-        def wait(self, timeout=None):
-            Event.evaluations += 1
-            return evaluating is not None and Event.evaluations >= evaluating
 
     @contextmanager
     def interruptible():

@@ -10,7 +10,7 @@ import pytest
 
 from cuelearner_jax import config, run_config
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import episodes, paced
+from cuelearner_jax.arbiters import Episodes, Paced
 from cuelearner_jax.config import Scalars, Schedule, Sizes, static
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig
@@ -86,9 +86,9 @@ def test_values_that_cannot_work_are_refused(group, values, message):
 
 def test_options_of_a_part_are_checked_under_its_name():
     with pytest.raises(UserError, match=r"arbiter\.probability is 1\.5: give a number from 0 to 1"):
-        run_config.check(probes.config(arbiter=episodes.Config(1.5)))
+        run_config.check(probes.config(arbiter=Episodes(1.5)))
     with pytest.raises(UserError, match=r"arbiter\.lead is -1"):
-        run_config.check(probes.config(arbiter=paced.Config(lead=-1.0)))
+        run_config.check(probes.config(arbiter=Paced(lead=-1.0)))
 
 
 def test_a_part_is_a_tree_of_what_is_traced_and_the_rest_is_its_structure():
@@ -103,7 +103,7 @@ def test_a_part_is_a_tree_of_what_is_traced_and_the_rest_is_its_structure():
 
 
 def test_a_run_s_options_come_back_from_json_with_their_parts():
-    asked = dataclasses.replace(probes.CONFIG, arbiter=paced.Config(lead=0.5))
+    asked = dataclasses.replace(probes.CONFIG, arbiter=Paced(lead=0.5))
     told = json.loads(json.dumps(run_config.to_json(asked)))
     assert (told["agent"]["name"], told["arbiter"]["name"]) == ("ddqn", "paced")
     assert run_config.from_json(asked.task, told) == asked

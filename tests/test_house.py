@@ -135,7 +135,7 @@ def test_no_module_imports_itself_in_a_circle():
 
 
 def test_few_modules_stand_directly_in_the_package():
-    assert len(list((ROOT / METHOD).glob("*.py"))) <= 17
+    assert len(list((ROOT / METHOD).glob("*.py"))) <= 18
 
 
 def undocumented(node, name):

@@ -14,7 +14,7 @@ import pytest
 from cuelearner_jax import asking, evaluate, loop
 from cuelearner_jax.agents.networks import as_function, q_network
 from cuelearner_jax.agents.replay import Transition, apply_symmetries
-from cuelearner_jax.arbiters import episodes
+from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Uniform
@@ -36,7 +36,7 @@ def replaced(probability=0.5, learning_rate=probes.AGENT.learning_rate, **schedu
     """The settings of `probes.CONFIG` with others."""
     return probes.SETTINGS._replace(
         schedule=dataclasses.replace(probes.SCHEDULE, **schedule),
-        arbiter=episodes.Config(probability),
+        arbiter=Episodes(probability),
         agent=dataclasses.replace(probes.AGENT, learning_rate=learning_rate),
     )
 

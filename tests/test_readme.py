@@ -9,13 +9,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from cuelearner_jax.arbiters.registry import ARBITERS
+from cuelearner_jax.arbiters import ARBITERS
 from cuelearner_jax.guides import registry
 from cuelearner_jax.report.statistics import interquartile_mean
 
 ROOT = Path(__file__).resolve().parents[1]
 README, DATA, PAGES = (ROOT / "README.md").read_text(encoding="utf-8"), ROOT / "docs/data", ROOT / "docs/feedback"
-UNTAUGHT = {"none", "heuristic", "any_aim", "rule"}
+UNTAUGHT = {"none", "heuristic", "any_aim"}
 PAGE_OF = dict.fromkeys(UNTAUGHT, "no_labels") | {"clic_shown": "clic"}
 
 

@@ -9,7 +9,7 @@ Code is never loaded because a file names it: the caller who opens the policy na
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,21 +18,19 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import changes as own_changes
 from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.registry import AGENTS
-from cuelearner_jax.config import Frame, GuideSizes, Scalars, check_guide, check_part
+from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Spaces, actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import NAME, Guide
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, in_space, layers, uniform_in
 from cuelearner_jax.reading.policy import KIND as READING
 from cuelearner_jax.reading.policy import Read, unread
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
-CORRECTED = ("guided", READING)  # policies that change another policy's actions
-KINDS = ("agent", "uniform", "heuristic", *CORRECTED, "code")
+KINDS = ("agent", "uniform", "heuristic", "guided", READING, "code")
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # groups in a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other values and the arrays hold them already
-MOST_LAYERS = 16  # most layers of a policy that was adapted again and again
 
 
 def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
@@ -60,33 +58,6 @@ def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
         for name in DERIVED:
             layer.pop(name, None)
     return described
-
-
-def check(values: dict[str, Any]) -> None:
-    """Check that plain values from a file describe an adapted policy.
-
-    Raises:
-        UserError: a size or scalar that cannot work.
-        ValueError, TypeError, KeyError, AttributeError: anything else that `to_json` would not have written.
-    """
-    for depth, layer in enumerate(layers(values)):
-        kind = layer["policy"]
-        if kind not in (KINDS if depth else CORRECTED) or depth >= MOST_LAYERS:
-            raise ValueError(f"{kind!r} is not a kind of policy that a folder holds")
-        if (kind in CORRECTED) != isinstance(layer.get("base"), dict):
-            raise ValueError(f"a policy of kind {kind} has a base that it must not have, or lacks its base")
-        if kind == "agent":
-            check_part(part_from_json(AGENTS, layer["agent"]), "agent")
-            if set(layer) != {"policy", "agent", "frame"} or layer["frame"] not in get_args(Frame):
-                raise ValueError(f"an agent is described by {sorted(layer)}, in the frame {layer.get('frame')!r}")
-        if kind == "code" and not isinstance(layer["named"], str):
-            raise TypeError(f"code is named {layer['named']!r}")
-        if kind == "guided":
-            sizes, scalars = (configuration.from_json(of, layer[part]) for of, part in PARTS)
-            check_guide(sizes, scalars)
-            if not NAME.fullmatch(layer["guidance"]) or type(layer["bounded"]) is not bool:
-                raise ValueError(f"a guidance is called {layer['guidance']!r}, and bounded {layer['bounded']!r}")
-            kind_from_json(layer["guidance"], layer["options"])
 
 
 def arrays_of(policy: Any) -> Any:
@@ -138,7 +109,6 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
 
     Raises:
         UserError: the policy's code was not given, or it needs what the environment has not.
-        KeyError, TypeError, ValueError: the values make no sense.
     """
     kind = values["policy"]
     if kind == "agent":
@@ -158,7 +128,7 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
         own = _unread(values, env, own_changes.rebuild_family(values, env, changes))
         return own.replace(base=base, correction=arrays["correction"], bound=arrays["bound"])
     if kind != "code":
-        raise ValueError(f"{kind!r} is no policy")
+        raise UserError(f"{kind!r} is not a kind of policy that this program knows: use the cuelearner that wrote it")
     if code is None:
         raise UserError(
             f"this policy is made of code, {values['named']}, which is not loaded because a file names it: add "

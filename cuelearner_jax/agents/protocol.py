@@ -6,7 +6,6 @@ equal options for equal spaces is equal, so that a program compiled for one serv
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Int, PRNGKeyArray
@@ -15,9 +14,6 @@ from cuelearner_jax.agents.replay import Memory
 from cuelearner_jax.config import Frame, Scalars, Sizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.types import Params
-
-# (observations (n, obs), actions (n, action)) -> actions (n, action) offered in their place
-Offer = Callable[[Array, Array], Array]
 
 
 @runtime_checkable
@@ -116,19 +112,7 @@ class AgentOptions(Protocol):
 class OptionalFacts(Protocol):
     """Optional members of a class of options, beside `AgentOptions`; read them by the functions below."""
 
-    ACTOR: ClassVar[
-        bool
-    ]  # True if an actor chooses, not the argmax of `value`; `update` then takes an `Offer`, `other`
     SORTS: ClassVar[bool]  # True if `update` draws guided and own steps separately; replay then counts guided steps
-
-
-def has_actor(options: Any) -> bool:
-    """Return whether agents of these options act by an actor.
-
-    An argmax of values never finds another action better by the same values. An actor's choice can be compared by them,
-    and `update(..., other=offer)` lets targets bootstrap from the better of the actor's action and the one offered.
-    """
-    return getattr(options, "ACTOR", False)
 
 
 def draws_sorts(options: Any) -> bool:

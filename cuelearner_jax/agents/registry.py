@@ -6,4 +6,4 @@ from cuelearner_jax.agents import ddqn, sac
 from cuelearner_jax.agents.protocol import AgentOptions
 from cuelearner_jax.plugins import PartRegistry
 
-AGENTS = PartRegistry[AgentOptions]("agent", ddqn.Config, sac.Config)
+AGENTS = PartRegistry[AgentOptions]("agent", "make", ddqn.Config, sac.Config)

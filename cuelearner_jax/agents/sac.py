@@ -24,7 +24,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.agents.ddqn import optimizer
 from cuelearner_jax.agents.networks import q_network
-from cuelearner_jax.agents.protocol import Offer
 from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
@@ -209,11 +208,10 @@ class SoftActorCritic:
         rest: SACState,
         memory: Memory,
         key: PRNGKeyArray,
-        other: Offer | None = None,
     ) -> tuple[Params, SACState, Float[Array, ""], Float[Array, ""]]:
         """Make as many critic steps as the options say, then one step of actor and temperature.
 
-        See `protocol.AgentFunctions.update`. `other`: see `targets`. The loss is the critics'.
+        See `protocol.AgentFunctions.update`. The loss is the critics'.
         """
         own, actor, most = self.options, params["actor"], scalars.max_grad_norm
         k_critics, k_actor = jax.random.split(key)
@@ -223,7 +221,7 @@ class SoftActorCritic:
             critics, opt_state, target_critics, _ = carry
             k_batch, k_target = jax.random.split(key)
             (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
-            targets = self.targets(scalars.discount, actor, target_critics, temperature, batch, k_target, other)
+            targets = self.targets(scalars.discount, actor, target_critics, temperature, batch, k_target)
             unit = self.in_unit(batch.action)
             error = lambda critics: loss_of(self.values(critics, batch.obs, unit), targets)  # noqa: E731
             loss, gradient = jax.value_and_grad(error)(critics)
@@ -269,13 +267,10 @@ class SoftActorCritic:
         temperature: Float[Array, ""] | float,
         batch: Transition,
         key: PRNGKeyArray,
-        other: Offer | None = None,
     ) -> Float[Array, " batch"]:
         """Return the critics' targets of a batch: r + discount * (Q'(s', a') - temperature * log p(a')).
 
-        Q' is the smallest value of the target critics drawn for this batch, a' the actor's draw. With an `other` it is
-        r + discount * Q'(s', other) where that is larger. An offered action has no entropy; would Q' alone decide which
-        of the two counts, a target could be smaller for an offer, and good places would look bad.
+        Q' is the smallest value of the target critics drawn for this batch, a' the actor's draw.
         """
         if not self.bootstraps:
             return batch.reward
@@ -283,12 +278,6 @@ class SoftActorCritic:
         drawn, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
         own = self.values(judges, batch.next_obs, drawn.unit).min(0)
         value = own - temperature * drawn.log_density if self.options.entropy_in_targets else own
-        if other is not None:
-            action = self.in_box(drawn.unit)
-            offered = other(batch.next_obs, action)
-            its = self.values(judges, batch.next_obs, self.in_unit(offered)).min(0)
-            # An actor's own action as an offer is none: it has entropy.
-            value = jnp.where((offered != action).any(-1), jnp.maximum(its, value), value)
         return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
 
     def _judges(self, target_critics: Params, key: PRNGKeyArray) -> Params:

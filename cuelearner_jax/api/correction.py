@@ -210,7 +210,7 @@ def labels_from_file(path: Path) -> GivenLabels:
         values = {name: value for name, value in file.task.items() if name not in ("name", "from")}
         try:
             config = configuration.from_json(LogsConfig, values)
-        except (TypeError, UserError) as error:
+        except UserError as error:
             raise UserError(f"{path} does not name the situations of its labels: write the file again") from error
     return GivenLabels(rows, file.space, file.eps, config)
 

@@ -33,10 +33,7 @@ from cuelearner_jax.errors import NotFinite, UserCodeError, UserError, machine_m
 from cuelearner_jax.signals import Interrupted
 
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, its option classes by command name.
-COMMANDS = (
-    *("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export"),
-    "bench",
-)
+COMMANDS = ("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -60,7 +60,7 @@ PAGES: dict[str, Page] = {
         ),
     ),
     "sweep": Page(
-        ("out", "env", "teacher", "guidance", "labels", "seeds", "labels-from", "resume", "shard", "cluster"),
+        ("out", "env", "teacher", "guidance", "labels", "seeds", "labels-from", "resume", "shard"),
         (
             Example("guided and unguided agents", "sweep billiards --preset quickstart --out runs/quickstart"),
             Example(
@@ -198,19 +198,6 @@ PAGES: dict[str, Page] = {
             Example("for a robot without JAX", "export {subject}{exported} --format numpy --out exported"),
             Example("for ONNX's runtime", "export {subject}{exported} --format onnx --out exported-onnx"),
             Example("for JAX elsewhere", "export {subject}{exported} --format stablehlo --out exported-jax"),
-        ),
-    ),
-    "bench": Page(
-        ("seeds", "seconds", "devices", "out"),
-        (
-            Example("the small presets, in about a minute", "bench"),
-            Example("8 and 75 seeds of one preset", "bench billiards --preset quickstart --seeds 8 75"),
-            Example("also as a file", "bench navigation --preset quickstart --out machine.json"),
-        ),
-        (
-            Example("one preset", "bench {subject} --preset {preset}"),
-            Example("two numbers of seeds", "bench {subject} --preset {preset} --seeds 8 75"),
-            Example("also as a file", "bench {subject} --preset {preset} --out machine.json"),
         ),
     ),
 }

@@ -68,7 +68,7 @@ class Lane:
     def name_in(self, source: PolicySource, world: Any) -> str:
         """Return the policy's name. Raises UserError if the source has no such policy, or none for that world."""
         name = self.policy or source.default_policy
-        source.check(name, world, **self.chosen)
+        source.check(name, world, self.guidance)
         return name
 
     def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Generic, Literal
+from dataclasses import dataclass
+from typing import Any, Generic
 
 from cuelearner_jax.cli.parsing import out
 from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset
-from cuelearner_jax.runs import cluster
-from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
-from cuelearner_jax.runs.order import Plan, make_plan
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.studies import train
 
@@ -30,30 +27,15 @@ class Sweep(Training[RunT], Generic[RunT]):
     shard: str | None = None
     """Run only shard i of n, given as i/n: its share of the seeds, in a folder of its own below --out. An interrupted
     shard is continued."""
-    cluster: Literal["slurm"] | None = None
-    """Submit the sweep to Slurm as a job array with one job per shard, and return. Repeat the command to continue
-    shards that are not finished. Needs submitit."""
-    shards: int | None = None
-    """With --cluster: number of shards, each of which is one job."""
-    job: Job = field(default_factory=Job)
 
 
 OPTIONS = {"sweep": Sweep}
 
 
 def run(arguments: list[str]) -> None:
-    """Run the command. Raises what `studies.train.run` and `cluster.submit` raise."""
+    """Run the command. Raises what `studies.train.run` raises."""
     task, asked = asked_of_preset(arguments, "sweep", Sweep, _options)
     grid = Grid(asked.guidance, seeds_of(asked.first_seed, asked.seeds), asked.labels)
-    cluster.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
-    if asked.cluster:
-
-        def plan(shard: Shard) -> Plan:
-            return make_plan(asked.order(task, grid, shard))
-
-        assert asked.shards  # `cluster.check`
-        cluster.submit(asked.shards, asked.job, asked.out, arguments, plan, out.print)
-        return
     shard = Shard.parse(asked.shard) if asked.shard else None
     train.run(asked.order(task, grid, shard))
     out.print(asked.done)

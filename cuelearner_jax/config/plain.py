@@ -41,9 +41,7 @@ def to_json(config: Any) -> dict[str, Any]:
 def from_json(kind: type, values: dict[str, Any]) -> Any:
     """Return a flat configuration dataclass (Sizes, Scalars, Schedule, a task's) from JSON values; lists become tuples.
 
-    Raises:
-        UserError: an unknown field.
-        TypeError: a value of another type than its field's.
+    Raises UserError for an unknown field, or a value of another type than its field's.
     """
     known = {field.name for field in dataclasses.fields(kind)}
     unknown = sorted(set(values) - known)
@@ -55,7 +53,7 @@ def from_json(kind: type, values: dict[str, Any]) -> Any:
     types = get_type_hints(kind)
     for name, value in values.items():
         if not fits(value, types[name]):
-            raise TypeError(f"{name} is {value!r}, not {types[name]}")
+            raise UserError(f"{name} is {value!r} in a file of another version of cuelearner or of the task")
     return kind(**values)
 
 

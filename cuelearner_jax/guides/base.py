@@ -5,12 +5,11 @@ What a teacher *said* (its answer, kept in labels) and what a network *predicts*
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -68,13 +67,6 @@ class Kind:
     def make(self, sizes: GuideSizes, spaces: Spaces, options: Any = None) -> Guide:
         """Return the guide for an environment's spaces; `options`: a `config` (None: its defaults)."""
         return self.guide(self, sizes, spaces, self.config() if options is None and self.config else options)
-
-
-class Candidates(NamedTuple):
-    """The candidate actions of one situation, among which a guide chooses."""
-
-    actions: Float[Array, "candidates action"]
-    possible: Bool[Array, " candidates"]  # False: not possible in this situation
 
 
 @dataclass(frozen=True)
@@ -192,29 +184,6 @@ class Guide:
         """
         refines = jax.random.bernoulli(key, scalars.refined_fraction)
         return self.act(model, env, obs[None], base[None], refines[None], scalars).actions[0]
-
-    def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates | None:
-        """Return the candidate actions of one situation by this kind; here None: the whole space."""
-        return None
-
-    def log_p(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, " obs"],
-        actions: Float[Array, "m action"],
-        scalars: GuideScalars,
-    ) -> Float[Array, " m"]:
-        """Return log p(action | labels) of each action in one situation, up to a constant.
-
-        Here an action is likelier, the less one pass of `act` changes it: a Laplace distribution of scale eps. All
-        actions are equally likely where a guide changes none, for example without a fitted model.
-        """
-        space, rows = self.spaces.actions, len(actions)
-        once = dataclasses.replace(scalars, k_max=1)
-        seen, everywhere = jnp.broadcast_to(obs, (rows, *obs.shape)), jnp.ones(rows, bool)
-        moved = self.act(model, env, seen, actions, everywhere, once).actions
-        return -space.distance(actions, moved) / space.from_unit(scalars.eps_deg)
 
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]

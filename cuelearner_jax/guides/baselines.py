@@ -1,4 +1,4 @@
-"""Baseline kinds without a model or questions: the agent alone, and the task's heuristic."""
+"""Baseline kinds without a model or questions: the agent alone, the task's heuristic, the nearest of its aims."""
 
 from __future__ import annotations
 
@@ -61,5 +61,31 @@ class HeuristicGuide(Untaught):
         return Refinement(jnp.where(active[:, None], jax.vmap(env.heuristic)(obs), actions), active.astype(jnp.int32))
 
 
+class AnyAim(Untaught):
+    """A guide that follows the nearest aim: what `intent` is before its first label."""
+
+    def act(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refinement:
+        """Return the nearest of the aims that may be followed, in active rows; without any aim, the given action."""
+
+        def one(obs: Array, action: Array) -> tuple[Array, Array]:
+            aims = env.aims(obs)
+            possible = aims.possible if aims.open is None else aims.possible & aims.open
+            off = self.spaces.actions.distance(action[None], aims.actions)
+            return aims.actions[jnp.argmin(jnp.where(possible, off, jnp.inf))], possible.any()
+
+        goals, there = jax.vmap(one)(obs, actions)
+        moved = active & there
+        return Refinement(jnp.where(moved[:, None], goals, actions), moved.astype(jnp.int32))
+
+
 NONE = Kind("none", "the agent alone", Untaught, title="no guidance", colour="#4d4d4d")
 HEURISTIC = Kind("heuristic", "the task's obvious action", HeuristicGuide, needs=("heuristic",), colour="#D55E00")
+ANY_AIM = Kind("any_aim", "any of the task's aims, without a label", AnyAim, needs=("aims",), colour="#999933")

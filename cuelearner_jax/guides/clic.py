@@ -270,17 +270,6 @@ class Clic(Guide):
         chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
         return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
-    def log_p(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, " obs"],
-        actions: Float[Array, "m action"],
-        scalars: GuideScalars,
-    ) -> Float[Array, " m"]:
-        """Return -E of actions; 0 for all actions before the first fit."""
-        return jnp.where(model.fitted, -self.energy(env, model.params, obs, actions, None, scalars), 0.0)
-
 
 class ClicShown(Clic):
     """A guide that learns from demonstrated actions, by a set around each demonstration."""

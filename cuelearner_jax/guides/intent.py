@@ -27,8 +27,7 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import Bounds, Layers, part
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.aims import SPREAD, log_density, open_aims
-from cuelearner_jax.guides.base import Candidates, Guide, Kind
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, ensemble
 from cuelearner_jax.guides.refining import Refinement
@@ -36,6 +35,7 @@ from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 ELSEWHERE = 360  # evenly spaced actions that stand for "the teacher means none of the aims"
+SPREAD = 1 / 180  # distance of a meant action from its aim, as a share of the space's reach
 SLIPS = 0.02  # share of random answers
 WORDS = 3
 
@@ -48,31 +48,22 @@ class Config:
     """Hidden layers of the network that weighs the task's aims: the same ones for every aim."""
     aim_doubt: Annotated[float, Bounds(0)] = 2.0
     """Actions stay as they are where it is at least so many times likelier that no aim is meant."""
-    from_rule: bool = False
-    """Begin with the task's own rule among its aims, which labels correct; without, all aims begin alike."""
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Optional members of an environment that these options need, beside the kind's own."""
-        return ("rule",) if self.from_rule else ()
 
 
 class Weights(nn.Module):
     """Network of the log-weights of a situation's aims and of "none of them", with shared layers for all aims."""
 
     layers: tuple[int, ...]
-    from_last: bool = False  # True if an aim's last feature is its log-weight before the first label
 
     @nn.compact
     def __call__(
         self, features: Float[Array, "aims features"], possible: Bool[Array, " aims"]
     ) -> Float[Array, " aims_and_none"]:
-        """Return the log-weights; without training they are uniform, or the rule's."""
+        """Return the log-weights; without training they are uniform."""
         x = features
         for width in self.layers:
             x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
         weights = nn.Dense(1, kernel_init=nn.initializers.zeros)(x)[:, 0]
-        weights = weights + features[:, -1] if self.from_last else weights
         none = self.param("none", nn.initializers.zeros, (1,))
         return jnp.concatenate([jnp.where(possible, weights, -jnp.inf), none])
 
@@ -137,8 +128,8 @@ class Intent(Guide):
 
         Its inputs are the aims' features and a mask of possible aims, in place of observations and actions.
         """
-        weights = Weights(self.options.aim_layers, self.options.from_rule)
-        width = (self.spaces.aims or 0) + self.options.from_rule
+        weights = Weights(self.options.aim_layers)
+        width = self.spaces.aims or 0
 
         def init(key: PRNGKeyArray) -> Params:
             return weights.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
@@ -150,20 +141,11 @@ class Intent(Guide):
 
         return ensemble(self.sizes.ensemble, init, shares)
 
-    def aims(self, env: Any, obs: Float[Array, " obs"]) -> Aims:
-        """Return a situation's aims; with `from_rule` their features end with their log-weights by the task's rule."""
-        aims: Aims = env.aims(obs)
-        if not self.options.from_rule:
-            return aims
-        return aims._replace(features=jnp.concatenate([aims.features, env.rule(obs)[:, None]], -1))
-
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
         """Return the maximum-likelihood model of the answers."""
-        rows = jax.vmap(lambda label: evidence_of(self.aims(env, label.obs), self.spaces.actions, label, scalars))(
-            labels
-        )
+        rows = jax.vmap(lambda label: evidence_of(env.aims(label.obs), self.spaces.actions, label, scalars))(labels)
 
         def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
             """Return -log of the probability of each answer."""
@@ -182,7 +164,7 @@ class Intent(Guide):
         scalars: GuideScalars,
     ) -> Refinement:
         """Move each action by at most eps a pass toward the likeliest aim, in active rows with a sure, fitted model."""
-        space, aims = self.spaces.actions, jax.vmap(partial(self.aims, env))(obs)
+        space, aims = self.spaces.actions, jax.vmap(env.aims)(obs)
         share = self.shares(model, env, aims)
         find = partial(choose_aim, space, doubt=self.options.aim_doubt)
         goals, sure = jax.vmap(find)(share, aims.actions, actions)
@@ -197,28 +179,11 @@ class Intent(Guide):
         share = self.network.predict(env, model.params, aims.features, aims.possible)
         return share if aims.open is None else share.at[:, :-1].multiply(aims.open)
 
-    def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates:
-        """Return the aims that may be followed."""
-        return open_aims(env.aims(obs))
-
-    def log_p(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, " obs"],
-        actions: Float[Array, "m action"],
-        scalars: GuideScalars,
-    ) -> Float[Array, " m"]:
-        """Return the log density of actions around the aims (`log_density`); before the first fit the rule's, or 0."""
-        aims = jax.vmap(partial(self.aims, env))(obs[None])
-        share = self.shares(model, env, aims)[0]
-        return log_density(self.spaces.actions, aims.actions[0], share, actions)
-
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
         """Return the variance of the members' probabilities, summed over aims; it does not depend on the action."""
-        aims = jax.vmap(partial(self.aims, env))(obs)
+        aims = jax.vmap(env.aims)(obs)
         return self.network.disagreement(env, model.params, aims.features, aims.possible)
 
 

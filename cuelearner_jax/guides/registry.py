@@ -14,7 +14,6 @@ from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.guides import (
-    aims,
     baselines,
     bdcoach,
     clic,
@@ -37,8 +36,7 @@ _BUILT_IN = (
     relative.KIND,
     intent.KIND,
     baselines.HEURISTIC,
-    aims.ANY_AIM,
-    aims.RULE,
+    baselines.ANY_AIM,
     *_TAUGHT,
     *_PEERS,
 )
@@ -106,7 +104,7 @@ def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
         UserError: no such kind, or the environment lacks what it needs.
     """
     kind = find(name)
-    for need in (*kind.needs, *getattr(options, "needs", ())):
+    for need in kind.needs:
         if not offers(env, need):
             raise UserError(
                 f"guidance {kind.name!r} needs an environment with `{need}`, which this task does not "

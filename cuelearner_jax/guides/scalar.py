@@ -68,18 +68,6 @@ class Scalar(Guide):
         chosen = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
         return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
-    def log_p(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, " obs"],
-        actions: Float[Array, "m action"],
-        scalars: GuideScalars,
-    ) -> Float[Array, " m"]:
-        """Return the log of the predicted value of each action; 0 for all actions before the first fit."""
-        good = jnp.clip(self.network.predict(env, model.params, obs, actions)[:, 0], LEAST, 1.0)
-        return jnp.where(model.fitted, jnp.log(good), 0.0)
-
     def question(
         self,
         key: PRNGKeyArray,

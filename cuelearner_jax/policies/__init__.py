@@ -4,7 +4,6 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 (`evaluate.rollout_lanes` maps over them); what lanes share is there once.
 """
 
-from cuelearner_jax.policies.final import Arbitrated, acting_state, arbiter_of, final_policy
 from cuelearner_jax.policies.layers import (
     Agent,
     Common,
@@ -30,7 +29,6 @@ __all__ = [
     "BY_LANE",
     "SHARED",
     "Agent",
-    "Arbitrated",
     "Common",
     "Corrected",
     "Guided",
@@ -44,13 +42,10 @@ __all__ = [
     "Taught",
     "Teaching",
     "Uniform",
-    "acting_state",
-    "arbiter_of",
     "asked_from",
     "best_actions",
     "call_policy",
     "describe",
-    "final_policy",
     "in_space",
     "lanes_in",
     "layers",

@@ -1,1 +1,1 @@
-"""Runs of many lanes: grids, lane groups, sweeps, shards, clusters, and the trained policies."""
+"""Runs of many lanes: grids, lane groups, sweeps, shards, and the trained policies."""

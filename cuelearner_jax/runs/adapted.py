@@ -16,7 +16,6 @@ from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.policies import Common, lanes_in, layers
 from cuelearner_jax.runs.grid import world_of
@@ -76,13 +75,9 @@ class AdaptedLanes:
 
     def _arrays(self, env: Any) -> Any:
         values = self.values["policy"]
-        try:
-            lanes = serialization.shapes_of(
-                {**values, "base": {"policy": "uniform"}}, env, self.lanes.number, self.changes
-            )
-            like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows, self.changes)}
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise formats.damaged("policy", self.folder / policy_folders.POLICY) from error
+        alone = {**values, "base": {"policy": "uniform"}}
+        lanes = serialization.shapes_of(alone, env, self.lanes.number, self.changes)
+        like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows, self.changes)}
         return policy_folders.read_arrays(self.folder, like, self.values)
 
 
@@ -102,14 +97,8 @@ def open_folder(
     """
     path = folder / policy_folders.POLICY
     values = formats.read("policy", path)
-    try:
-        task, world = world_of(values["task"], find, path)
-        serialization.check(values["policy"])
-        *columns, used = (np.array(values["lanes"][name]) for name in COLUMNS)
-    except UserError as error:
-        raise error if str(path) in str(error) else UserError(f"{path}: {error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise formats.damaged("policy", path) from error
+    task, world = world_of(values["task"], find, path)
+    *columns, used = (np.array(values["lanes"][name]) for name in COLUMNS)
     return task, world, AdaptedLanes(folder, values, Lanes(*columns), used, values["rows"], code, changes)
 
 

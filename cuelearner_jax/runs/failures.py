@@ -46,17 +46,21 @@ def without_failed(loaded: Sequence[Any]) -> list[Any]:
     left = []
     for lanes in loaded:
         failed = np.asarray(lanes.policies["failed"])
-        pairs = sorted(zip(lanes.budgets[failed].tolist(), lanes.seeds[failed].tolist(), strict=True))
-        for budget in sorted({budget for budget, _ in pairs}):
-            seeds = [str(seed) for own, seed in pairs if own == budget]
-            name = variant_name(lanes.guidance.name, budget)
-            console.print(f"{name}: {_listed(seeds)} failed, no longer finite: left out")
+        if failed.any():
+            names = named(lanes.seeds[failed], lanes.budgets[failed])
+            console.print(f"{lanes.guidance.name}: {names} failed, no longer finite: left out")
         if not failed.all():
             kept = jax.tree.map(lambda leaf, failed=failed: leaf[~failed], lanes.policies)
             left.append(replace(lanes, seeds=lanes.seeds[~failed], budgets=lanes.budgets[~failed], policies=kept))
     if not left:
         raise UserError("all of these lanes failed: there is nothing to evaluate; train again with other settings")
     return left
+
+
+def named(seeds: np.ndarray, budgets: np.ndarray) -> str:
+    """Return the names of lanes (lanes,) of one kind of guidance in a message."""
+    pairs = zip(seeds.tolist(), budgets.tolist(), strict=True)
+    return _listed([f"{seed} ({budget:,} labels)" if budget else str(seed) for seed, budget in pairs])
 
 
 def _listed(seeds: Sequence[str]) -> str:

@@ -6,18 +6,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.policies import Policy, call_policy, policy_name
-from cuelearner_jax.spaces import Space
 from cuelearner_jax.task import Pictures
-from cuelearner_jax.types import EnvState
 
 FILMS = ("gif", "mp4")
 
@@ -59,12 +54,10 @@ def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, ste
         The reward of each step.
 
     Raises:
-        UserError: the policy returned something other than actions; nothing has been written.
+        UserError: the policy's first action is not finite; nothing has been written.
     """
-    acting = _Watched(policy, actions_of(env))
-    frames, rewards = pictures.record(env, acting, _start(episode), steps)
-    jax.effects_barrier()
-    user_code.check_actions(np.array(acting.sound, bool), policy_name(policy))
+    _first(env, policy, episode)
+    frames, rewards = pictures.record(env, policy, _start(episode), steps)
     to.film.parent.mkdir(parents=True, exist_ok=True)
     pictures.still(env, frames, to.still)
     pictures.animate(env, frames, to.film)
@@ -74,8 +67,15 @@ def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, ste
 def question(pictures: Pictures, env: Environment, policy: Policy, episode: int, to: Path) -> None:
     """Write a picture of a validation episode's first situation, with the policy's action as the asked action.
 
-    Raises UserError, and writes nothing, if the policy returns something other than an action.
+    Raises UserError, and writes nothing, if that action is not finite.
     """
+    state, obs, action = _first(env, policy, episode)
+    to.parent.mkdir(parents=True, exist_ok=True)
+    pictures.question(env, state, obs, action, to)
+
+
+def _first(env: Environment, policy: Policy, episode: int) -> tuple[Any, jax.Array, jax.Array]:
+    """Return an episode's first state, observation and action. Raises UserError unless the action is finite."""
 
     @jax.jit
     def first(env: Environment, key: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
@@ -87,22 +87,7 @@ def question(pictures: Pictures, env: Environment, policy: Policy, episode: int,
 
     state, obs, action = first(env, _start(episode))
     user_code.check_actions(action, policy_name(policy))
-    to.parent.mkdir(parents=True, exist_ok=True)
-    pictures.question(env, state, obs, action, to)
-
-
-class _Watched:
-    """Records whether a policy returned actions; needed since films are drawn inside compiled programs."""
-
-    def __init__(self, policy: Policy, actions: Space) -> None:
-        self.policy, self.sound = policy, []
-        self._actions = actions
-
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """Return the policy's actions, with NaN in place of anything that is not an action."""
-        chosen = call_policy(self.policy, key, states, obs, self._actions)
-        jax.debug.callback(lambda sound: self.sound.append(bool(sound)), jnp.isfinite(chosen).all())
-        return chosen
+    return state, obs, action
 
 
 def _start(episode: int) -> jax.Array:

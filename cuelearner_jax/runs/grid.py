@@ -12,12 +12,11 @@ import numpy as np
 from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import episodes
+from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import NAME, Guide, Kind
-from cuelearner_jax.plugins import REFERENCE
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage import formats, label_files
 from cuelearner_jax.storage.folders import CONFIG
@@ -101,7 +100,7 @@ def describe(
 
 def defaults(task: Task) -> dict[str, Any]:
     """Return the default of every field, for config.json files written before the field existed."""
-    groups = {"task": task.config, **run_config.GROUPS, "agent": ddqn.Config, "arbiter": episodes.Config}
+    groups = {"task": task.config, **run_config.GROUPS, "agent": ddqn.Config, "arbiter": Episodes}
     return {name: configuration.defaults(kind) for name, kind in groups.items()}
 
 
@@ -127,51 +126,20 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     if not path.is_file():
         raise UserError(f"{folder} is not a run folder (it has no config.json): give the --out of a train or sweep")
     values = formats.read("config", path)
-    try:
-        task, world = world_of(values["task"], find, path)
-        if "robot" in values:
-            task = _on(task, values["robot"])
-        config = run_config.from_json(world, values)
-        grid = _grid(values["grid"])
-        run_config.check(config)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise formats.damaged("config", path) from error
-    return task, config, grid
-
-
-def _on(task: Task, robot: Any) -> Task:
-    """Return the task with the robot of a run. Raises ValueError for one that it lacks."""
-    if robot not in [body.name for body in task.bodies]:
-        raise ValueError(f"{task.name} has no robot {robot!r}")
-    return task.on(robot)
-
-
-def _grid(values: dict[str, Any]) -> Grid:
-    """Parse a grid; its kinds of guidance may be unknown. Raises ValueError, TypeError or KeyError if invalid."""
-    grid = Grid(*(tuple(values[name]) for name in ("guidance", "seeds", "labels")))
-    if not all(NAME.fullmatch(kind) for kind in grid.guidance):  # they name folders, and never code
-        raise ValueError(f"{grid.guidance} are not names of kinds of guidance")
-    return grid
+    task, world = world_of(values["task"], find, path)
+    config = run_config.from_json(world, values)
+    grid = Grid(*(tuple(values["grid"][name]) for name in ("guidance", "seeds", "labels")))
+    return task.on(values.get("robot")), config, grid
 
 
 def world_of(told: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:
     """Return the task and the world (a configuration) that a folder's file describes.
 
-    Raises:
-        UserError: the task is unknown; the message says how to name a task from outside the package.
-        ValueError, KeyError, TypeError, AttributeError: the description is invalid.
+    Raises UserError if the task is unknown; the message says how to name a task from outside the package.
     """
-    name, origin = told["name"], told.get("from")
-    if origin is not None and not REFERENCE.fullmatch(origin):
-        raise ValueError(f"{origin!r} is not the name of code")
-    task = _known_task(find, name, origin, path)
-    fields = {field: value for field, value in told.items() if field not in ("name", "from")}
-    return task, configuration.from_json(task.config, fields)
-
-
-def _known_task(find: Callable[[str], Task], name: str, origin: str | None, path: Path) -> Task:
+    origin = told.get("from")
     try:
-        return find(name)
+        task = find(told["name"])
     except UserError as error:
         if origin is None:
             raise UserError(f"{path} belongs to an unknown task ({error})") from error
@@ -179,3 +147,5 @@ def _known_task(find: Callable[[str], Task], name: str, origin: str | None, path
             f"{path} belongs to a task outside the package; its code is not loaded just because a file names it: "
             f"add --task {origin} if you trust that code"
         ) from error
+    fields = {field: value for field, value in told.items() if field not in ("name", "from")}
+    return task, configuration.from_json(task.config, fields)

@@ -13,14 +13,13 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import PRNGKeyArray
 
-from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import BY_LANE, fixed_numerics, lane_mesh, place
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.evaluate import Tell, ignore_progress, rollout_lanes
+from cuelearner_jax.evaluate import rollout_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Clock, TrainState
-from cuelearner_jax.policies import PolicyBlock, arbiter_of
+from cuelearner_jax.policies import PolicyBlock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.program import Program, make_program
@@ -45,11 +44,6 @@ class LaneGroup:
         )
 
     @property
-    def arbiter(self) -> Arbiter:
-        """The arbiter of all lanes."""
-        return arbiter_of(self.config)
-
-    @property
     def rounds(self) -> int:
         """Label rounds of the largest budget."""
         return label_slots(self.largest_budget, self.config.sizes) // self.config.sizes.labels_per_round
@@ -66,19 +60,6 @@ class LaneGroup:
         earlier, now, every = self.asked(before), self.asked(rounds), self.config.schedule.guide_eval_every
         due = now == self.budgets
         return (now > earlier) & (due | (now % every == 0) if every else due)
-
-    def looks(self, rounds: int, given: bool) -> list[tuple[int, int, int]]:
-        """Return (seed, budget, labels asked for) of each evaluation of a guide alone, up to a number of rounds.
-
-        `given`: whether labels were taken from a file at once, instead of asked for.
-        """
-        made = [(0, rounds)] if given else [(number - 1, number) for number in range(1, rounds + 1)]
-        found = []
-        for before, after in made:
-            due = self.examined(after, before)
-            columns = (self.seeds, self.budgets, self.asked(after))
-            found += zip(*(column[due].tolist() for column in columns), strict=True)
-        return found
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return (seeds, budgets) of each block; the last block is padded with repeats, whose results are dropped."""
@@ -104,13 +85,6 @@ class LaneGroup:
         if jax.default_backend() != "cpu" or self.mesh.size > 1:
             return len(self.seeds)
         return -(-len(self.seeds) // CORES)
-
-    @property
-    def at_once(self) -> int:
-        """Lanes that a device works on at the same time; on a CPU one of each block."""
-        if jax.default_backend() == "cpu":
-            return min(CORES, len(self.cut)) if self.mesh.size == 1 else 1
-        return self.cut.shape[1] // self.mesh.size
 
     def each(self, work: Callable[..., T], *blocks: list[Any]) -> list[T]:
         """Apply `work` to every block; a CPU works on as many blocks at once as it has cores."""
@@ -164,16 +138,12 @@ class LaneGroup:
         num_envs: int,
         steps: int,
         blocks: list[TrainState],
-        tell: Tell = ignore_progress,
     ) -> dict[str, np.ndarray]:
-        """Return metrics (lanes,) of a policy of each block on the same episodes.
-
-        One device reports progress by `tell` between stretches; several devices evaluate in one stretch.
-        """
+        """Return metrics (lanes,) of a policy of each block on the same episodes."""
         mesh = self.mesh if self.mesh.size > 1 else None
 
         def measured(block: TrainState) -> dict[str, Any]:
-            return rollout_lanes(env, policy_of(block), key, num_envs, steps, tell, mesh).means
+            return rollout_lanes(env, policy_of(block), key, num_envs, steps, mesh=mesh).means
 
         return self.columns(self.each(measured, blocks))
 

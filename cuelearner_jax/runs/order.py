@@ -19,7 +19,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid, check_grid, defaults, describe
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.storage import formats, label_files, results, tracking
+from cuelearner_jax.storage import label_files, tracking
 from cuelearner_jax.storage.folders import CONFIG, check_folder
 from cuelearner_jax.task import Task, shape_of
 
@@ -55,11 +55,6 @@ class Plan:
     order: Order  # of this shard: its seeds and its folder
     described: dict[str, Any]  # the contents of config.json
     labels: label_files.LabelFile | None
-
-    @property
-    def finished(self) -> bool:
-        """Whether nothing is left to do."""
-        return all((self.order.out / kind / results.PARQUET).exists() for kind in self.order.grid.guidance)
 
 
 def resolve_request(request: RequestT) -> RequestT:
@@ -111,10 +106,7 @@ def check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> Non
         name = told.get("name")
         raise UserError(f"{path} holds labels of {name}, but this run trains {task.name}: give labels of the same task")
     values = {name: value for name, value in told.items() if name not in ("name", "from")}
-    try:
-        theirs = configuration.to_json(configuration.from_json(task.config, values))
-    except TypeError as error:
-        raise formats.damaged("labels", path) from error
+    theirs = configuration.to_json(configuration.from_json(task.config, values))
     ours = configuration.to_json(world)
     apart = [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]
     if apart:

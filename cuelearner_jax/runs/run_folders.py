@@ -14,7 +14,6 @@ from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import acting_state, arbiter_of
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load, run_key
@@ -39,12 +38,12 @@ class RunLanes:
     guidance: Guide
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
-    policies: Any  # what they act with, see `policies.acting_state`, leading axis: lanes
+    policies: Any  # what they act with, see `lane_checkpoints.items`, leading axis: lanes
     step: int
 
 
 def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid, tuple[Piece, ...]]:
-    """Open the run in a folder, or the sweep whose shards lie below it (`--shard`, `--cluster`).
+    """Open the run in a folder, or the sweep whose shards lie below it (`--shard`).
 
     Returns the task, the configuration, the grid of all shards, and the folders. `find`: see `grid.load`.
 
@@ -80,11 +79,10 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     some of which may not have begun. Raises UserError if there is no checkpoint, or one is damaged.
     """
     env = shape_of(task, config.task)
-    guidance, arbiter = config.guide_in(env, kind), arbiter_of(config)
+    guidance = config.guide_in(env, kind)
 
     def lane(key: PRNGKeyArray) -> dict[str, Any]:
-        state = arbiter.init(config.sizes.num_envs)
-        return acting_state(arbiter, config.agent_in(env).init(key)[0], guidance.init(key), state)
+        return {"params": config.agent_in(env).init(key)[0], "guidance": guidance.init(key)}
 
     like = jax.eval_shape(lane, jax.random.key(0))
     found: dict[int, list[RunLanes]] = {}

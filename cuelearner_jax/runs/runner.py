@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Any
 
@@ -12,9 +11,9 @@ from rich.progress import Progress
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.runs.failures import LISTED, variant_name
+from cuelearner_jax.runs.failures import named
 from cuelearner_jax.runs.grid import config_hash, run_key
-from cuelearner_jax.runs.lane_checkpoints import items, read_due, restore_blocks, write_due
+from cuelearner_jax.runs.lane_checkpoints import items, restore_blocks
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.training import Training, mean_of_finite
@@ -35,7 +34,6 @@ class Runner:
         self,
         group: LaneGroup,
         examined: Environment,
-        judged: Environment | None,
         order: Order,
         described: dict[str, Any],
         stopping: threading.Event,
@@ -43,9 +41,9 @@ class Runner:
     ) -> None:
         """Prepare without starting.
 
-        `described`: contents of config.json. `stopping`: set by Ctrl-C. For `examined` and `judged` see `Training`.
+        `described`: contents of config.json. `stopping`: set by Ctrl-C. For `examined` see `Training`.
         """
-        self.training = Training(group, examined, order.split, self._end_if_asked, judged)
+        self.training = Training(group, examined, order.split)
         self.group, self.order, self.described = group, order, described
         self.stopping, self.bars = stopping, bars
         self.name = group.guidance.name
@@ -59,6 +57,7 @@ class Runner:
         Raises Interrupted when asked to stop, once everything is saved.
         """
         if (self.folder / results.PARQUET).exists():
+            self._check_rows(self.group.config.schedule.total_steps)
             console.print(f"{self.name}: finished before, left as it is")
             return
         asks = self.group.guidance.asks
@@ -94,46 +93,37 @@ class Runner:
         if saved.latest() is None:
             self.training.begin()
         else:
-            blocks, clock, wall = restore_blocks(self.group, saved)
-            due = read_due(self.folder, int(clock.step), len(self.group.seeds))
-            self.training.go_on(blocks, clock, wall, due)
+            self.training.go_on(*restore_blocks(self.group, saved))
             self.failed = self.training.failed
-            # A checkpoint of labels alone precedes the rows of step 0; one without its evaluation precedes its rows.
-            last_step = self.training.step - (self.training.step == 0 or due is not None)
+            last_step = self.training.step or -1  # a checkpoint of labels alone precedes the rows of step 0
             last_round = self.training.round
+        self._check_rows(last_step)
         tables.truncate(self.folder, results.SCHEMA, keep=lambda row: row["step"] <= last_step)
         tables.truncate(self.folder, results.GUIDES, keep=lambda row: row["round"] <= last_round)
 
+    def _check_rows(self, step: int) -> None:
+        """Raise UserError unless the folder's tables are of this run, and hold the rows of each lane up to a step."""
+        evaluations = step // self.group.config.schedule.eval_every + 1
+        results.check_complete(self.folder, step, len(self.group.seeds) * evaluations, self.key)
+
     def _save(self, saved: Checkpoints) -> None:
         now = self.training
-        saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall, self.group.arbiter))
-
-    def _interrupted(self, where: str = "") -> Interrupted:
-        return Interrupted(
-            f"stopped at step {self.training.step} of {self.name}{where}; go on with the same command and --resume"
-        )
-
-    def _end_if_asked(self, done: int, count: int) -> None:
-        """End an evaluation if asked to stop: an `evaluate.Tell`, called by several threads."""
-        if self.stopping.wait(0):
-            raise self._interrupted(", before its evaluation")
+        saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
 
     def _stop_if_asked(self, saved: Checkpoints) -> None:
         if self.stopping.is_set():
             self._save(saved)
-            raise self._interrupted()
+            step = self.training.step
+            raise Interrupted(f"stopped at step {step} of {self.name}; go on with the same command and --resume")
 
     def _tell_failed(self, when: str) -> None:
-        """Print a line for each newly failed lane, or for the first ones if there are many."""
-        found, group = np.flatnonzero(self.training.failed & ~self.failed), self.group
-        for lane in found[:LISTED]:
-            variant = variant_name(self.name, int(group.budgets[lane]))
+        """Print a line if lanes have newly failed."""
+        found, group = self.training.failed & ~self.failed, self.group
+        if found.any():
+            names = named(group.seeds[found], group.budgets[found])
             console.print(
-                f"{variant}: the lane of seed {group.seeds[lane]} is no longer finite {when}: kept at its last finite "
-                "state and marked as failed"
+                f"{self.name}: {names} no longer finite {when}: kept at the last finite state, marked as failed"
             )
-        if len(found) > LISTED:
-            console.print(f"{self.name}: so are {len(found) - LISTED} more lanes")
         self.failed = self.training.failed
 
     def _label(
@@ -143,11 +133,12 @@ class Runner:
         teacher: Teacher | None,
         labels: label_files.LabelFile | None,
     ) -> None:
-        """Take the labels of a file, or ask the teacher for missing ones; write the label file."""
-        now = self.training
-        if now.labelled and label_files.readable(self.folder / label_files.PARQUET):
-            return
-        if not now.labelled:
+        """Take the labels of a file, or ask the teacher for missing ones; write the label file.
+
+        A kill may have torn the file, so it is written anew whenever a run goes on.
+        """
+        now, asks = self.training, not self.training.labelled
+        if asks:
             bar = self.bars.add_task(f"{self.name}: labels", total=self.group.rounds, note="", completed=now.round)
             if labels is not None:
                 now.take(labels)
@@ -163,7 +154,8 @@ class Runner:
                         self._save(saved)
                     self._stop_if_asked(saved)
         self._write_labels()
-        self._save(saved)
+        if asks:
+            self._save(saved)
 
     def _examine(self, guides: TableWriter, before: int) -> None:
         """Write the evaluations of guides that are due after the rounds since `before`."""
@@ -184,7 +176,7 @@ class Runner:
     def _train(self, saved: Checkpoints, writer: TableWriter, tracker: tracking.Tracker | None) -> None:
         now, schedule = self.training, self.group.config.schedule
         self.bars.update(self._bar, completed=now.step)
-        for row in self._evaluated(saved):
+        for row in now.stretches():
             writer.append(**row)
             if tracker is not None:
                 tracker.log(now.step, tracking.means(row))
@@ -195,15 +187,3 @@ class Runner:
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(saved)
             self._stop_if_asked(saved)
-
-    def _evaluated(self, saved: Checkpoints) -> Iterator[dict[str, Any]]:
-        """Yield the rows of the next stretches; save an interrupted stretch, for evaluation on resuming."""
-        now = self.training
-        try:
-            yield from now.stretches()
-        except Interrupted:
-            if now.due is not None:
-                # written first: beside an older checkpoint the file has no effect
-                write_due(self.folder, now.step, now.due)
-                self._save(saved)
-            raise

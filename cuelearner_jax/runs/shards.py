@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, format_numbers
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import CONFIG, differences
 
@@ -93,14 +92,6 @@ def missing(configurations: list[Path]) -> list[str]:
             if shard := formats.read("config", path).get("shard"):
                 begun.setdefault((path.parent.parent, shard["count"]), set()).add(shard["index"])
     for (sweep, count), there in sorted(begun.items()):
-        absent = _between(sorted(there), count)
-        if absent:
-            lines.append(f"{sweep.as_posix()}: shards not begun, of {count}: {', '.join(absent)}")
+        if absent := set(range(1, count + 1)) - there:
+            lines.append(f"{sweep.as_posix()}: shards not begun, of {count}: {format_numbers(absent)}")
     return lines
-
-
-def _between(there: list[int], count: int) -> list[str]:
-    """Return the missing stretches of 1 to `count`: few, however many numbers are missing."""
-    edges = [0, *there, count + 1]
-    stretches = [(low + 1, high - 1) for low, high in itertools.pairwise(edges) if high - low > 1]
-    return [str(first) if first == last else f"{first} to {last}" for first, last in stretches]

@@ -10,19 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, check_layout, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import (
+    Agent,
     Corrected,
     Guided,
     Heuristic,
     Policy,
     Taught,
-    arbiter_of,
     asked_from,
-    final_policy,
     uniform_in,
 )
 from cuelearner_jax.run_config import RunConfig
@@ -91,7 +89,7 @@ def make(
         assert adapted is not None
         return adapted.policy(view) if name == "adapted" else adapted.base(view)
     assert lanes is not None
-    agent = final_policy(config, lanes.guidance, view, lanes.step, lanes.policies)
+    agent = Agent(lanes.policies["params"], config.agent_in(view), view)
     if name == "agent":
         return agent
     if name == "corrected":
@@ -146,52 +144,36 @@ class PolicySource:
         """Return the source with another robot of the task (None: the default). Raises UserError if unknown."""
         return replace(self, task=self.task.on(robot))
 
-    def check(self, policy: str, changed: Any, **lanes: Any) -> None:
+    def check(self, policy: str, changed: Any, guidance: str | tuple[str, ...] | None = None) -> None:
         """Raise UserError unless the policy is available and acts in the changed world.
 
         A trained policy needs the observations and aims of its training world; other policies act in any world.
-
-        `lanes`: options that choose among a run's lanes, by name; a given option must have something to choose.
+        `guidance`: chosen kinds of a run's lanes.
         """
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{suggestion(policy, POLICIES)}")
-        named = POLICIES[policy]
+        named, after = POLICIES[policy], shape_of(self.task, changed)
         if named.trained and not self.grid:
             others = [name for name, one in POLICIES.items() if not one.kept or (one.adapted and self.adapted)]
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
         if named.adapted and not self.adapted:
             raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` wrote")
-        given = [name for name, value in lanes.items() if value not in (None, ())]
-        if given and not named.kept:
-            raise UserError(
-                f"--{given[0]} has no effect, since policy {policy!r} belongs to no lane of a run: leave it out"
-            )
-        if self.grid and given and given[-1].endswith("bound-deg"):
-            raise UserError("--bound-deg chooses among the lanes of a policy folder, but this is a run: leave it out")
-        after = shape_of(self.task, changed)
-        for need in named.needs:
-            if not offers(after, need):
-                raise UserError(f"{self.task.name} has no {need}: choose another policy")
+        if lacking := [need for need in named.needs if not offers(after, need)]:
+            raise UserError(f"{self.task.name} has no {lacking[0]}: choose another policy")
         if not named.kept:
+            check_no_lane(policy, guidance)
             return
-        what = "run" if self.grid else "policy"
-        known = shape_of(self.task, self.config.task)
+        what, known = "run" if self.grid else "policy", shape_of(self.task, self.config.task)
         check_layout(f"the {what}", known.observation, actions_of(known), after)
-        if policy in ("agent", "corrected") and not isinstance(arbiter_of(self.config), Finishes):
+        if policy in ("agent", "corrected"):
             return
-        chosen = next((value for name, value in lanes.items() if name.endswith("guidance") and value), None)
-        if not self._weighs_aims((chosen,) if isinstance(chosen, str) else chosen):
-            return
-        if (width := spaces_of(known).aims) != (now := spaces_of(after).aims):
+        chosen = (guidance,) if isinstance(guidance, str) else guidance
+        kinds = self.adapted.kinds if self.adapted else chosen or (self.grid.guidance if self.grid else ())
+        weighs_aims = any("aims" in kind.needs for name in kinds if (kind := guidances.find_or_none(name)))
+        if weighs_aims and (width := spaces_of(known).aims) != (now := spaces_of(after).aims):
             raise UserError(
                 f"the {what} uses aims of {width} features, this world's have {now}: keep the options that set the aims"
             )
-
-    def _weighs_aims(self, chosen: tuple[str, ...] | None) -> bool:
-        """Whether a policy's guidance uses the task's aims. `chosen`: only these kinds of a run."""
-        kinds = self.adapted.kinds if self.adapted else chosen or (self.grid.guidance if self.grid else ())
-        found = (guidances.find_or_none(kind) for kind in kinds)
-        return any(kind is not None and "aims" in kind.needs for kind in found)
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[RunLanes]:
         """Return the lanes of a run's kinds of guidance (none named: all), grouped by step.
@@ -265,6 +247,12 @@ def blocks_of(
     return blocks
 
 
+def check_no_lane(policy: str, *choices: Any) -> None:
+    """Raise UserError if there is a choice of a lane for a policy without lanes."""
+    if any(choice not in (None, ()) for choice in choices):
+        raise UserError(f"policy {policy!r} belongs to no lane of a run: leave out the options that choose a lane")
+
+
 def one_policy(
     source: PolicySource,
     world: Any,
@@ -313,33 +301,29 @@ def several(
     teacher = source.task.make_teacher(world, env) if named.taught else None
     view = source.task.view(world) if env is None else view_of(env)
     if not named.kept:
+        check_no_lane(name, kind, labels, seeds, bound_deg)
         return [make(name, source.config, view, teacher)], (0,)
     kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
     blocks = blocks_of(source, name, view, teacher, kinds, failed_too=True)
-    known = {
-        part: np.concatenate([getattr(block, part) for block in blocks]) for part in ("seeds", "budgets", "bounds")
-    }
-    budget = int(known["budgets"].max()) if labels is None else labels
-    bound = float(known["bounds"].max()) if bound_deg is None else bound_deg
-    found = []
-    for seed in seeds or (int(known["seeds"][0]),):
-        for block in blocks:
-            within = np.isclose(block.bounds, bound, rtol=1e-4)
-            index = np.flatnonzero((block.seeds == seed) & (block.budgets == budget) & within)
-            if len(index):
-                if block.failed[index[0]]:
-                    console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
-                found.append(block.policy.lane(int(index[0])))
-                break
-        else:
-            known_seeds, known_budgets, known_bounds = (format_numbers(values.tolist()) for values in known.values())
-            of, bounds, others = "run", "", ""
-            if source.grid is None:
-                unit, of = actions_of(view).unit, "folder"
-                if bound or bound_deg is not None:
-                    bounds, others = f" within {bound:g} {unit}", f" within {known_bounds} {unit}"
-            raise UserError(
-                f"no lane with seed {seed} and {budget} labels{bounds}: the {of} has seeds {known_seeds} "
-                f"and labels {known_budgets}{others}"
-            )
-    return found, seeds or (int(known["seeds"][0]),)
+    budget = int(max(block.budgets.max() for block in blocks)) if labels is None else labels
+    bound = float(max(block.bounds.max() for block in blocks)) if bound_deg is None else bound_deg
+    seeds = seeds or (int(blocks[0].seeds[0]),)
+    return [_lane(blocks, seed, budget, bound, actions_of(view).unit) for seed in seeds], seeds
+
+
+def _lane(blocks: list[Block], seed: int, budget: int, bound: float, unit: str) -> Any:
+    """Return the policy of a lane. Raises UserError if no block has the lane."""
+    for block in blocks:
+        within = np.isclose(block.bounds, bound, rtol=1e-4)
+        for index in np.flatnonzero((block.seeds == seed) & (block.budgets == budget) & within)[:1].tolist():
+            if block.failed[index]:
+                console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
+            return block.policy.lane(index)
+    seeds, budgets, bounds = (
+        format_numbers(np.concatenate([getattr(block, part) for block in blocks]).tolist())
+        for part in ("seeds", "budgets", "bounds")
+    )
+    within, others = (f" within {bound:g} {unit}", f" within {bounds} {unit}") if bound else ("", "")
+    raise UserError(
+        f"no lane with seed {seed} and {budget} labels{within}: there are seeds {seeds} and labels {budgets}{others}"
+    )

@@ -10,50 +10,35 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.asking import blame, label_slots
-from cuelearner_jax.devices import BY_LANE, SHARED, place
+from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.environment import Environment, view_of
-from cuelearner_jax.evaluate import Tell, episodes, ignore_progress
+from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.loop import Clock, TrainState, start_clock
-from cuelearner_jax.policies import Guided, PolicyBlock, acting_state, asked_from, final_policy
-from cuelearner_jax.runs.judging import Returns, judges_envs, judges_episodes, scores
+from cuelearner_jax.policies import Agent, Guided, PolicyBlock, asked_from
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.types import Label, Teacher
+from cuelearner_jax.types import Label, Params, Teacher
 
 
 class Training:
     """The state of a group of lanes in training, and its next stretches.
 
-    Between two stretches `clock`, `blocks` and `wall` are the whole state; after an interrupted evaluation also `due`.
+    Between two stretches `clock`, `blocks` and `wall` are the whole state.
     """
 
-    def __init__(
-        self,
-        group: LaneGroup,
-        examined: Environment,
-        split: str,
-        tell: Tell = ignore_progress,
-        judged: Environment | None = None,
-    ) -> None:
+    def __init__(self, group: LaneGroup, examined: Environment, split: str) -> None:
         """Start at the beginning.
 
         Args:
             group: the lanes.
             examined, split: environment and episodes of evaluations, see `evaluate.SPLITS`.
-            tell: called while evaluations run; an exception from it ends them.
-            judged: environment in which an arbiter's arms are validated, see `judging`; None: no arms.
         """
-        self.group, self.split, self.tell = group, split, tell
-        self.judged = (
-            None if judged is None else place(group.mesh, Returns(judged, group.config.scalars.discount), SHARED)
-        )
+        self.group, self.split = group, split
         self.examined = place(group.mesh, examined, SHARED)
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
         self.wall = 0.0  # seconds of labelling and training so far
-        self.due: dict[str, np.ndarray] | None = None  # columns of the newest stretch, until its evaluation is done
         # round of the newest evaluation of guides, and its result
         self._guides: tuple[int, dict[str, np.ndarray]] | None = None
 
@@ -61,11 +46,9 @@ class Training:
         """Start fresh lanes."""
         self.blocks = self.group.start()
 
-    def go_on(
-        self, blocks: list[TrainState], clock: Clock, wall: float, due: dict[str, np.ndarray] | None = None
-    ) -> None:
+    def go_on(self, blocks: list[TrainState], clock: Clock, wall: float) -> None:
         """Continue from a saved state."""
-        self.blocks, self.wall, self.due = blocks, wall, due
+        self.blocks, self.wall = blocks, wall
         self.clock = place(self.group.mesh, clock, SHARED)
 
     @property
@@ -146,56 +129,28 @@ class Training:
         if self.step == 0:
             yield {**self.evaluation(), **self.guide_alone()}
         iterations = schedule.eval_every // group.config.sizes.num_envs
-        while not self.done or self.due is not None:
-            if self.due is None:
-                started = time.perf_counter()
-                self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
-                self.wall += time.perf_counter() - started
-                self.due = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
-            row = {**self.evaluation(), **self._of_finite(self.due)}
-            self.due = None
-            yield row
+        while not self.done:
+            started = time.perf_counter()
+            self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
+            self.wall += time.perf_counter() - started
+            trained = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
+            yield {**self.evaluation(), **self._of_finite(trained)}
 
     def evaluation(self) -> dict[str, Any]:
         """Return the columns of one evaluation of all agents: scalars, or (lanes,) with NaN for failed lanes."""
         group = self.group
         own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
         own["failed"] = self.failed.astype(float)
-        judged = self._judge()
-        return {**own, **judged, **self._measured(lambda lane: self._policy(lane, view_of(self.examined)))}
+        return {**own, **self._measured(lambda lane: self._policy(lane.agent.params, view_of(self.examined)))}
 
     def policies(self, view: Any) -> PolicyBlock:
         """The finished policies of all lanes as they stand, for a world of that view."""
-        known = [
-            acting_state(self.group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter) for lane in self.blocks
-        ]
-        joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *known)
-        return final_policy(self.group.config, self.group.guidance, view, self.step, joined)
+        params = [lane.agent.params for lane in self.blocks]
+        joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
+        return self._policy(joined, view)
 
-    def _policy(self, lane: TrainState, view: Any, **arm: Any) -> PolicyBlock:
-        """Return a block's finished policies; `arm` overrides the arm that validated best."""
-        group = self.group
-        known = {**acting_state(group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter), **arm}
-        return final_policy(group.config, group.guidance, view, self.step, known)
-
-    def _judge(self) -> dict[str, np.ndarray]:
-        """Let each lane act by its best validated arm; return columns (lanes,): its number, and all scores."""
-        group, arbiter, world = self.group, self.group.arbiter, self.judged
-        if world is None or not isinstance(arbiter, Finishes):
-            return {}
-        bootstraps, view = group.config.bootstraps, view_of(world.env)
-        size = (judges_envs(bootstraps), arbiter.judge_steps)
-        found = []
-        for arm in map(jnp.asarray, range(len(arbiter.arms))):
-            policy_of = lambda lane, arm=arm: self._policy(lane, view, arm=arm)  # noqa: E731
-            found.append(group.evaluate(policy_of, world, judges_episodes(), *size, self.blocks, self.tell))
-        worth = scores(found, bootstraps)
-        best = np.argmax(np.nan_to_num(worth, nan=-np.inf), axis=0).astype(np.int32)
-        for block, rows in enumerate(group.cut):
-            chosen, lanes = place(group.mesh, jnp.asarray(best[rows]), BY_LANE), self.blocks[block]
-            self.blocks[block] = lanes.replace(arbiter=arbiter.with_arm(lanes.arbiter, chosen))
-        judged = {f"judged_{name}": values for name, values in zip(arbiter.arms, worth, strict=True)}
-        return self._of_finite({"arm": best.astype(float), **judged})
+    def _policy(self, params: Params, view: Any) -> PolicyBlock:
+        return Agent(params, self.group.config.agent_in(view), view)
 
     def guide_alone(self) -> dict[str, np.ndarray]:
         """Return metrics (lanes,) of the actions that questions begin with, under guidance; without it that is chance.
@@ -218,7 +173,7 @@ class Training:
         schedule = self.group.config.schedule
         key = episodes(self.split)
         size = (schedule.eval_envs, schedule.eval_steps)
-        found = self.group.evaluate(policy_of, self.examined, key, *size, self.blocks, self.tell)
+        found = self.group.evaluate(policy_of, self.examined, key, *size, self.blocks)
         return self._of_finite(found)
 
     def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -136,15 +136,6 @@ class Checkpoints:
             self._manager.save(number, args=ocp.args.Composite(**args))
             self._manager.wait_until_finished()
 
-    def compare(self, like: dict[str, Any]) -> None:
-        """Check that the newest checkpoint's items have the leaves of those in `like`, without reading arrays.
-
-        Raises:
-            UserError: there is no checkpoint, it cannot be read, or its shapes differ.
-        """
-        with self._reading() as folder:
-            _compare(folder, {name: _flat(item) for name, item in like.items()})
-
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
         """Return the newest checkpoint's items named in `like` (trees of arrays or shapes), on the default device.
 

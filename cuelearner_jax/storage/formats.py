@@ -6,7 +6,6 @@
 | `labels`  | a label file           | what it says of itself |
 | `teacher` | `teacher.json`         | its contents           |
 | `policy`  | `policy.json`          | its contents           |
-| `due`     | `due.json` of a run    | its contents           |
 
 A file has its format number under `format`. Whoever changes what is written raises the number here and rewrites the
 repository's files by a script; readers support the current format only.
@@ -25,13 +24,12 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage.whole import replacing, unreadable
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
-FORMATS = {"config": 1, "labels": 1, "teacher": 1, "policy": 1, "due": 1}
+FORMATS = {"config": 1, "labels": 1, "teacher": 1, "policy": 1}
 REMEDIES = {  # the remedy in the message about a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
     "teacher": "is damaged: restore it, or train the teacher anew",
     "policy": "is damaged: restore it, or adapt the policy anew",
-    "due": "is damaged: restore it, or move the folder that it is in away and give --resume",
 }
 
 Values = dict[str, Any]

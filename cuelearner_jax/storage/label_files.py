@@ -261,15 +261,6 @@ def _standing(table: pa.Table) -> pa.Table:
     return table.take(pa.array(kept, pa.int64()))
 
 
-def readable(path: Path) -> bool:
-    """Whether a path holds a complete label file."""
-    try:
-        read(path)
-    except UserError:
-        return False
-    return True
-
-
 def digest(path: Path) -> str:
     """Return a short SHA-256 of a file's contents."""
     return hashlib.sha256((found_in(path) or path).read_bytes()).hexdigest()[:12]

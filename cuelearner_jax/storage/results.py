@@ -35,8 +35,7 @@ A run appends the rows of a step, or of a round, before it saves that checkpoint
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -68,33 +67,23 @@ LANE = ("guidance", "labels", "seed")  # columns that identify a lane of a run
 LaneKey = tuple[str, int, int]
 
 
-def check_complete(
-    folder: Path,
-    schema: tables.Schema,
-    columns: Sequence[str],
-    rows: Iterable[tuple[int, ...]],
-    among: pc.Expression,
-    run: str,
-) -> None:
-    """Raise UserError unless a folder's table has each of the rows exactly once, and no other row in `among`.
+def check_complete(folder: Path, step: int, count: int, run: str) -> None:
+    """Raise UserError unless a folder's tables are a run's, and its results have `count` rows up to a step.
 
-    `rows` are values of the `columns`. `run` is the key of the table's run, which tables of earlier versions lack. A
-    missing table has no rows.
+    `run` is the key of the run, which tables of earlier versions lack. A missing table has no rows.
     """
-    path = schema.found_in(folder) or folder / schema.jsonl
-    wanted, found = Counter(rows), Counter[tuple[int, ...]]()
-    if path.exists() and (table := tables.read(path, schema)).num_rows:
-        if (tables.about_of(table) or {}).get("run", run) != run:
+    found = 0
+    for schema in (GUIDES, SCHEMA):
+        path = schema.found_in(folder)
+        table = None if path is None else tables.read(path, schema)
+        if table is not None and (tables.about_of(table) or {}).get("run", run) != run:
             raise UserError(f"{path} belongs to another run: put its own back")
-        found.update(zip(*(table.filter(among)[name].to_pylist() for name in columns), strict=True))
-    if found == wanted:
-        return
-    wrong = sorted((wanted - found) or (found - wanted))
-    first = ", ".join(f"{name} {value}" for name, value in zip(columns, wrong[0], strict=True))
-    raise UserError(
-        f"{path} {'lacks' if wanted - found else 'has too many'} rows: {len(wrong)}, the first of {first}; restore it, "
-        f"or move {folder} away and give --resume, which trains these lanes anew"
-    )
+        found = table.filter(pc.field("step") <= step).num_rows if table is not None and table.num_rows else 0
+    if found != count:
+        raise UserError(
+            f"{folder} has {found} of {count} results up to step {step}: restore its table, or move the folder away "
+            "and give --resume, which trains these lanes anew"
+        )
 
 
 def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> list[Path]:

@@ -281,8 +281,7 @@ def _bases(subject: Subject, request: AdaptRequest, env: Any) -> tuple[Any, tupl
         policy = in_space(subject.policy, actions_of(env))
         user_code.acts_in(named or "policy", policy, env)
         return Common(policy), (0,), {"code": named}
-    chosen = {"base.guidance": base.guidance, "base.labels": base.labels, "base.seeds": base.seeds}
-    source.check(base.policy, request.task, **chosen, **{"base.bound-deg": base.bound_deg})
+    source.check(base.policy, request.task, base.guidance)
     if trained.POLICIES[base.policy].taught:
         raise UserError(f"policy {base.policy!r} asks the teacher, so there is nothing to adapt: choose another")
     if len(set(base.seeds)) < len(base.seeds):

@@ -21,8 +21,6 @@ from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import Grid, defaults, seeds_of
-from cuelearner_jax.runs.judging import judges_world
-from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order, Plan, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
@@ -70,15 +68,12 @@ def run(order: Order) -> None:
         with claimed(order.out), interruptible() as stopping:
             # Nobody else can change it any more.
             check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(order.task))
-            for group in made.groups if order.resume else ():
-                described = formats.read("config", order.out / CONFIG)
-                check_standing(group, order.out / group.guidance.name, described, given=plan.labels is not None)
             prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
             # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
             described = formats.read("config", order.out / CONFIG)
             bars.remove_task(waiting)
             for group in made.groups:
-                runner = Runner(group, made.examined, made.judged, order, described, stopping, bars)
+                runner = Runner(group, made.examined, order, described, stopping, bars)
                 runner.run(made.teacher, plan.labels)
     groups = made.groups
     failures.check(order.out, [order.out / group.guidance.name for group in groups])
@@ -90,7 +85,6 @@ class _Made(NamedTuple):
     groups: list[LaneGroup]
     teacher: Teacher | None
     examined: Environment
-    judged: Environment | None
 
 
 def _made(order: Order, plan: Plan) -> _Made:
@@ -103,8 +97,7 @@ def _made(order: Order, plan: Plan) -> _Made:
     if asked:
         check_teacher(teacher, config.scalars)
     examined = task.environment(config.task, order.split)
-    judged = judges_world(config, lambda split: task.environment(config.task, split))
-    return _Made(groups, teacher, examined, judged)
+    return _Made(groups, teacher, examined)
 
 
 class Trained(NamedTuple):
@@ -139,11 +132,10 @@ def in_memory(
     if asking and labels is None:
         teacher = place(mesh, teacher, SHARED)
         check_teacher(teacher, request.config.scalars)
-    judged = judges_world(request.config, lambda split: request.task.environment(request.config.task, split))
     rows, trainings = [], {}
     with progress_bars(shown=progress) as bars:
         for group in groups:
-            name, training = group.guidance.name, Training(group, examined, request.split, judged=judged)
+            name, training = group.guidance.name, Training(group, examined, request.split)
             training.begin()
             if not training.labelled and labels is not None:
                 training.take(labels)

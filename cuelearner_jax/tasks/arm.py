@@ -14,7 +14,7 @@ from cuelearner_envs.arm.environment import ACTIONS
 from cuelearner_envs.arm.places import BASE
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import sac
-from cuelearner_jax.arbiters import episodes, paced
+from cuelearner_jax.arbiters import Episodes, Paced
 from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import OWN, Environment, Quantity
 from cuelearner_jax.errors import UserError
@@ -163,7 +163,7 @@ QUICKSTART = RunConfig(
         first_temperature=0.1,  # rewards are distances in metres
         polyak=0.02,
     ),
-    paced.Config(lead=0.0),
+    Paced(lead=0.0),
 )
 PAPER = dataclasses.replace(
     QUICKSTART,
@@ -201,7 +201,7 @@ CORRECTED = dataclasses.replace(
         checkpoint_every=120_000,
     ),
     agent=dataclasses.replace(PAPER.agent, replay_capacity=480_000),
-    arbiter=episodes.Config(probability=0.0),
+    arbiter=Episodes(probability=0.0),
 )
 
 ARM = Task(

@@ -16,11 +16,10 @@ from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.teacher import LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
 from cuelearner_jax import teachers
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import paced, prior
+from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides import intent
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Teacher
@@ -41,7 +40,7 @@ LOCAL_SEARCH = "local_search"
 AGENT = ddqn.Config(coarse_directions=720, coarse_dtype="bfloat16", peaks=8)
 # The action frame and pacing learn fastest here, see docs/results.
 SEEN_FROM_THE_STRIKE = Sizes(frame="action", num_envs=100)
-PACED = paced.Config(lead=0.5)  # a guide gets its whole share if it earns half a shot more than the agent, less below
+PACED = Paced(lead=0.5)  # a guide gets its whole share if it earns half a shot more than the agent, less below
 
 
 def teacher_folder(config: BilliardsConfig) -> Path | None:
@@ -210,27 +209,6 @@ BILLIARDS = Task(
             labels=(100, 500),
             takes="16 seeds under one guidance: 15 minutes on one H200; one: hours on 2 cores; both by arithmetic",
         ),
-        "shaped": Preset(
-            "the table of regulation, its rule and 100 labels as a prior of the choice: good from the first step on",
-            RunConfig(
-                BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
-                # With few labels, a single model in long fits forgets the rule.
-                dataclasses.replace(SEEN_FROM_THE_STRIKE, ensemble=5, fit_steps=200),
-                schedule=Schedule(
-                    total_steps=1_000_000,
-                    guidance_until=1_000_000,
-                    eval_every=50_000,
-                    checkpoint_every=250_000,
-                    guide_eval_every=50,
-                ),
-                agent=dataclasses.replace(AGENT, replay_capacity=1_000_000),
-                arbiter=prior.Config(judge_steps=4_000),
-                kinds={"intent": intent.Config(from_rule=True)},
-            ),
-            guidance=("rule", "intent"),
-            labels=(100,),
-            takes="not run whole; one seed: hours on 2 cores, by arithmetic",
-        ),
         "easy": Preset(
             "larger balls and pockets, seen from the strike, the paper's networks, 1 million steps a seed",
             RunConfig(
@@ -263,7 +241,7 @@ BILLIARDS = Task(
                     checkpoint_every=500,
                 ),
                 ddqn.Config(q_layers=(128, 128), directions=360, replay_capacity=20_000, learning_rate=0.01),
-                paced.Config(lead=0.25),
+                Paced(lead=0.25),
             ),
             guidance=("none", "relative"),
             labels=(100,),

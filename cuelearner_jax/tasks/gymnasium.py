@@ -23,7 +23,7 @@ from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax import plugins
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import paced
+from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
 from cuelearner_jax.bridges.gymnasium.instances import Running, success_in
 from cuelearner_jax.bridges.gymnasium.layout import Actions, actions_of
@@ -417,7 +417,7 @@ def presets(config: GymnasiumConfig, num_envs: int = NUM_ENVS) -> dict[str, Pres
             learning_rate=0.001,
             polyak=0.05,
         ),
-        paced.Config(),
+        Paced(),
     )
     about = f"small networks, {6 * every:,} steps a seed"
     return {"quickstart": Preset(about, run, guidance=("none", "relative"), labels=(100,), seeds=1)}

@@ -16,7 +16,7 @@ from cuelearner_envs.navigation.roadmap import make_brief_teacher as make_brief_
 from cuelearner_envs.navigation.roadmap import make_sided_teacher
 from cuelearner_envs.navigation.roadmap import make_teacher as make_road_map
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import paced
+from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.guides import scalar
@@ -217,7 +217,7 @@ NAVIGATION = Task(
                     replay_capacity=50_000,
                     learning_rate=0.003,
                 ),
-                paced.Config(lead=0.0),  # returns go up to 10; leads of 2, 5 and 10 were not shown to help
+                Paced(lead=0.0),  # returns go up to 10; leads of 2, 5 and 10 were not shown to help
                 NAVIGATION_KINDS,
             ),
             guidance=("none", "relative"),

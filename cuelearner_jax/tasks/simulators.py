@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import paced
+from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout, layout_of
 from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.errors import UserError, format_value
@@ -129,7 +129,7 @@ def presets(config: SimulatorConfig) -> dict[str, Preset]:
                     learning_rate=0.001,
                     polyak=0.05,
                 ),
-                paced.Config(),
+                Paced(),
             ),
             guidance=("none",),
             seeds=4,

@@ -186,8 +186,6 @@ def _asked(env: Any, obs: Array, actions: Array) -> dict[str, Any]:
         found["features"] = tuple(env.features(obs[0], few)), singly
     if offers(env, "aims"):
         found["aims"] = jax.vmap(env.aims)(obs)
-    if offers(env, "aims") and offers(env, "rule"):
-        found["rule"] = jax.vmap(env.rule)(obs)
     if offers(env, "mirror"):
         which = jnp.arange(symmetries_of(env))
         rows = jax.vmap(env.mirror, (None, 0, 0))
@@ -252,12 +250,6 @@ def _check_optional(laws: Laws, env: Environment, walk: Trajectory) -> None:
         _check_features(laws, *walk.optional["features"])
     if "aims" in walk.optional:
         _check_aims(laws, env, walk.optional["aims"])
-    if "rule" in walk.optional:
-        rows, wanted = np.asarray(walk.optional["rule"]), np.shape(walk.optional["aims"].possible)
-        laws.hold(
-            rows.shape == wanted and np.isfinite(rows).all(),
-            f"`rule` gives {rows.shape[1:]} numbers for {wanted[1:]} aims: give a finite one for each, possible or not",
-        )
     if "mirror" in walk.optional:
         _check_mirrors(laws, walk, **walk.optional["mirror"])
 

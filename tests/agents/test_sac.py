@@ -12,7 +12,7 @@ import pytest
 from walk_task import BOX, SMALL, Walk
 
 from cuelearner_jax.agents import sac
-from cuelearner_jax.agents.protocol import AgentFunctions, has_actor
+from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.replay import Memory, Transition, buffer_for, count_guided, stored_step
 from cuelearner_jax.config import static
 from cuelearner_jax.environment import Spaces, spaces_of
@@ -105,27 +105,6 @@ def test_targets_are_those_counted_by_hand(entropy):
     np.testing.assert_allclose(found, batch.reward + 0.9 * batch.discount * value, rtol=1e-5, atol=1e-6)
     # Nothing follows a termination.
     np.testing.assert_array_equal(found[1::2], batch.reward[1::2])
-
-
-def test_targets_take_an_offer_where_it_is_worth_more_than_the_actors_action_with_its_entropy():
-    agent = agent_of()
-    params, rest = agent.init(KEY)
-    batch, temperature, middle = batch_of(200), 0.3, jnp.array([1.0, 0.25])
-    arguments = (0.9, params["actor"], rest.target_critics, temperature, batch, KEY)
-    plain = agent.targets(*arguments)
-    found = agent.targets(*arguments, lambda obs, own: jnp.broadcast_to(middle, own.shape))
-    drawn = agent.draw(params["actor"], batch.next_obs, jax.random.split(KEY)[0])
-    own, its = (
-        np.minimum(*(by_hand(rest.target_critics, n, batch.next_obs, unit) for n in range(2)))
-        for unit in (drawn.unit, np.zeros((200, 2)))
-    )
-    soft = own - temperature * np.asarray(drawn.log_density)
-    assert 20 < (its > soft).sum() < 180
-    assert ((its > own) & (its < soft)).any()  # where Q' alone would have made the target smaller
-    expected = batch.reward + 0.9 * batch.discount * np.maximum(its, soft)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    # Its own actions offered are no other ones, to the last bit.
-    np.testing.assert_array_equal(agent.targets(*arguments, lambda obs, own: own), plain)
 
 
 def test_each_target_draws_a_subset_of_the_critics():
@@ -271,6 +250,4 @@ def test_options_that_do_not_fit_are_refused():
 
 def test_it_is_what_the_protocol_asks():
     assert isinstance(agent_of(), AgentFunctions)
-    assert has_actor(SMALL)
-    assert not has_actor(probes.AGENT)
     assert set(agent_of().described) == {"rule", "frame"}

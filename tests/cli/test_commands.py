@@ -242,9 +242,7 @@ def explained(command, out, err):
     if command in ("train", "sweep", "evaluate", "render"):
         default = "quickstart" if command in ("train", "sweep") else "paper"
         assert f"(--preset; {default} where none is given)" in out
-        assert re.search(
-            r"\):\n  paper +.*\n  regulation +.*\n  shaped +.*\n  easy +.*\n  quickstart  .*minutes on 2 cores\)\n", out
-        )
+        assert re.search(r"\):\n  paper +.*\n  regulation +.*\n  easy +.*\n  quickstart  .*minutes on 2 cores\)\n", out)
 
 
 def test_an_option_that_does_not_exist_is_refused_in_one_line(refused, tmp_path):

@@ -13,7 +13,6 @@ import cuelearner_jax as cl
 from cuelearner_jax import teachers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Heuristic
-from cuelearner_jax.runs.lane_checkpoints import read_due, write_due
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files, results
 from cuelearner_jax.tasks import registry as tasks
@@ -40,16 +39,10 @@ def read_teacher(folder):
     return teachers.load(folder, small_policies.ENV, 0.0, 0.0).params
 
 
-def wait(folder):
-    folder.mkdir()
-    write_due(folder, 48, {"train_loss": np.float32([0.1, 0.2])})
-
-
 KINDS = {
     "policy": (small_policies.write, lambda folder: cl.load_policy(folder, task=small_policies.TASK)(SEEN)),
     "export": (export, lambda folder: cl.load_exported(folder)(SEEN)),
     "teacher": (teach, read_teacher),
-    "due": (wait, lambda folder: read_due(folder, 48, 2)),
 }
 DAMAGES = {
     "emptied": lambda content, place: b"",

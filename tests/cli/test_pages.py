@@ -18,7 +18,6 @@ NAMED = {  # what is named after a command
     "render": ("billiards",),
     "label": ("navigation",),
     "export": ("docs/data/navigation_agent",),
-    "bench": ("billiards",),
 }
 SHORT = [("labels inspect", ""), ("report", ""), ("sweep", "billiards")]  # of one kind each
 PAGES = [

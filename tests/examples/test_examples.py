@@ -6,7 +6,10 @@ import importlib
 import json
 import re
 import shlex
+import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from importlib.abc import Loader, MetaPathFinder
 from importlib.util import spec_from_loader
 from pathlib import Path
@@ -21,8 +24,7 @@ from PIL import Image
 from cuelearner_jax import loop
 from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.registry import AGENTS
-from cuelearner_jax.arbiters.protocol import Arbiter, Outcome
-from cuelearner_jax.arbiters.registry import ARBITERS
+from cuelearner_jax.arbiters import ARBITERS, Arbiter, Outcome
 from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -251,17 +253,16 @@ def test_the_soft_agent_learns_the_soft_values_of_a_chain():
 
 def test_the_late_arbiter_leaves_the_first_steps_to_the_agent():
     late = importlib.import_module("examples.late_arbiter")
-    options = late.Config(after=2, probability=1.0)
-    arbiter = options.make(False)
+    arbiter = late.Config(after=2, probability=1.0)
     assert isinstance(arbiter, Arbiter)
     state, guided = arbiter.init(2), []
     for done in ([0, 1], [0, 0], [1, 0], [0, 0], [0, 0]):
-        outcome = Outcome(jnp.zeros(2), jnp.array(done, bool), jnp.array(True))
-        state = arbiter.follow(state, options, probes.SCALARS, outcome, jax.random.key(0))
+        outcome = Outcome(jnp.zeros(2), jnp.array(done, bool), jnp.array(True), False)
+        state = arbiter.follow(state, outcome, probes.SCALARS, jax.random.key(0))
         guided.append(arbiter.guided(state).tolist())
     assert guided == [[False, False], [False, False], [False, True], [False, True], [True, True]]
     outcome = outcome._replace(done=jnp.ones(2, bool))
-    assert not arbiter.follow(state, late.Config(2, 0.0), probes.SCALARS, outcome, jax.random.key(0)).chosen.any()
+    assert not late.Config(2, 0.0).follow(state, outcome, probes.SCALARS, jax.random.key(0)).chosen.any()
 
 
 def test_the_soft_agent_does_not_see_from_the_action():
@@ -394,3 +395,19 @@ def test_the_shots_that_the_page_on_billiards_shows_are_won(capsys):
     assert re.search(r"(\d+) of 3600 directions win", printed)
     assert told["shot"].pocketed.tolist() == [False, False, False, True]
     assert float(told["shot"].duration) == pytest.approx(3.1, abs=0.05)
+
+
+def test_slurm_gets_one_command_a_piece_which_saves_when_its_job_ends(tmp_path):
+    pytest.importorskip("submitit")
+    piece = importlib.import_module("examples.slurm_sweep").Piece(["billiards", "--out", "runs/a"], 2, 16)
+    assert piece.command[-6:] == ["sweep", "billiards", "--out", "runs/a", "--shard", "2/16"]
+    saves = f"trap 'touch {tmp_path}/saved; exit 143' TERM; touch {tmp_path}/up; while :; do sleep 0.05; done"
+    piece.command = ["sh", "-c", saves]
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(piece)
+        while not (tmp_path / "up").exists():
+            time.sleep(0.05)
+        assert piece.checkpoint().function is piece
+        assert (tmp_path / "saved").exists()
+        with pytest.raises(subprocess.CalledProcessError):
+            done.result()

@@ -37,8 +37,7 @@ def test_pieces_are_bounded_and_every_world_has_its_controls(study):
         assert bool(piece.labels) == any(registry.find(kind).asks for kind in piece.kinds)
     for world in study.WORLDS:
         own = {(piece.run, *piece.kinds, *piece.labels) for piece in study.TRAINED if piece.world == world}
-        assert {("alone", "none"), ("by_value", "heuristic"), ("shuffled", "relative", 100, 500)} < own
-        assert {("by_value", "relative", 100, 500), ("rlpd", "demonstration", 100, 500)} < own
+        assert {("alone", "none"), ("stored", "relative", 100, 500), ("rlpd", "demonstration", 100, 500)} < own
         assert all(piece.seeds == 8 for piece in study.TRAINED)
 
 
@@ -81,7 +80,7 @@ def test_every_adaptation_is_a_command_that_would_begin(study, corrections, monk
 def test_agents_in_fetch_wait_until_they_are_trained_and_all_of_them_are_adapted(study, tmp_path, capsys):
     (piece,) = [one for one in study.CORRECTED if one.path == "reach_fetch/adapted/relative"]
     assert study.commands(piece, tmp_path, "paper") == []
-    assert "run --pieces reach/own_policy/relative first" in capsys.readouterr().out
+    assert "run --pieces reach/stored/relative first" in capsys.readouterr().out
     run = tmp_path / piece.source
     run.mkdir(parents=True)
     (run / "config.json").write_text(json.dumps({"grid": {"seeds": [4000, 4001]}}))
@@ -104,7 +103,7 @@ def test_the_table_counts_the_seeds_that_reach_the_level(study):
     steps = study.reached(rows)
     assert steps[:2] == [100, pytest.approx(100 + 100 * 0.4 / 0.6)]
     assert math.isinf(steps[2])
-    faster = [{**row, "run": "by_value", "each": dict.fromkeys(row["each"], 0.8)} for row in rows[1:]]
+    faster = [{**row, "run": "stored", "each": dict.fromkeys(row["each"], 0.8)} for row in rows[1:]]
     alone, guided = sorted(study.compared([*rows, *faster]), key=lambda row: row["run"])
     assert alone["reached"] == 2
     assert "ratio" not in alone
@@ -123,7 +122,7 @@ def test_the_table_counts_the_seeds_that_reach_the_level(study):
 @pytest.mark.long
 def test_pieces_run_are_told_and_are_not_run_again(study, tmp_path, capsys):
     pieces = [
-        "reach/by_value/relative",
+        "reach/stored/relative",
         "reach/corrections/relative",
         "reach_turned/script",
         "reach_turned/adapted/scalar",
@@ -132,7 +131,7 @@ def test_pieces_run_are_told_and_are_not_run_again(study, tmp_path, capsys):
     assert study.main(command) == 0
     told = json.loads((tmp_path / "smoke" / "arms.json").read_text())
     found = {(row["run"], row["labels"], row["step"]) for row in told["training"]}
-    assert {("by_value", labels, step) for labels in (10, 20) for step in (0, 160)} < found
+    assert {("stored", labels, step) for labels in (10, 20) for step in (0, 160)} < found
     assert {row["labels"] for row in told["guides"] if row["run"] == "corrections"} >= {10, 20}
     assert {(row["guidance"], row["mean"]) for row in told["adaptation"] if row["run"] == "script"} == {
         ("unchanged", 1.0),

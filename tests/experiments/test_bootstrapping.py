@@ -19,7 +19,7 @@ from _efficiency import efficiency_of
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import Transferred
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import paced
+from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.guides import registry
@@ -97,7 +97,7 @@ def known_kind(name):
 
 def options_known(piece):
     """Are a piece's options and kinds part of this version?"""
-    fields = {**GROUPS, "agent": ddqn.Config, "arbiter": paced.Config}
+    fields = {**GROUPS, "agent": ddqn.Config, "arbiter": Paced}
     known = {f"{group}.{field.name}" for group, kind in fields.items() for field in dataclasses.fields(kind)}
     own = {name.replace("-", "_") for name in piece.options if name.partition(".")[0] in fields and "." in name}
     return own <= known and all(map(known_kind, piece.kinds))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from cuelearner_jax.guides.aims import log_density
 
 from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.config import GuideSizes
@@ -18,7 +19,6 @@ from cuelearner_jax.environment import Quantity, Spaces, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import human_answer
 from cuelearner_jax.guides import registry
-from cuelearner_jax.guides.aims import log_density
 from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons, squared_errors
 from cuelearner_jax.guides.relative import KIND as RELATIVE
 from cuelearner_jax.spaces import UNSAID, Box, Choices, Cue

@@ -67,34 +67,17 @@ def test_who_reads_intent_needs_aims():
         registry.make("intent", SIZES, probes.Window())
 
 
-class Ruleless(probes.Aimed):
-    @property
-    def rule(self):
-        raise AttributeError("rule")
+class Alone(probes.Aimed):
+    def aims(self, obs):
+        return super().aims(obs)._replace(open=jnp.arange(4) == 2)
 
 
-class Ruled(probes.Aimed):
-    """Its rule holds the third of four aims for e^2 times as likely as any other."""
-
-    def rule(self, obs):
-        return jnp.array([0.0, 0.0, 2.0, 0.0])
-
-
-def test_labels_begin_with_the_tasks_rule_and_correct_it():
-    options = dataclasses.replace(OPTIONS, from_rule=True)
-    with pytest.raises(UserError, match="needs an environment with `rule`"):
-        registry.make("intent", SIZES, Ruleless(), options)
-    env = Ruled()
-    bundle = registry.make("intent", SIZES, env, options)
-    aims = jax.vmap(lambda obs: bundle.aims(env, obs))(OBS)
-    share = bundle.shares(bundle.init(jax.random.key(0)), env, aims)[0]
-    possible = np.flatnonzero(ENV.aims(OBS[0]).possible)
-    weights = np.exp([2.0 * (aim == 2) for aim in possible])
-    np.testing.assert_allclose(share[possible], weights / (weights.sum() + 1.0), rtol=1e-5)  # the last: none
-    assert share[2] == share.max()
-    bundle, model = told(SIZES, env, options)
-    share = bundle.shares(model, env, aims)[0]
-    assert share[1] > 0.9  # what the expert means
+def test_any_aim_leads_to_the_nearest_that_may_be_followed():
+    bundle, obs = registry.make("any_aim", SIZES, ENV), jnp.array([[1.0, 0.0]])
+    base = directions.rotate(obs, jnp.array([-0.7]))
+    for env, turn in ((ENV, -1.0), (Alone(), 2.5)):
+        acted = bundle.act(bundle.init(jax.random.key(0)), env, obs, base, jnp.ones(1, bool), probes.SCALARS)
+        np.testing.assert_allclose(acted.actions, directions.rotate(obs, jnp.array([turn])), atol=1e-6)
 
 
 @pytest.fixture(scope="module")

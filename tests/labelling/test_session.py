@@ -305,4 +305,3 @@ def test_a_policy_that_gives_no_actions_is_named_before_a_question_is_asked(open
     nothing = Opaque(lambda obs: obs * np.where(obs.any(), np.nan, 1.0), on_host=True)
     with pytest.raises(UserError, match=r"policy .*lambda.* gave zero or not finite numbers"):
         opened(base=Base(nothing, "mine"))
-    assert not label_files.readable(tmp_path / "labels")  # there is no label in it

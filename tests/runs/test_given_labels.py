@@ -108,7 +108,7 @@ def test_labels_of_another_world_are_refused_but_for_what_they_do_not_depend_on(
     with pytest.raises(ValueError, match="labels_hold names 'colour'"):
         dataclasses.replace(task, labels_hold=("colour",))
     written(path, task={"name": "window", "half_width_deg": "wide"})
-    with pytest.raises(UserError, match="damaged"):
+    with pytest.raises(UserError, match="half_width_deg is 'wide' in a file of another version"):
         read_for(path)
 
 

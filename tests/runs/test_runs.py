@@ -65,7 +65,6 @@ def test_a_run_of_another_robot_is_described_and_comes_back_on_that_robot(out, t
     assert runs.load(out, lambda name: two)[0] is two
     with pytest.raises(UserError, match="was run with other values of robot: give the same options"):
         check_folder(out, described(task=two.on("other")), resume=True, overwrite=False)
-    not_loaded(folder, "damaged or of another program")  # the task that is known here lacks the robot
 
 
 @pytest.mark.parametrize(
@@ -131,13 +130,6 @@ def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda values: values.pop("grid"), "damaged or of another program"),
-        (lambda values: values["grid"].pop("seeds"), "damaged or of another program"),
-        (lambda values: values.update(grid=[1]), "damaged or of another program"),
-        (lambda values: values["grid"].update(seeds=3), "damaged or of another program"),
-        (lambda values: values.pop("schedule"), "damaged or of another program"),
-        (lambda values: values.update(sizes=3), "damaged or of another program"),
-        (lambda values: values["task"].pop("name"), "damaged or of another program"),
         (lambda values: values["task"].update(name="tennis"), "unknown task 'tennis'"),
         (lambda values: values["scalars"].update(colour=1), "unknown field 'colour' for Scalars"),
     ],

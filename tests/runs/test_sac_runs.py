@@ -1,4 +1,4 @@
-"""Runs of soft actor-critics whose critics compare with a guide: lanes, resuming, the finished policy, its export."""
+"""Runs of guided soft actor-critics: lanes, resuming, the finished policy, its export."""
 
 import dataclasses
 from functools import partial
@@ -14,11 +14,11 @@ from walk_task import SMALL, TASK, Walk, WalkConfig
 
 from cuelearner_jax import loop
 from cuelearner_jax.adaptation import serialization
-from cuelearner_jax.arbiters import by_value
+from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.evaluate import episodes, rollout_with_progress
 from cuelearner_jax.export import contract, decisions
 from cuelearner_jax.guides import registry
-from cuelearner_jax.policies import Arbitrated
+from cuelearner_jax.policies import Agent
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.trained import PolicySource, one_policy
@@ -30,7 +30,7 @@ ENV = Walk()
 SCHEDULE = {"total_steps": 48, "guidance_until": 48, "eval_every": 16, "checkpoint_every": 16, "learn_after": 8}
 CONFIG = walk_task.config(
     dataclasses.replace(SMALL, replay_capacity=32),  # written over before the end
-    by_value.Config(judge_steps=80),
+    Episodes(1.0),
     sizes={"lanes_per_block": 1},
     schedule=SCHEDULE,
 )
@@ -42,7 +42,7 @@ def run(out, **options):
 
 
 def rows(out):
-    names = ("seed", "step", "reward", "arm", "judged_own", "judged_better", "train_loss", "train_guided_share")
+    names = ("seed", "step", "reward", "train_loss", "train_guided_share")
     found = [{name: row[name] for name in names} for row in results.read(out).to_pylist()]
     return sorted(found, key=lambda row: (row["seed"], row["step"]))
 
@@ -70,14 +70,13 @@ def test_a_stopped_run_goes_on_to_the_same_rows_and_parameters(whole, tmp_path):
     assert all(np.array_equal(a, b) for a, b in zip(mine, again, strict=True))
     last = rows(whole)[-1]
     assert last["train_guided_share"] > 0
-    assert np.isfinite([last["train_loss"], last["judged_own"], last["judged_better"]]).all()
+    assert np.isfinite(last["train_loss"])
 
 
 def test_what_is_loaded_acts_as_what_was_evaluated(whole):
     policy = policy_of(whole)
-    assert isinstance(policy, Arbitrated)
+    assert isinstance(policy, Agent)
     last = next(row for row in rows(whole) if (row["seed"], row["step"]) == (1, 48))
-    assert int(policy.arm) == last["arm"] == int(last["judged_better"] > last["judged_own"])
     found = rollout_with_progress(ENV, policy, episodes(), CONFIG.schedule.eval_envs, CONFIG.schedule.eval_steps).means
     assert float(found["reward"]) == last["reward"]
 
@@ -85,20 +84,16 @@ def test_what_is_loaded_acts_as_what_was_evaluated(whole):
 @pytest.mark.parametrize(
     "format", ["onnx", *(pytest.param(one, marks=pytest.mark.long) for one in ("numpy", "stablehlo"))]
 )
-def test_the_agent_and_the_better_of_both_are_exported_as_they_act(whole, tmp_path, format):
+def test_the_agent_is_exported_as_it_acts(whole, tmp_path, format):
     policy = policy_of(whole)
-    better = policy.replace(arm=jnp.int32(by_value.BETTER))
-    for name, one in (("agent", policy.base), ("better", better)):
-        drawn = partial(decisions.observations, ENV, one, 32)
-        written = contract.write(one, ENV, drawn, format, tmp_path / name, {})
-        assert written["difference"] <= decisions.TOLERANCE
-        assert written["action"]["space"]["name"] == "box"
-    assert (written["policy"]["policy"], written["policy"]["arm"]) == ("arbitrated", "better")
-    assert written["policy"]["base"]["agent"]["name"] == "sac"
+    written = contract.write(policy, ENV, partial(decisions.observations, ENV, policy, 32), format, tmp_path, {})
+    assert written["difference"] <= decisions.TOLERANCE
+    assert written["action"]["space"]["name"] == "box"
+    assert written["policy"]["agent"]["name"] == "sac"
 
 
 def test_a_policy_folder_can_keep_the_agent(whole):
-    agent = policy_of(whole).base
+    agent = policy_of(whole)
     again = serialization.from_json(serialization.to_json(agent), serialization.arrays_of(agent), ENV)
     obs = jnp.linspace(-1.0, 1.0, 8).reshape(4, 2)
     np.testing.assert_array_equal(*(policy.act(jax.random.key(0), None, obs) for policy in (agent, again)))
@@ -149,20 +144,3 @@ def test_replay_tells_ends_by_time_from_terminations_and_guided_steps(lanes):
     by_guide = np.isclose(told, columns[:, 2:4], atol=1e-6).all(-1)
     np.testing.assert_array_equal(np.asarray(state.agent.guided)[:, 0], np.cumsum(by_guide))
     assert 0 < by_guide.sum() < 24
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("wrong", [0.0, 2.0])
-def test_a_finished_policy_is_not_worse_for_a_guide_whatever_the_guide_is_worth(tmp_path, wrong):
-    agent = dataclasses.replace(SMALL, actor_layers=(32,), critic_layers=(32, 32), batch_size=64, replay_capacity=2000)
-    total = {"total_steps": 2000, "guidance_until": 2000, "eval_every": 1000, "checkpoint_every": 1000}
-    evaluated = {"random_steps": 200, "learn_after": 100, "eval_steps": 800, "eval_envs": 100}
-    config = walk_task.config(agent, by_value.Config(judge_steps=400), schedule={**total, **evaluated})
-    config = dataclasses.replace(config, task=WalkConfig(wrong))
-    train.run(Order(TASK, config, Grid(("none", "heuristic"), tuple(range(6)), (0,)), tmp_path / "run"))
-    last = [row for row in results.read(tmp_path / "run").to_pylist() if row["step"] == 2000]
-    earned = {
-        kind: np.array([row["reward"] for row in last if row["guidance"] == kind]) for kind in ("none", "heuristic")
-    }
-    spread = np.hypot(*(values.std(ddof=1) / len(values) ** 0.5 for values in earned.values()))
-    assert earned["heuristic"].mean() > earned["none"].mean() - 2 * spread - 0.005

@@ -134,11 +134,6 @@ class Unequal(Aimed):
         return super().aims(obs)._replace(possible=jnp.ones(3, bool))
 
 
-class Unruly(Aimed):
-    def rule(self, obs):
-        return super().rule(obs)[:3]
-
-
 class Pointless(Aimed):
     possible = (False, False, False, False)
 
@@ -198,7 +193,6 @@ BROKEN = {
     "features": (Narrow(), "`features` of 8 actions"),
     "features of an action": (Confused(), "`features` hold values in `own` that depend on the action"),
     "aims": (Unequal(), "give a row of each, and a bool, for every aim"),
-    "rule": (Unruly(), "give a finite one for each"),
     "possible aims": (Pointless(), "no aim was possible in any step"),
     "sample": (Loose(), "what its actions' `sample` draws is not an action of the space"),
     "shape of samples": (Short(), "`sample` gives shape (3,) for 3 actions of 2"),

@@ -21,8 +21,6 @@ THROWS = 8  # fixed-point steps for the line of centres: the throw depends on th
 THINNEST = 0.15  # cosine of the thinnest cut that is tried
 FARTHEST = 2.0  # clearances and misses are capped at this value
 INWARD = 0.25  # a corner pocket is aimed at this share of its gap before the corner: its jaws stand out
-GROWTH, CLEAR, SCRATCH = 4, 7, 13  # columns of an aim's features
-SURE = 3.0  # an aim whose sum by the rule is larger by 1 is likelier by a factor of exp(3)
 EDGE = 20.0  # steepness of "there is room", per ball diameter or hole width
 
 
@@ -49,16 +47,6 @@ def aims_of(table: Table, obs: Float[Array, " obs"]) -> Aims:
         return Aims(contact.strike, features, on_table[ball] & (jnp.cos(contact.cut) > THINNEST))
 
     return jax.vmap(one)(ball, pocket)
-
-
-def rule_of(aims: Aims) -> Float[Array, " aims"]:
-    """Return log-weights of the aims by a hand-made sum of three numbers, chosen on tuning episodes.
-
-    By what factor an error of the aim grows on its way to the mouth (its logarithm); by how many ball diameters another
-    ball stands in the cue ball's way; whether the cue ball goes on into a pocket.
-    """
-    growth, clear, scratch = (aims.features[:, column] for column in (GROWTH, CLEAR, SCRATCH))
-    return SURE * (jnp.minimum(clear, 0.0) - growth - scratch)
 
 
 def contact_for(table: Table, cue: Float[Array, "2"], target: Float[Array, "2"], way: Float[Array, "2"]) -> Contact:

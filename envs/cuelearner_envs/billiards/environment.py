@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_envs.billiards.aims import aims_of, rule_of
+from cuelearner_envs.billiards.aims import aims_of
 from cuelearner_envs.billiards.physics import Shot, simulate
 from cuelearner_envs.billiards.table import Table, parking, rack
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
@@ -148,10 +148,6 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         As the player sees the table: of a sensor's bias, a turned strike or a tilt they know nothing.
         """
         return aims_of(self.table, obs)
-
-    def rule(self, obs: Float[Array, " obs"]) -> Float[Array, " aims"]:
-        """log-weights of the aims by hand: easy shots with clear ways (`aims.rule_of`)."""
-        return rule_of(self.aims(obs))
 
     def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]) -> Features:
         """A shot as the player sees it: balls relative to the cue ball, along and across the direction of the strike.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.navigation.geometry import free_path
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES, BEAMS, MAX_RANGE
-from cuelearner_envs.navigation.look_ahead import EVERY, SHORTER, look_ahead
+from cuelearner_envs.navigation.look_ahead import EVERY, look_ahead
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.environment import Aims
@@ -27,7 +27,6 @@ BESIDE = (0, 1, -1, 2, -2, 4, -4, 8, -8)  # neighbours that a way takes into acc
 # 0.2 m, and a body that turns needs more room than one that goes straight.
 ROOM = (0.6, 0.1)
 SCALE = 5.0  # of lengths among the features [m]
-CLOSE = 0.1  # of two ways by the rule, the one that leaves so much less is likelier by a factor of e [m]
 UNSEEN = -1.0  # nearness in directions that the lidar does not cover
 
 
@@ -53,15 +52,6 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
     features = jnp.concatenate([row.reshape(-1, WAYS) for row in [*beside, *rows]]).T
     room = (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & seen
     return Aims(ways, features, jnp.ones(WAYS, bool), room)
-
-
-def rule_of(aims: Aims) -> Float[Array, " ways"]:
-    """Return log-weights by a simple hand-written rule: the shortest rest to the goal after two legs.
-
-    `aims` with the features of a look ahead. Of ways that leave as much the shorter plan counts.
-    """
-    left, detour, _ = aims.features[:, -3:].T * SCALE
-    return -(left + SHORTER * detour) / CLOSE
 
 
 def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Array, "radii n"]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_envs.navigation.aims import aims_of, rule_of
+from cuelearner_envs.navigation.aims import aims_of
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
 from cuelearner_envs.navigation.sides import count_passed, heading
@@ -233,10 +233,6 @@ class Navigation(Described, struct.PyTreeNode):
         detour they are, and the first leg's length (`look_ahead.look_ahead`).
         """
         return aims_of(obs, self.look_ahead)
-
-    def rule(self, obs: Float[Array, " obs"]) -> Float[Array, " aims"]:
-        """log-weights of the aims by hand: the less is left to the goal after two legs, the better (`aims.rule_of`)."""
-        return rule_of(aims_of(obs, ahead=True))
 
     def mirror(
         self, which: Int[Array, ""] | int, obs: Float[Array, " obs"], vector: Float[Array, "2"]

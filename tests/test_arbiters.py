@@ -10,29 +10,29 @@ import numpy as np
 import probes
 import pytest
 
+from cuelearner_jax import arbiters as pace
 from cuelearner_jax import loop
-from cuelearner_jax.arbiters import paced as pace
-from cuelearner_jax.arbiters.protocol import Outcome
+from cuelearner_jax.arbiters import Outcome, Paced
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.tasks import registry
 
-HALF = pace.Config(lead=0.0)  # any lead will do
+HALF = Paced(lead=0.0)  # any lead will do
 FADE = 1 - 1 / pace.WINDOW  # of the sums, with each episode
 
 
 @partial(jax.jit, static_argnames="bootstraps")
 def followed(discount, rewards, dones, guided, counts, bootstraps=False):
     """The sums after steps (steps, 1) of one environment, each guided or not."""
-    arbiter, scalars = HALF.make(bootstraps), Scalars(discount=discount)
+    scalars = Scalars(discount=discount)
 
     def step(state, row):
         reward, done, arm, counted = row
         state = state.replace(guided=arm)
-        return arbiter.follow(state, HALF, scalars, Outcome(reward, done, counted), jax.random.key(0)), None
+        return HALF.follow(state, Outcome(reward, done, counted, bootstraps), scalars, jax.random.key(0)), None
 
-    return jax.lax.scan(step, arbiter.init(1), (rewards, dones, guided, counts))[0].sums
+    return jax.lax.scan(step, HALF.init(1), (rewards, dones, guided, counts))[0].sums
 
 
 def episodes_of(rewards, lengths):
@@ -119,7 +119,7 @@ def sums(own, guided):
 )
 def test_the_share_of_known_sums(own, guided, most, expected):
     known = sums(own, guided)
-    found = pace.probability(known, pace.Config(most, 0.0))
+    found = pace.guided_share(known, Paced(most, 0.0))
     assert float(found) == pytest.approx(expected, abs=1e-6)
 
 
@@ -128,7 +128,7 @@ def test_the_share_is_twice_the_chance_that_guidance_is_better():
     # Variances of one episode 0.25 * 40 / 39 and 0.24 * 40 / 39, pooled 0.245 * 40 / 39 at least.
     error = math.sqrt((0.25 + 0.245) / 39)
     chance = 0.5 * (1 + math.erf(-0.1 / error / math.sqrt(2)))
-    assert float(pace.probability(known, HALF)) == pytest.approx(0.5 * 2 * chance, rel=1e-4)
+    assert float(pace.guided_share(known, HALF)) == pytest.approx(0.5 * 2 * chance, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -145,31 +145,30 @@ def test_the_share_is_twice_the_chance_that_guidance_is_better():
 )
 def test_with_a_lead_the_share_is_what_own_episodes_are_behind(own, guided, expected):
     known = sums(own, guided)
-    found = pace.probability(known, pace.Config(lead=0.5))
+    found = pace.guided_share(known, Paced(lead=0.5))
     assert float(found) == pytest.approx(expected, abs=1e-5)
 
 
 def test_few_episodes_that_went_alike_are_not_believed_for_certain():
     # Three guided failures against own luck of 0.3: by their own variance (0) guidance were worse for certain.
     known = sums((200, 60), (3, 0))
-    assert float(pace.probability(known, HALF)) > 0.1
+    assert float(pace.guided_share(known, HALF)) > 0.1
 
 
 @partial(jax.jit, static_argnames="episodes")
 def played(key, own, guided, episodes):
     """Bandit episodes in four environments, guided as paced: the share after each step. Chances (steps,) to win."""
-    arbiter = HALF.make(False)
 
     def step(carry, row):
         state, key = carry
         key, k_win, k_arm = jax.random.split(key, 3)
         won = jax.random.uniform(k_win, (4,)) < jnp.where(state.guided, row[1], row[0])
-        outcome = Outcome(won.astype(jnp.float32), jnp.ones(4, bool), jnp.array(True))
-        state = arbiter.follow(state, HALF, Scalars(), outcome, k_arm)
-        return (state, key), pace.probability(state.sums, HALF)
+        outcome = Outcome(won.astype(jnp.float32), jnp.ones(4, bool), jnp.array(True), False)
+        state = HALF.follow(state, outcome, Scalars(), k_arm)
+        return (state, key), pace.guided_share(state.sums, HALF)
 
     chances = jnp.stack(jnp.broadcast_arrays(own, guided, jnp.zeros(episodes // 4))[:2], -1)
-    return jax.lax.scan(step, (arbiter.init(4), key), chances)[1]
+    return jax.lax.scan(step, (HALF.init(4), key), chances)[1]
 
 
 def test_a_guide_that_becomes_worse_half_way_is_followed_within_a_window():
@@ -184,10 +183,10 @@ def test_a_guide_that_becomes_worse_half_way_is_followed_within_a_window():
     assert back[:, 650:].mean() > 0.4  # a guide that becomes better is tried, though seldom seen before
 
 
-def test_every_preset_is_paced_but_the_papers_and_the_one_that_labels_shape():
+def test_every_preset_is_paced_but_the_papers():
     offered = map(registry.find, ("arm", "billiards", "navigation"))
     found = {(task.name, name): preset.config.arbiter.NAME for task in offered for name, preset in task.presets.items()}
-    others = {("billiards", "paper"): "episodes", ("navigation", "paper"): "episodes", ("billiards", "shaped"): "prior"}
+    others = {("billiards", "paper"): "episodes", ("navigation", "paper"): "episodes"}
     others[("arm", "corrected")] = "episodes"  # labels correct steps there, and guide no episode
     assert found == {named: others.get(named, "paced") for named in found}
 

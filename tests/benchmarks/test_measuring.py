@@ -1,14 +1,13 @@
 """Measuring a machine: figures that agree with each other, of lanes that learn from the first step."""
 
+import _measuring
 import probes
 import pytest
 from probes import CONFIG, Window, compilations
 
-from cuelearner_jax.runs import speed
-
 
 def test_a_row_s_figures_agree_with_each_other():
-    row = speed.measure(CONFIG, Window, 3, seconds=0.01)
+    row = _measuring.measure_training(CONFIG, Window, 3, seconds=0.01)
     assert row["steps_a_second"] == pytest.approx(3 * 1e3 / row["ms_a_step"])
     # Replay keeps 4,000 rows of 5 numbers; the networks, Adam's two averages and the rest are small beside it.
     assert 0.08 < row["mb_a_seed"] < 0.11
@@ -20,7 +19,7 @@ def test_a_row_s_figures_agree_with_each_other():
 @pytest.mark.long
 def test_timed_lanes_learn_and_compile_once():
     config = probes.config(agent={"batch_size": 7})  # another program than that of other tests
-    timed = speed.Timed(speed.learning(config), Window(), "none", 2)
+    timed = _measuring.Timed(_measuring.learning(config), Window(), "none", 2)
     assert [timed.train(3) > 0 for _ in range(2)] == [True, True]
     assert int(timed.clock.step) == int(timed.clock.update) == 2 * 3 * CONFIG.sizes.num_envs
     assert compilations(timed.group.program.train) == [1]
