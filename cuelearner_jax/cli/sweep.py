@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Generic, Literal
+from typing import Any, Literal
 
-from cuelearner_jax.cli.parsing import out
-from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset
+from cuelearner_jax.cli.options import out
+from cuelearner_jax.cli.train import Training, task_and_options
 from cuelearner_jax.runs import cluster
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
@@ -15,8 +15,8 @@ from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.studies import train
 
 
-@dataclass(frozen=True)
-class Sweep(Training[RunT], Generic[RunT]):
+@dataclass(frozen=True, kw_only=True)
+class Sweep(Training):
     """Train seeds x label budgets x kinds of guidance in one process."""
 
     guidance: tuple[str, ...] = ()
@@ -38,28 +38,25 @@ class Sweep(Training[RunT], Generic[RunT]):
     job: Job = field(default_factory=Job)
 
 
-OPTIONS = {"sweep": Sweep}
-
-
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` and `cluster.submit` raise."""
-    task, asked = asked_of_preset(arguments, "sweep", Sweep, _options)
-    grid = Grid(asked.guidance, seeds_of(asked.first_seed, asked.seeds), asked.labels)
-    cluster.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
-    if asked.cluster:
+    task, options = task_and_options(arguments, "sweep", Sweep, _of_grid)
+    grid = Grid(options.guidance, seeds_of(options.first_seed, options.seeds), options.labels)
+    cluster.check(options.cluster, options.shards, options.job, options.shard, options.overwrite, options.out)
+    if options.cluster:
 
         def plan(shard: Shard) -> Plan:
-            return make_plan(asked.order(task, grid, shard))
+            return make_plan(options.order(task, grid, shard))
 
-        assert asked.shards  # `cluster.check`
-        cluster.submit(asked.shards, asked.job, asked.out, arguments, plan, out.print)
+        assert options.shards  # `cluster.check`
+        cluster.submit(options.shards, options.job, options.out, arguments, plan, out.print)
         return
-    shard = Shard.parse(asked.shard) if asked.shard else None
-    train.run(asked.order(task, grid, shard))
-    out.print(asked.done)
+    shard = Shard.parse(options.shard) if options.shard else None
+    train.run(options.order(task, grid, shard))
+    out.print(options.done)
 
 
-def _options(grid: Grid) -> dict[str, Any]:
+def _of_grid(grid: Grid) -> dict[str, Any]:
     """Return the options of what a preset compares."""
     seeds = {"seeds": len(grid.seeds), "first_seed": grid.seeds[0]}
     return {"guidance": grid.guidance, "labels": grid.labels, **seeds}

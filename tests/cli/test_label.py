@@ -97,7 +97,6 @@ def test_a_browser_is_told_a_file_that_others_cannot_read(tmp_path, monkeypatch)
         (["--bound-deg", "0"], "--bound-deg is 0: give a number above 0 and up to 180"),
         (["--port", "70000"], "--port is 70000: give a number"),
         (["--base.seed", "1"], "--base.… chooses a folder's lane, but no folder is given"),
-        (["--who", " "], "--who is empty"),
         (["--one-cue"], "--one-cue is for relative answers about several cues: leave it out"),
         (["--cues", "left,right"], "has its own: leave it out"),
         (["--robot", "anymal"], "has no robots to choose from"),
@@ -254,7 +253,7 @@ def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
     refused(["labels", "export", both, labelled / "one", "--out", "x.csv"], "takes one label file", tmp_path)
     refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
     refused(["labels", "inspect", both, "--teacher"], "replay its situations", tmp_path)
-    refused(["labels", "mend"], "unknown command 'labels mend'", tmp_path)
+    refused(["labels", "mend"], "Available subcommands: inspect, merge, export", tmp_path)
 
 
 def test_runs_take_a_pages_folder(labelled, tmp_path):
