@@ -34,20 +34,6 @@ def test_a_sweep_leaves_a_complete_folder(run_folder):
     assert (run_folder / "relative" / "labels.parquet").exists()
 
 
-@pytest.mark.long
-def test_the_same_seed_gives_the_same_rewards_in_another_run(run_folder, tmp_path):
-    out = tmp_path / "one"
-    command = ["train", "billiards", "--preset", "quickstart", *SMALL, "--seed", "2001", "--labels", "20"]
-    assert main([*command, "--out", str(out)]) == 0
-    alone = [(row["step"], row["reward"]) for row in results.read(out).to_pylist()]
-    beside = [
-        (row["step"], row["reward"])
-        for row in results.read(run_folder / "relative").to_pylist()
-        if row["seed"] == 2001 and row["labels"] == 20
-    ]
-    assert alone == beside
-
-
 @pytest.mark.parametrize(
     "policy",
     [
@@ -121,15 +107,6 @@ def test_an_evaluation_says_how_far_it_is(run_folder, monkeypatch):
         assert re.search(rf"{kind} .*{5 * lanes}/{5 * lanes} ", shown.getvalue())
 
 
-def test_a_teacher_is_evaluated_in_a_changed_world(run_folder, tmp_path):
-    out, changed = tmp_path / "turned.json", ["--task.action-turn-deg", "90", "--task.search-directions", "1440"]
-    command = ["evaluate", str(run_folder), "--policy", "teacher", *changed, "--steps", "20", "--envs", "10"]
-    assert main([*command, "--out", str(out)]) == 0
-    measured = json.loads(out.read_text())
-    assert measured["world"]["action_turn_deg"] == 90.0
-    assert measured["rows"][0]["reward"][0] > 0.8  # the teacher searches in the changed world
-
-
 def test_a_report_has_curves_and_tables(run_folder, tmp_path):
     out = tmp_path / "report"
     assert main(["report", str(run_folder), "--out", str(out)]) == 0
@@ -148,15 +125,6 @@ def test_render_makes_a_film_and_a_still(run_folder, tmp_path, film):
     still, filmed = (tmp_path / f"small-agent.{end}" for end in ("png", film))
     assert imageio.imread(still).std() > 1
     assert filmed.stat().st_size > 1000
-
-
-@pytest.mark.long
-def test_render_makes_the_picture_of_a_question(run_folder, refused, tmp_path):
-    command = ["render", str(run_folder), "--question", "--scenario", "turned_strike", "--out", str(tmp_path)]
-    assert main(command) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["small-turned_strike-agent-question.png"]
-    assert imageio.imread(tmp_path / "small-turned_strike-agent-question.png").std() > 1
-    refused(command, "give --overwrite to replace it", tmp_path)
 
 
 def test_the_overview_has_a_line_for_each_command(capsys):
@@ -190,15 +158,6 @@ def test_the_task_may_be_named_by_an_option(run_folder, tmp_path):
     assert rewards == beside
     given = ["--task", "billiards", "--policy", "uniform", "--steps", "20", "--envs", "10"]
     assert main(["evaluate", str(run_folder), *given]) == 0
-
-
-@pytest.mark.long
-def test_labels_of_a_run_train_another(run_folder, tmp_path):
-    out = tmp_path / "again"
-    command = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--guidance", "relative"]
-    given = ["--labels-from", str(run_folder / "relative" / "labels.parquet"), "--labels", "20"]
-    assert main([*command, *given, "--out", str(out)]) == 0
-    assert len(results.read(out).to_pylist()) == 6
 
 
 @pytest.mark.long

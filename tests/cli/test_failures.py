@@ -2,7 +2,6 @@ import errno
 import importlib
 import shutil
 
-import probes
 import pytest
 from small_runs import SMALL, SWEEP, listing
 
@@ -82,26 +81,6 @@ def test_a_full_disk_advises_what_the_command_can_do(command, advice, capsys, mo
     assert capsys.readouterr().err.splitlines() == [f"error: the disk is full: free some, then {advice}"]
 
 
-def test_a_folder_in_use_is_left_alone(refused, run_folder, tmp_path):
-    refused([*SWEEP, "--out", run_folder], "--resume to go on, --overwrite", run_folder)
-    (tmp_path / "thesis.txt").write_text("mine")
-    refused([*SWEEP, "--out", tmp_path, "--overwrite"], "will not delete it", tmp_path)
-    refused([*SWEEP, "--out", tmp_path, "--resume"], "nothing to resume", tmp_path)
-
-
-def test_resume_with_other_options_names_them(refused, run_folder):
-    changed = [*SWEEP, "--scalars.eps-deg", "3", "--out", run_folder, "--resume"]
-    refused(changed, "other values of scalars.eps_deg", run_folder)
-
-
-@pytest.mark.long
-def test_overwrite_deletes_an_earlier_run(run_folder, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(run_folder, folder)
-    assert main([*QUICK, "--guidance", "none", "--seeds", "2", "--out", str(folder), "--overwrite"]) == 0
-    assert not (folder / "relative").exists()
-
-
 @pytest.fixture
 def copy(run_folder, tmp_path):
     return shutil.copytree(run_folder, tmp_path / "copy")
@@ -140,18 +119,6 @@ def test_what_is_no_run_is_refused(refused, copy, tmp_path, command):
 def test_a_lane_that_is_not_there_is_refused(refused, copy, tmp_path):
     refused(["render", copy, "--seed", "7", "--out", tmp_path / "new"], "the run has seeds 2000, 2001", tmp_path)
     refused(["render", copy, "--labels", "7", "--guidance", "relative"], "labels 10, 20", tmp_path)
-
-
-def test_a_damaged_checkpoint_is_refused(refused, copy):
-    for file in (copy / "none" / "checkpoints").rglob("*"):
-        if file.is_file() and file.stat().st_size > 200:
-            file.write_bytes(b"\x00" * 10)
-    refused(["evaluate", copy, "--guidance", "none"], "cannot be read", copy)
-
-
-def test_a_checkpoint_of_another_run_is_refused(refused, copy):
-    probes.edit_json(copy / "config.json", lambda values: values["agent"].update(q_layers=[24]))
-    refused(["evaluate", copy, "--guidance", "none"], "belongs to another run", copy)
 
 
 def test_a_run_without_checkpoints_is_refused(refused, copy):
@@ -193,8 +160,3 @@ def test_pictures_and_measurements_are_not_replaced_unasked(refused, copy, tmp_p
     assert main([*render, "--overwrite"]) == 0
     (tmp_path / "measured.json").write_text("{}")
     refused(["evaluate", copy, "--out", tmp_path / "measured.json"], "exists", tmp_path)
-
-
-def test_a_config_of_another_version_is_refused(refused, copy):
-    probes.edit_json(copy / "config.json", lambda values: values["sizes"].update(hidden=3))
-    refused(["evaluate", copy], "another version", copy)
