@@ -128,9 +128,8 @@ def _print_agreement(named: str, policy: Any, path: Any) -> None:
 
 def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
     """Return the source and name of the policy to compare with. Raises UserError if it does not act in that world."""
-    if len(options.compare) != (1 if options.subject or options.env else 2):
-        words = " ".join(options.compare)
-        raise UserError(f"--compare {words}: name a policy, then --compare and another one; or give --compare A B")
+    if len(options.compare) > (1 if options.subject else 2):
+        raise UserError(f"--compare {' '.join(options.compare)} names too many policies: give two in all")
     name = options.compare[-1]
     folder = shipped.folder_of(name)
     if name in POLICIES and not folder.exists():

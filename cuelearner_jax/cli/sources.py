@@ -112,7 +112,7 @@ def source_and_options(
     `more` is added to the help's text. Raises UserError for choices that do not exist.
     """
     ahead = look_ahead_of(arguments, command, kind)
-    if not ahead.words and not ahead.task and not ahead.env:  # evaluate --compare A B
+    if not ahead.words and len(ahead.compare or ()) > 1:  # evaluate --compare A B
         ahead.words = ahead.compare[:1]
     source = source_of(ahead)
     world = source.config.task
