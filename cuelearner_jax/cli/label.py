@@ -271,10 +271,12 @@ def _source(task: Task, named: str | None, changed: str | None) -> PolicySource 
     if not folder.is_dir():
         raise UserError(f"no policy at {named}: give a run folder, a policy folder or package.module:NAME")
     own = None if changed is None else changes.load(changed)
-    found = PolicySource.of_folder(folder, lambda name: task if task.name == name else registry.find(name), changes=own)
-    if found.task.name != task.name:
-        raise UserError(f"{folder} is of {found.task.name}, not of {task.name}: give one of the same task")
-    return found
+    source = PolicySource.of_folder(
+        folder, lambda name: task if task.name == name else registry.find(name), changes=own
+    )
+    if source.task.name != task.name:
+        raise UserError(f"{folder} is of {source.task.name}, not of {task.name}: give one of the same task")
+    return source
 
 
 def _base(task: Task, options: Label, source: PolicySource | None, env: Any) -> Base:
@@ -357,11 +359,11 @@ def _following(task: Task, preset: str, config: RunConfig, options: Label, label
     name, out, policy = typed_name(task), str(options.out), options.policy
     if options.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
-    given = ["--labels-from", out, "--labels", str(labels)]
+    source = ["--labels-from", out, "--labels", str(labels)]
     if policy is None and options.questions == PROPOSED:
         return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'
     if policy is None:
-        words = ["train", name, "--preset", preset, "--guidance", options.guidance, *given]
+        words = ["train", name, "--preset", preset, "--guidance", options.guidance, *source]
         parts = ("task", task.config), ("sizes", GuideSizes), ("scalars", GuideScalars)
         for part, kind in parts:
             words += _differing(part, kind, getattr(config, part), getattr(options, part))
@@ -369,12 +371,8 @@ def _following(task: Task, preset: str, config: RunConfig, options: Label, label
     words = ["adapt", policy, *([] if shipped.is_shipped(policy) or Path(policy).exists() else ["--task", name])]
     words += [] if options.scenario is None else ["--scenario", options.scenario]
     words += [] if options.robot is None else ["--robot", options.robot]
-    words += [
-        "--guidance",
-        options.guidance,
-        *([] if options.changes is None else ["--changes", options.changes]),
-        *given,
-    ]
+    words += [] if options.changes is None else ["--changes", options.changes]
+    words += ["--guidance", options.guidance, *source]
     words += _differing("task", task.config, config.task, options.task)
     return shlex.join(["cuelearner", *words, "--out", f"policies/{Path(out).name}"])
 

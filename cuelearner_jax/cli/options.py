@@ -148,9 +148,9 @@ def look_ahead(arguments: list[str]) -> argparse.Namespace:
         parser.add_argument(f"--task.{name}", nargs="*", type=float)
     parser.add_argument("--task.actions")
     parser.add_argument("--cues")
-    known, rest = parser.parse_known_args(arguments)
-    known.words = list(takewhile(lambda word: not word.startswith("-"), rest))
-    return known
+    ahead, rest = parser.parse_known_args(arguments)
+    ahead.words = list(takewhile(lambda word: not word.startswith("-"), rest))
+    return ahead
 
 
 def look_ahead_of(arguments: list[str], command: str, kind: type) -> argparse.Namespace:
