@@ -7,7 +7,7 @@ import time
 from rich.table import Table
 
 from cuelearner_jax import terminal
-from cuelearner_jax.cli.parsing import out
+from cuelearner_jax.cli.options import out
 from cuelearner_jax.terminal import console, progress_bars
 
 TEXT = "runs/br[/x]/[red]r:smile:"

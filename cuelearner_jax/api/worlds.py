@@ -92,7 +92,7 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
         scenario: a changed world of the task's by name.
         robot: the body that acts (default: the task's own): "anymal" in navigation, "pooltool" in billiards, "fetch" in
             arm.
-        changes: fields of its configuration, as `cuelearner evaluate TASK --help-all` lists them under "task options".
+        changes: fields of its configuration, as `cuelearner evaluate TASK --help` lists them under "task options".
 
     Raises:
         UserError: no such task, scenario, robot or field.

@@ -13,27 +13,31 @@ Exit status:
 
 from __future__ import annotations
 
-import ast
 import importlib
 import os
 import sys
 import traceback
 from collections.abc import Sequence
-from pathlib import Path
-from types import ModuleType
 
 # Set before JAX starts: its start-up warnings are of no use to the user.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 # JAX takes seconds to load, so a command imports it only when needed, never for `--version` and `--help`.
 from cuelearner_jax import __version__
-from cuelearner_jax.cli import pages
-from cuelearner_jax.cli.pages import HELP
 from cuelearner_jax.errors import NotFinite, UserCodeError, UserError, machine_message, suggestion
 from cuelearner_jax.signals import Interrupted
 
-# Each is a file beside this one with `run(arguments)` and `OPTIONS`, its option classes by command name.
-COMMANDS = ("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export")
+COMMANDS = {  # each a file beside this one with `run(arguments)`
+    "train": "Train one seed under one kind of guidance.",
+    "sweep": "Train seeds x label budgets x kinds of guidance in one process.",
+    "adapt": "Correct a finished policy by labels about what the policy does in a changed world.",
+    "evaluate": "Measure a policy on validation episodes, or compare two; in any changed world.",
+    "report": "Write curves and tables with intervals from recorded results.",
+    "render": "Draw a still and a film of a policy at work, or the picture of a question.",
+    "label": "Label actions in a browser: uniform ones, a policy's, or recorded ones.",
+    "labels": "Inspect, merge or export label files.",
+    "export": "Write a policy as a file for a robot, with a contract; --check FOLDER replays one.",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,14 +49,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()  # flush here, where a missing reader is handled
     except UserError as error:
-        _tell(f"error: {error}")
+        _print(f"error: {error}")
         if isinstance(error, UserCodeError) and (cause := error.__cause__) is not None:
             from cuelearner_jax.user_code import user_traceback
 
             traceback.print_exception(cause.with_traceback(user_traceback(cause) or cause.__traceback__))
         return 2
     except (Interrupted, NotFinite) as error:
-        _tell(str(error))
+        _print(str(error))
         return error.status
     except BrokenPipeError:  # the reader of the output has gone, as `head` does
         from cuelearner_jax.terminal import abandon
@@ -60,28 +64,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         abandon(sys.stdout)
         return 141
     except Exception as error:
-        told = machine_message(error, _resumes(arguments))
-        if told is None:
+        message = machine_message(error, resumes=arguments[0] in ("train", "sweep"))
+        if message is None:
             raise
-        _tell(f"error: {told}")
+        _print(f"error: {message}")
         return 1
     except KeyboardInterrupt:  # in a process that does more than this command: see `signals`
-        _tell("stopped at once; what was saved before is safe")
+        _print("stopped at once; what was saved before is safe")
         return 130
 
 
-def _tell(line: str) -> None:
+def _print(line: str) -> None:
     from cuelearner_jax.terminal import console
 
     console.print(line)
 
 
 def _dispatch(arguments: list[str]) -> int:
-    for argument in arguments:
-        if not argument.isascii() and argument != argument.encode(errors="replace").decode():
-            raise UserError(f"{argument!r} is not encoded as UTF-8: results could not name it")
-    if not arguments or arguments[0] in HELP:
-        _overview()
+    if not arguments or arguments[0] in ("-h", "--help"):
+        width = max(map(len, COMMANDS)) + 2
+        print("usage: cuelearner COMMAND ...\n\nLearning from relative feedback with off-policy deep RL.\n")
+        print("commands:", *(f"  {name:<{width}}{about}" for name, about in COMMANDS.items()), sep="\n")
+        print("\nEach command has --help, for instance: cuelearner sweep billiards --help; cuelearner --version")
         return 0 if arguments else 2
     command = arguments[0]
     if command == "--version":
@@ -92,47 +96,6 @@ def _dispatch(arguments: list[str]) -> int:
     from cuelearner_jax import devices, user_code
 
     devices.fix_numerics()
-    user_code.report_user_errors(_file(command).run)(arguments[1:])
+    run = importlib.import_module(f"cuelearner_jax.cli.{command}").run
+    user_code.report_user_errors(run)(arguments[1:])
     return 0
-
-
-def _resumes(arguments: list[str]) -> bool:
-    """Whether the given command has an option --resume."""
-    options = _file(arguments[0]).OPTIONS if arguments and arguments[0] in COMMANDS else {}
-    asked = [kind for name, kind in options.items() if name.split() == arguments[: len(name.split())]]
-    return any(hasattr(kind, "resume") for kind in asked)
-
-
-def _file(command: str) -> ModuleType:
-    """Import the file of a command; other commands' dependencies are not loaded."""
-    return importlib.import_module(f"cuelearner_jax.cli.{command}")
-
-
-def summaries(command: str) -> dict[str, str]:
-    """Return one line about each command of a file, by its full name: the start of its options' docstring.
-
-    The file is read, not imported, since importing it loads JAX.
-    """
-    module = ast.parse(Path(__file__).with_name(f"{command}.py").read_text(encoding="utf-8"))
-    abouts = {node.name: ast.get_docstring(node) or "" for node in module.body if isinstance(node, ast.ClassDef)}
-    assigned = [node for node in module.body if isinstance(node, ast.Assign)]
-    (options,) = [node.value for node in assigned if ast.unparse(node.targets[0]) == "OPTIONS"]
-    assert isinstance(options, ast.Dict)
-    named = zip(options.keys, options.values, strict=True)
-    abouts = {ast.literal_eval(name): abouts[ast.unparse(kind)] for name, kind in named if name}
-    return {name: " ".join(about.split("\n\n")[0].split()) for name, about in abouts.items()}
-
-
-def _overview() -> None:
-    from cuelearner_jax.tasks import registry
-
-    print("usage: cuelearner COMMAND ...\n\nLearning from relative feedback with off-policy deep RL.\n\ncommands:")
-    told = {name: about for command in COMMANDS for name, about in summaries(command).items()}
-    width = max(map(len, told)) + 2
-    for name, about in told.items():
-        print(f"  {name:<{width}}{about}")
-    print("\nexamples:")
-    for command in ("sweep", "evaluate", "label"):
-        print(*pages.lines_of(pages.examples_of(command)[:1]), sep="\n")
-    print(f"\ntasks: {', '.join(registry.names())};\n  or one of your own: package.module:NAME")
-    print("Each command has --help, for instance: cuelearner sweep billiards --help; cuelearner --version")

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
-from typing import Any, Generic
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from cuelearner_jax.api import correction
-from cuelearner_jax.cli.parsing import out, taken
-from cuelearner_jax.cli.shared_options import Outside, TaskT, asked_of_source
-from cuelearner_jax.cli.sources import code_of, is_code
+from cuelearner_jax.cli.options import Finished, look_ahead, out, parse
+from cuelearner_jax.cli.sources import code_of, is_code, source_and_options
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.measurements import Difference
@@ -27,7 +25,7 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(EvaluateRequest[TaskT], Outside, Generic[TaskT]):
+class Evaluate(Finished, EvaluateRequest[Any]):
     """Measure a policy on validation episodes, or compare two; in any changed world.
 
     The policy is of a run or a policy folder, or a task's teacher, heuristic or chance."""
@@ -35,87 +33,79 @@ class Evaluate(EvaluateRequest[TaskT], Outside, Generic[TaskT]):
     robot: str | None = None
     """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
-    scenario: str | None = None
-    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
-    compare: str | None = None
+    compare: tuple[str, ...] = ()
     """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference. Two may
     stand here with nothing named before: evaluate --compare A B."""
     labels_from: Path | None = None
     """Instead: how many answers of this label file the policy agrees with. Also of package.module:NAME and of a file in
     ONNX; beside the policy as it was and "already right" always."""
     out: Path | None = None
-    """Also write the measurements to this JSON file. (Beside all these: --base and --changes package.module:NAME give
-    the code of a policy folder that has some, --agent and --arbiter that of a run's own parts.)"""
-
-
-OPTIONS = {"evaluate": Evaluate}
-COMPARE = "--compare"
+    """Also write the measurements to this JSON file."""
 
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises UserError for what cannot be evaluated."""
-    if arguments and is_code(arguments[0]) and (file := taken(arguments, "--labels-from", "a labels.parquet"))[0]:
-        if len(file[1]) > 1:
-            raise UserError(f"the answers of a label file need the policy alone: leave out {file[1][1]}")
-        _print_agreement(arguments[0], code_of(arguments[0]), file[0])
+    ahead = look_ahead(arguments)
+    if ahead.labels_from and ahead.words and is_code(ahead.words[0]):
+        options, alone = parse(Evaluate, arguments, "evaluate", Evaluate()), Path(ahead.labels_from)
+        if options != Evaluate(subject=ahead.words[0], labels_from=alone):
+            raise UserError("the answers of a label file need the policy alone: leave out the other options")
+        _print_agreement(ahead.words[0], code_of(ahead.words[0]), alone)
         return
-    source, asked = asked_of_source(_named_first(arguments), "evaluate", Evaluate)
-    if asked.labels_from is not None:
-        source.check(asked.policy, asked.task, guidance=asked.guidance)
-        if trained.POLICIES[asked.policy].taught:
+    source, options = source_and_options(arguments, "evaluate", Evaluate)
+    if options.labels_from is not None:
+        source.check(options.policy, options.task, guidance=options.guidance)
+        if trained.POLICIES[options.policy].taught:
             raise UserError(
-                f"policy {asked.policy!r} asks the teacher, who looks at the true state: choose another policy"
+                f"policy {options.policy!r} asks the teacher, who looks at the true state: choose another policy"
             )
-        policy = trained.one_policy(source, asked.task, asked.policy, next(iter(asked.guidance), None), None, None)
-        _print_agreement(f"{source.folder}, {asked.policy}", policy, asked.labels_from)
+        policy = trained.one_policy(
+            source, options.task, options.policy, next(iter(options.guidance), None), None, None
+        )
+        _print_agreement(f"{source.folder}, {options.policy}", policy, options.labels_from)
         return
-    source.task.engine(asked.engine)
-    source.check(asked.policy, asked.task, guidance=asked.guidance)
-    envs, steps = evaluate.amount(source.task, asked)
-    if asked.out and asked.out.exists():
-        raise UserError(f"{asked.out} exists: give another --out")
-    other = _other(source, asked) if asked.compare is not None else None
+    source.task.engine(options.engine)
+    source.check(options.policy, options.task, guidance=options.guidance)
+    amount = evaluate.amount(source.task, options)
+    if options.out and options.out.exists():
+        raise UserError(f"{options.out} exists: give another --out")
+    other = _other(source, options) if options.compare else None
     with progress_bars() as bars:
         watch = watched_by(bars)
-        found = evaluate.run(source, asked, watch)
-        others = evaluate.run(other[0], replace(asked, policy=other[1], guidance=()), watch) if other else []
-    compared = measurements.differences(found, others) if other else None
-    told = {"robot": source.task.robot, "engine": asked.engine, "scenario": asked.scenario}
-    told = {name: value for name, value in told.items() if value}
+        rows = evaluate.run(source, options, watch)
+        others = evaluate.run(other[0], replace(options, policy=other[1], guidance=()), watch) if other else []
+    _print_measured(source, options, amount, rows, others)
+
+
+def _print_measured(
+    source: PolicySource,
+    options: Evaluate,
+    amount: tuple[int, int],
+    rows: list[Measured],
+    others: list[Measured],
+) -> None:
+    """Print the measurements, or the comparison with others, and write them to the chosen file."""
+    envs, steps = amount
+    compared = measurements.differences(rows, others) if options.compare else None
+    about = {"robot": source.task.robot, "engine": options.engine, "scenario": options.scenario}
+    about = {name: value for name, value in about.items() if value}
     robot = {"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {}
-    amount = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
-    title = ", ".join([asked.policy, *told.values(), amount])
-    if asked.out:  # first: whoever reads the table may leave before its end
-        named = (str(asked.compare), compared) if compared is not None else None
-        described = {**told, **robot}
-        measurements.write(asked.out, source, asked.task, asked.policy, envs, steps, found, described, named)
+    lane = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
+    title, other = ", ".join([options.policy, *about.values(), lane]), " ".join(options.compare[-1:])
+    if options.out:  # first: whoever reads the table may leave before its end
+        both = (other, compared) if compared is not None else None
+        described = {**about, **robot}
+        measurements.write(options.out, source, options.task, options.policy, envs, steps, rows, described, both)
     shares = f"{envs:,} episodes" if source.task.longest else f"{envs:,} environments of {steps // envs:,} steps"
     if compared is None:
-        out.print(_measurements(found, title, shares))
+        out.print(_measurements(rows, title, shares))
     for difference in compared or ():
-        out.print(_comparison(difference, str(asked.compare), title, shares))
+        out.print(_comparison(difference, other, title, shares))
         out.print(_verdict(difference))
-    if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in [*found, *others]):
+    if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in [*rows, *others]):
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
-    if asked.out:
-        out.print(f"wrote {asked.out}")
-
-
-def _named_first(arguments: list[str]) -> list[str]:
-    """Return the arguments with `--compare A B` as `A --compare B` where nothing is named before.
-
-    Raises UserError for a single policy after a --compare that comes first.
-    """
-    if COMPARE not in arguments or not arguments[0].startswith("-"):
-        return arguments
-    place = arguments.index(COMPARE) + 1
-    both = list(takewhile(lambda word: not word.startswith("-"), arguments[place:]))
-    if place == 1 and len(both) == 1:
-        raise UserError(f"--compare {both[0]} compares with nothing: give two, as --compare {both[0]} uniform")
-    if len(both) != 2:
-        return arguments
-    first, second = both
-    return [first, *arguments[: place - 1], COMPARE, second, *arguments[place + 2 :]]
+    if options.out:
+        out.print(f"wrote {options.out}")
 
 
 def _print_agreement(named: str, policy: Any, path: Any) -> None:
@@ -136,26 +126,28 @@ def _print_agreement(named: str, policy: Any, path: Any) -> None:
     out.print(table)
 
 
-def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, str]:
+def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
     """Return the source and name of the policy to compare with. Raises UserError if it does not act in that world."""
-    given = str(asked.compare)
-    folder = shipped.folder_of(given)
-    if given in POLICIES and not folder.exists():
-        other, policy = source, given
+    if len(options.compare) > (1 if options.subject else 2):
+        raise UserError(f"--compare {' '.join(options.compare)} names too many policies: give two in all")
+    name = options.compare[-1]
+    folder = shipped.folder_of(name)
+    if name in POLICIES and not folder.exists():
+        other, policy = source, name
     elif folder.exists():
         code = source.adapted.code if source.adapted and policy_folders.is_one(folder) else None
         other = PolicySource.of_folder(folder, registry.find, code)
         if other.task.name != source.task.name:
-            raise UserError(f"{given} is of {other.task.name}, not of {source.task.name}: compare within one task")
-        other, policy = other.on(asked.robot), other.default_policy
+            raise UserError(f"{name} is of {other.task.name}, not of {source.task.name}: compare within one task")
+        other, policy = other.on(options.robot), other.default_policy
     else:
         known = ", ".join(POLICIES)
         raise UserError(
-            f"--compare is {given!r}: give a run folder, a policy folder, a shipped agent, or one of {known}"
+            f"--compare is {name!r}: give a run folder, a policy folder, a shipped agent, or one of {known}"
         )
-    if policy == asked.policy and other.folder.absolute() == source.folder.absolute():
-        raise UserError(f"--compare is {given!r}, the policy that is evaluated: give another one")
-    other.check(policy, asked.task)
+    if policy == options.policy and other.folder.absolute() == source.folder.absolute():
+        raise UserError(f"--compare is {name!r}, the policy that is evaluated: give another one")
+    other.check(policy, options.task)
     return other, policy
 
 

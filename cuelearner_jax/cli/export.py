@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Generic
 
-from cuelearner_jax.cli.parsing import out, taken
-from cuelearner_jax.cli.shared_options import Flag, Lane, Outside, TaskT, asked_of_source
+from cuelearner_jax.cli.options import Finished, Flag, Lane, out, parse
+from cuelearner_jax.cli.sources import source_and_options
 from cuelearner_jax.config import digest, to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions
@@ -17,12 +16,11 @@ from cuelearner_jax.runs import trained
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Outside, Lane, Generic[TaskT]):
+class Export(Finished, Lane):
     """Write a policy as a file for a robot, with a contract; --check FOLDER replays one.
 
     The contract tells what goes in and comes out."""
 
-    task: TaskT
     format: str = "stablehlo"
     """stablehlo, onnx or numpy."""
     out: Path = Path("exported")
@@ -33,45 +31,43 @@ class Export(Outside, Lane, Generic[TaskT]):
     scenario: str | None = None
     """A changed world, by its name, whose observations the golden cases are. Options of the task
     (--task.…) come on top of it."""
-
-
-OPTIONS = {"export": Export}
+    check: Path | None = None
+    """Instead: replay the golden cases of this exported folder."""
 
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises UserError for what cannot be exported, or does not fulfil its contract."""
-    folder, rest = taken(arguments, "--check", "the folders that were exported")
-    if folder is not None:
-        if rest:
-            raise UserError(f"--check takes a folder and nothing else: leave out {rest[0]}")
-        _check(Path(folder))
+    if any(word.partition("=")[0] == "--check" for word in arguments):
+        options = parse(Export, arguments, "export", Export())
+        assert options.check is not None  # tyro
+        _check(options.check)
         return
     formats = "\n".join(f"  {name:<11}{one.about}" for name, one in FORMATS.items())
-    source, asked = asked_of_source(arguments, "export", Export, f"\n\nformats (--format):\n{formats}")
-    name = asked.name_in(source, asked.task)
+    source, options = source_and_options(arguments, "export", Export, f"\n\nformats (--format):\n{formats}")
+    name = options.name_in(source, options.task)
     if trained.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who needs the true state: choose another policy")
-    contract.check_request(asked.format, asked.out)
-    env = source.task.environment(asked.task)
-    if asked.only_correction and source.adapted is not None:
+    contract.check_request(options.format, options.out)
+    env = source.task.environment(options.task)
+    if options.only_correction and source.adapted is not None:
         source = replace(source, adapted=replace(source.adapted, code=source.adapted.code or uniform_in(env)))
-    policy = asked.policy_in(source, asked.task, env)
+    policy = options.policy_in(source, options.task, env)
     drawn, seen = (lambda: decisions.observations(env, policy)), env
-    if asked.only_correction:
+    if options.only_correction:
         policy, seen = correction.correction_of(policy, env)
         drawn = lambda: correction.cases(env)  # noqa: E731
     origin = {
         "subject": source.folder.name,
         "policy": name,
-        **{option.replace("-", "_"): value for option, value in asked.chosen.items()},
-        "world": {"name": source.task.name, **to_json(asked.task)},
+        **options.chosen,
+        "world": {"name": source.task.name, **to_json(options.task)},
         "config": digest(to_json(source.config)),
     }
-    written = contract.write(policy, seen, drawn, asked.format, asked.out, origin)
+    written = contract.write(policy, seen, drawn, options.format, options.out, origin)
     golden = written["golden"]
     out.print(
         f"{golden['cases']} golden cases replayed, largest difference {written['difference']:.1e} "
-        f"({golden['steady']} of {golden['drawn']} decisions are insensitive to rounding); wrote {asked.out}"
+        f"({golden['steady']} of {golden['drawn']} decisions are insensitive to rounding); wrote {options.out}"
     )
 
 

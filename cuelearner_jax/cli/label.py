@@ -7,11 +7,12 @@ import dataclasses
 import os
 import shlex
 import webbrowser
+from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
@@ -19,11 +20,20 @@ import tyro
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import by_model, by_reading, changes
-from cuelearner_jax.cli import pages
-from cuelearner_jax.cli.parsing import about, check_numbers, out, parse, taken
-from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind, typed_name
-from cuelearner_jax.cli.situations import WORDS, task_named, with_cues
-from cuelearner_jax.cli.sources import code_of, is_code, preset_of
+from cuelearner_jax.cli.options import (
+    Flag,
+    Lane,
+    Outside,
+    Unnamed,
+    Word,
+    about,
+    check_numbers,
+    look_ahead_of,
+    out,
+    parse,
+)
+from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, typed_name, with_cues
+from cuelearner_jax.cli.train import asking_kind
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
@@ -39,7 +49,7 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.train import preset_kinds
-from cuelearner_jax.task import PAPER, QUICKSTART, Task, shape_of
+from cuelearner_jax.task import PAPER, QUICKSTART, Preset, Task, shape_of
 from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
@@ -50,17 +60,19 @@ MOST_LABELS = 100_000
 UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch`, or choose another --robot"
 
 
-@dataclass(frozen=True)
-class Label(Generic[TaskT]):
+@dataclass(frozen=True, kw_only=True)
+class Label(Outside):
     """Label actions in a browser: uniform ones, a policy's, or recorded ones.
 
     Name a policy after the task: a run folder, a policy folder, or package.module:NAME of a function of observations.
     In place of a task, a folder of recorded situations may be named: its recorded actions are asked about."""
 
-    task: TaskT
-    sizes: GuideSizes
-    scalars: GuideScalars
-    out: Path
+    policy: Annotated[Word, tyro.conf.arg(metavar="POLICY")] = None
+    """Policy to ask about: a run folder, a policy folder, a shipped agent, or package.module:NAME of a function."""
+    task: Any = field(default_factory=Unnamed)
+    sizes: GuideSizes = field(default_factory=GuideSizes)
+    scalars: GuideScalars = field(default_factory=GuideScalars)
+    out: Path = Path("labels/NAME")
     """Folder for the labels. A folder with labels of this session is continued."""
     labels: int = 500
     """Number of answers to collect; to continue later, give more (default without a policy: the preset's largest
@@ -100,9 +112,6 @@ class Label(Generic[TaskT]):
     base: Lane = field(default_factory=Lane)
 
 
-OPTIONS = {"label": Label}
-
-
 def run(arguments: list[str]) -> None:
     """Run the command.
 
@@ -110,50 +119,51 @@ def run(arguments: list[str]) -> None:
         UserError: bad input, a port or folder in use, or a folder with labels of another session.
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
-    server, typed = _server(), list(arguments)
-    task, rest = task_named(arguments, "label", Label)
-    named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
-    finished_policy = named is not None or task.proposed is not None  # whether the labels are to correct a policy
-    usual = PAPER if finished_policy else QUICKSTART
-    chosen, preset, rest = preset_of(task, rest, usual)
-    kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    scenario, _ = taken(rest, "--scenario", ", ".join(task.scenarios) or "none")
-    changed = task.scenario(scenario) if scenario else None
-    source = _source(task, named, taken(rest, "--changes", "package.module:NAME")[0])
-    world = source.config.task if source else preset.config.task
-    world = changed.apply(world) if changed else world
-    if (cues := taken(rest, "--cues", WORDS)[0]) is not None:
-        world = with_cues(task, world, cues)
-    by_evidence = _reads_evidence(rest, named is not None)
+    server = _server()
+    ahead = look_ahead_of(arguments, "label", Label)
+    task = recorded_or_task(ahead)
+    named = ahead.words[1] if len(ahead.words) > 1 else None
+    usual = QUICKSTART if named is None and task.proposed is None else PAPER
+    name, preset = preset_of(task, ahead.preset, usual)
+    source = _source(task, named, ahead.changes)
+    default = _suggested(task, preset, source, ahead, named)
+    options = parse(Label, arguments, "label", default, about(Label, task, preset=usual))
+    plan = make_plan(task, preset.config, options, source)
+    config = preset.config if source is None else dataclasses.replace(preset.config, task=default.task)
+    again = shlex.join(["cuelearner", "label", *arguments])
+    commands = server.Commands(again, partial(_following, task, name, config, options))
+    # The port comes first, so that nothing has been written where it is refused.
+    with server.bind(options.port) as port, claimed(options.out), interruptible("the answer of the moment") as stopping:
+        ending = _served(server, plan, options, port, stopping, commands)
+    if ending is None:
+        raise Interrupted(f"stopped; every answer is in {options.out}: repeat the same command to continue")
+    out.print(f"done: {ending.line}\nnext: {ending.following}")
+
+
+def _suggested(task: Task, preset: Preset, source: PolicySource | None, ahead: Namespace, named: str | None) -> Label:
+    """Return the default options; labels that are to correct a policy are asked for as `adapt` corrects it."""
+    scenario = task.scenario(ahead.scenario) if ahead.scenario else None
+    world = (source.config if source else preset.config).task
+    world = scenario.apply(world) if scenario else world
+    world = world if ahead.cues is None else with_cues(task, world, ahead.cues)
+    by_evidence = named is not None if ahead.guidance is None else guidances.resolve(ahead.guidance[0]).by_evidence
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
-    if finished_policy:  # as `adapt` corrects it
+    if named is not None or task.proposed is not None:
         frame = source.config.sizes.frame if source else sizes.frame
         sizes = by_model.SIZES if by_evidence else dataclasses.replace(by_model.SIZES, frame=frame)
         settling = by_reading.settling if by_evidence else by_model.settling
-        scalars = settling(scalars, changed.eps_deg if changed else None)
-        bound = changed.bound_deg if changed and not by_evidence else None
-    default = kind(
-        world,
-        _part(GuideSizes, sizes),
-        _part(GuideScalars, scalars),
-        Path("labels") / task.name,
+        scalars = settling(scalars, scenario.eps_deg if scenario else None)
+        bound = scenario.bound_deg if scenario and not by_evidence else None
+    return Label(
+        task=world,
+        sizes=_part(GuideSizes, sizes),
+        scalars=_part(GuideScalars, scalars),
+        out=Path("labels") / task.name,
         guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
         bound_deg=bound,
         labels=max(preset.labels) if named is None else by_reading.USUAL if by_evidence else Label.labels,
         questions=UNIFORM if named is not None else _usual_questions(task),
     )
-    subject = pages.subject_of(arguments[0] if task.proposed is not None else typed_name(task), task.name, task)
-    asked = parse(kind, rest, f"label {subject.typed}", default, about(Label, task, preset=usual), subject)
-    plan = make_plan(task, preset.config, asked, named, source)
-    config = preset.config if source is None else dataclasses.replace(preset.config, task=world)
-    again = shlex.join(["cuelearner", "label", *typed])
-    commands = server.Commands(again, partial(_following, task, chosen, config, asked, named))
-    # The port comes first, so that nothing has been written where it is refused.
-    with server.bind(asked.port) as port, claimed(asked.out), interruptible("the answer of the moment") as stopping:
-        finished = _served(server, plan, asked, port, stopping, commands)
-    if finished is None:
-        raise Interrupted(f"stopped; every answer is in {asked.out}: repeat the same command to continue")
-    out.print(f"done: {finished.line}\nnext: {finished.following}")
 
 
 def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
@@ -161,70 +171,62 @@ def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
     return PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
 
 
-def _reads_evidence(arguments: list[str], default: bool) -> bool:
-    """Return whether a reading is asked for; `default`: without --guidance. Raises UserError for an unknown kind."""
-    name, _ = taken(arguments, "--guidance", ", ".join(kind.name for kind in guidances.kinds()))
-    return default if name is None else guidances.resolve(name).by_evidence
-
-
-def make_plan(
-    task: Task, config: RunConfig, asked: Label[Any], named: str | None, source: PolicySource | None = None
-) -> Plan:
+def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySource | None = None) -> Plan:
     """Return the plan of the session. Raises UserError for an invalid request."""
     merged = dataclasses.replace(
         config,
-        task=asked.task,
-        sizes=dataclasses.replace(config.sizes, **dataclasses.asdict(asked.sizes)),
-        scalars=dataclasses.replace(config.scalars, **dataclasses.asdict(asked.scalars)),
+        task=options.task,
+        sizes=dataclasses.replace(config.sizes, **dataclasses.asdict(options.sizes)),
+        scalars=dataclasses.replace(config.scalars, **dataclasses.asdict(options.scalars)),
     )
     configuration.check_guide(merged.sizes, merged.scalars)
-    check_numbers(asked, labels=(1, MOST_LABELS), seed=(0, LARGEST_SEED - 1), port=(0, 65535))
-    if not asked.who.strip():
-        raise UserError("--who is empty: give a name, or leave it out")
+    check_numbers(options, labels=(1, MOST_LABELS), seed=(0, LARGEST_SEED - 1), port=(0, 65535))
     if merged.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but the page takes situations as they come: leave it out")
     if merged.sizes.store_labelled:
         raise UserError("this preset keeps labelled steps, but the page executes none: give another --preset")
-    robot, task = _robot(task, asked.robot), task.on(asked.robot)
+    robot, task = _robot(task, options.robot), task.on(options.robot)
     if task.pictures(UNDRAWN).sketch is None:
         raise UserError(f"{task.name} has no sketch of a situation: {UNDRAWN}")
-    env = shape_of(task, asked.task)
+    env = shape_of(task, options.task)
     space = actions_of(env)
-    if asked.bound_deg is not None and not 0 < asked.bound_deg <= space.reach:
+    if options.bound_deg is not None and not 0 < options.bound_deg <= space.reach:
         raise UserError(
-            f"--bound-deg is {asked.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
+            f"--bound-deg is {options.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
-    guidance = merged.guide_in(env, guidances.kind_name(asked.guidance))
+    guidance = merged.guide_in(env, guidances.kind_name(options.guidance))
     if guidance.kind.by_evidence:
-        _check_evidence(asked, named)
+        _check_evidence(options)
     if guidance.kind.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
         asking = [kind.name for kind in guidances.kinds() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
     controls.check(guidance.form, space)
-    if asked.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):
+    if options.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):
         raise UserError("--one-cue is for relative answers about several cues: leave it out")
-    wanted = asked.labels, asked.seed, asked.who.strip(), asked.bound_deg, robot
-    if asked.again is not None:
-        plan = Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted, one_cue=asked.one_cue)
-        return _second(plan, asked, named)
-    family = _family(asked, env) if guidance.kind.by_evidence else ()
-    base = _base(task, asked, named, source, env)
-    return Plan(task, merged, guidance, base, *wanted, family=family, one_cue=asked.one_cue)
+    wanted = options.labels, options.seed, options.who.strip(), options.bound_deg, robot
+    if options.again is not None:
+        plan = Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted, one_cue=options.one_cue)
+        return _second(plan, options)
+    family = _family(options, env) if guidance.kind.by_evidence else ()
+    base = _base(task, options, source, env)
+    return Plan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
 
 
-def _check_evidence(asked: Label[Any], named: str | None) -> None:
+def _check_evidence(options: Label) -> None:
     """Raise UserError for options that a reading does not use."""
-    if named is None or asked.again is not None:
+    if options.policy is None or options.again is not None:
         raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
-    scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(asked.scalars))
-    by_reading.check_unused(asked.sizes, scalars, bound_deg=asked.bound_deg)
+    scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(options.scalars))
+    by_reading.check_unused(options.sizes, scalars, bound_deg=options.bound_deg)
 
 
-def _family(asked: Label[Any], env: Any) -> Family:
+def _family(options: Label, env: Any) -> Family:
     """Return what may have changed. Raises UserError for invalid changes."""
-    return declared_distortions(env) if asked.changes is None else changes.family_of(changes.load(asked.changes), env)
+    return (
+        declared_distortions(env) if options.changes is None else changes.family_of(changes.load(options.changes), env)
+    )
 
 
 def _robot(task: Task, name: str | None) -> str:
@@ -233,25 +235,27 @@ def _robot(task: Task, name: str | None) -> str:
     return "" if body.name == task.bodies[0].name else f"{body.name} {body.digest}".strip()
 
 
-def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
+def _second(plan: Plan, options: Label) -> Plan:
     """Return a plan with the questions of another page's file. Raises UserError if they are not of this world."""
-    assert asked.again is not None
-    file = label_files.read(asked.again)
+    assert options.again is not None
+    file = label_files.read(options.again)
     if file.session is None or file.people is None:
-        raise UserError(f"{asked.again} was not written by the labelling page: its questions cannot be asked again")
-    if named is not None or asked.seed or asked.bound_deg is not None:
+        raise UserError(f"{options.again} was not written by the labelling page: its questions cannot be asked again")
+    if options.policy is not None or options.seed or options.bound_deg is not None:
         raise UserError("--again repeats another page's questions: leave out the policy, --seed and --bound-deg")
     for name, value in plan.world.items():
         if file.task.get(name) != value:
-            raise UserError(f"{asked.again} asked in a world with another {name} ({file.task.get(name)}, not {value})")
+            raise UserError(
+                f"{options.again} asked in a world with another {name} ({file.task.get(name)}, not {value})"
+            )
     if (other := file.session.get("robot", "")) != plan.robot:
-        raise UserError(f"{asked.again} asked about {other or 'its own robot'}: give the same --robot")
-    found = label_files.found_in(asked.again)
+        raise UserError(f"{options.again} asked about {other or 'its own robot'}: give the same --robot")
+    found = label_files.found_in(options.again)
     assert found is not None  # the file was read above
     actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(found)}
     again = tuple(actions[number] for number in sorted(actions))
     base = dataclasses.replace(plan.base, name=f"{file.session['base']} {file.session['base_digest']}".strip())
-    wanted, digest = min(plan.labels, len(again)), label_files.digest(asked.again)
+    wanted, digest = min(plan.labels, len(again)), label_files.digest(options.again)
     seed = int(file.session["seed"])
     return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
 
@@ -267,34 +271,38 @@ def _source(task: Task, named: str | None, changed: str | None) -> PolicySource 
     if not folder.is_dir():
         raise UserError(f"no policy at {named}: give a run folder, a policy folder or package.module:NAME")
     own = None if changed is None else changes.load(changed)
-    found = PolicySource.of_folder(folder, lambda name: task if task.name == name else registry.find(name), changes=own)
-    if found.task.name != task.name:
-        raise UserError(f"{folder} is of {found.task.name}, not of {task.name}: give one of the same task")
-    return found
+    source = PolicySource.of_folder(
+        folder, lambda name: task if task.name == name else registry.find(name), changes=own
+    )
+    if source.task.name != task.name:
+        raise UserError(f"{folder} is of {source.task.name}, not of {task.name}: give one of the same task")
+    return source
 
 
-def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource | None, env: Any) -> Base:
+def _base(task: Task, options: Label, source: PolicySource | None, env: Any) -> Base:
     """Return the policy to ask about. Raises UserError if it is not available, or needs other observations."""
-    lane = asked.base
-    if named is not None and asked.questions != UNIFORM:
-        raise UserError(f"--questions is {asked.questions}, but the questions are about {named}: leave out one of them")
+    lane, named = options.base, options.policy
+    if named is not None and options.questions != UNIFORM:
+        raise UserError(
+            f"--questions is {options.questions}, but the questions are about {named}: leave out one of them"
+        )
     if source is None:
         if lane != Lane():
             raise UserError("--base.… chooses a folder's lane, but no folder is given: leave it out")
         if named is not None:
             return Base(in_space(code_of(named), actions_of(env)), named)
-        if asked.questions == UNIFORM:
+        if options.questions == UNIFORM:
             return Base(uniform_in(env), UNIFORM)
-        if asked.questions == PROPOSED:
+        if options.questions == PROPOSED:
             if task.proposed is None:
                 raise UserError(f"--questions is {PROPOSED}, but {task.name} is not a recording: give {UNIFORM}")
-            return Base(task.proposed(task.environment(asked.task)), PROPOSED)
+            return Base(task.proposed(task.environment(options.task)), PROPOSED)
         if not offers(env, "aims"):
             raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
-        reach = float(actions_of(env).from_unit(REACH * asked.scalars.eps_deg))
-        return Base(NearAims(task.view(asked.task), reach), NEAR_AIMS)
-    name = lane.name_in(source, asked.task)
-    return Base(lane.policy_in(source, asked.task, None), f"{source.folder.resolve().name}, {name}")
+        reach = float(actions_of(env).from_unit(REACH * options.scalars.eps_deg))
+        return Base(NearAims(task.view(options.task), reach), NEAR_AIMS)
+    name = lane.name_in(source, options.task)
+    return Base(lane.policy_in(source, options.task, None), f"{source.folder.resolve().name}, {name}")
 
 
 def _part(kind: type, values: Any) -> Any:
@@ -316,16 +324,16 @@ def _server() -> Any:
     return server
 
 
-def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any, commands: Any) -> Any:
+def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, commands: Any) -> Any:
     """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
     from cuelearner_jax.labelling.opening import Opening
     from cuelearner_jax.labelling.session import Session
 
-    leads_there = asked.out / "open.html"  # command lines, unlike this file, can be read by every user of the machine
+    leads_there = options.out / "open.html"  # command lines, unlike this file, can be read by every user of the machine
 
     def open_page(address: str) -> None:
         out.print(f"open {address}")
-        if asked.open:
+        if options.open:
             leads_there.unlink(missing_ok=True)
             with os.fdopen(os.open(leads_there, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
                 file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}">\n')
@@ -335,7 +343,7 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
         console.print(f"{words} ...")
 
     def make(tell: Callable[[str], None]) -> Session:
-        return Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0)
+        return Session(plan, options.out, tell, practice=PRACTICE if options.practice else 0)
 
     with Opening(make, stopping.set, tell) as opening, contextlib.ExitStack() as end:
         end.callback(leads_there.unlink, missing_ok=True)
@@ -343,28 +351,29 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
         return server.serve(opening, f"label {plan.task.name}", port, stopping, open_page, commands)
 
 
-def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: str | None, labels: int) -> str:
+def _following(task: Task, preset: str, config: RunConfig, options: Label, labels: int) -> str:
     """Return the command that uses the labels: `train` for labels of uniform actions, `adapt` for a policy's.
 
-    `asked`: the options of `cuelearner label` as used. `config`: the preset's configuration.
+    `config`: the preset's configuration.
     """
-    name, out = typed_name(task), str(asked.out)
-    if asked.again is not None:
-        return shlex.join(["cuelearner", "labels", "inspect", str(asked.again), out])
-    given = ["--labels-from", out, "--labels", str(labels)]
-    if policy is None and asked.questions == PROPOSED:
+    name, out, policy = typed_name(task), str(options.out), options.policy
+    if options.again is not None:
+        return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
+    source = ["--labels-from", out, "--labels", str(labels)]
+    if policy is None and options.questions == PROPOSED:
         return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'
     if policy is None:
-        words = ["train", name, "--preset", preset, "--guidance", asked.guidance, *given]
+        words = ["train", name, "--preset", preset, "--guidance", options.guidance, *source]
         parts = ("task", task.config), ("sizes", GuideSizes), ("scalars", GuideScalars)
         for part, kind in parts:
-            words += _differing(part, kind, getattr(config, part), getattr(asked, part))
+            words += _differing(part, kind, getattr(config, part), getattr(options, part))
         return shlex.join(["cuelearner", *words, "--out", f"runs/{Path(out).name}"])
     words = ["adapt", policy, *([] if shipped.is_shipped(policy) or Path(policy).exists() else ["--task", name])]
-    words += [] if asked.scenario is None else ["--scenario", asked.scenario]
-    words += [] if asked.robot is None else ["--robot", asked.robot]
-    words += ["--guidance", asked.guidance, *([] if asked.changes is None else ["--changes", asked.changes]), *given]
-    words += _differing("task", task.config, config.task, asked.task)
+    words += [] if options.scenario is None else ["--scenario", options.scenario]
+    words += [] if options.robot is None else ["--robot", options.robot]
+    words += [] if options.changes is None else ["--changes", options.changes]
+    words += ["--guidance", options.guidance, *source]
+    words += _differing("task", task.config, config.task, options.task)
     return shlex.join(["cuelearner", *words, "--out", f"policies/{Path(out).name}"])
 
 

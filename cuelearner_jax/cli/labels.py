@@ -12,12 +12,9 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from cuelearner_jax.cli import pages
-from cuelearner_jax.cli.pages import HELP
-from cuelearner_jax.cli.parsing import out, parse, summary
-from cuelearner_jax.cli.shared_options import Flag
+from cuelearner_jax.cli.options import Flag, out, parse
 from cuelearner_jax.config import Scalars
-from cuelearner_jax.errors import UserError, one_line, suggestion
+from cuelearner_jax.errors import UserError, one_line
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.report.escaping import cell
 from cuelearner_jax.spaces import UNSAID
@@ -61,37 +58,28 @@ class LabelsExport:
     """New file, .csv or .parquet; an existing file is not replaced."""
 
 
-OPTIONS = {"labels inspect": Inspect, "labels merge": Merge, "labels export": LabelsExport}
-KINDS = {name.split()[1]: kind for name, kind in OPTIONS.items()}
+Labels = (
+    Annotated[Inspect, tyro.conf.subcommand("inspect")]
+    | Annotated[Merge, tyro.conf.subcommand("merge")]
+    | Annotated[LabelsExport, tyro.conf.subcommand("export")]
+)
 
 
 def run(arguments: list[str]) -> None:
     """Run one of the commands. Raises UserError for invalid files, or files that do not fit together."""
-    if not arguments or arguments[0] in HELP:
-        print("usage: cuelearner labels inspect|merge|export FILE ... [OPTIONS]\n")
-        for name, kind in KINDS.items():
-            print(f"  {name:<9}{summary(kind)}")
-        print("\nexamples:")
-        for name in OPTIONS:
-            print(*pages.lines_of(pages.examples_of(name)[:1]), sep="\n")
-        print("\nEach has --help, for instance: cuelearner labels inspect --help")
-        raise SystemExit(0 if arguments else 2)
-    name, rest = arguments[0], arguments[1:]
-    if name not in KINDS:
-        raise UserError(f"unknown command 'labels {name}'{suggestion(name, KINDS)}")
-    asked = parse(KINDS[name], rest, f"labels {name}")
-    if not asked.files:
-        raise UserError(f"name a label file: cuelearner labels {name} FILE")
-    {"inspect": _inspect, "merge": _merge, "export": _export}[name](asked)
+    options = parse(Labels, arguments, "labels")
+    if not options.files:
+        raise UserError(f"name a label file: cuelearner labels {arguments[0]} FILE")
+    {Inspect: _inspect, Merge: _merge, LabelsExport: _export}[type(options)](options)
 
 
 # --- inspect ---------------------------------------------------------------------------------------------------------
 
 
-def _inspect(asked: Inspect) -> None:
-    files = [comparing.read_checked(path) for path in asked.files]
-    table = Table("", *(one_line(str(path)) for path in asked.files))
-    told = [_told(path, file, asked.teacher) for path, file in zip(asked.files, files, strict=True)]
+def _inspect(options: Inspect) -> None:
+    files = [comparing.read_checked(path) for path in options.files]
+    table = Table("", *(one_line(str(path)) for path in options.files))
+    told = [_told(path, file, options.teacher) for path, file in zip(options.files, files, strict=True)]
     for name in dict.fromkeys(name for one in told for name in one):
         table.add_row(name, *(one_line(one.get(name, "")) for one in told))
     if len(files) == 2:
@@ -162,23 +150,23 @@ def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
 # --- merge and export ------------------------------------------------------------------------------------------------
 
 
-def _merge(asked: Merge) -> None:
-    if asked.out is None or asked.out.suffix != ".parquet":
+def _merge(options: Merge) -> None:
+    if options.out is None or options.out.suffix != ".parquet":
         raise UserError("merge needs --out: give it a name that ends in .parquet")
-    file, left_out = comparing.merge([comparing.read_checked(path) for path in asked.files])
-    sources = [f"{path.name} {label_files.digest(path)}" for path in asked.files]
-    label_files.write_file(asked.out, file, merged_from=sources)
+    file, left_out = comparing.merge([comparing.read_checked(path) for path in options.files])
+    sources = [f"{path.name} {label_files.digest(path)}" for path in options.files]
+    label_files.write_file(options.out, file, merged_from=sources)
     twice = f"; {left_out} duplicates of an earlier file's labels were left out" if left_out else ""
-    out.print(f"wrote {len(file.seeds)} labels of {len(asked.files)} files to {asked.out}{twice}")
+    out.print(f"wrote {len(file.seeds)} labels of {len(options.files)} files to {options.out}{twice}")
 
 
-def _export(asked: LabelsExport) -> None:
-    if len(asked.files) != 1:
+def _export(options: LabelsExport) -> None:
+    if len(options.files) != 1:
         raise UserError("export takes one label file: first join several by `cuelearner labels merge`")
-    place = asked.out
+    place = options.out
     if place is None or place.suffix not in (".csv", ".parquet"):
         raise UserError("export needs --out: give it a name that ends in .csv or .parquet")
-    file = comparing.read_checked(asked.files[0])
+    file = comparing.read_checked(options.files[0])
     if place.suffix == ".parquet":
         label_files.write_file(place, file)
     else:

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from cuelearner_jax.cli.parsing import out, parse
-from cuelearner_jax.cli.shared_options import Flag
+from cuelearner_jax.cli.options import Flag, out, parse
 from cuelearner_jax.errors import UserError
 
 
@@ -34,25 +33,22 @@ class Report:
     """Replace an existing report."""
 
 
-OPTIONS = {"report": Report}
-
-
 def run(arguments: list[str]) -> None:
     """Run the command. Raises UserError for what cannot be reported."""
     # The import loads Matplotlib, which no other command needs.
     from cuelearner_jax.report.document import report
 
-    asked = parse(Report, arguments, "report")
-    if not asked.folders:
+    options = parse(Report, arguments, "report")
+    if not options.folders:
         raise UserError("no folder to report on: cuelearner report RUN_FOLDER ... --out FOLDER")
     written = report(
-        asked.folders,
-        asked.out,
-        asked.metric,
-        split=asked.split,
-        lower_is_better=asked.lower_is_better,
-        by_run=asked.by_run,
-        overwrite=asked.overwrite,
+        options.folders,
+        options.out,
+        options.metric,
+        split=options.split,
+        lower_is_better=options.lower_is_better,
+        by_run=options.by_run,
+        overwrite=options.overwrite,
         command=shlex.join(["cuelearner", "report", *arguments]),
     )
     out.print(f"wrote {written}")

@@ -1,60 +1,74 @@
-"""What the first words of a command line name: a task and its preset, a run folder, a policy or its code."""
+"""What a command line names: a task and its preset, a folder with policies, a policy's code, recorded situations."""
 
 from __future__ import annotations
 
 import dataclasses
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
 from cuelearner_jax import plugins
 from cuelearner_jax.adaptation import changes
-from cuelearner_jax.cli.pages import HELP, HELP_ALL
-from cuelearner_jax.cli.parsing import explain, taken
+from cuelearner_jax.cli.options import about, look_ahead_of, parse
 from cuelearner_jax.environment import actions_of, check_layout
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.policies import policy_of, teaching
 from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.spaces import cues_from
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import PAPER, Preset, Task, shape_of
-from cuelearner_jax.tasks import registry, shipped
-
-TASK_OPTIONS = ("--task", "--env")  # two names of one option
-
-
-def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[str]]:
-    """Return the task named first, or by --task or --env, and the other arguments. Raises UserError if unavailable.
-
-    --teacher makes code its teacher.
-    """
-    given, rest = _task_option(arguments)
-    teacher, rest = taken(rest, "--teacher", "package.module:NAME")
-    if given is None:
-        if not rest or rest[0] in HELP:
-            explain(command, kind, "TASK", HELP_ALL in rest)
-            raise SystemExit(0 if arguments else 2)
-        given, rest = rest[0], rest[1:]
-    elif rest and not rest[0].startswith("-"):
-        raise UserError(f"the task is named twice, {rest[0]!r} and {given!r}: name it once")
-    return _taught(registry.resolve(given), teacher), rest
+from cuelearner_jax.tasks import logs, registry, shipped
+from cuelearner_jax.terminal import console
 
 
-def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[str, Preset, list[str]]:
-    """Return the preset (default: `default` or the first) and the other arguments. Raises UserError if unknown."""
+def task_of(ahead: Namespace) -> Task:
+    """Return the task named first, or by --task or --env; --teacher makes code its teacher. Raises UserError."""
+    option = _task_option(ahead)
+    if option is not None and ahead.words:
+        raise UserError(f"the task is named twice, {ahead.words[0]!r} and {option!r}: name it once")
+    return _with_teacher(registry.resolve(option or ahead.words[0]), ahead.teacher)
+
+
+def recorded_or_task(ahead: Namespace) -> Task:
+    """Return the task of a folder of recorded situations that is named first, or `task_of`."""
+    folder = ahead.words[0].removeprefix("logs:") if ahead.words else ""
+    if not folder or folder in registry.names() or not (Path(folder).exists() or folder != ahead.words[0]):
+        return task_of(ahead)
+    low, high, actions = (getattr(ahead, f"task.{name}") for name in ("low", "high", "actions"))
+
+    def note(words: str) -> None:
+        console.print(words.replace("give low and high", "give --task.low and --task.high"))
+
+    return logs.task_of(folder, ahead.cues or "", low, high, actions or "box", note=note)
+
+
+def with_cues(task: Task, config: Any, cues: str) -> Any:
+    """Return a task's configuration with other words for its cues. Raises UserError if the cues are the task's own."""
+    fields = {entry.name for entry in dataclasses.fields(config)}
+    if not {"cues", "cue_names"} <= fields:
+        raise UserError(f"--cues names cues, and {task.name} has its own: leave it out")
+    own = {"keys": ()} if "keys" in fields else {}  # the recorded keys belong to the replaced words
+    changed = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in cues_from(cues)), **own)
+    shape_of(task, changed)  # reports cues that do not fit
+    return changed
+
+
+def preset_of(task: Task, name: str | None, default: str = PAPER) -> tuple[str, Preset]:
+    """Return the preset of a name (default: `default` or the first). Raises UserError if unknown."""
     if not task.presets and task.name in registry.FAMILIES:
         raise UserError(f"{task.name} is a family of tasks: name one of its environments, as {task.name}:NAME")
     if not task.presets:
         raise UserError(f"{task.name} has no preset to start from: give its Task one")
-    name, rest = taken(arguments, "--preset", ", ".join(task.presets))
     name = task.first_preset(default) if name is None else name
     if name not in task.presets:
         raise UserError(f"unknown preset {name!r}{suggestion(name, task.presets)}")
-    return name, task.presets[name], rest
+    return name, task.presets[name]
 
 
-def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
-    """Return the run folder, policy folder or task named first, and the other arguments.
+def source_of(ahead: Namespace) -> PolicySource:
+    """Return the run folder, policy folder or task named first.
 
     --task, or --env, makes an outside task known, and a library's environment the world of a folder. --teacher makes
     code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code.
@@ -62,75 +76,73 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
     Raises:
         UserError: the folder or task does not exist or is not available.
     """
-    given, rest = _task_option(arguments)
-    teacher, rest = taken(rest, "--teacher", "package.module:NAME")
-    known = None if given is None else registry.resolve(given)
-    reference, rest = taken(rest, "--base", "package.module:NAME")
-    code = None if reference is None else code_of(reference)
-    named, rest = taken(rest, "--changes", "package.module:NAME")
-    changed = None if named is None else changes.load(named)
+    named, option = ahead.words[0] if ahead.words else None, _task_option(ahead)
+    task = None if option is None else registry.resolve(option)
+    code = None if ahead.base is None else code_of(ahead.base)
     for name, parts in PARTS.items():
-        reference, rest = taken(rest, f"--{name}", "package.module:NAME")
-        if reference is not None:
-            parts.resolve(reference)
-    if known is None and (not rest or rest[0] in HELP):
-        explain(command, kind, "FOLDER|TASK", HELP_ALL in rest)
-        raise SystemExit(0 if arguments else 2)
-    if rest and (known is None or not rest[0].startswith("-")):
-        name, rest = rest[0], rest[1:]
-        folder = shipped.folder_of(name)
+        if (part := getattr(ahead, name)) is not None:
+            parts.resolve(part)
+    if named is not None:
+        folder = shipped.folder_of(named)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
-        if holds or (folder.exists() and name not in registry.names()):
-            source = _of_folder(folder, known, code, changed)
-            if named is not None and source.adapted is None and command != "adapt":
-                raise UserError(f"{folder} is a run, without changes in its policies: leave out --changes")
-            return dataclasses.replace(source, task=_taught(source.task, teacher)), rest
-        if known is not None:
-            raise UserError(f"{name!r} is no run folder of the task {known.name}: give one, or leave it out")
-        if ":" not in name and name not in registry.names():
+        if holds or (folder.exists() and named not in registry.names()):
+            own = None if ahead.changes is None else changes.load(ahead.changes)
+            source = _of_folder(folder, task, code, own)
+            return dataclasses.replace(source, task=_with_teacher(source.task, ahead.teacher))
+        if task is not None:
+            raise UserError(f"{named!r} is no run folder of the task {task.name}: give one, or leave it out")
+        if ":" not in named and named not in registry.names():
             raise UserError(
-                f"{name!r} is neither a run folder nor a task ({', '.join(registry.names())}) "
+                f"{named!r} is neither a run folder nor a task ({', '.join(registry.names())}) "
                 f"nor a shipped agent ({', '.join(shipped.names())})"
             )
-        known = registry.resolve(name)
-    assert known is not None  # otherwise the first argument was taken for its name
+        task = registry.resolve(named)
+    assert task is not None  # otherwise a word was named
     if code is not None:
         raise UserError("--base names the code in a policy folder: give that folder, or leave it out")
-    _, preset, rest = preset_of(known, rest)
-    return PolicySource(_taught(known, teacher), preset.config, None, Path(known.name)), rest
+    _, preset = preset_of(task, ahead.preset)
+    return PolicySource(_with_teacher(task, ahead.teacher), preset.config, None, Path(task.name))
 
 
-def world_of(source: PolicySource, arguments: list[str]) -> Any:
-    """Return the source's world, changed by --scenario; options on top are parsed from the same arguments later.
+def source_and_options(
+    arguments: list[str], command: str, kind: Any, more: str = "", **defaults: Any
+) -> tuple[PolicySource, Any]:
+    """Return the policies' source, with the chosen robot, and the options of a command about finished policies.
 
-    Raises:
-        UserError: there is no such scenario.
+    `more` is added to the help's text. Raises UserError for choices that do not exist.
     """
-    name, _ = taken(arguments, "--scenario", ", ".join(source.task.scenarios) or "none")
-    return source.config.task if name is None else source.task.scenario(name).apply(source.config.task)
+    ahead = look_ahead_of(arguments, command, kind)
+    if not ahead.words and len(ahead.compare or ()) > 1:  # evaluate --compare A B
+        ahead.words = ahead.compare[:1]
+    source = source_of(ahead)
+    world = source.config.task
+    if ahead.scenario is not None:
+        world = source.task.scenario(ahead.scenario).apply(world)
+    default = kind(task=world, policy=source.default_policy, **defaults)
+    options = parse(kind, arguments, command, default, about(kind, source.task, policies=True) + more)
+    return source.on(getattr(options, "robot", None)), options
 
 
-def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
-    choices = f"{', '.join(registry.names())}, or package.module:name"
-    found, rest = [], arguments
-    for option in TASK_OPTIONS:
-        given, rest = taken(rest, option, choices)
-        if given is not None:
-            found.append(_environment(given) if option == "--env" else given)
-    if len(found) > 1:
-        raise UserError(f"the task is named twice, {found[0]!r} and {found[1]!r}: name it once")
-    return (found or [None])[0], rest
+def typed_name(task: Task) -> str:
+    """Return how a task is named on the command line."""
+    return task.origin or task.named or task.name
 
 
-def _environment(given: str) -> str:
+def _task_option(ahead: Namespace) -> str | None:
+    if ahead.task is not None and ahead.env is not None:
+        raise UserError(f"the task is named twice, {ahead.task!r} and {ahead.env!r}: name it once")
+    return ahead.task if ahead.env is None else _environment(ahead.env)
+
+
+def _environment(name: str) -> str:
     """Return the name of a task; code that is no task is an environment of Gymnasium's kind."""
-    is_outside = plugins.REFERENCE.fullmatch(given) and given.partition(":")[0] not in registry.FAMILIES
-    if is_outside and not isinstance(plugins.load(given, object, "an environment"), Task):
-        return f"gymnasium:{given}"
-    return given
+    is_outside = plugins.REFERENCE.fullmatch(name) and name.partition(":")[0] not in registry.FAMILIES
+    if is_outside and not isinstance(plugins.load(name, object, "an environment"), Task):
+        return f"gymnasium:{name}"
+    return name
 
 
-def _taught(task: Task, reference: str | None) -> Task:
+def _with_teacher(task: Task, reference: str | None) -> Task:
     """Return the task with the teacher that `package.module:NAME` leads to: a teacher, or a policy used as one.
 
     Raises UserError if there is none.

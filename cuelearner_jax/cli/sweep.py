@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any
 
-from cuelearner_jax.cli.parsing import out
-from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset
+from cuelearner_jax.cli.options import out
+from cuelearner_jax.cli.train import Training, task_and_options
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.studies import train
 
 
-@dataclass(frozen=True)
-class Sweep(Training[RunT], Generic[RunT]):
+@dataclass(frozen=True, kw_only=True)
+class Sweep(Training):
     """Train seeds x label budgets x kinds of guidance in one process."""
 
     guidance: tuple[str, ...] = ()
@@ -29,19 +29,16 @@ class Sweep(Training[RunT], Generic[RunT]):
     shard is continued."""
 
 
-OPTIONS = {"sweep": Sweep}
-
-
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
-    task, asked = asked_of_preset(arguments, "sweep", Sweep, _options)
-    grid = Grid(asked.guidance, seeds_of(asked.first_seed, asked.seeds), asked.labels)
-    shard = Shard.parse(asked.shard) if asked.shard else None
-    train.run(asked.order(task, grid, shard))
-    out.print(asked.done)
+    task, options = task_and_options(arguments, "sweep", Sweep, _of_grid)
+    grid = Grid(options.guidance, seeds_of(options.first_seed, options.seeds), options.labels)
+    shard = Shard.parse(options.shard) if options.shard else None
+    train.run(options.order(task, grid, shard))
+    out.print(options.done)
 
 
-def _options(grid: Grid) -> dict[str, Any]:
+def _of_grid(grid: Grid) -> dict[str, Any]:
     """Return the options of what a preset compares."""
     seeds = {"seeds": len(grid.seeds), "first_seed": grid.seeds[0]}
     return {"guidance": grid.guidance, "labels": grid.labels, **seeds}

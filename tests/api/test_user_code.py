@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -172,8 +171,7 @@ def test_a_refusal_of_the_package_within_a_policy_is_told_as_it_is():
 
 
 def test_the_command_line_says_it_in_one_line_above_the_users_own_traceback(monkeypatch, capsys):
-    failing = SimpleNamespace(run=functools.partial(Failing.Window().step, None, None))
-    monkeypatch.setattr(dispatch, "_file", lambda command: failing)
+    monkeypatch.setattr("cuelearner_jax.cli.train.run", functools.partial(Failing.Window().step, None, None))
     assert dispatch.main(["train"]) == 2
     first, second, place, *_, last = capsys.readouterr().err.splitlines()
     assert first.startswith("error: Failing.Window.step raised ZeroDivisionError: no floor here")

@@ -203,7 +203,7 @@ def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
 def defaults_of(capsys, *options):
     """What `adapt` would take, by the options of its help."""
     with pytest.raises(SystemExit) as status:
-        main(["adapt", "own_turned:straight", *TASK, *options, "--help-all"])
+        main(["adapt", "own_turned:straight", *TASK, *options, "--help"])
     assert status.value.code == 0
     shown = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
     wanted = ("--guidance", "--judge-by", "--sizes.labels-per-round", "--scalars.k-max")
@@ -220,7 +220,7 @@ def test_a_scenario_says_how_unless_another_kind_is_asked_for(home, capsys):
 def test_a_scenario_says_which_bounds_are_tried_unless_labels_decide(home, capsys):
     for options, shown in (([], "(default: 0.5 0.25)"), (["--judge-by", "labels"], "(default: )")):
         with pytest.raises(SystemExit):
-            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *FIT, *options, "--help-all"])
+            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *FIT, *options, "--help"])
         told = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
         assert shown in told[told.index("--judge-bounds") : told.index("--overwrite")]
 

@@ -11,16 +11,12 @@ import urllib.request
 from pathlib import Path
 
 import numpy as np
-import probes
 import pytest
 from sessions import OWN, expert, plan, served
 
 from cuelearner_jax.cli import label, main
-from cuelearner_jax.labelling.plan import Base
 from cuelearner_jax.labelling.session import Session
-from cuelearner_jax.policies import Uniform
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry as tasks
 
@@ -97,7 +93,6 @@ def test_a_browser_is_told_a_file_that_others_cannot_read(tmp_path, monkeypatch)
         (["--bound-deg", "0"], "--bound-deg is 0: give a number above 0 and up to 180"),
         (["--port", "70000"], "--port is 70000: give a number"),
         (["--base.seed", "1"], "--base.… chooses a folder's lane, but no folder is given"),
-        (["--who", " "], "--who is empty"),
         (["--one-cue"], "--one-cue is for relative answers about several cues: leave it out"),
         (["--cues", "left,right"], "has its own: leave it out"),
         (["--robot", "anymal"], "has no robots to choose from"),
@@ -205,11 +200,6 @@ def test_a_reading_is_planned_with_what_may_have_changed(refused, tmp_path, monk
         refused(command, f"{name} is {float(value):g}" if "bound" not in name else "leave bound_deg out", tmp_path)
 
 
-def test_set_up_installs_what_the_page_needs():
-    rule = (ROOT / "Makefile").read_text().partition("$(VENV)/.installed:")[2].partition("\n\n")[0]
-    assert "--editable '.[label]'" in rule
-
-
 def test_policies_that_cannot_be_had_are_refused(refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(["label", OWN, "nowhere", "--out", "labels"], "no policy at nowhere: give a run folder", tmp_path)
@@ -254,27 +244,7 @@ def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
     refused(["labels", "export", both, labelled / "one", "--out", "x.csv"], "takes one label file", tmp_path)
     refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
     refused(["labels", "inspect", both, "--teacher"], "replay its situations", tmp_path)
-    refused(["labels", "mend"], "unknown command 'labels mend'", tmp_path)
-
-
-def test_runs_take_a_pages_folder(labelled, tmp_path):
-    from page_task import TASK
-
-    from cuelearner_jax.runs.grid import Grid
-    from cuelearner_jax.runs.order import read_labels
-
-    config, grid = probes.CONFIG, Grid(("relative",), (5,), (12,))
-    file = read_labels(labelled / "one", TASK, config.task, config.sizes, config.scalars, grid)
-    assert len(file.seeds) == 12
-
-
-def test_a_page_that_is_kept_is_not_opened_twice(labelled, refused):
-    with claimed(labelled / "one"):
-        refused(["label", OWN, "--out", labelled / "one"], "is being written by another process", labelled)
-
-
-def test_a_base_is_told_apart_by_its_parameters():
-    assert Base(Uniform(), "uniform").digest == ""
+    refused(["labels", "mend"], "Available subcommands: inspect, merge, export", tmp_path)
 
 
 def test_the_file_names_another_robot_and_that_one_has_a_page():

@@ -1,14 +1,12 @@
 """A task of the user's own, in a file beside: trained, evaluated, and never loaded because a run folder names it."""
 
-import importlib
 import json
-import re
 import sys
 
 import pytest
 
 from cuelearner_jax.cli import main, sweep
-from cuelearner_jax.cli.shared_options import asked_of_preset
+from cuelearner_jax.cli.train import task_and_options
 from cuelearner_jax.storage import results
 from cuelearner_jax.tasks import registry
 
@@ -88,15 +86,6 @@ def test_a_run_goes_on_wherever_its_task_has_moved(run, home):
     assert json.loads((run / "config.json").read_text())["task"]["from"] == "own_window:TASK"
 
 
-def test_where_a_task_is_from_changes_no_hash(run, home, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(home)
-    registry.register(importlib.import_module("own_window").TASK)
-    assert main(["train", "window", "--guidance", "none", "--out", str(tmp_path / "again")]) == 0
-    assert "from" not in json.loads((tmp_path / "again" / "config.json").read_text())["task"]
-    here, there = ({row["config_hash"] for row in results.read(out).to_pylist()} for out in (run, tmp_path / "again"))
-    assert here == there
-
-
 def test_a_scenario_is_the_ground_for_options(run, tmp_path):
     worlds = []
     for number, option in enumerate(([], ["--scenario", "narrow"], ["--task.half-width-deg", "9"])):
@@ -115,8 +104,7 @@ def test_what_cannot_be_is_refused(run, refused, tmp_path):
     refused(["train", "own_window:MUTE", "--guidance", "relative", *new], "mute has no teacher to ask", tmp_path)
     refused(["train", "own_window:TASKS", *new], "own_window has no 'TASKS', did you mean 'TASK'", tmp_path)
     refused(["train", "billiards", "--task", "navigation", *new], "the task is named twice", tmp_path)
-    refused(["train", "--task", "billiards", "--task", "navigation", *new], "--task is given twice", tmp_path)
-    refused(["train", "--task"], "--task needs a name", tmp_path)
+    refused(["train", "--task"], "--task: expected one argument", tmp_path)
     refused(["evaluate", "own_window:TASK", "--scenario", "narow"], "did you mean 'narrow'", tmp_path)
     forget()
     refused(["evaluate", run, "--task", "own_window:MUTE"], "add --task own_window:TASK", run)
@@ -124,32 +112,9 @@ def test_what_cannot_be_is_refused(run, refused, tmp_path):
     refused(["evaluate", run, "--task", "own_window:MUTE"], "is a run of window, not of mute: leave out --task", run)
 
 
-def test_help_names_what_there_is_to_choose_from(capsys):
-    for command in ("train", "sweep", "evaluate", "render"):
-        with pytest.raises(SystemExit) as stop:
-            main([command, "own_window:TASK", "--help-all"])
-        assert stop.value.code == 0
-        told = capsys.readouterr().out
-        for name, about in (
-            ("small", "seconds"),
-            ("narrow", r"a narrow window \(--task\.half-width-deg 5\.0\)"),
-            ("relative", "a model of"),
-        ):
-            assert re.search(rf"^  {name} +{about}", told, re.MULTILINE)
-
-
 def test_training_starts_from_the_preset_of_minutes_where_none_is_named():
     task = registry.find("billiards")
-    asked = asked_of_preset(["billiards", "--schedule.eval-envs", "4"], "sweep", sweep.Sweep, sweep._options)[1]
-    assert asked.out.name == "billiards-quickstart"
-    assert asked.run.schedule.total_steps == task.presets["quickstart"].config.schedule.total_steps
-
-
-@pytest.mark.parametrize("command", ["train", "sweep", "adapt", "evaluate", "render", "export"])
-def test_help_says_how_a_world_and_a_teacher_of_ones_own_are_named(command, capsys):
-    for whole in ("--help", "--help-all"):
-        with pytest.raises(SystemExit):
-            main([command, "billiards", whole])
-        told = capsys.readouterr().out
-        named = ("--env", "--teacher") if whole == "--help-all" or command in ("train", "sweep", "adapt") else ()
-        assert all(f"  {option} " in told for option in named), told
+    words = ["billiards", "--schedule.eval-envs", "4"]
+    options = task_and_options(words, "sweep", sweep.Sweep, sweep._of_grid)[1]
+    assert options.out.name == "billiards-quickstart"
+    assert options.run.schedule.total_steps == task.presets["quickstart"].config.schedule.total_steps

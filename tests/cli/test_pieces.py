@@ -3,12 +3,10 @@
 import json
 import shutil
 
-import numpy as np
 import pytest
 from probes import edit_json
 from small_runs import SMALL
 
-import cuelearner_jax as cl
 from cuelearner_jax.cli import main
 
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]
@@ -72,15 +70,6 @@ def test_pieces_at_other_steps_are_not_averaged(pieces, measured):
     rows, told = measured(pieces)
     assert [(row["trained_steps"], row["seeds"]) for row in rows] == [(200, [7, 8]), (100, [9])]
     assert told == f"{pieces / 'shard-2-of-2'}: none guidance at step 100 of 200\n"
-
-
-@pytest.mark.long
-def test_a_lane_of_any_piece_is_drawn_and_called(sweeps, tmp_path):
-    command = ["render", str(sweeps / "pieces"), "--seed", "9", "--steps", "1", "--question", "--out", str(tmp_path)]
-    assert main(command) == 0
-    obs = np.linspace(-0.2, 0.2, 6)
-    whole, pieces = (cl.load_policy(sweeps / name, seed=9)(obs) for name in ("whole", "pieces"))
-    np.testing.assert_array_equal(whole, pieces)
 
 
 @pytest.mark.long

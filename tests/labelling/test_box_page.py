@@ -22,8 +22,8 @@ def planned(**options):
     config = TASK.presets["paper"].config
     sizes, scalars = label._part(GuideSizes, config.sizes), label._part(GuideScalars, SCALARS)
     options = {"labels": 20, "guidance": "relative", **options}
-    asked = label.Label(config.task, sizes, scalars, label.Path("labels"), **options)
-    return label.make_plan(TASK, config, asked, None)
+    asked = label.Label(task=config.task, sizes=sizes, scalars=scalars, out=label.Path("labels"), **options)
+    return label.make_plan(TASK, config, asked)
 
 
 def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():

@@ -12,7 +12,8 @@ pytest.importorskip("nicegui")
 from page_user import press, shown
 
 from cuelearner_jax.cli import label
-from cuelearner_jax.cli.situations import task_named, with_cues
+from cuelearner_jax.cli.options import look_ahead
+from cuelearner_jax.cli.sources import recorded_or_task, with_cues
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.labelling import controls, pointing, view
@@ -141,19 +142,19 @@ def test_one_press_about_one_cue_says_nothing_of_the_others():
 @pytest.mark.long
 def test_one_cue_a_press_on_a_folder_of_pictures(folder, tmp_path):
     arguments = [str(folder), "--cues", CUES, *BOUNDS]
-    task, _ = task_named(arguments, "label", label.Label)
+    task = recorded_or_task(look_ahead(arguments))
     config = task.presets["paper"].config
     asked = label.Label(
-        task.plain(),
-        label._part(label.GuideSizes, label.by_model.SIZES),
-        label._part(label.GuideScalars, config.scalars),
-        tmp_path / "labels",
+        task=task.plain(),
+        sizes=label._part(label.GuideSizes, label.by_model.SIZES),
+        scalars=label._part(label.GuideScalars, config.scalars),
+        out=tmp_path / "labels",
         guidance="relative",
         labels=10,
         questions="proposed",
         one_cue=True,
     )
-    plan = label.make_plan(task, config, asked, None)
+    plan = label.make_plan(task, config, asked)
     with Session(plan, tmp_path / "labels") as session:
 
         async def acts(user, pages):
@@ -228,18 +229,18 @@ def test_the_page_shows_what_gymnasium_renders_and_films_where_an_action_leads(t
         (["--cues", "left,right;up,down"], "2 pairs of words for 3 entries"),
         (["--cues", "left;right"], "two words for each entry"),
         ([*BOUNDS[:4]], "low is given alone"),
-        (["--task.low", "a", "b"], "--task.low is 'a b': give a number for each entry"),
+        (["--task.low", "a", "b"], "--task.low: invalid float value: 'a'"),
     ],
 )
 def test_what_does_not_fit_a_folder_is_told_in_one_line(folder, given, told):
     with pytest.raises(UserError, match=re.escape(told)):
-        task_named([str(folder), *given], "label", label.Label)
+        recorded_or_task(look_ahead([str(folder), *given]))
 
 
 def test_cues_and_one_cue_need_a_space_that_has_several(tmp_path):
-    task, _ = task_named(["navigation"], "label", label.Label)
+    task = recorded_or_task(look_ahead(["navigation"]))
     with pytest.raises(UserError, match="navigation has its own: leave it out"):
         with_cues(task, task.plain(), "left,right")
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="is empty"):
-        task_named([str(tmp_path / "empty")], "label", label.Label)
+        recorded_or_task(look_ahead([str(tmp_path / "empty")]))

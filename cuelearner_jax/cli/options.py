@@ -1,0 +1,233 @@
+"""Options that several commands share, and how a command line becomes a dataclass: a field is an option.
+
+A task, a preset or a kind of guidance decides which other options there are. So `look_ahead` reads those words first;
+from them a command makes the default options, whose types tyro turns into the command's options.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import inspect
+import io
+import os
+import re
+from dataclasses import dataclass, field
+from itertools import takewhile
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.runs import trained
+from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.task import PAPER, Task
+from cuelearner_jax.tasks import registry
+from cuelearner_jax.terminal import PLAIN
+
+Flag = tyro.conf.FlagCreatePairsOff
+Word = Annotated[str | None, tyro.conf.Positional]
+unprefixed = tyro.conf.arg(name="")
+Kinds = Annotated[dict[str, Any], unprefixed]  # options of kinds of guidance, named `--KIND.…`
+HELP = ("-h", "--help")
+
+
+class _Output(Console):
+    """Standard output."""
+
+    def on_broken_pipe(self) -> None:
+        """Raise BrokenPipeError: the reader of the output has gone."""
+        raise BrokenPipeError
+
+
+out = _Output(**PLAIN)
+
+
+@dataclass(frozen=True)
+class Unnamed:
+    """Options of a task that is not named yet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outside:
+    """What a command is about, and the code and worlds that it names."""
+
+    subject: Annotated[Word, tyro.conf.arg(metavar="TASK|FOLDER")] = None
+    """A task by its name, as package.module:NAME or as gymnasium:FetchReach-v4; or a run folder, a policy folder or a
+    shipped agent, for commands about finished policies."""
+    env: Annotated[str | None, tyro.conf.arg(aliases=("--task",))] = None
+    """World: a task, or a library's environment, as gymnasium:FetchReach-v4 (--task is another name of this option)."""
+    teacher: str | None = None
+    """Your own teacher: package.module:NAME of a function of observations, a policy or a teacher (default: the
+    task's)."""
+    preset: str | None = None
+    """Preset of the task, by its name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """A run's parts from outside the package, or other parts than the preset's."""
+
+    agent_part: Annotated[str | None, tyro.conf.arg(name="agent")] = None
+    """Agent: ddqn, sac, or package.module:NAME of your own."""
+    arbiter_part: Annotated[str | None, tyro.conf.arg(name="arbiter")] = None
+    """Arbiter, by its name, or package.module:NAME of your own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finished(Outside, Parts):
+    """A finished policy's code, which is never loaded because a file names it, and its world."""
+
+    task: Any = field(default_factory=Unnamed)
+    code: Annotated[str | None, tyro.conf.arg(name="base")] = None
+    """Code of a policy folder's base policy: package.module:NAME."""
+    changes: str | None = None
+    """Distortions of your own that a reading of answers knows, in place of those that the world declares:
+    package.module:NAME."""
+    scenario: str | None = None
+    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lane:
+    """Choice of a folder's policy, and of its lane."""
+
+    policy: str | None = None
+    """Name of the acting policy, as for evaluate (default: the agent, or the adapted policy)."""
+    guidance: str | None = None
+    """Kind of guidance of the lane (default: the run's last)."""
+    labels: int | None = None
+    """Label budget of the lane (default: the largest)."""
+    bound_deg: float | None = None
+    """Bound of a policy folder's lane (default: the largest) [deg]."""
+    seed: int | None = None
+    """Seed of the lane (default: the first)."""
+
+    @property
+    def chosen(self) -> dict[str, Any]:
+        """Return the options that were given to choose a lane, by name."""
+        lane = {"guidance": self.guidance, "labels": self.labels, "seed": self.seed, "bound_deg": self.bound_deg}
+        return {name: value for name, value in lane.items() if value is not None}
+
+    def name_in(self, source: PolicySource, world: Any) -> str:
+        """Return the policy's name. Raises UserError if the source has no such policy, or none for that world."""
+        name = self.policy or source.default_policy
+        source.check(name, world, guidance=self.guidance)
+        return name
+
+    def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:
+        """Return the single policy. Raises UserError if there is no such lane."""
+        name = self.policy or source.default_policy
+        return trained.one_policy(source, world, name, self.guidance, self.labels, self.seed, self.bound_deg, env)
+
+
+ONE = ("task", "env", "teacher", "preset", "scenario", "agent", "arbiter", "base", "changes", "labels-from", "judge-by")
+SEVERAL = ("guidance", "compare")  # options with several words
+
+
+class _Ahead(argparse.ArgumentParser):
+    def error(self, message: str) -> Any:
+        """Raise UserError."""
+        raise UserError(message.removeprefix("argument "))
+
+
+def look_ahead(arguments: list[str]) -> argparse.Namespace:
+    """Return the options that decide which other options there are, and the words before the first option as `words`.
+
+    An option that is not given is None. Raises UserError for an option without its value.
+    """
+    parser = _Ahead(add_help=False, allow_abbrev=False)
+    for name in ONE:
+        parser.add_argument(f"--{name}")
+    for name in SEVERAL:
+        parser.add_argument(f"--{name}", nargs="*")
+    for name in ("low", "high"):
+        parser.add_argument(f"--task.{name}", nargs="*", type=float)
+    parser.add_argument("--task.actions")
+    parser.add_argument("--cues")
+    ahead, rest = parser.parse_known_args(arguments)
+    ahead.words = list(takewhile(lambda word: not word.startswith("-"), rest))
+    return ahead
+
+
+def look_ahead_of(arguments: list[str], command: str, kind: type) -> argparse.Namespace:
+    """Return `look_ahead`'s options. Where nothing is named, print help (SystemExit) or raise UserError."""
+    ahead = look_ahead(arguments)
+    if ahead.words or ahead.task or ahead.env or len(ahead.compare or ()) > 1:
+        return ahead
+    tasks = ", ".join(registry.names())
+    if any(word in HELP for word in arguments):
+        about = f"{summary(kind)}\n\ntasks: {tasks}; or one of your own, as package.module:NAME\n\n"
+        parse(kind, ["--help"], command, kind(), f"{about}With a task, --help lists the task's options too.")
+    raise UserError(f"{command} needs a subject: name a task ({tasks}) or a folder; see cuelearner {command} --help")
+
+
+def summary(kind: type) -> str:
+    """Return a command's purpose: its options' docstring."""
+    return inspect.cleandoc(kind.__doc__ or "")
+
+
+def parse(kind: Any, arguments: list[str], command: str, default: Any = None, about: str = "") -> Any:
+    """Return arguments as a dataclass. Raises UserError with tyro's message in one line, or for an impossible `out`.
+
+    `about`: the text above the options (default: the docstring of `kind`).
+    """
+    errors = io.StringIO()
+    chosen: dict[str, Any] = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(errors):
+            options = tyro.cli(kind, args=arguments, prog=f"cuelearner {command}", description=about or None, **chosen)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [re.sub("[-─]{3,}", "", line).strip("│╭╮╰╯|+ ") for line in errors.getvalue().splitlines()]
+        message = re.split("For full helptext|Argument helptext", " ".join(" ".join(lines[1:]).split()))[0].strip()
+        raise UserError(f"{message}; see cuelearner {command} --help") from None
+    check_out(getattr(options, "out", None))
+    return options
+
+
+def check_out(place: Path | None) -> None:
+    """Raise UserError unless the folder of an output exists, or can be made, and may be written to."""
+    if place is None:
+        return
+    there = next(parent for parent in place.absolute().parents if parent.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise UserError(f"{there} is not a folder that may be written to: give another --out")
+
+
+def check_numbers(options: Any, **bounds: tuple[int, int]) -> None:
+    """Raise UserError for the first option, by its field, that is outside its bounds (least, most)."""
+    for name, (least, most) in bounds.items():
+        if not least <= (value := getattr(options, name)) <= most:
+            raise UserError(f"--{name} is {value}: give a number from {least} to {most:,}")
+
+
+def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:
+    """Return the text above a command's options: its purpose and the names to choose from. `preset`: the default."""
+    scenarios = {name: f"{one.about} ({_as_options(one.changes)})" for name, one in task.scenarios.items()}
+    presets = {name: f"{one.about}{f' ({one.takes})' if one.takes else ''}" for name, one in task.presets.items()}
+    default = f"; {task.first_preset(preset)} where none is given" if presets else ""
+    groups = {
+        f"presets (--preset{default})": presets,
+        "changed worlds (--scenario)": scenarios,
+        "robots (--robot)": {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {},
+        "guidance (--guidance; your own as package.module:NAME)": {one.name: one.about for one in guidances.kinds()},
+        "policies (--policy)": {name: one.about for name, one in POLICIES.items()} if policies else {},
+    }
+    # A line that is not indented would be taken for the end of the one above: the groups stand apart.
+    return "\n\n".join([summary(kind), *(f"{title}:\n{_rows(rows)}" for title, rows in groups.items() if rows)])
+
+
+def _as_options(changes: dict[str, Any]) -> str:
+    """Return fields of a configuration as command-line options."""
+    several = {name: value if isinstance(value, tuple) else (value,) for name, value in changes.items()}
+    return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in several.items())
+
+
+def _rows(texts: dict[str, str]) -> str:
+    width = max(map(len, texts)) + 2
+    return "\n".join(f"  {name:<{width}}{text}" for name, text in texts.items())
