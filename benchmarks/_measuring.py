@@ -1,26 +1,68 @@
-"""Shared parts of benchmarks: rounds of labels in `speed.Timed`, and rows with the share of the matmul rate."""
+"""Shared parts of benchmarks: what training costs on this machine, rounds of labels, the share of the matmul rate.
+
+Training is unguided, with the program of `cuelearner sweep`, learning from the first step on. Compilation and the first
+stretch are apart; figures are medians over stretches of some iterations.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from _flops import step_operations
+from jax.sharding import Mesh
 
-from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.devices import SHARED, lane_mesh, place
+from cuelearner_jax.environment import Environment, spaces_of
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs import speed
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Teacher
 
+FEWEST_STRETCHES = 3
+STEPS_A_STRETCH = {"cpu": 128, "gpu": 1024, "tpu": 1024}  # per seed
 
-class Labelled(speed.Timed):
+T = TypeVar("T")
+
+
+def timed(work: Callable[[], T]) -> tuple[float, T]:
+    """Return the seconds until everything that `work` returns is computed, and the returned value."""
+    began = time.perf_counter()
+    done = jax.block_until_ready(work())
+    return time.perf_counter() - began, done
+
+
+class Timed:
+    """Lanes of one kind of guidance, ready to be timed."""
+
+    def __init__(
+        self, config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0, mesh: Mesh | None = None
+    ) -> None:
+        mesh = mesh or lane_mesh()
+        env, grid = place(mesh, env, SHARED), Grid((kind,), tuple(range(seeds)), (labels,))
+        self.group = LaneGroup(config, env, config.guide_in(env, kind), grid, mesh)
+        self.clock, self.blocks = place(mesh, start_clock(), SHARED), self.group.start()
+
+    def train(self, iterations: int) -> float:
+        """Return the seconds for some iterations of all lanes. The first call with a number compiles."""
+        seconds, done = timed(lambda: self.group.train(self.clock, self.blocks, iterations))
+        self.clock, self.blocks, _ = done
+        return seconds
+
+
+class Labelled(Timed):
     """Lanes that ask, ready to be timed."""
 
     def label_round(self, teacher: Teacher) -> float:
         """Seconds of one round of questions and the fit that follows it. The first call compiles."""
-        seconds, done = speed.timed(lambda: self.group.label_round(teacher, self.clock, self.blocks))
+        seconds, done = timed(lambda: self.group.label_round(teacher, self.clock, self.blocks))
         self.clock, self.blocks = done
         return seconds
 
@@ -28,8 +70,56 @@ class Labelled(speed.Timed):
         """Seconds of one fit to the labels there are. The first call compiles."""
         # The blocks are given up to the program, so their labels go into it as copies.
         labels = [jax.block_until_ready(jax.tree.map(jnp.copy, block.guide.labels)) for block in self.blocks]
-        seconds, self.blocks = speed.timed(lambda: self.group.take_labels(labels, self.blocks))
+        seconds, self.blocks = timed(lambda: self.group.take_labels(labels, self.blocks))
         return seconds
+
+
+def learning(config: RunConfig, *, guided: bool = False) -> RunConfig:
+    """Return the configuration with greedy actions and learning from the first step; always guided, or never."""
+    until = 2**30 if guided else 0
+    schedule = dataclasses.replace(config.schedule, random_steps=0, learn_after=0, guidance_until=until)
+    return dataclasses.replace(config, schedule=schedule)
+
+
+def measure_training(
+    config: RunConfig, env: Callable[[], Environment], seeds: int, seconds: float, mesh: Mesh | None = None
+) -> dict[str, Any]:
+    """Measure the training of `seeds` unguided lanes for `seconds` after compilation, over all devices of a mesh.
+
+    Returns:
+        `steps_a_second` (environment steps of all seeds), `ms_a_step` (one step of every seed), `mb_a_seed` (at rest)
+        and `peak_gb` (of the first device in this process so far; None where unknown). Further `first_step_s`
+        (environment, compilation and first step, without imports), `seeds`, `devices`, `stretches` and `spread`
+        (slowest less fastest stretch, over their median).
+    """
+    began, mesh = time.perf_counter(), mesh or lane_mesh()
+    group = Timed(learning(config), env(), "none", seeds, mesh=mesh)
+    iterations = max(1, STEPS_A_STRETCH[jax.default_backend()] // config.sizes.num_envs)
+    group.train(iterations)
+    first = time.perf_counter() - began
+    at_rest = sum(state_bytes(block) for block in group.blocks) / sum(block.key.shape[0] for block in group.blocks)
+    stretches = []
+    while len(stretches) < FEWEST_STRETCHES or sum(stretches) < seconds:
+        stretches.append(group.train(iterations))
+    typical = statistics.median(stretches)
+    step = typical / iterations / config.sizes.num_envs
+    memory = jax.local_devices()[0].memory_stats() or {}
+    return {
+        "seeds": seeds,
+        "devices": mesh.size,
+        "steps_a_second": seeds / step,
+        "ms_a_step": 1e3 * step,
+        "mb_a_seed": at_rest / 1e6,
+        "peak_gb": memory["peak_bytes_in_use"] / 1e9 if "peak_bytes_in_use" in memory else None,
+        "first_step_s": first - (iterations - 1) / iterations * typical,
+        "stretches": len(stretches),
+        "spread": (max(stretches) - min(stretches)) / typical,
+    }
+
+
+def state_bytes(tree: Any) -> int:
+    """Return the memory of a tree of arrays or shapes [bytes]."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def matmul_rate(dtype: str = "float32", repeats: int = 5) -> float:
@@ -41,13 +131,13 @@ def matmul_rate(dtype: str = "float32", repeats: int = 5) -> float:
     a, b = (jax.random.normal(jax.random.key(k), (size, size), dtype) for k in (0, 1))
     product = jax.jit(jnp.matmul)
     product(a, b).block_until_ready()
-    best = min(speed.timed(lambda: [product(a, b) for _ in range(queued)])[0] for _ in range(repeats))
+    best = min(timed(lambda: [product(a, b) for _ in range(queued)])[0] for _ in range(repeats))
     return queued * 2 * size**3 / best
 
 
 def measure(task: Task, config: RunConfig, seeds: int, seconds: float, mesh: Any = None) -> dict[str, Any]:
-    """A row of `speed.measure` with what the networks reach of the machine's matmul rate in the same run."""
-    row = speed.measure(config, lambda: task.environment(config.task), seeds, seconds, mesh)
+    """Return a row of `measure_training` with what the networks reach of the machine's matmul rate in the same run."""
+    row = measure_training(config, lambda: task.environment(config.task), seeds, seconds, mesh)
     rate = matmul_rate(repeats=3) * (row["devices"] if jax.default_backend() != "cpu" else 1)
     spaces = spaces_of(task.environment(config.task))
     flops = row["steps_a_second"] * step_operations(config, spaces).total

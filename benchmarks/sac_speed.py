@@ -34,6 +34,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _measuring import timed
 from pendulum import STEPS, Pendulum
 
 from cuelearner_jax.agents import sac
@@ -44,7 +45,6 @@ from cuelearner_jax.loop import start_clock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.runs.speed import timed
 from cuelearner_jax.storage.provenance import provenance
 
 PENDULUM = "pendulum"

@@ -23,13 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-from _measuring import Labelled, measure
+from _measuring import Labelled, learning, measure
 from matplotlib import ticker
 from matplotlib.figure import Figure
 
 from cuelearner_jax.report.figures import OTHER_COLOURS, STYLE, save_figure
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.speed import learning
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry

@@ -19,14 +19,13 @@ from pathlib import Path
 import jax
 import numpy as np
 from _flops import step_operations
-from _measuring import matmul_rate
+from _measuring import Timed, learning, matmul_rate
 from cartpole import CartPole
 
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.speed import Timed, learning
 
 BATCH, ENVS, DIRECTIONS = 256, 8, 2
 

@@ -7,15 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _measuring import Timed
 from pendulum import STEPS, Pendulum, Swing, seen
 
 from cuelearner_jax.agents import sac
 from cuelearner_jax.config import Scalars, Schedule, Sizes
-from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.judging import Returns, score
-from cuelearner_jax.runs.speed import Timed
 from cuelearner_jax.testing import check_environment
 
 ENV = Pendulum(jnp.array(STEPS))
@@ -68,7 +66,7 @@ def test_soft_actor_critic_swings_it_up(changes, steps):
     )
     timed = Timed(config, ENV, "none", 2)
     timed.train(steps)
-    world, functions = place(lane_mesh(), Returns(ENV, 1.0), SHARED), config.agent_in(ENV)
+    functions = config.agent_in(ENV)
     policy = lambda lane: Agent(lane.agent.params, functions)  # noqa: E731
-    found = timed.group.evaluate(policy, world, jax.random.key(5), 20, 20 * STEPS, timed.blocks)
-    assert (score(found, True) > -300).all()
+    found = timed.group.evaluate(policy, ENV, jax.random.key(5), 20, 20 * STEPS, timed.blocks)
+    assert (STEPS * found["reward"] > -300).all()
