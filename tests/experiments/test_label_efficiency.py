@@ -4,7 +4,6 @@ import csv
 import json
 from collections.abc import Sequence
 
-import _efficiency_statistics as statistics
 import label_efficiency
 import numpy as np
 import pytest
@@ -185,12 +184,3 @@ def test_the_command_writes_tables_and_a_section(runs, tmp_path):
     assert not left & {"efficiency.csv", "labels_to_level.csv", "equal_area.csv"}
     assert "Label efficiency" not in (out / "report.md").read_text()
     assert "run" not in rows(out / "summary.csv")[0]
-
-
-def test_ratios_of_bounds_by_hand():
-    """30 over 60; more than 100 over 50; 30 over more than 100; of two that are more than 100 nothing is known."""
-    above = statistics.censored(np.array([30.0, np.inf, 30.0, np.inf, 0.0]), 100)
-    below = statistics.censored(np.array([60.0, 50.0, np.inf, np.inf, 0.0]), 100)
-    found = statistics.ratio_bounds(above, below)
-    np.testing.assert_allclose(found.lower, [0.5, 2.0, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(found.upper, [0.5, np.inf, 0.3, np.inf, np.inf])
