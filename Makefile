@@ -93,8 +93,6 @@ docs: $(VENV)/.documented
 bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/billiards_speed.py
 	$(BIN)/python benchmarks/training_speed.py
-	$(BIN)/python benchmarks/guidance_overhead.py
-	$(BIN)/python benchmarks/lidar_parity.py
 
 PYTHONS ?= 3.11 3.12 3.13
 release: $(BIN)/uv

@@ -92,7 +92,7 @@ def compiler_options(lanes: int) -> dict[str, Any]:
     """Return XLA's options for the training loop of so many lanes on each device.
 
     A GPU runs the independent kernels of a captured step side by side, and takes the matrix products of many lanes from
-    NVIDIA's library, those of few from XLA's compiler (benchmarks/matrix_products.py).
+    NVIDIA's library, those of few from XLA's compiler (docs/scaling.md).
     """
     if jax.default_backend() != "gpu":
         return {}

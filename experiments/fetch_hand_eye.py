@@ -3,11 +3,11 @@
     python experiments/fetch_hand_eye.py --out runs/fetch [--pieces FetchPush-v4/reading/0] [--resume]
 
 FetchReach and FetchPush of gymnasium_robotics (the extra `gymnasium`), played by scripted policies. A teacher of all
-cues, of the worst one or of one at random answers; no rewarded step is taken: held-out labels judge. Controls: the
-policy as it was, and models of labels that have each other's answers. Label seeds play episodes of their own, and each
+cues or of one at random answers; no rewarded step is taken: held-out labels judge. Controls: the policy as it was, and
+models of labels that have each other's answers. Label seeds play episodes of their own, and each
 of these is played by the policy as it was too, with the camera in its place and displaced. `--split tuning` plays
 episodes, and asks with label seeds, on which nothing is reported. OUT/ENVIRONMENT/KIND/SEED.json grows as it measures.
-At the scale `paper` a piece takes some minutes of one core; `--list` names them.
+At the scale `paper` a piece takes some minutes of one core; `--list` names them, `--table` prints what OUT has.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from cuelearner_jax.bridges.gymnasium.layout import flatten, leaves_of
 from cuelearner_jax.bridges.gymnasium.source import make_registered
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import mean_interval
 from cuelearner_jax.policies import in_space, policy_of
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import fetch_layout
@@ -44,7 +45,6 @@ STEPS, SIDE_BY_SIDE = 50, 25  # of an episode; environments that play at once
 FIRST_EPISODE = {"validation": 10_000, "tuning": 1_000}
 FIRST_SEED = {"validation": 0, "tuning": 100}  # of labels
 SIZES = GuideSizes(feedback_layers=(64, 64), fit_steps=400, fit_batch_size=64, labels_per_round=10, question_every=5)
-SAYS = ("all", "worst", "one")
 Row = dict[str, Any]
 
 
@@ -63,7 +63,7 @@ class Condition(NamedTuple):
 
 
 SCALES = {"smoke": Scale(20, 2), "quick": Scale(50, 20), "paper": Scale(100, 50)}
-CONDITIONS = (*(Condition(says) for says in SAYS), Condition("all", shuffled=True))
+CONDITIONS = (Condition("all"), Condition("all", shuffled=True), Condition("one"))
 KINDS = ("base", "reading", "relative")  # "base": the policy as it was, unchanged and displaced
 SEEDS = range(4)  # of labels, each with its own policy
 PIECES = tuple(f"{environment}/{kind}/{seed}" for environment in SCRIPTS for kind in KINDS for seed in SEEDS)
@@ -188,6 +188,20 @@ def run(piece: str, scale: str, split: str, out: Path, resume: bool) -> None:
         print(f"{told} {row.get('judged', '')} {row.get('estimates', '')} ({took:.0f} s)", flush=True)
 
 
+def table(folder: Path) -> str:
+    """Return a line for each environment and condition: success of all seeds' episodes with its 95% interval."""
+    found: dict[tuple[str, ...], list[int]] = {}
+    for file in sorted(folder.glob("*/*/*.json")):
+        for row in json.loads(file.read_text())["rows"]:
+            words = (row["what"], row["says"], "shuffled" if row["shuffled"] else "")
+            found.setdefault((file.parts[-3], " ".join(filter(None, words))), []).extend(row["success"])
+    lines = []
+    for (environment, name), success in found.items():
+        mean, low, high = 100 * mean_interval(np.array(success, float))
+        lines.append(f"{environment:<15}{name:<25}{mean:.1f} [{low:.1f}, {high:.1f}]")
+    return "\n".join(lines)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure pieces."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -197,7 +211,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="name the pieces and leave")
     parser.add_argument("--out", type=Path, default=Path("runs/fetch"), help="folder")
     parser.add_argument("--resume", action="store_true", help="keep what OUT has")
+    parser.add_argument("--table", action="store_true", help="print what OUT has and leave")
     given = parser.parse_args(arguments)
+    if given.table:
+        print(table(given.out))
+        return 0
     if given.list:
         print("\n".join(PIECES))
         return 0

@@ -10,17 +10,13 @@ folder of `--work` already is not made again. Each film shows the same episodes 
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
-from cuelearner_jax.bridges.gymnasium.pool import drawing_variables
 from cuelearner_jax.cli import main as cuelearner
 
 HERE = Path(__file__).resolve().parent
@@ -39,13 +35,11 @@ class Film:
     before: str = ""  # arguments of `cuelearner render`
     after: str = ""
     make: tuple[tuple[str, str], ...] = ()  # (folder that the command writes, arguments of `cuelearner`)
-    program: str = ""  # of this folder, which makes both renderings in place of the commands
     width: int = 360  # of each picture [pixels]
     period: int = 80  # from one picture to the next in the renderings [ms]
     slower: float = 1.0  # by this factor the film is played
     most: int = 120  # pictures
     ends: int = 120  # pictures of the rendering before labels, which then stands still: the end of its first episode
-    box: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)  # what is shown of each: left, top, right, low
 
 
 SCRIPTS = "cuelearner_envs.arm.scripts"
@@ -104,15 +98,6 @@ FILMS = (
     _of_arm("reach", "reach", "turned_camera"),
     _of_arm("push", "past", "hand_eye"),
     _of_arm("pick", "pick", "hand_eye"),
-    Film(
-        "fetch",
-        program="fetch_film.py",
-        words=CAMERA,
-        width=300,
-        period=160,
-        slower=1.5,
-        box=(0.1, 0.3, 0.9, 0.95),
-    ),
 )
 
 
@@ -139,29 +124,17 @@ def make_film(film: Film, work: Path, to: Path) -> int:
     place = work / "films" / film.name
     sides = [place / side for side in ("before", "after")]
     commands = [(work / folder, f"cuelearner {words} --out WORK/{folder}") for folder, words in film.make]
-    if film.program:
-        commands.append((sides[1], f"python {HERE / film.program} --out {place}"))
-    else:
-        renderings = zip(sides, (film.before, film.after), strict=True)
-        commands += [(side, f"cuelearner render {words} --out {side}") for side, words in renderings]
+    renderings = zip(sides, (film.before, film.after), strict=True)
+    commands += [(side, f"cuelearner render {words} --out {side}") for side, words in renderings]
     for folder, command in commands:
         if not folder.exists():
             words = shlex.split(command.replace("WORK", str(work)))
             print(f"$ {shlex.join(words)}", flush=True)
-            status = _run(words)
+            status = cuelearner(words[1:])
             if status:
                 return status
     print(f"{to}: {join([next(side.glob('*.gif')) for side in sides], film, to):,} bytes")
     return 0
-
-
-def _run(words: list[str]) -> int:
-    """Run a command in this process if it is `cuelearner`, in one of its own if it is `python`; return its status."""
-    if words[0] == "cuelearner":
-        return cuelearner(words[1:])
-    return subprocess.run(
-        [sys.executable, *words[1:]], env={**os.environ, **drawing_variables()}, check=False
-    ).returncode
 
 
 def join(files: Sequence[Path], film: Film, to: Path) -> int:
@@ -198,23 +171,10 @@ def _pictures(files: Sequence[Path], film: Film) -> list[tuple[Image.Image, ...]
         with Image.open(file) as opened:
             for frame in ImageSequence.Iterator(opened):
                 time += frame.info["duration"]
-                reel += [_cut(frame.convert("RGB"), film.box)] * max(0, -(-time // film.period) - len(reel))
+                reel += [frame.convert("RGB")] * max(0, -(-time // film.period) - len(reel))
         reels.append(reel[:ends])
     length = min(max(map(len, reels)), film.most)
     return list(zip(*((reel + [reel[-1]] * length)[:length] for reel in reels), strict=True))
-
-
-def _cut(picture: Image.Image, box: tuple[float, float, float, float]) -> Image.Image:
-    """Return the part of a picture that is shown."""
-    left, top, right, low = box
-    return picture.crop(
-        (
-            round(left * picture.width),
-            round(top * picture.height),
-            round(right * picture.width),
-            round(low * picture.height),
-        )
-    )
 
 
 def _beside(pair: Sequence[Image.Image], words: Sequence[str], width: int) -> Image.Image:

@@ -3,7 +3,7 @@
     python experiments/label_efficiency.py RUN_FOLDER ... --out FOLDER [--by-run] [--level 0.4] [--reference relative]
 
 Writes what `cuelearner report` writes; its report.md has a section more, and there are `efficiency.csv`,
-`labels_to_level.csv`, `equal_area.csv`, `labels_to_quality.png/.svg` and `steps_saved.png/.svg` besides.
+`labels_to_level.csv` and `equal_area.csv` besides.
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from _efficiency import Question, efficiency_of
-from _efficiency_document import efficiency_figures, efficiency_lines
+import numpy as np
+from _efficiency import Carried, Efficiency, Known, Question, efficiency_of
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.report import escaping
 from cuelearner_jax.report.document import Study, report
+from cuelearner_jax.report.statistics import Interval
+from cuelearner_jax.report.tables import markdown_table
 from cuelearner_jax.report.variants import Variant
 
 
@@ -40,13 +43,50 @@ def parsed(arguments: Sequence[str]) -> argparse.Namespace:
     return asked
 
 
+def known_cell(known: Known, form: str) -> str:
+    """Return a quantity with its interval as a cell: `0.62 [0.54, 0.71]`, `above 1.40 [1.30, no bound]`."""
+    low, high = (float(bound) for bound in known.bounds)
+    if low == high:
+        text = form.format(low)
+    elif np.isinf(high):
+        text = f"above {form.format(low)}" if low > 0 else "not known"
+    else:
+        text = f"below {form.format(high)}" if low <= 0 else f"{form.format(low)} to {form.format(high)}"
+    if np.isnan(known.lower):
+        return text
+    upper = form.format(known.upper) if np.isfinite(known.upper) else "no bound"
+    return f"{text} [{form.format(known.lower)}, {upper}]"
+
+
+def section(found: Efficiency) -> list[str]:
+    """Return the section of the report: a row for each variant."""
+    level = f"The level is {found.level:.3f}: {escaping.markdown(found.origin)}."
+    header = ["run", "guidance", "labels", "guide alone", "steps to the level", "ratio to unguided"]
+    header += [f"mean over the curve to {found.shared:,}", "ratio to unguided"]
+    return ["", "## Label efficiency", "", level, "", *markdown_table(header, [_cells(each) for each in found.carried])]
+
+
+def _cells(each: Carried) -> list[str]:
+    run, guidance = escaping.markdown(each.variant.run), escaping.markdown(each.variant.guidance)
+    cells = [run, guidance, f"{each.variant.labels:,}", _interval(each.guide), known_cell(each.steps, "{:,.0f}")]
+    cells += [known_cell(each.ratio, "{:.2f}") if each.ratio else "", _interval(each.variant.mean)]
+    return [*cells, _interval(each.area_ratio, "{:.2f}")]
+
+
+def _interval(found: Interval | None, form: str = "{:.3f}") -> str:
+    if found is None or np.isnan(found.estimate):
+        return ""
+    estimate, lower, upper = (form.format(float(value)) for value in found)
+    return estimate if np.isnan(found.lower) else f"{estimate} [{lower}, {upper}]"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the report; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
 
-    def study(variants: Sequence[Variant], title: str) -> Study:
+    def study(variants: Sequence[Variant]) -> Study:
         found = efficiency_of(variants, asked.question, asked.lower_is_better)
-        return Study(efficiency_lines(found), found.tables(), efficiency_figures(found, title, asked.metric))
+        return Study(section(found), found.tables())
 
     try:
         asked = parsed(arguments)

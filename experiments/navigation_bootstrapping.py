@@ -1,13 +1,11 @@
-"""Label efficiency in navigation: every form of feedback, with budgets, faults and ways to ask, in both frames.
+"""Label efficiency in navigation: every form of feedback, with budgets, faulty teachers and pacing.
 
     python experiments/navigation_bootstrapping.py --list
     python experiments/navigation_bootstrapping.py --out FOLDER --pieces clutter/frame [--resume]
     python experiments/navigation_bootstrapping.py --out FOLDER --report
 
-The sweeps are data below: every piece fits half an hour of one accelerator, has a folder of its own and is resumed.
-After the pieces, or alone with --report, there is a report (FOLDER/clutter/report). Several processes may share FOLDER,
-each with pieces of its own. At the scale `quick` a piece takes minutes, at `cpu` ten minutes on one core (45 for five
-models), at `smoke` seconds on a CPU; all have folders of their own in FOLDER.
+The sweeps are data below: every piece has a folder of its own and is resumed. After the pieces, or alone with --report,
+there is a report (FOLDER/clutter/report). At the scale `cpu` a piece takes ten minutes on one core, at `smoke` seconds.
 """
 
 from __future__ import annotations
@@ -17,9 +15,8 @@ from pathlib import Path
 
 from _pieces import Experiment, Options, Piece, Scale, run
 
-FEW, MANY = (25, 50, 100), (350, 500, 1_000)
+BUDGETS = (25, 50, 100, 350, 500, 1_000)
 ASKING = ("relative", "demonstration", "scalar", "dcoach")
-SEEDS, VARIED_SEEDS = 16, 8
 
 HALLS: Options = {
     "preset": "paper",
@@ -29,83 +26,38 @@ HALLS: Options = {
     "schedule.eval-envs": 200,
     "schedule.eval-steps": 40_000,
     "schedule.checkpoint-every": 50_000,
+    "sizes.frame": "action",
+    "arbiter": "episodes",
 }
-# Long enough for what is compared over the first 40,000 steps alone.
-HALF: Options = {"schedule.total-steps": 50_000, "schedule.guidance-until": 50_000}
-RAW: Options = {"sizes.frame": "raw", "arbiter": "episodes"}  # said whatever the presets say
-FRAME: Options = {"sizes.frame": "action", "arbiter": "episodes"}
-LEAD = 10.0  # a return: guided episodes that earn that much more than own ones have their whole share
-FAULTS: dict[str, Options] = {
-    "flipped-05": {"scalars.mistake-probability": 0.05},
-    "flipped-10": {"scalars.mistake-probability": 0.1},
+# Given on the labelling page by a script that sees the page alone, and errs (docs/labels.md).
+PAGE = Path(__file__).parents[1] / "docs/data/labelling/navigation/labels.parquet"
+VARIATIONS: dict[str, Options] = {  # of 500 relative labels
     "flipped-20": {"scalars.mistake-probability": 0.2},
     "random": {"scalars.mistake-probability": 0.5},  # leaves "already right" true, which `shuffled` does not
     "shuffled": {"scalars.answer": "shuffled"},
     "silent-20": {"scalars.silence-probability": 0.2},
-    "indifferent": {"scalars.indifference-deg": 20.0},
     "biased": {"scalars.teacher-bias-deg": 10.0},
-}
-# Given on the labelling page by a script that sees the page alone, and errs (docs/labels.md).
-PAGE = Path(__file__).parents[1] / "docs/data/labelling/navigation/labels.parquet"
-WAYS: dict[str, Options] = {
-    # Labels in three instalments, the later ones about the agent's own actions: commit 5f07753 can repeat it.
-    "instalments": {"schedule.ask-at": (0, 20_000, 40_000), "scalars.ask-bound-deg": 60.0},
-    "ensemble": {"sizes.ensemble": 5},
     "active": {"sizes.ensemble": 5, "sizes.candidates": 16},
+    "paced": {"arbiter": "paced", "arbiter.lead": 10.0},  # a return: the lead of guided episodes for a whole share
+    "page": {"labels-from": PAGE},
+    "raw": {"sizes.frame": "raw"},
 }
-
-
-def budgets(name: str, options: Options, minutes: int) -> list[Piece]:
-    """Every form of feedback with every budget, beside agents that nobody guides; some half as long."""
-    whole = {**HALLS, **options}
-    half = {**whole, **HALF}
-    alone = whole if name == "frame" else half  # those seen from the action are whom all others are compared with
-    pieces = [
-        Piece("clutter", name, "none", ("none",), (), SEEDS, alone, minutes // 2, "unguided agents, of every figure"),
-        Piece("clutter", name, "heuristic", ("heuristic",), (), SEEDS, half, minutes // 4, "against walking straight"),
-    ]
-    for kind in ASKING:
-        serves, many = f"labels of {kind}", whole if name == "raw" else half
-        pieces.append(Piece("clutter", name, f"{kind}-few", (kind,), FEW, SEEDS, whole, minutes, serves))
-        pieces.append(Piece("clutter", name, f"{kind}-many", (kind,), MANY, SEEDS, many, minutes + 3, serves))
-    return pieces
-
-
-def variations(minutes: int) -> list[Piece]:
-    """Five hundred labels of a faulty teacher, and other ways to ask; then paced."""
-    options = {**HALLS, **FRAME, **HALF}
-    relative, seeds, brief = ("relative",), VARIED_SEEDS, minutes // 2
-    pieces = [
-        Piece("clutter", name, "relative", relative, (500,), seeds, {**options, **fault}, brief, "faulty teachers")
-        for name, fault in FAULTS.items()
-    ]
-    pieces += [
-        Piece("clutter", name, "relative", relative, (100, 500), seeds, {**options, **way}, minutes, "what is asked")
-        for name, way in WAYS.items()
-    ]
-    paced: Options = {**options, "arbiter": "paced", "arbiter.lead": LEAD}
-    given: Options = {**options, "labels-from": PAGE}
-    serves = "labels given on the page"
-    pieces.append(Piece("clutter", "page", "relative", relative, (450, 500), seeds, given, brief, serves))
-    random = {**paced, **FAULTS["random"]}
-    shuffled = {**paced, **FAULTS["shuffled"]}
-    serves = "guidance never costs"
-    pieces += [
-        Piece("clutter", "paced", "heuristic", ("heuristic",), (), seeds, paced, brief, serves),
-        Piece("clutter", "paced", "relative", relative, (500,), seeds, paced, brief, serves),
-        Piece("clutter", "paced-random", "relative", relative, (500,), seeds, random, brief, serves),
-        Piece("clutter", "paced-shuffled", "relative", relative, (500,), seeds, shuffled, brief, serves),
-    ]
-    return pieces
-
-
-PIECES = (*budgets("frame", FRAME, 16), *budgets("raw", RAW, 16), *variations(16))
+PIECES = (
+    Piece("clutter", "frame", "none", ("none",), (), 16, HALLS),
+    Piece("clutter", "frame", "heuristic", ("heuristic",), (), 16, HALLS),
+    *(Piece("clutter", "frame", kind, (kind,), BUDGETS, 16, HALLS) for kind in ASKING),
+    Piece("clutter", "raw", "none", ("none",), (), 8, {**HALLS, **VARIATIONS["raw"]}),
+    *(
+        Piece("clutter", run_name, "relative", ("relative",), (500,), 8, {**HALLS, **options})
+        for run_name, options in VARIATIONS.items()
+    ),
+)
 
 SCALES = {
     "smoke": Scale(
         "seconds a piece on a CPU, to see that everything runs",
         seeds=2,
-        labels={25: 5, 350: 10, 450: 14, 500: 15},
+        labels={25: 5, 350: 10, 500: 15},
         options={
             "task.worlds": 2,
             "task.max-steps": 20,
@@ -150,20 +102,8 @@ SCALES = {
             "schedule.eval-steps": 6_000,
             "schedule.checkpoint-every": 12_000,
         },
-        reported=True,
     ),
-    "quick": Scale(
-        "minutes a piece on an accelerator, to see where it goes",
-        seeds=4,
-        labels={100: 100, 500: 500},
-        options={
-            "schedule.total-steps": 50_000,
-            "schedule.guidance-until": 30_000,
-            "schedule.eval-every": 5_000,
-            "schedule.checkpoint-every": 50_000,
-        },
-    ),
-    "paper": Scale("what is reported", reported=True),
+    "paper": Scale("half an hour a piece on an accelerator"),
 }
 
 EXPERIMENT = Experiment(

@@ -46,8 +46,8 @@ def test_success_on_fetch_push():
         return 100 * np.mean(found)
 
     labelled, without = row("success on FetchPush")[1:3]
-    assert labelled == f"100 labels: {success('calibration', 'all', False):.0f}%"
-    shuffled = success("calibration", "all", True)
+    assert labelled == f"100 labels: {success('reading', 'all', False):.0f}%"
+    shuffled = success("reading", "all", True)
     assert without == f"{success('displaced', '', False):.0f}%; shuffled answers: {shuffled:.0f}%"
 
 

@@ -125,7 +125,7 @@ class DoubleDQN:
         """Return the action of the whole set with the largest value.
 
         The rough first look (`coarse_directions`) is for play while learning alone: where values are sharp it misses
-        peaks, which costs a finished agent reward (`benchmarks/search_agreement.py`).
+        peaks, which costs a finished agent reward (docs/scaling.md).
         """
         return best_of(partial(self.value, env, params), self._directions, obs)
 

@@ -3,7 +3,7 @@
 A report is a folder. `report.html` is one file: figures with values under the pointer, the table, what is missing, and
 the provenance. `report.md` holds the same for other documents. Beside them are `summary.csv` (the table), `curves.csv`
 (the curves' values) and `curves.png/.svg`; for several label budgets also `label_efficiency.png/.svg`. A study may add
-tables, figures and a section (`experiments/label_efficiency.py`). Equal results always give equal bytes.
+tables and a section (`experiments/label_efficiency.py`). Equal results always give equal bytes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cuelearner_jax.report.page import page
 from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
 
-FIGURES = ("curves", "label_efficiency", "labels_to_quality", "steps_saved")
+FIGURES = ("curves", "label_efficiency")
 UNKNOWN = "not recorded"
 PERMISSIVE: dict[str, Any] = {"promote_options": "permissive"}  # runs may differ in their metrics
 TABLES = ("summary", "curves", "efficiency", "labels_to_level", "equal_area")
@@ -34,7 +34,6 @@ class Study(NamedTuple):
 
     lines: Sequence[str]  # of Markdown, below the summary
     tables: dict[str, list[tables.Row]]  # by the name of the file
-    figures: dict[str, Figure]
 
 
 def report(
@@ -46,7 +45,7 @@ def report(
     task: str | None = None,
     lower_is_better: bool = False,
     by_run: bool = False,
-    study: Callable[[Sequence[Variant], str], Study] | None = None,
+    study: Callable[[Sequence[Variant]], Study] | None = None,
     overwrite: bool = False,
     command: str = "",
 ) -> Path:
@@ -60,7 +59,7 @@ def report(
         task: keeps only this task's runs; needed where there are several tasks.
         lower_is_better: smaller values of the metric are better, for the best value and for reaching a value.
         by_run: reports each folder separately, under its name, as needed where the runs' configurations differ.
-        study: called with the variants and the title; returns additions to the report.
+        study: called with the variants; returns additions to the report.
         overwrite: replaces an existing report.
         command: command line that makes this report, recorded in it.
 
@@ -85,9 +84,8 @@ def report(
     figures = {"curves": draw_curves(variants, title, metric)}
     if len({variant.labels for variant in variants if variant.labels}) > 1:
         figures["label_efficiency"] = draw_label_efficiency(variants, title, metric)
-    added = study(variants, title) if study else Study((), {}, {})
+    added = study(variants) if study else Study((), {})
     written |= added.tables
-    figures |= added.figures
     _write(out, written, figures)
     missing = _missing(folders, groups, variants, metric, split)
     text = _markdown(title, written["summary"], list(figures), added.lines, missing, _provenance(groups, command))

@@ -14,7 +14,6 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS
-from cuelearner_jax.tasks.billiards import BILLIARDS
 
 LAYERS, OBS = (64, 48), 10
 SPACES = Spaces(OBS, DIRECTIONS)
@@ -40,14 +39,6 @@ def test_operations_are_those_counted_by_hand():
     assert counted(0.5).targets == 7 * target
     assert counted(0.5, n_step=30).targets == 2 * 7 * target
     assert counted(0.0, n_step=30).targets == 0
-
-
-def test_the_paper_s_argmax_costs_4_5_gflop_a_step():
-    paper = BILLIARDS.presets["paper"].config
-    full = dataclasses.replace(paper, agent=dataclasses.replace(paper.agent, coarse_directions=0))
-    counted = step_operations(full, Spaces(12, DIRECTIONS))
-    assert counted.acting == 2 * (12 * 400 + 3600 * (2 * 400 + 2 * 160_000 + 120_000 + 2 * 90_000 + 300))
-    assert counted.targets == 0
 
 
 def traced_operations(function, *arguments):

@@ -265,27 +265,6 @@ def test_the_late_arbiter_leaves_the_first_steps_to_the_agent():
     assert not late.Config(2, 0.0).follow(state, outcome, probes.SCALARS, jax.random.key(0)).chosen.any()
 
 
-def test_the_soft_agent_does_not_see_from_the_action():
-    soft = importlib.import_module("examples.soft_agent")
-    with pytest.raises(UserError, match=r"--sizes\.frame raw"):
-        soft.Config().make("action", spaces_of(probes.Window()))
-
-
-@pytest.mark.long
-def test_a_kind_that_asks_needs_a_teacher(home, capsys):
-    for kind in ("relative", "examples.clone:KIND"):
-        command = ["train", "examples.brax_task:TASK", *TINY, "--guidance", kind, "--out", home / "new"]
-        refused(capsys, command, "pendulum has no teacher to ask")
-    assert not (home / "new").exists()
-
-
-def test_a_teacher_that_knows_the_best_action_alone_answers_about_no_other(home, capsys):
-    command = ["train", "examples.reach:TASK", *TINY, "--labels", "5", "--guidance", "relative"]
-    command += ["--scalars.answer", "nearest", "--out", home / "new"]
-    refused(capsys, command, "give --scalars.answer best")
-    assert not (home / "new").exists()
-
-
 @pytest.mark.long
 def test_a_run_goes_on_with_the_same_command(runs, home):
     described = (runs / "clone" / "config.json").read_text()
@@ -296,20 +275,6 @@ def test_a_run_goes_on_with_the_same_command(runs, home):
     assert ((runs / "clone" / "config.json").read_text(), results.read(runs / "clone").num_rows) == (described, rows)
     assert json.loads(described)["grid"]["guidance"] == ["none", "clone"]
     assert json.loads(described)["kinds"] == {"clone": {"way": 0.9}}
-
-
-def test_the_boats_page_shows_where_things_are_and_where_an_action_leads():
-    reach = importlib.import_module("examples.reach")
-    env = reach.make_environment(reach.ReachConfig(wind=0.0))
-    boat = reach.Boat(np.float32([0.2, 0.1]), np.float32([0.2, 0.6]), np.zeros(2, np.float32), np.int32(0))
-    found = reach.sketch(env, boat)
-    assert found.places["boat"] == pytest.approx((0.2, -0.1, 0.0))
-    assert 'cx="0.2" cy="-0.6"' in found.still  # the buoy, half a metre up
-    there, away = (reach.reel(env, boat, np.float32([0.0, up])) for up in (1.0, -1.0))
-    assert (there.words, len(there.frames)) == ("the buoy is reached", 6)  # at 0.1 m a step, seen before and after
-    assert there.frames[-1]["boat"] == pytest.approx((0.2, -0.6, -90.0), abs=1e-5)
-    assert away.words.endswith("not there")
-    assert len(away.frames) == reach.FILM
 
 
 @pytest.mark.long
@@ -329,21 +294,6 @@ def test_the_parts_keep_the_laws(tmp_path):
         reach.make_environment(dataclasses.replace(config, wind=-1))
 
 
-def test_the_skipper_makes_straight_for_the_buoy():
-    """Its way never leaves the line from the start to the buoy, and the rudder is allowed for."""
-    reach = importlib.import_module("examples.reach")
-    jax = importlib.import_module("jax")
-    for rudder in (0.0, 25.0):
-        env = reach.make_environment(reach.ReachConfig(rudder_deg=rudder))
-        state, _ = env.reset(jax.random.key(3))
-        line = np.asarray(state.buoy)
-        for _ in range(5):
-            state = env.moved(state, reach.Skipper(env).best_action(state, env.observe(state)))
-            x, y = np.asarray(state.place)
-            assert abs(x * line[1] - y * line[0]) < 1e-5
-        assert x * line[0] + y * line[1] > 0
-
-
 @pytest.mark.long
 def test_policies_of_ones_own_reach_the_buoy(tmp_path, capsys):
     policy = importlib.import_module("examples.policy")
@@ -354,14 +304,6 @@ def test_policies_of_ones_own_reach_the_buoy(tmp_path, capsys):
     for name in ("leaning.gif", "leaning.png"):
         assert (tmp_path / name).stat().st_size > 1000
     assert "wrote" in capsys.readouterr().out
-
-
-def test_a_kind_of_ones_own_that_asks_needs_labels(tmp_path, capsys):
-    command = ["sweep", "examples.reach:TASK", *TINY, "--guidance", "examples.clone:KIND"]
-    command += ["--out", str(tmp_path / "run")]
-    assert main([*command, "--labels", "0"]) == 2
-    assert "a label budget of 0 teaches nothing" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ import pytest
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.export import contract, decisions
-from examples import exported_in_mujoco, ros2_node
+from examples import ros2_node
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -36,21 +36,6 @@ def test_the_policy_crosses_a_hall_in_mujoco_without_jax(walker):
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("goal after")
-
-
-def test_mujoco_knows_a_collision_and_a_timeout(walker, monkeypatch):
-    class Straight:
-        def __init__(self, folder):
-            pass
-
-        def __call__(self, obs):
-            return np.array([1.0, 0.0])
-
-    monkeypatch.setattr(exported_in_mujoco, "Decision", Straight)
-    ended, places = exported_in_mujoco.drive(walker)
-    assert ended == "collision"
-    assert places[-1][0] < -2.5  # the first box stands in the straight way
-    assert exported_in_mujoco.drive(walker, longest=3)[0] == "timeout"
 
 
 def scan(count=541, around=3 * np.pi / 2, distance=4.0):
@@ -110,13 +95,3 @@ def test_the_node_shows_what_the_contract_says_and_holds_the_direction_in_the_wo
     walk.step(10.4)
     assert walk.command(10.4) == (0.0, 0.0, 0.0)  # arrived
     assert len(decide.shown) == 2
-
-
-def test_the_node_refuses_a_narrow_scan_and_another_tasks_decision(walker, monkeypatch):
-    walk = ros2_node.Walk(walker)
-    with pytest.raises(ValueError, match="does not reach"):
-        walk.hear_scan(scan(around=np.pi), 0.0)
-    slices = [{"name": "cue ball: place", "from": 0, "to": 2, "size": 2}]
-    monkeypatch.setattr(ros2_node, "Decision", lambda folder: Recorded({"observation": {"slices": slices}}))
-    with pytest.raises(ValueError, match="for the navigation task"):
-        ros2_node.Walk(walker)

@@ -8,18 +8,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
 import train_teacher
-from _teacher_program import TeacherConfig, Trainer, check_config, finished, make_program
+from _teacher_program import TeacherConfig, make_program
 
 from cuelearner_jax import teachers
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.evaluate import rollout
-from cuelearner_jax.policies import Taught
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.terminal import Interrupted
 
@@ -64,15 +61,6 @@ def refused(out, says, **changed):
     assert files() == before
 
 
-@pytest.fixture(scope="module")
-def trained():
-    state, metrics = PROGRAM.init(ENV, jax.random.key(0)), []
-    for _ in range(2):
-        state, measured = PROGRAM.train(ENV, state, 100)
-        metrics.append(jax.tree.map(float, measured))
-    return finished(CONFIG, ENV, state), metrics
-
-
 @pytest.fixture
 def begun(tmp_path):
     """A training that Ctrl-C has stopped in its first stretch."""
@@ -86,39 +74,6 @@ def begun(tmp_path):
         with pytest.raises(Interrupted, match="stopped at round 100"):
             train(tmp_path / "teacher")
     return tmp_path / "teacher"
-
-
-@pytest.mark.long
-def test_it_learns_to_win_nearly_always(trained):
-    made, metrics = trained
-    measure = jax.jit(lambda made: rollout(Taught(made), ENV, jax.random.key(5), 20, 200))
-    assert float(measure(made)["reward"]) > 0.97
-    assert metrics[1]["reward"] > metrics[0]["reward"]
-    assert metrics[1]["loss"] < 0.5 * metrics[0]["loss"]
-
-
-@pytest.mark.long
-def test_its_values_are_chances_to_win_and_an_imperfect_aim_goes_to_the_middle(trained):
-    made, best = trained[0], ENV.best(OBS)
-    inside, outside = (jax.vmap(lambda obs, action: made.values(obs, action[None])[0])(OBS, s * best) for s in (1, -1))
-    np.testing.assert_allclose(inside, 1, atol=0.15)
-    np.testing.assert_allclose(outside, 0, atol=0.15)
-    careful = made.replace(aim_error=0.3)
-    error = [float(directions.difference(ENV.best(obs), careful.best_action(None, obs))) for obs in OBS]
-    assert np.abs(error).max() < math.radians(12)
-
-
-@pytest.mark.long
-def test_tries_come_first_from_the_best_and_last_from_anywhere():
-    training, state = Trainer(CONFIG), PROGRAM.init(ENV, jax.random.key(1))
-    keys = jax.random.split(jax.random.key(2), 500)
-    tried = jax.jit(jax.vmap(lambda key: training.propose(ENV, state.params, OBS[0], key)))(keys)
-    np.testing.assert_allclose(jnp.linalg.norm(tried, axis=-1), 1, atol=1e-5)
-    best_value = training.value(ENV, state.params, OBS[0], directions.evenly_spaced(3600)).max()
-    first = training.value(ENV, state.params, OBS[0], tried[:, 0])
-    assert float((best_value - first).max()) < 0.1  # as fine as the search is
-    counts, _ = np.histogram(directions.to_angle(tried[:, -2:]).ravel(), bins=6, range=(-math.pi, math.pi))
-    assert counts.min() > 120  # 167 each
 
 
 @pytest.mark.long
@@ -156,25 +111,6 @@ def test_a_training_that_diverges_stops_and_keeps_what_was_finite(begun, monkeyp
         train(begun, resume=True)
     assert probes.files_of(newest) == before
     assert not (begun / "teacher.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"learning_rate": math.nan}, "positive, finite"),
-        ({"explore_probability": math.nan}, "from 0 to 1"),
-        ({"spread_deg": math.nan}, "from 0 to 180"),
-        ({"tables": 0}, "teacher.tables is 0"),
-        ({"tables": 10**12}, "at most 2147483647"),
-        ({"rounds": 10**6, "updates": 10**6}, "teacher.rounds times teacher.updates"),
-        ({"tries": 3}, "at least 4"),
-        ({"layers": (8, 0)}, "positive width"),
-    ],
-    ids=str,
-)
-def test_settings_that_cannot_work_are_refused(change, says):
-    with pytest.raises(UserError, match=says):
-        check_config(dataclasses.replace(CONFIG, **change))
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ SENSOR_NOISE = 0.02  # standard deviation of a scanner's range error [m]
 CONTROL_STEPS = 10  # per step of navigation: 0.2 s at 50 Hz
 TURNING_TIME = 0.3  # time constant of the commanded turn toward the heading; the turn rate stays bounded [s]
 # The command changes by no more than this [m/s^2, rad/s^2]: of robots told other ways at once 11% fell within 10 s
-# (experiments/fit_robot.py), with these bounds none.
+# (docs/data/anymal_fit.json), with these bounds none.
 ACCELERATION, TURN_ACCELERATION = 8.0, 20.0
 
 

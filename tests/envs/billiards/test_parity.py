@@ -1,4 +1,4 @@
-"""Random shots end as in Chipmunk at a fine step. `benchmarks/billiards_parity.py` does this at length."""
+"""Random shots end as in Chipmunk at a fine step."""
 
 import importlib.util
 from pathlib import Path

@@ -234,7 +234,7 @@ def test_beams_end_where_mujocos_rays_do(engine, style):
         theirs.append([engine.scan(model, data, pose, 10.0) for pose in poses])
     apart = np.abs(np.asarray(ours, float) - np.array(theirs))
     assert (np.array(theirs) < 10.0).mean() > 0.5  # else it says little
-    assert (apart <= 1e-3).mean() >= 0.999  # `benchmarks/lidar_parity.py` does this at length
+    assert (apart <= 1e-3).mean() >= 0.999
 
 
 def test_beams_end_where_mujocos_rays_do_in_a_room_by_hand(engine):
