@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from cuelearner_jax.guides.aims import log_density
 
 from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.config import GuideSizes
@@ -202,14 +201,6 @@ def test_answers_too_weak_to_move_a_choice_are_refused_and_never_the_default():
     with pytest.raises(UserError, match=r"scalars\.eps_deg is 0\.3 steps: give at least 1"):
         by_model.check_amounts(GEARS, [2.0], weak)
     assert FRUIT.reach == 1.0
-
-
-@pytest.mark.parametrize("space", [GEARS, FRUIT], ids=["ordered", "not ordered"])
-def test_the_density_of_aims_among_choices_is_one_on_average(space):
-    every, share = jnp.eye(space.count), jnp.array([0.7, 0.3])
-    density = np.exp(log_density(space, every[1:2], share, every))
-    assert density.mean() == pytest.approx(1.0, rel=1e-5)
-    np.testing.assert_allclose(density, 0.3 + 0.7 * space.count * (np.arange(space.count) == 1), rtol=1e-5)
 
 
 def test_directions_are_asked_of_as_before():
