@@ -30,6 +30,7 @@ TITLES = {  # of the measured quantity
     "corrections": "success [%]",
     "fetch": "success [%]",
     "navigation": "success",
+    "zoo": "success",
 }
 X = {"bootstrapping": "labels", **dict.fromkeys(("arms", "navigation"), "environment steps of a seed")}
 GREY = "#7f7f7f"

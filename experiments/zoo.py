@@ -2,6 +2,7 @@
 
     python experiments/zoo.py --cues 3 --robots 28 --seeds 4 --out runs/zoo        # one group of robots
     python experiments/zoo.py --table runs/zoo                                      # of all groups there
+    python experiments/zoo.py --table runs/zoo --record                             # and into docs/data
 
 Each robot meets every error of `cuelearner_envs.zoo.ERRORS`, and a teacher who errs or speaks of one cue alone. Base
 and corrected policy then play `JUDGED` episodes for the sequential test, and others that are reported. Nothing is
@@ -11,6 +12,7 @@ chosen on held-out robots. An accelerator reads all cells of a group side by sid
 from __future__ import annotations
 
 import argparse
+import csv
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +36,7 @@ from cuelearner_jax.storage.provenance import provenance
 EPS = 0.05  # strength of an answer, as a share of the range
 EPS_TURN = float(np.deg2rad(9.0))  # of directions [rad]
 PLAYED = 10  # episodes between two batches of questions, from which situations are drawn
+DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 JUDGED, REPORTED = 50, 20  # episodes of the sequential test, and of the results
 FAULTS = {"": (0.0, False), "20% wrong": (0.2, False), "one cue a label": (0.0, True)}
 IN_FAMILY = ("nothing", "constant", "gain", "mixing", "seen_shift", "two")
@@ -288,6 +291,25 @@ def table(rows: list[dict[str, Any]]) -> None:
     print(f"right actions within their 95% intervals, where the change is in the family: {np.mean(inside):.3f}")
 
 
+def record(rows: list[dict[str, Any]], about: dict[bytes, bytes]) -> None:
+    """Write all rows, and the success of each error with its interval over robots, into docs/data."""
+    pq.write_table(pa.Table.from_pylist(rows).replace_schema_metadata(about), DATA / "zoo.parquet", compression="zstd")
+    random = np.random.default_rng(0)
+    with (DATA / "results" / "zoo.csv").open("w", newline="", encoding="utf-8") as lines:
+        out = csv.writer(lines)
+        out.writerow(("panel", "series", "x", "value", "lower", "upper"))
+        for error, fault in dict.fromkeys((row["error"], row["fault"]) for row in rows):
+            own = [row for row in rows if (row["error"], row["fault"]) == (error, fault)]
+            robots = sorted({(row["cues"], row["robot"]) for row in own})
+            for series, name in (("as it was", "before"), ("corrected", "after"), ("unchanged world", "unchanged")):
+                each = [[row[f"{name} success"] for row in own if (row["cues"], row["robot"]) == r] for r in robots]
+                means = np.array([np.mean(values) for values in each])
+                drawn = means[random.integers(len(means), size=(2000, len(means)))].mean(1)
+                ends = np.quantile(drawn, (0.025, 0.975))
+                label = ", ".join(filter(None, (error, fault))).replace("_", " ")
+                out.writerow((f"{len(robots)} robots", series, label, *np.round((means.mean(), *ends), 4)))
+
+
 def group(cues: int, count: int, split: str) -> Any:
     """Return a group of robots, stacked."""
     draw = jax.jit(zoo.robots, static_argnames=("cues", "count", "split"))
@@ -320,9 +342,14 @@ def main() -> None:
     parser.add_argument("--at-once", type=int, default=420, help="cells side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/zoo"), help="folder for a Parquet file a group")
     parser.add_argument("--table", type=Path, help="print the table of this folder, and measure nothing")
+    parser.add_argument("--record", action="store_true", help="with --table: write what the page shows into docs/data")
     asked = parser.parse_args()
     if asked.table:
-        table([row for file in sorted(asked.table.glob("*.parquet")) for row in pq.read_table(file).to_pylist()])
+        tables = [pq.read_table(file) for file in sorted(asked.table.glob("*.parquet"))]
+        rows = [row for part in tables for row in part.to_pylist()]
+        table(rows)
+        if asked.record:
+            record(rows, tables[0].schema.metadata)
         return
     robots = group(asked.cues, asked.robots, asked.split)
     cells, file = cells_of(asked.robots, asked.seeds), asked.out / f"{asked.split}_{asked.cues}.parquet"

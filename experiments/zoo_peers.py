@@ -53,28 +53,43 @@ CHOSEN: Mapping[str, tuple[float, float, float]] = dict.fromkeys(KINDS, SETTINGS
 
 
 class Even(WholeObservations, struct.PyTreeNode):
-    """A world of the zoo whose actions are in half ranges, so that one program serves all robots of a group."""
+    """A world of the zoo with actions in half ranges and observations in standard deviations, as networks take them."""
 
     world: zoo.World
+    mean: Float[Array, " obs"]
+    deviation: Float[Array, " obs"]
     actions: Space = struct.field(pytree_node=False)
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
+
+    @classmethod
+    def of(cls, world: zoo.World, key: PRNGKeyArray) -> Even:
+        """Return a world in the units of what the robot's policy meets in it."""
+        act = lambda obs: zoo.policy(world.robot, obs)  # noqa: E731
+        obs = jax.vmap(lambda key: zoo.rollout(key, world, act)[0])(jax.random.split(key, study.PLAYED))
+        obs = obs.reshape(-1, obs.shape[-1])
+        observation = (Quantity("observation", obs.shape[-1], "1"),)
+        return cls(world, obs.mean(0), obs.std(0) + 1e-6, study.space_of(world.robot), observation)
+
+    def observe(self, state: Any) -> Float[Array, " obs"]:
+        """Return the observation in standard deviations."""
+        return (zoo.observe(self.world, state) - self.mean) / self.deviation
 
     def reset(self, key: PRNGKeyArray) -> tuple[Any, Array]:
         """Begin an episode."""
         state = zoo.reset(key, self.world)
-        return state, zoo.observe(self.world, state)
+        return state, self.observe(state)
 
     def step(self, key: PRNGKeyArray, state: Any, action: Float[Array, " action"]) -> tuple[Any, Step]:
         """Execute an action; a new episode follows the last step of one."""
         after, reward = zoo.step(self.world, state, study.from_even(self.world.robot, action))
-        ends, final = after.steps >= zoo.STEPS, zoo.observe(self.world, after)
+        ends, final = after.steps >= zoo.STEPS, self.observe(after)
         start, first = self.reset(key)
         step = Step(jnp.where(ends, first, final), final, final, reward, jnp.array(False), ends, {}, {})
         return jax.tree.map(lambda new, old: jnp.where(ends, new, old), start, after), step
 
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the action of the robot's policy."""
-        return study.to_even(self.world.robot, zoo.policy(self.world.robot, obs))
+        return study.to_even(self.world.robot, zoo.policy(self.world.robot, obs * self.deviation + self.mean))
 
     def best_action(self, state: Any, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the teacher's action."""
@@ -90,16 +105,17 @@ def learn(
     guidance: Guide, world: Any, key: PRNGKeyArray, wrong: Array, scalars: Scalars, bound: Array, labels: int
 ) -> Any:
     """Return the policy of one observation that a kind has learned from labels."""
-    space = study.space_of(world.robot)
-    env = Even(world, space, (Quantity("observation", world.robot.unit.shape[0], "1"),))
+    k_model, k_env, k_lane, k_units = jax.random.split(key, 4)
+    env = Even.of(world, k_units)
     scalars, base = replace(scalars, mistake_probability=wrong), Heuristic(env)
-    k_model, k_env, k_lane = jax.random.split(key, 3)
     guide = asking.start(guidance, env, labels, labels, k_model, k_env, SIZES)
     inquiry = asking.Inquiry(guidance, env, scalars, base, bound)
     for _ in range(labels // SIZES.labels_per_round):
         guide = asking.label_round(inquiry, SIZES, env, guide, k_lane)
     policy = Guided(base, guide.model, env, scalars, guidance, bound)
-    return lambda obs: study.from_even(world.robot, policy.act(k_lane, None, obs[None])[0])
+    return lambda obs: study.from_even(
+        world.robot, policy.act(k_lane, None, ((obs - env.mean) / env.deviation)[None])[0]
+    )
 
 
 @partial(jax.jit, static_argnames=("guidance", "labels"))
@@ -119,8 +135,7 @@ def measure(
     """Return a row a cell."""
     worlds, keys = study.worlds_of(robots, cells)
     space, (strength, most, rate) = study.space_of(robots), setting
-    env = Even(zoo.unchanged(jax.tree.map(lambda leaf: leaf[0], robots)), space, (Quantity("observation", 1, "1"),))
-    env = env.replace(observation=(Quantity("observation", robots.unit.shape[-1], "1"),))
+    env = Even.of(zoo.unchanged(jax.tree.map(lambda leaf: leaf[0], robots)), jax.random.key(0))
     of = KINDS[kind]
     guidance = of.make(SIZES, spaces_of(env), of.config() if of.config else None)
     unit = unit_of(space)

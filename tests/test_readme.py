@@ -81,14 +81,14 @@ def test_steps_of_an_arm_that_learns_to_pick():
     assert without == medians["alone", "none", 0]
 
 
-def test_labels_worth_as_much_in_navigation():
-    with (DATA / "bootstrapping/clutter/report/equal_area.csv").open() as file:
-        kind = ("frame", "relative", "100")
-        own = [row for row in csv.DictReader(file) if (row["run"], row["reference"], row["reference_labels"]) == kind]
-    worth = {row["guidance"]: row for row in own}
-    fewer, more = row("labels that are worth 100 relative labels")[1:3]
-    assert fewer == f"demonstrations: fewer than {float(worth['demonstration']['labels_below']):.0f}"
-    assert more == f"good/bad: more than {float(worth['scalar']['labels_above']):.0f}"
+def test_success_of_robots_drawn_by_chance():
+    rows = [row for row in pq.read_table(DATA / "zoo.parquet").to_pylist() if row["seed"] == 0]
+    robots = {(one["cues"], one["robot"]) for one in rows}
+    worlds = {(one["error"], one["fault"]) for one in rows}
+    assert f"{len(robots)} small robots in {len(worlds)} changed worlds" in row("success of 112 small robots")[0]
+    labelled, without = row("success of 112 small robots")[1:3]
+    assert labelled == f"100 labels: {np.mean([one['after success'] for one in rows]):.2f}"
+    assert without == f"{np.mean([one['before success'] for one in rows]):.2f}"
 
 
 def test_each_kind_of_feedback_has_a_page():
