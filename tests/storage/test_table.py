@@ -253,8 +253,8 @@ def test_an_empty_table_cannot_be_finished_and_a_missing_one_neither(tmp_path):
 def test_every_recorded_table_is_read():
     for path in sorted((ROOT / "docs" / "data").rglob("*.jsonl")):
         assert results.read(path).num_rows
-    files = sorted((ROOT / "docs" / "data").rglob("*.parquet"))
-    assert len(files) > 200
+    files = sorted((ROOT / "docs" / "data").glob("*/**/*.parquet"))
+    assert len(files) > 20
     for path in files:
         assert tables.DIGEST in (pq.read_schema(path).metadata or {}), path
     assert len(label_files.read(ROOT / "docs" / "data" / "labelling" / "navigation").seeds) == 500

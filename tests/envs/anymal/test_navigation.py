@@ -1,12 +1,11 @@
 """Navigation by the quadruped: the contract of the simple robot's environment, its sensor, C MuJoCo's own episodes."""
 
-import importlib.util
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import mujoco_world
 import numpy as np
 import pytest
 import rooms
@@ -180,20 +179,18 @@ def test_beams_pass_over_what_is_too_low():
 
 
 def test_a_tilted_sensor_reads_what_mujocos_rays_do(env):
-    path = Path(__file__).parents[3] / "benchmarks" / "mujoco_world.py"
-    spec = importlib.util.spec_from_file_location("mujoco_world", path)
-    engine = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(engine)
     rng, equal = np.random.default_rng(0), []
     for number in range(4):
         world = jax.tree.map(lambda leaf, number=number: np.asarray(leaf[number]), env.worlds)
-        model = engine.model(world)
-        data = engine.settled(model)
+        model = mujoco_world.model(world)
+        data = mujoco_world.settled(model)
         for start in world.starts[:4]:
             turn = tilted(rng.uniform(-3, 3), *rng.uniform(-0.08, 0.08, 2))
             origin = np.array([*start, 0.52])
             ours = np.asarray(look(world, jnp.asarray(origin, jnp.float32), jnp.asarray(turn)))
-            beams = np.stack([np.cos(engine.ANGLES), np.sin(engine.ANGLES), np.zeros(271)], -1) @ turn.T.astype(float)
+            beams = np.stack(
+                [np.cos(mujoco_world.ANGLES), np.sin(mujoco_world.ANGLES), np.zeros(271)], -1
+            ) @ turn.T.astype(float)
             hit = np.zeros(1, np.int32)
             found = np.array([mujoco.mj_ray(model, data, origin, beam, None, 1, -1, hit) for beam in beams])
             down = np.where(beams[:, 2] < 0, -0.52 / np.minimum(beams[:, 2], -1e-9), np.inf)  # the floor

@@ -1,12 +1,11 @@
 """The lidar reads what geometry by hand and MuJoCo's rays say, and its faults are those that were asked for."""
 
-import importlib.util
 import math
-from pathlib import Path
 
 import chex
 import jax
 import jax.numpy as jnp
+import mujoco_world
 import numpy as np
 import pytest
 import rooms
@@ -211,40 +210,30 @@ def test_changed_faults_need_no_new_trace():
 # ---------------------------------------------------------------------------------------------------- another engine
 
 
-@pytest.fixture(scope="module")
-def engine():
-    """Worlds in MuJoCo, a file shared with the benchmarks."""
-    path = Path(__file__).parents[3] / "benchmarks" / "mujoco_world.py"
-    spec = importlib.util.spec_from_file_location("mujoco_world", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("style", ["clutter", "rooms", "corridor"])
-def test_beams_end_where_mujocos_rays_do(engine, style):
+def test_beams_end_where_mujocos_rays_do(style):
     rng = np.random.default_rng(0)
     ours, theirs = [], []
     for number in range(8):
         solids = generate_one(jax.random.fold_in(jax.random.key(5), number), style=style)
-        poses = engine.poses(rng, solids, 4)
-        model = engine.model(solids)
-        data = engine.settled(model)
+        poses = mujoco_world.poses(rng, solids, 4)
+        model = mujoco_world.model(solids)
+        data = mujoco_world.settled(model)
         ours.append(scan_many(solids, jnp.asarray(poses)))
-        theirs.append([engine.scan(model, data, pose, 10.0) for pose in poses])
+        theirs.append([mujoco_world.scan(model, data, pose, 10.0) for pose in poses])
     apart = np.abs(np.asarray(ours, float) - np.array(theirs))
     assert (np.array(theirs) < 10.0).mean() > 0.5  # else it says little
     assert (apart <= 1e-3).mean() >= 0.999
 
 
-def test_beams_end_where_mujocos_rays_do_in_a_room_by_hand(engine):
+def test_beams_end_where_mujocos_rays_do_in_a_room_by_hand():
     solids = world(
         boxes=[[2.0, 1.0, 0.4, 0.8, 0.3], [-2.0, -1.5, 2.0, 0.5, 0.05]],
         circles=[[1.0, -2.0, 0.6], [-1.2, 2.1, 0.1]],
         walls=8.0,
     )
-    model = engine.model(solids)
+    model = mujoco_world.model(solids)
     assert model.ngeom == 8
     for pose in ([0.0, 0.0, 0.0], [0.0, 0.0, 2.5], [2.1, 1.0, -1.0], [1.2, -2.1, 0.7]):  # the last two inside a solid
-        theirs = engine.scan(model, engine.settled(model), np.float32(pose), 10.0)
+        theirs = mujoco_world.scan(model, mujoco_world.settled(model), np.float32(pose), 10.0)
         np.testing.assert_allclose(ranges(solids, *pose), theirs, atol=1e-4)

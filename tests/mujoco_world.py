@@ -1,0 +1,93 @@
+"""This package's navigation worlds in MuJoCo, with a lidar of MuJoCo's rays, as an independent reference."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module has no stubs)
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from cuelearner_envs.navigation.world import FAR_AWAY, World
+
+LIDAR_HEIGHT = 0.5  # of the rays above the floor [m]: below the top of every solid
+FIELD_OF_VIEW, BEAMS = np.deg2rad(270.0), 271
+ANGLES = np.linspace(-FIELD_OF_VIEW / 2, FIELD_OF_VIEW / 2, BEAMS)  # from straight ahead [rad]
+
+
+def model(world: World) -> mujoco.MjModel:
+    """A static MuJoCo model of one world (no batch): boxes and upright cylinders, no rows that only fill up."""
+    geoms = []
+    for (x, y, yaw, length, width), height in _used(world.boxes, world.box_heights):
+        size = f"{length!r} {width!r} {height / 2!r}"
+        geoms.append(f'<geom type="box" pos="{x!r} {y!r} {height / 2!r}" euler="0 0 {yaw!r}" size="{size}"/>')
+    for (x, y, radius), height in _used(world.circles, world.circle_heights):
+        geoms.append(f'<geom type="cylinder" pos="{x!r} {y!r} {height / 2!r}" size="{radius!r} {height / 2!r}"/>')
+    solids = "\n".join(geoms)
+    xml = f'<mujoco><compiler angle="radian"/><worldbody>{solids}</worldbody></mujoco>'
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def settled(model: mujoco.MjModel) -> mujoco.MjData:
+    """The data in which rays are cast: everything where the model says."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def scan(
+    model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray, max_range: float, angles: np.ndarray = ANGLES
+) -> np.ndarray:
+    """MuJoCo's distances along beams [m], `max_range` where a ray meets nothing nearer.
+
+    Args:
+        model: from `model`.
+        data: from `settled`.
+        pose: x, y, yaw [m, rad].
+        max_range: [m].
+        angles: of the beams, from straight ahead [rad].
+    """
+    x, y, yaw = (float(value) for value in pose)
+    origin, geom = np.array([x, y, LIDAR_HEIGHT]), np.zeros(1, np.int32)
+    turned = yaw + angles
+    beams = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
+    found = np.array([mujoco.mj_ray(model, data, origin, beam, None, 1, -1, geom) for beam in beams])
+    return np.minimum(np.where(found < 0, max_range, found), max_range)
+
+
+def poses(rng: np.random.Generator, world: World, count: int) -> np.ndarray:
+    """Random poses in the hall (count, 3) in single precision [m, rad], turned at random.
+
+    In turn: anywhere (which may be inside a solid), anywhere, inside a solid, and just outside one (within 0.3 m). The
+    outer walls are no such solid; a place beyond them is moved to the hall's edge.
+    """
+    boxes = np.array([row for row, _ in _used(world.boxes, world.box_heights)])[4:]
+    circles = np.array([row for row, _ in _used(world.circles, world.circle_heights)]).reshape(-1, 3)
+    half = np.asarray(world.extent, float) / 2
+    places = np.array([_place(rng, number % 4, boxes, circles, half) for number in range(count)])
+    yaws = rng.uniform(-np.pi, np.pi, (count, 1))
+    return np.concatenate([np.clip(places, -half + 1e-3, half - 1e-3), yaws], axis=-1).astype(np.float32)
+
+
+def _used(rows, heights) -> list[tuple[list[float], float]]:
+    pairs = zip(np.asarray(rows, float).tolist(), np.asarray(heights, float).tolist(), strict=True)
+    return [(row, height) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
+
+
+def _place(rng: np.random.Generator, kind: int, boxes: np.ndarray, circles: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """0 and 1: anywhere; 2: inside a solid; 3: within 0.3 m of one."""
+    if kind < 2:
+        return rng.uniform(-half, half)
+    which = rng.integers(len(boxes) + len(circles))
+    if which >= len(boxes):
+        x, y, radius = circles[which - len(boxes)]
+        turn = rng.uniform(-np.pi, np.pi)
+        far = radius * np.sqrt(rng.uniform()) if kind == 2 else radius + rng.uniform(0.0, 0.3)
+        return np.array([x, y]) + far * np.array([np.cos(turn), np.sin(turn)])
+    x, y, yaw, *sides = boxes[which]
+    place = rng.uniform(-1.0, 1.0, 2) * sides
+    if kind == 3:  # pushed out through one of the four sides
+        axis = rng.integers(2)
+        place[axis] = rng.choice([-1.0, 1.0]) * (sides[axis] + rng.uniform(0.0, 0.3))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.array([x, y]) + np.array([[cos, -sin], [sin, cos]]) @ place
