@@ -17,7 +17,7 @@ from cuelearner_jax.reading.session import is_python
 from cuelearner_jax.types import EnvState, Teacher
 
 BEFORE = 12  # steps before the first questions
-EACH, APART = 4, 2  # situations of each environment between two batches; steps between two situations
+EACH, APART = 4, 12  # situations of each environment between two batches; steps between two situations
 
 
 class Walk:
