@@ -242,7 +242,8 @@ def test_spaces_that_are_not_served_are_told_in_one_line(seen, does, told):
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"env": "Nope-v1"}, "Gymnasium has no environment 'Nope-v1'"),
+        ({"env": "Nope-v1"}, "no environment 'Nope-v1'.*; of an id that your own code registers give the class"),
+        ({"env": "CartPol-v1"}, "no environment 'CartPol-v1', did you mean 'CartPole-v1'"),
         ({"env": "os:system"}, "would import code"),
         ({"env": 7}, "env is 7: give an id of Gymnasium's registry"),
         ({"env": Adder, "max_steps": 0}, "max_steps is 0: give a whole number"),
