@@ -89,6 +89,10 @@ def source_of(ahead: Namespace) -> PolicySource:
             own = None if ahead.changes is None else changes.load(ahead.changes)
             source = _of_folder(folder, task, code, own)
             return dataclasses.replace(source, task=_with_teacher(source.task, ahead.teacher))
+        if task is not None and is_code(named):
+            _, preset = preset_of(task, ahead.preset)
+            own, task = code_of(named), _with_teacher(task, ahead.teacher)
+            return PolicySource(task, preset.config, None, Path(task.name), code=own)
         if task is not None:
             raise UserError(f"{named!r} is no run folder of the task {task.name}: give one, or leave it out")
         if ":" not in named and named not in registry.names():

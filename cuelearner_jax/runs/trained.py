@@ -21,6 +21,7 @@ from cuelearner_jax.policies import (
     Policy,
     Taught,
     asked_from,
+    in_space,
     uniform_in,
 )
 from cuelearner_jax.run_config import RunConfig
@@ -59,6 +60,7 @@ POLICIES: dict[str, Named] = {
     "teacher": Named("the teacher", taught=True),
     "heuristic": Named("the task's obvious action", needs=("heuristic",)),
     "uniform": Named("chance"),
+    "own": Named("code of your own, package.module:NAME, named first"),
 }
 
 
@@ -69,6 +71,7 @@ def make(
     teacher: Teacher | None = None,
     lanes: RunLanes | None = None,
     adapted: AdaptedLanes | None = None,
+    code: Any = None,
 ) -> Policy:
     """Return a policy by its name, or a block of its lanes.
 
@@ -79,9 +82,11 @@ def make(
         teacher: that world's teacher, where the policy asks one.
         lanes: a run's lanes, for a trained policy.
         adapted: a policy folder's lanes, for an adapted policy.
+        code: a policy of the user's own.
     """
-    if name in ("uniform", "heuristic"):
-        return uniform_in(view) if name == "uniform" else Heuristic(view)
+    if name in ("uniform", "heuristic", "own"):
+        own = None if code is None else in_space(code, actions_of(view))
+        return {"uniform": uniform_in(view), "heuristic": Heuristic(view), "own": own}[name]
     if name == "teacher":
         assert teacher is not None
         return Taught(teacher)
@@ -109,6 +114,7 @@ class PolicySource:
     folder: Path
     pieces: tuple[Piece, ...] = ()  # shards of a run; empty: the whole run lies in its folder
     adapted: AdaptedLanes | None = None  # of a policy folder
+    code: Any = None  # a policy of the user's own
 
     @classmethod
     def of_run(cls, folder: Path, find: Callable[[str], Task]) -> PolicySource:
@@ -138,6 +144,8 @@ class PolicySource:
         """The policy that acts where none is named."""
         if self.adapted:
             return "adapted"
+        if self.code is not None:
+            return "own"
         return "agent" if self.grid else "heuristic"
 
     def on(self, robot: str | None) -> PolicySource:
@@ -158,6 +166,8 @@ class PolicySource:
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
         if named.adapted and not self.adapted:
             raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` wrote")
+        if policy == "own" and self.code is None:
+            raise UserError("policy 'own' is code: name it first, as package.module:NAME --env TASK")
         if lacking := [need for need in named.needs if not offers(after, need)]:
             raise UserError(f"{self.task.name} has no {lacking[0]}: choose another policy")
         if not named.kept:
@@ -302,7 +312,7 @@ def several(
     view = source.task.view(world) if env is None else view_of(env)
     if not named.kept:
         check_no_lane(name, kind, labels, seeds, bound_deg)
-        return [make(name, source.config, view, teacher)], (0,)
+        return [make(name, source.config, view, teacher, code=source.code)], (0,)
     kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
     blocks = blocks_of(source, name, view, teacher, kinds, failed_too=True)
     budget = int(max(block.budgets.max() for block in blocks)) if labels is None else labels

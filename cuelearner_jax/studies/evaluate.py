@@ -115,7 +115,7 @@ def run(
     named = POLICIES[name]
     teacher = task.make_teacher(world, env) if policy is None and named.taught else None
     if policy is not None or not named.kept:
-        policy = make(name, source.config, view_of(env), teacher) if policy is None else policy
+        policy = make(name, source.config, view_of(env), teacher, code=source.code) if policy is None else policy
         none = np.zeros(1, int)
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
     else:

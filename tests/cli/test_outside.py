@@ -12,6 +12,7 @@ from cuelearner_jax.tasks import registry
 
 OWN = """
 import dataclasses
+import jax.numpy as jnp
 from probes import CONFIG, make_task
 from cuelearner_jax.task import Preset, Scenario
 
@@ -21,6 +22,10 @@ TASK = dataclasses.replace(
     scenarios={"narrow": Scenario("a narrow window", {"half_width_deg": 5.0})},
 )
 MUTE = dataclasses.replace(TASK, name="mute", teacher=None)
+
+
+def ahead(obs):
+    return jnp.tile(jnp.array([[1.0, 0.0]]), (len(obs), 1))
 """
 EVALUATE = ["--policy", "uniform", "--steps", "20", "--envs", "10"]
 
@@ -96,6 +101,13 @@ def test_a_scenario_is_the_ground_for_options(run, tmp_path):
     assert [world["world"]["half_width_deg"] for world in worlds] == [28.0, 5.0, 9.0]
     assert [world.get("scenario") for world in worlds] == [None, "narrow", "narrow"]
     assert [world["subject"] for world in worlds] == ["window"] * 3
+
+
+def test_a_policy_of_code_is_measured_in_a_task(refused, capsys, tmp_path):
+    measure = ["--task", "own_window:TASK", *EVALUATE[2:]]
+    assert main(["evaluate", "own_window:ahead", *measure, "--compare", "uniform"]) == 0
+    assert "own, 20 steps a lane" in " ".join(capsys.readouterr().out.split())
+    refused(["evaluate", *measure, "--policy", "own"], "policy 'own' is code: name it first", tmp_path)
 
 
 def test_what_cannot_be_is_refused(run, refused, tmp_path):
