@@ -141,3 +141,7 @@ def limited(start=0.0, render_mode=None):
 def reach():
     """`Reach` with a limit of steps that Gymnasium knows."""
     return gymnasium.wrappers.TimeLimit(Reach(), 12)
+
+
+if "ReachByName-v0" not in gymnasium.registry:
+    gymnasium.register("ReachByName-v0", reach)

@@ -181,7 +181,7 @@ def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> Pol
     if known is not None and known.named:
         before = shape_of(known, source.config.task)
         check_layout(f"{folder}", before.observation, actions_of(before), shape_of(known, known.plain()))
-        if known.named == f"{known.name}:{getattr(source.config.task, 'environment', '')}":
+        if getattr(known.plain(), "environment", None) == getattr(source.config.task, "environment", ""):
             return dataclasses.replace(source, task=known)  # with the folder's settings of this environment
         world = dataclasses.replace(source.config, task=known.plain())
         source = dataclasses.replace(source, task=known, config=world)

@@ -12,6 +12,8 @@ from small_runs import next_command, stopping_at
 import cuelearner_jax as cl
 from cuelearner_jax.bridges.gymnasium import pool
 from cuelearner_jax.cli import main
+from cuelearner_jax.cli.options import look_ahead
+from cuelearner_jax.cli.sources import source_of
 from cuelearner_jax.storage import results
 
 REACH = "gymnasium:gymnasium_worlds:reach"
@@ -86,12 +88,17 @@ APART = {"wall_s", "commit", "command", "folder", "run"}
 
 
 def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
-    out = tmp_path / "better"
-    command = ["adapt", "gymnasium_worlds:beside", "--env", REACH, "--teacher", "gymnasium_worlds:toward"]
-    assert main([*command, "--guidance", "relative", "--labels", "20", *SMALL, "--out", str(out)]) == 0
+    out, world = tmp_path / "better", ["--env", "gymnasium:gymnasium_worlds:ReachByName-v0"]
+    command = ["adapt", "gymnasium_worlds:beside", *world, "--teacher", "gymnasium_worlds:toward"]
+    layout = ["--task.slices", "hand", "goal", "--task.slice-sizes", "3", "3", "--task.units", "1", "m"]
+    layout += ["--task.slice-kinds", "", ""]
+    assert main([*command, "--guidance", "relative", "--labels", "20", *SMALL, *layout, "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert "success on tuning episodes" in told  # where there is one, success judges
-    assert main([*next_command(told), "--episodes", "4"]) == 0  # with the folder's number of processes
+    again = next_command(told)
+    source = source_of(look_ahead(again[1:]))
+    assert (source.config.task.slices, source.config.task.processes) == (("hand", "goal"), 1)  # the folder's own
+    assert main([*again, "--episodes", "4"]) == 0
 
 
 def test_python_and_the_command_line_agree(tmp_path):
