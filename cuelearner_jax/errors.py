@@ -124,5 +124,10 @@ def format_numbers(numbers: Iterable[float]) -> str:
 def suggestion(word: str, known: Iterable[str]) -> str:
     """Return the end of a message about an unknown word: the probably intended word, or all known words."""
     known = list(known)
-    found = difflib.get_close_matches(str(word)[:100], known, n=1)
-    return f", did you mean {found[0]!r}?" if found else f": choose one of {', '.join(known)}"
+    return near(word, known) or f": choose one of {', '.join(known)}"
+
+
+def near(word: str, known: Iterable[str]) -> str:
+    """Return the end of a message that names the probably intended word; empty where none is near."""
+    nearest = difflib.get_close_matches(str(word)[:100], list(known), n=1)
+    return f", did you mean {nearest[0]!r}?" if nearest else ""

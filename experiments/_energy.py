@@ -2,8 +2,7 @@
 
 The public code of CLIC learns one policy from its first correction on, and its energy knows nothing of another policy.
 Here the energy also sees how far an action lies from what a finished policy did, along each cue and in units of eps.
-A few labels tell that, where no energy of the situation can be learned from them: so does `offset` with relative
-feedback. With a_0 what the policy did:
+A few labels tell that, where no energy of the situation can be learned from them. With a_0 what the policy did:
 
     E(s, a, log(a_0, a) / eps),  a <- argmin over b within tau_max of a_0 of E
 

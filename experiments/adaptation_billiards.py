@@ -30,7 +30,7 @@ LEARNING: Mapping[str, Any] = {"task.teacher": "local_search", "sizes.num_envs":
 
 
 def pieces(world: str, bound: float) -> list[Piece]:
-    """Return the pieces of a world; of the unchanged one too: what do methods do to a policy that is right?"""
+    """Return the pieces of a world; in the unchanged one they show whether a method harms a policy that is right."""
     asked: dict[str, Any] = {"bound_deg": bound, "labels": (50, 100, 250), "seeds": 4}
     rate, noise = (0.05, 0.6) if world == "turned_strike" else (0.01, 0.3)
     tuned: dict[str, Any] = {"rate": rate, "noise_deg": noise, "steps": 60_000, "every": 10_000, "seeds": 4}

@@ -53,12 +53,12 @@ def _number(cell: str) -> Any:
 def colours(rows: Sequence[Row]) -> dict[str, str]:
     """Return the colour of each series: a kind's own, grey for those without labels."""
     names, spare = dict.fromkeys(str(row["series"]) for row in rows), list(OTHER_COLOURS)
-    found = {}
+    hues = {}
     for name in names:
         plain = name.startswith(("no ", "not ", "without", "SAC alone"))
-        known = registry.find_or_none(name)
-        found[name] = GREY if plain else colour_of(name) if known else spare.pop(0)
-    return found
+        is_kind = registry.find_or_none(name) is not None
+        hues[name] = GREY if plain else colour_of(name) if is_kind else spare.pop(0)
+    return hues
 
 
 def draw_curves(axes: Axes, rows: Sequence[Row], hues: dict[str, str]) -> None:

@@ -1,10 +1,10 @@
 """Peers on the robots of the zoo: the same worlds, teachers and budgets of labels, learned by other kinds of guidance.
 
-    python experiments/zoo_peers.py --kind relative --cues 3 --tuning --out runs/zoo_peers    # compares settings
-    python experiments/zoo_peers.py --kind relative --cues 3 --seeds 4 --out runs/zoo_peers   # with the best of these
+    python experiments/zoo_peers.py --kind relative --cues 3 --tuning                # compares all settings
+    python experiments/zoo_peers.py --kind relative --cues 3 --setting 4 --seeds 4   # with the best of these
 
-A kind asks its own questions, as its method says, about what it has made of the policy's actions so far. Settings
-(`SETTINGS`) are compared on tuning robots; CHOSEN are the best of these.
+A kind asks its own questions, as its method says, about what it has made of the policy's actions so far. `SETTINGS` are
+to be compared on tuning robots, and the best to be measured on held-out ones.
 """
 
 from __future__ import annotations
@@ -49,7 +49,6 @@ KINDS: Mapping[str, Kind] = {
 }
 # strength of an answer and largest correction [half of a cue's range; 90 degrees], rate of learning
 SETTINGS = tuple(product((0.1, 0.3), (0.6, 1.2), (1e-3, 3e-3)))
-CHOSEN: Mapping[str, tuple[float, float, float]] = dict.fromkeys(KINDS, SETTINGS[0])
 
 
 class Even(WholeObservations, struct.PyTreeNode):
@@ -165,19 +164,20 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4, help="of labels")
     parser.add_argument("--labels", type=int, default=100)
     parser.add_argument("--tuning", action="store_true", help="compare settings on tuning robots")
-    parser.add_argument("--setting", type=int, help="one of SETTINGS in place of the chosen one")
+    parser.add_argument("--setting", type=int, choices=range(len(SETTINGS)), help="number of one of SETTINGS")
     parser.add_argument("--at-once", type=int, default=392, help="cells side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/zoo_peers"), help="folder for Parquet files")
-    asked = parser.parse_args()
-    split = "tuning" if asked.tuning else "held_out"
-    robots, cells = study.group(asked.cues, asked.robots, split), cells_of(asked.robots, asked.seeds)
-    chosen = CHOSEN[asked.kind] if asked.setting is None else SETTINGS[asked.setting]
-    for number, setting in enumerate(SETTINGS if asked.tuning else (chosen,)):
-        file = asked.out / f"{asked.kind}_{split}_{asked.cues}{f'_{number}' if asked.tuning else ''}.parquet"
-        one = partial(measure, kind=asked.kind, setting=setting, labels=asked.labels)
-        rows = study.measured(file, cells, asked.at_once, lambda part, one=one: one(robots, part))
+    options = parser.parse_args()
+    split = "tuning" if options.tuning else "held_out"
+    robots, cells = study.group(options.cues, options.robots, split), cells_of(options.robots, options.seeds)
+    if options.tuning == (options.setting is not None):
+        parser.error("give --tuning, or --setting with the best setting of tuning robots")
+    for number, setting in enumerate(SETTINGS if options.tuning else (SETTINGS[options.setting],)):
+        file = options.out / f"{options.kind}_{split}_{options.cues}{f'_{number}' if options.tuning else ''}.parquet"
+        one = partial(measure, kind=options.kind, setting=setting, labels=options.labels)
+        rows = study.measured(file, cells, options.at_once, lambda part, one=one: one(robots, part))
         back = study.shares(rows, lambda row: True)
-        print(asked.kind, setting, f"loss back: mean {np.clip(back, -1, 1).mean():.3f}, median {np.median(back):.3f}")
+        print(options.kind, setting, f"loss back: mean {np.clip(back, -1, 1).mean():.3f}, median {np.median(back):.3f}")
 
 
 if __name__ == "__main__":

@@ -177,7 +177,7 @@ def test_no_kind_of_guidance_is_named_outside_its_room():
 @pytest.mark.parametrize(
     ("folders", "most"),
     [(["cuelearner_jax"], 31_500), (["envs"], 8_100), (["tests"], 29_700), (["experiments", "benchmarks"], 7_200)],
-    ids=lambda given: given[0] if isinstance(given, list) else "",
+    ids=["package", "envs", "tests", "experiments"],
 )
 def test_the_house_does_not_grow(folders, most):
     files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]

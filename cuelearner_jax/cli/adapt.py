@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from argparse import Namespace
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,12 +85,10 @@ def _source(ahead: Namespace) -> tuple[PolicySource, Any]:
 
     Raises UserError if they are not available.
     """
-    if not ahead.words or not is_code(ahead.words[0]):
-        return source_of(ahead), None
-    named = ahead.words[0]
-    if ahead.task is None and ahead.env is None:
-        return _of_labels(named, ahead.labels_from), code_of(named)
-    return source_of(Namespace(**{**vars(ahead), "words": [], "base": None})), code_of(named)
+    if ahead.words and is_code(ahead.words[0]) and ahead.task is None and ahead.env is None:
+        return _of_labels(ahead.words[0], ahead.labels_from), code_of(ahead.words[0])
+    source = source_of(ahead)
+    return replace(source, code=None), source.code
 
 
 def _of_labels(named: str, path: str | None) -> PolicySource:

@@ -28,7 +28,8 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 class Evaluate(Finished, EvaluateRequest[Any]):
     """Measure a policy on validation episodes, or compare two; in any changed world.
 
-    The policy is of a run or a policy folder, or a task's teacher, heuristic or chance."""
+    The policy is of a run or a policy folder, or a task's teacher, heuristic or chance; or, with --env, it is
+    package.module:NAME, any function of observations."""
 
     robot: str | None = None
     """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking

@@ -53,7 +53,7 @@ class Unnamed:
 
 @dataclass(frozen=True, kw_only=True)
 class Outside:
-    """What a command is about, and the code and worlds that it names."""
+    """The subject of a command, and the code and worlds that it names."""
 
     subject: Annotated[Word, tyro.conf.arg(metavar="TASK|FOLDER")] = None
     """A task by its name, as package.module:NAME or as gymnasium:FetchReach-v4; or a run folder, a policy folder or a

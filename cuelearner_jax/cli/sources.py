@@ -68,7 +68,7 @@ def preset_of(task: Task, name: str | None, default: str = PAPER) -> tuple[str, 
 
 
 def source_of(ahead: Namespace) -> PolicySource:
-    """Return the run folder, policy folder or task named first.
+    """Return the run folder, policy folder or task named first; or code, a policy of the user's own in a task.
 
     --task, or --env, makes an outside task known, and a library's environment the world of a folder. --teacher makes
     code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code.
@@ -77,7 +77,7 @@ def source_of(ahead: Namespace) -> PolicySource:
         UserError: the folder or task does not exist or is not available.
     """
     named, option = ahead.words[0] if ahead.words else None, _task_option(ahead)
-    task = None if option is None else registry.resolve(option)
+    task, own = None if option is None else registry.resolve(option), None
     code = None if ahead.base is None else code_of(ahead.base)
     for name, parts in PARTS.items():
         if (part := getattr(ahead, name)) is not None:
@@ -89,23 +89,20 @@ def source_of(ahead: Namespace) -> PolicySource:
             own = None if ahead.changes is None else changes.load(ahead.changes)
             source = _of_folder(folder, task, code, own)
             return dataclasses.replace(source, task=_with_teacher(source.task, ahead.teacher))
-        if task is not None and is_code(named):
-            _, preset = preset_of(task, ahead.preset)
-            own, task = code_of(named), _with_teacher(task, ahead.teacher)
-            return PolicySource(task, preset.config, None, Path(task.name), code=own)
-        if task is not None:
+        if task is not None and not is_code(named):
             raise UserError(f"{named!r} is no run folder of the task {task.name}: give one, or leave it out")
-        if ":" not in named and named not in registry.names():
+        if task is None and ":" not in named and named not in registry.names():
             raise UserError(
                 f"{named!r} is neither a run folder nor a task ({', '.join(registry.names())}) "
                 f"nor a shipped agent ({', '.join(shipped.names())})"
             )
-        task = registry.resolve(named)
+        own = None if task is None else code_of(named)
+        task = task or registry.resolve(named)
     assert task is not None  # otherwise a word was named
     if code is not None:
         raise UserError("--base names the code in a policy folder: give that folder, or leave it out")
     _, preset = preset_of(task, ahead.preset)
-    return PolicySource(_with_teacher(task, ahead.teacher), preset.config, None, Path(task.name))
+    return PolicySource(_with_teacher(task, ahead.teacher), preset.config, None, Path(task.name), code=own)
 
 
 def source_and_options(

@@ -84,9 +84,9 @@ def make(
         adapted: a policy folder's lanes, for an adapted policy.
         code: a policy of the user's own.
     """
-    if name in ("uniform", "heuristic", "own"):
-        own = None if code is None else in_space(code, actions_of(view))
-        return {"uniform": uniform_in(view), "heuristic": Heuristic(view), "own": own}[name]
+    alone = {"uniform": uniform_in, "heuristic": Heuristic, "own": lambda view: in_space(code, actions_of(view))}
+    if name in alone:
+        return alone[name](view)
     if name == "teacher":
         assert teacher is not None
         return Taught(teacher)

@@ -72,16 +72,16 @@ def check_complete(folder: Path, step: int, count: int, run: str) -> None:
 
     `run` is the key of the run, which tables of earlier versions lack. A missing table has no rows.
     """
-    found = 0
-    for schema in (GUIDES, SCHEMA):
+    rows = 0
+    for schema in (GUIDES, SCHEMA):  # the results last: theirs are the rows that count
         path = schema.found_in(folder)
         table = None if path is None else tables.read(path, schema)
         if table is not None and (tables.about_of(table) or {}).get("run", run) != run:
             raise UserError(f"{path} belongs to another run: put its own back")
-        found = table.filter(pc.field("step") <= step).num_rows if table is not None and table.num_rows else 0
-    if found != count:
+        rows = table.filter(pc.field("step") <= step).num_rows if table is not None and table.num_rows else 0
+    if rows != count:
         raise UserError(
-            f"{folder} has {found} of {count} results up to step {step}: restore its table, or move the folder away "
+            f"{folder} has {rows} of {count} results up to step {step}: restore its table, or move the folder away "
             "and give --resume, which trains these lanes anew"
         )
 

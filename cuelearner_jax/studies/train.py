@@ -80,7 +80,7 @@ def run(order: Order) -> None:
 
 
 class _Made(NamedTuple):
-    """What a training needs before its first step."""
+    """The parts of a training before its first step."""
 
     groups: list[LaneGroup]
     teacher: Teacher | None

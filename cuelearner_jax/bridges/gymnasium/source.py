@@ -8,12 +8,11 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, near
 
 DRAWN = "render_mode"
 MISSING = "Gymnasium is not installed: pip install 'cuelearner-jax[gymnasium]'"
@@ -120,9 +119,8 @@ def registry_spec(name: str) -> Any:
     except Exception as error:
         if not isinstance(error, gymnasium.error.Error):
             raise
-        near = get_close_matches(name[:100], list(gymnasium.registry), n=1)
         raise UserError(
-            f"Gymnasium has no environment {name!r}{f', did you mean {near[0]!r}?' if near else ''}; "
+            f"Gymnasium has no environment {name!r}{near(name, gymnasium.registry)}; "
             "of an id that your own code registers give the class or function (gymnasium:package.module:NAME)"
         ) from error
 
