@@ -19,10 +19,11 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.judging import Judge, Judgement, Judging
+from cuelearner_jax.adaptation.judging import LABELS, Judge, Judgement, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState, ask_round, begin, blame, rounds, take_labels
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
+from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.policies import Policy, policy_name
@@ -62,6 +63,37 @@ class AdaptationResult:
         """Return the lanes' adapted policies, to act in `env`."""
         return self.of.policy(self.block, env)
 
+    @property
+    def words(self) -> list[str]:
+        """The result line by line: of each lane what a reading found, whether the correction is used, and why."""
+        lines, unit = [], actions_of(self.of.env).unit
+        for lane in range(self.lanes.number):
+            _, seed, budget, bound = (column[lane] for column in self.lanes)
+            result = self.results[lane] if self.results else None
+            within = "" if result else f" within {bound:g} {unit}"
+            told = result.words() if result else []
+            if result is None or result.changed:
+                told.append(self._verdict(lane, unit))
+            lane_of = f", seed {seed}" if self.lanes.number > 1 else ""
+            lines += [f"{budget} labels{within}{lane_of}: {line}" for line in told]
+        return lines
+
+    def _verdict(self, lane: int, unit: str) -> str:
+        judged, bound = self.judged, self.lanes.bound_deg[lane]
+        before, after, narrowed = (column[lane] for column in (judged.before, judged.after, judged.within_deg))
+        if judged.by != LABELS:
+            difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*judged.difference[lane])
+            spent = f"difference {difference}; {judged.rewarded_steps[lane]:,} rewarded steps"
+            why = f"{judged.by} on tuning episodes {before:.4g} before, {after:.4g} after ({spent})"
+        elif self.results:
+            factor = np.exp(min(after, 50.0))
+            why = f"answers predicted before they were read: {factor:.3g} times as likely as without a change"
+        else:
+            why = f"predicts {after:.4g} of held-out answers, always 'already right' {before:.4g}"
+        if not judged.used[lane]:
+            return f"{why}; not shown to be better, so the policy stays as it was"
+        return f"{why}; the correction is used" + (f" within {narrowed:g} {unit}" if narrowed < 0.999 * bound else "")
+
 
 def adapt(
     of: Adaptation,
@@ -82,22 +114,17 @@ def adapt(
         labels: rows (lanes, slots, ...) in place of questions, fitted at once.
         mesh: devices that share the lanes (default: all of this process's).
         watch: takes the name of a piece of work, returns its progress callback.
-
-    Raises:
-        UserError: policies cannot be judged as asked.
     """
     mesh, count = mesh or lane_mesh(), lanes.number
     # the block is filled up with repeats of the last lane, which are dropped in the end
     filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)
-    judge = Judge(of, lanes.rows(filled), how, mesh, watch)
     if labels is not None:
         labels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
-    block = learn_lanes(of, lanes.rows(filled), teacher, labels, mesh, watch, judge.measure_if_due)
+    judge = Judge(of, lanes.rows(filled), how, mesh, watch)
+    block = learn_lanes(of, judge.lanes, teacher, labels, mesh, watch, judge.measure_if_due)
     judged, block = judge.judge_lanes(block)
-    model = block.guide.model  # a model that is not used leaves actions unchanged
-    block = block.replace(
-        guide=block.guide.replace(model=model.replace(fitted=model.fitted & jnp.asarray(judged.used)))
-    )
+    fitted = block.guide.model.fitted & jnp.asarray(judged.used)  # an unfitted model leaves actions unchanged
+    block = block.replace(guide=block.guide.replace(model=block.guide.model.replace(fitted=fitted)))
     block = jax.tree.map(lambda leaf: leaf[:count], block)
     curve = [{name: values[:count] for name, values in row.items()} for row in judge.curve]
     return AdaptationResult(of, lanes, block, Judgement(judged.by, *(column[:count] for column in judged[1:])), curve)
@@ -119,10 +146,9 @@ def learn_lanes(
     """
     mesh = mesh or lane_mesh(jax.local_devices()[:1])
     placed = of.replace(env=place(mesh, of.env, SHARED), bases=place(mesh, of.bases, SHARED))
-    block = place(mesh, begin(of, lanes), BY_LANE)  # as it lies: whoever has begun it before has compiled it
+    block = place(mesh, begin(of, lanes), BY_LANE)
     if labels is not None:
         return take_labels(placed, place(mesh, labels, BY_LANE), block, mesh)
-    assert teacher is not None  # asked for where no labels are given
     asks, number, tell = place(mesh, teacher, SHARED), rounds(lanes, of.sizes), watch("labels")
     for done in range(number):
         tell(done, number)
@@ -134,22 +160,24 @@ def learn_lanes(
     return block
 
 
+def check_bounds(space: Space, bounds: Sequence[float]) -> None:
+    """Raise UserError for a bound that no action can reach, or that is given twice."""
+    if not all(0 < bound <= space.reach for bound in bounds) or len(set(bounds)) < len(bounds):  # NaN is neither
+        given = " ".join(f"{bound:g}" for bound in bounds)
+        raise UserError(f"bound_deg is {given}: give numbers above 0, up to {space.reach:g} ({space.unit}), each once")
+
+
 def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> str:
     """Return a hint if refinement cannot reach the largest bound, else an empty string.
 
-    Raises UserError for values that cannot work, or from which nothing could be learned.
+    Raises UserError for values from which nothing could be learned.
     """
-    eps, given = scalars.eps_deg, " ".join(f"{bound:g}" for bound in bounds)
-    if not all(math.isfinite(bound) and 0 < bound <= space.reach for bound in bounds):
-        raise UserError(f"bound_deg is {given}: give a number above 0 and up to {space.reach:g} ({space.unit})")
-    if len(set(bounds)) < len(bounds):
-        raise UserError(f"bound_deg is {given}: give each bound once")
-    if eps < space.grain:
-        raise UserError(f"scalars.eps_deg is {eps:g} {space.unit}: give at least {space.grain:g}, the smallest change")
-    if eps > min(bounds):
+    eps = scalars.eps_deg
+    check_bounds(space, bounds)
+    if not space.grain <= eps <= min(bounds):
         raise UserError(
-            f"labels of {eps:g} {space.unit} say nothing within a bound of {min(bounds):g}: give a smaller "
-            "scalars.eps_deg, about a tenth of the bound"
+            f"labels of {eps:g} {space.unit} say nothing within a bound of {min(bounds):g}: give a scalars.eps_deg "
+            f"from {space.grain:g} on, about a tenth of the bound"
         )
     if scalars.tau_deg >= eps:
         raise UserError(
@@ -170,9 +198,7 @@ def usual_bound(space: Space) -> float:
 
 
 def reach(space: Space, policy: Policy, obs: Any, action: Any) -> float:
-    """Return the distance within which 95% of labelled actions (labels, action) lie from a policy's own, in the space's
-    unit.
-    """
+    """Return how far 95% of labelled actions (labels, action) lie from a policy's own at most, in the space's unit."""
     away = _distances(space, policy, jnp.asarray(obs), jnp.asarray(action))
     user_code.check_actions(away, policy_name(policy))
     return float(space.to_unit(np.quantile(np.asarray(away), REACH_QUANTILE), np))

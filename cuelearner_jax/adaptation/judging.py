@@ -22,7 +22,7 @@ from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.errors import UserError, suggestion
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
 from cuelearner_jax.policies import PolicyBlock
 from cuelearner_jax.spaces import is_answered
@@ -35,7 +35,6 @@ AT_ONCE = 10  # episodes between two looks
 STAKES = np.array([0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # lambda of the sequential test
 DECIDED = 20.0  # value of the test martingale that decides
 SHARES = ("success", "finished")  # metrics within [0, 1]
-MOST_BOUNDS = 16  # largest number of shares of a bound
 
 
 @dataclass(frozen=True)
@@ -69,21 +68,10 @@ def metrics_of(env: Environment) -> tuple[str, ...]:
     return ("reward", *step.metrics, *step.outcome)
 
 
-def _step_of(env: Environment) -> Any:
+def _step_of(env: Any) -> Any:
     key = jax.random.key(0)
     state, _ = jax.eval_shape(env.reset, key)
     return jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))[1]
-
-
-def check_bounds(shares: tuple[float, ...], by: str) -> None:
-    """Raise UserError for shares of a bound outside (0, 1), or too many of them."""
-    if len(shares) > MOST_BOUNDS:
-        raise UserError(f"judge_bounds has {len(shares):,} shares, each played by itself: give at most {MOST_BOUNDS}")
-    if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
-        given = " ".join(f"{share:g}" for share in shares)
-        raise UserError(f"judge_bounds is {given}: give shares of the bound above 0 and below 1, each once")
-    if shares and by == LABELS:
-        raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
 
 
 class Judge:
@@ -103,10 +91,15 @@ class Judge:
         if self.how.every and asked % self.how.every == 0:
             self.measure(block)
 
+    def measure(self, block: Any) -> None:
+        """Roll out the lanes' current policies, and add a row to the learning curve."""
+        found = self._rolled(self.of.policy(block, self.how.env), "the adapted policy")
+        self.curve.append({"asked": np.asarray(block.asked), "failed": np.asarray(block.failed), **found.means})
+
     def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
         """Return the judgement of the finished lanes, and the lanes with the bounds that are used.
 
-        Raises UserError if the world has no such metric, or labels cannot judge.
+        Raises UserError if labels cannot judge.
         """
         how, lanes = self.how, self.lanes
         if how.by == LABELS:
@@ -114,15 +107,11 @@ class Judge:
             if how.env is not None:
                 self.measure(block)
             return found, block
-        assert how.env is not None  # a metric needs episodes
-        known = metrics_of(how.env)
-        if how.by not in known:
-            raise UserError(f"there is no metric {how.by!r} to judge by{suggestion(how.by, [*known, LABELS])}")
         if how.every:
             self.measure(block)
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
-        block, spent = self._narrowed(block)
-        test, values, steps = PairedTest(lanes.number), [], np.zeros(lanes.number, int)
+        block, steps = self._narrowed(block)
+        test, values = PairedTest(lanes.number), []
         for number in range(-(-how.num_envs // AT_ONCE)):
             pair, played = self._pair(block, number)
             values.append(pair)
@@ -131,16 +120,14 @@ class Judge:
             if (test.decided | ~usable).all():
                 break
         before, after = (np.concatenate([pair[end][how.by] for pair in values], -1) for end in (0, 1))
-        difference = mean_interval(after - before).T
-        used = usable & test.better
-        means = before.mean(-1), after.mean(-1)
-        return Judgement(how.by, *means, used, bounds_of(self.of, block), difference, steps + spent), block
+        means, difference = (before.mean(-1), after.mean(-1)), mean_interval(after - before).T
+        return Judgement(how.by, *means, usable & test.better, bounds_of(self.of, block), difference, steps), block
 
     def _pair(self, block: Any, number: int) -> tuple[tuple[dict[str, np.ndarray], ...], np.ndarray]:
         """Play episodes by base and adapted policy; return the values of each (lanes, episodes), and the steps."""
         key = jax.random.fold_in(episodes(SPLIT), number)
         bases = self._rolled(self.of.bases, "the policy as it was", key, AT_ONCE)
-        after = self._rolled(self._policy(block), "the corrected policy", key, AT_ONCE)
+        after = self._rolled(self.of.policy(block, self.how.env), "the corrected policy", key, AT_ONCE)
         shared = len(next(iter(bases.each.values()))) == 1
         own = np.zeros(self.lanes.number, int) if shared else self.lanes.base
         pair = ({name: np.asarray(values)[own] for name, values in bases.each.items()}, after.each)
@@ -149,41 +136,26 @@ class Judge:
     def _narrowed(self, block: Any) -> tuple[Any, np.ndarray]:
         """Return lanes within the best share of their bounds, and the rewarded steps (lanes,) of this."""
         spent = np.zeros(self.lanes.number, int)
-        if not self.how.bounds:
-            return block, spent
         best, value = block.bound, np.full(self.lanes.number, -np.inf)
-        for share in (1.0, *self.how.bounds):
+        for share in (1.0, *self.how.bounds) if self.how.bounds else ():
             tried = block.replace(bound=share * block.bound)
-            found = self._rolled(self._policy(tried), f"the adapted policy within {share:g} of its bound")
+            what = f"the adapted policy within {share:g} of its bound"
+            found = self._rolled(self.of.policy(tried, self.how.env), what)
             spent = spent + self._played(found, self.how.num_envs)
             better = np.asarray(found.means[self.how.by]) > value
             value = np.where(better, found.means[self.how.by], value)
             best = jnp.where(jnp.asarray(better), tried.bound, best)
         return block.replace(bound=best), spent
 
-    def measure(self, block: Any) -> Rollout:
-        """Roll out the lanes' current policies, and add a row to the learning curve."""
-        found = self._rolled(self._policy(block), "the adapted policy")
-        asked, failed = np.asarray(block.asked), np.asarray(block.failed)
-        self.curve.append({"asked": asked, "failed": failed, **found.means})
-        return found
-
-    def _policy(self, block: Any) -> PolicyBlock:
-        return self.of.policy(block, self.how.env)
-
     def _rolled(self, policy: PolicyBlock, what: str, key: Any = None, num_envs: int | None = None) -> Rollout:
         how = self.how
-        assert how.env is not None
+        assert how.env is not None  # a metric needs episodes
         mesh = None if policy is self.of.bases else self.mesh  # the number of environments may differ
         key, envs = episodes(SPLIT) if key is None else key, num_envs or how.num_envs
         return rollout_lanes(how.env, policy, key, envs, envs * how.steps, self.watch(what), mesh)
 
     def _played(self, rolled: Rollout, num_envs: int) -> np.ndarray:
-        """Return the environment steps (lanes,) of a roll-out that count.
-
-        Where a metric is an outcome, only the steps of first episodes count.
-        """
-        assert self.how.env is not None
+        """Return the environment steps (lanes,) that count: where a metric is an outcome, those of first episodes."""
         first, whole = np.asarray(rolled.episode_steps), num_envs * self.how.steps
         return first.sum(-1) if self.how.by in _step_of(self.how.env).outcome else np.full(len(first), whole)
 

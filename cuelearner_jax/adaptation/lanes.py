@@ -6,10 +6,10 @@ labels, bounds are traced, and several base policies are one pytree with a leadi
 compiled program: side by side on an accelerator, one by one on a CPU (`devices.each_lane`), shared out over a mesh.
 
     of = Adaptation(guide, sizes, scalars, env, bases)    # settings of all lanes
-    lanes = product(bases=8, seeds=(0,), budgets=(100, 250, 500), bounds_deg=(60.0, 180.0))    # or `one_each`
+    lanes = product(bases=8, seeds=(0,), budgets=(100, 250, 500), bounds_deg=(60.0, 180.0))
     block = begin(of, lanes)
     for _ in range(rounds(lanes, sizes)):
-        block = ask_round(of, teacher, block)    # or once: take_labels(of, labels, block)
+        block = ask_round(of, teacher, block, mesh)    # or once: take_labels(of, labels, block, mesh)
     policy = of.policy(block)    # a block for `evaluate.rollout_lanes`
 """
 
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import product as combinations
+from operator import index
 from typing import Any, NamedTuple
 
 import jax
@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_jax import asking
 from cuelearner_jax.asking import GuideState
 from cuelearner_jax.config import GuideSizes, Scalars
-from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, over_lanes
 from cuelearner_jax.environment import Environment, actions_of, view_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, PolicyBlock
@@ -50,26 +50,20 @@ class Lanes(NamedTuple):
         """The number of lanes."""
         return len(self.seed)
 
-    def rows(self, index: Any) -> Lanes:
+    def rows(self, numbers: Any) -> Lanes:
         """Return the lanes with these row numbers."""
-        return Lanes(*(column[index] for column in self))
+        return Lanes(*(column[numbers] for column in self))
 
 
-def _lanes(rows: Sequence[tuple[int, int, int, float]]) -> Lanes:
-    kinds = (np.int32, np.int32, np.int32, np.float32)
-    return Lanes(*(np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), kinds, strict=True)))
-
-
-def product(bases: int, seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float]) -> Lanes:
-    """Return the lanes of every combination of base policy, seed, label budget and bound."""
-    rows = combinations(bounds_deg, budgets, range(bases), seeds)
-    return _lanes([(base, seed, budget, bound) for bound, budget, base, seed in rows])
-
-
-def one_each(seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float]) -> Lanes:
-    """Return lanes that pair each base policy with a seed of its own, for every label budget and bound."""
-    rows = combinations(bounds_deg, budgets, enumerate(seeds))
-    return _lanes([(base, seed, budget, bound) for bound, budget, (base, seed) in rows])
+def product(
+    bases: int, seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float], one_each: bool = False
+) -> Lanes:
+    """Return the lanes of every combination; `one_each`: pair each base policy with a seed of its own."""
+    pairs = [*enumerate(seeds)] if one_each else [(base, seed) for base in range(bases) for seed in seeds]
+    rows = [(*pair, budget, bound) for bound in bounds_deg for budget in budgets for pair in pairs]
+    base, seed, budget, bound = zip(*rows, strict=True)
+    whole = lambda column: np.array([*map(index, column)], np.int32)  # noqa: E731  # refuses fractions
+    return Lanes(whole(base), whole(seed), whole(budget), np.array(bound, np.float32))
 
 
 def side_by_side(policies: Sequence[Any]) -> Any:
@@ -149,16 +143,13 @@ def begin(of: Adaptation, lanes: Lanes) -> LaneState:
     return _begin(of.guidance, of.sizes, slots, of.env, columns)
 
 
-def ask_round(of: Adaptation, teacher: Teacher, block: LaneState, mesh: Mesh | None = None) -> LaneState:
+@partial(jax.jit, static_argnames="mesh")
+def ask_round(of: Adaptation, teacher: Any, block: LaneState, mesh: Mesh) -> LaneState:
     """Ask a simulated teacher one round of questions in every lane, then fit each lane's model (`asking.label_round`).
 
-    A lane whose budget is used up does not change. `mesh`: devices that share the lanes (default: the first one alone).
+    A lane whose budget is used up does not change. `mesh`: devices that share the lanes.
     """
-    return _ask_round(of, teacher, block, mesh=mesh or lane_mesh(jax.local_devices()[:1]))
 
-
-@partial(jax.jit, static_argnames="mesh")
-def _ask_round(of: Adaptation, teacher: Any, block: LaneState, *, mesh: Mesh) -> LaneState:
     def of_device(of: Adaptation, teacher: Any, block: LaneState) -> LaneState:
         def one(lane: LaneState) -> LaneState:
             own = asking.Inquiry(of.guidance, of.env, of.scalars, of.bases.lane(lane.base), lane.bound)
@@ -169,22 +160,17 @@ def _ask_round(of: Adaptation, teacher: Any, block: LaneState, *, mesh: Mesh) ->
     return over_lanes(mesh, of_device, (SHARED, SHARED, BY_LANE), BY_LANE)(of, teacher, block)
 
 
-def take_labels(of: Adaptation, labels: Label, block: LaneState, mesh: Mesh | None = None) -> LaneState:
+@partial(jax.jit, static_argnames="mesh")
+def take_labels(of: Adaptation, labels: Label, block: LaneState, mesh: Mesh) -> LaneState:
     """Fit every lane once to given labels (lanes, slots, ...), as the last round of questions would.
 
     A kind that fits from scratch then has the same model as a lane that asked these questions. A kind that goes on
     learning (deep COACH) is corrected by all labels in one go, with other random numbers.
     """
-    return _take(of, labels, block, mesh=mesh or lane_mesh(jax.local_devices()[:1]))
 
-
-@partial(jax.jit, static_argnames="mesh")
-def _take(of: Adaptation, labels: Label, block: LaneState, *, mesh: Mesh) -> LaneState:
     def of_device(of: Adaptation, labels: Label, block: LaneState) -> LaneState:
         def one(labels: Label, lane: LaneState) -> LaneState:
-            if (
-                of.guidance.kind.sees_base
-            ):  # files do not keep the base policy's actions: the base policy is asked again
+            if of.guidance.kind.sees_base:  # files do not keep the base policy's actions: ask it again
                 labels = labels.replace(base=of.bases.lane(lane.base).act(lane.key, None, labels.obs))
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
             last = (lane.guide.budget - 1) // of.sizes.labels_per_round  # number of the last round

@@ -16,20 +16,18 @@ from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import blame
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.feedback import Labels, check_settings, divergence_error, label_path, labels_of, rows_of
-from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, source_of
+from cuelearner_jax.api.feedback import Labels, divergence_error, labels_of, rows_of
+from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, config_of
 from cuelearner_jax.api.worlds import World
-from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.config import GuideSizes, Scalars, normalize_options
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import Common
 from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.storage import label_files, policy_folders
-from cuelearner_jax.studies import adapt as study
-from cuelearner_jax.studies.adapt import AdaptedStudy, BaseLanes, Subject
-from cuelearner_jax.task import Body, Task
-from cuelearner_jax.types import Label, Teacher
+from cuelearner_jax.storage import policy_folders
+from cuelearner_jax.studies.adapt import AdaptedStudy, AdaptRequest, Subject
+from cuelearner_jax.types import Teacher
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,7 +38,7 @@ class AdaptedPolicy(CallablePolicy):
     """
 
     outcome: AdaptedStudy
-    named: str | None  # the base, as Python calls it; None: its world has no name either
+    named: str  # the base, as Python calls it
 
     @property
     def used(self) -> bool:
@@ -82,7 +80,7 @@ class AdaptedPolicy(CallablePolicy):
     @property
     def words(self) -> list[str]:
         """The lines that `cuelearner adapt` prints of this result."""
-        return study.sentences(self.outcome.found)
+        return self.outcome.found.words
 
     @user_code.report_user_errors
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
@@ -90,17 +88,11 @@ class AdaptedPolicy(CallablePolicy):
 
         Raises UserError if the folder is in use, or the policy was adapted in no world that can be named.
         """
-        folder = arguments.path("folder", folder)
-        arguments.flag("overwrite", overwrite)
-        if folder.exists() and not folder.is_dir():
-            raise UserError(f"folder {folder} is a file: give the path of a folder")
-        if self.named is None:
-            raise UserError(
-                "a policy folder names the world of its policy, and this policy was adapted in a "
-                "bare environment: adapt in a world from cl.make"
-            )
-        with policy_folders.place_of(folder, overwrite) as place:
-            self.outcome._replace(origin={"code": self.named}).write(place)
+        if self.world is None:
+            raise UserError("a policy folder names its world, and an environment has no name: adapt in one of cl.make")
+        subject = self.outcome.subject._replace(origin={"code": self.named})
+        with policy_folders.place_of(Path(folder), overwrite) as place:
+            self.outcome._replace(subject=subject).write(place)
 
 
 @user_code.report_user_errors
@@ -151,90 +143,45 @@ def adapt(
             environment that returns them (default: what the world declares).
 
     Raises:
-        UserError: settings that make no sense, or with which the fit diverges.
+        UserError: settings that cannot work, or with which the fit diverges.
     """
-    source = _source(policy, world)
-    env = world.env if isinstance(world, World) else world
-    space = actions_of(env)
-    sizes, scalars, eps_deg = check_settings(space, sizes, scalars, eps_deg)
-    guidance, judge_by = (
-        arguments.optional(arguments.text, name, value)
-        for name, value in (("guidance", guidance), ("judge_by", judge_by))
-    )
-    count, file, rows = _given(labels, world)
-    scenario = world.scenario if isinstance(world, World) else None
-    request = study.suggested(source, scenario, guidance, judge_by, file, eps_deg, sizes, scalars)
-    asked = {
-        "labels": None if count is None else (count,),
-        "bound_deg": None if bound_deg is None else (arguments.amount("bound_deg", bound_deg, space),),
-        "judge_bounds": arguments.optional(_shares, "judge_bounds", judge_bounds),
-    }
-    request = dataclasses.replace(
-        request,
-        task=source.config.task,
-        first_seed=arguments.seed("seed", seed),
-        judge_episodes=arguments.whole("judge_episodes", judge_episodes, 1, study.MOST_ENVS),
-        **{name: value for name, value in asked.items() if value is not None},
-    )
-    own = as_policy_in(policy, env)
-    if teacher is not None:
-        teacher = arguments.teacher("teacher", teacher, space)
-        user_code.answers_in("teacher", teacher, env)
-    elif file is None and rows is None:
-        raise UserError(
-            "teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels as arrays or a file"
-        )
-    subject = Subject(source, BaseLanes(source.default_policy), own, teacher=teacher, rows=rows, changes=changes)
-    outcome = study.run(subject, request, note=partial(warnings.warn, stacklevel=5))
-    if outcome.found.failed.any():
-        blame(outcome.found.of, teacher, outcome.found.block)
-        raise divergence_error()
-    if not outcome.found.judged.used.all():
-        warnings.warn(study.sentences(outcome.found)[-1], stacklevel=3)
-    adapted = outcome.found.policy(env).lane(0)
-    named = _called(policy) if isinstance(world, World) else None
-    trained = RunConfig(source.config.task)
-    observation = getattr(env, "observation", ())
-    where = world if isinstance(world, World) else None
-    told = {"trained": trained, "actions": space, "world": where}
-    return AdaptedPolicy(adapted, observation, **told, outcome=outcome, named=named)
-
-
-def _source(policy: Any, world: Any) -> PolicySource:
-    """Return a world's task and the configuration of its training. Raises UserError for an object that is no world."""
-    if isinstance(world, World):
-        return source_of(policy, world)
     if hasattr(world, "observation_space"):
         raise UserError("world is an environment of Gymnasium: give cl.from_gymnasium(its id, class or function)")
-    if isinstance(world, type) or not all(callable(getattr(world, name, None)) for name in ("reset", "step")):
-        raise arguments.argument_error("world", world, "a world, as cl.make gives it, or an environment")
-    task = Task("environment", "a bare environment", _Bare, (Body("own", "", lambda config, split: world),))
-    config = getattr(policy, "trained", None) or RunConfig(_Bare(), scalars=plain_scalars(actions_of(world)))
-    return PolicySource(task, config, None, Path(task.name))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Bare:
-    """The empty configuration of a bare environment."""
-
-
-def _given(labels: Any, world: Any) -> tuple[int | None, Path | None, Label | None]:
-    """Return labels as a number of questions, as a file, or as rows (labels, ...). Raises UserError for others."""
-    if isinstance(labels, str | os.PathLike):
-        path = label_path(labels)
-        if isinstance(world, World):
-            return None, path, None
-        return None, None, label_files.read(path).labels  # a bare environment has no name that a file could hold
-    if labels is None:
-        return None, None, None
-    if not isinstance(labels, tuple):
-        return arguments.budget("labels", labels), None, None
-    return None, None, rows_of(labels)
-
-
-def _shares(name: str, given: Any) -> tuple[float, ...]:
-    wanted = "shares of the bound below 1"
-    return tuple(arguments.number(name, bound, 1.0, wanted) for bound in arguments.several(name, given, wanted))
+    known = world if isinstance(world, World) else None
+    env = world.env if isinstance(world, World) else world
+    space = actions_of(env)
+    if known is not None:
+        config = config_of(policy, known)
+    else:
+        config = getattr(policy, "trained", None) or RunConfig(None, scalars=plain_scalars(space))
+    file = Path(labels) if isinstance(labels, str | os.PathLike) else None
+    rows = rows_of(labels) if isinstance(labels, tuple) else None
+    if teacher is not None:
+        teacher = arguments.teacher_of_world(teacher, space)
+        user_code.answers_in("teacher", teacher, env)
+    elif file is None and rows is None:
+        raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
+    sizes, scalars = sizes and normalize_options(sizes, "sizes"), scalars and normalize_options(scalars, "scalars")
+    task, scenario = (known.task, known.scenario) if known else (None, None)
+    chosen: dict[str, Any] = {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
+    if file is None and rows is None and labels is not None:
+        chosen["labels"] = (labels,)
+    if bound_deg is not None:
+        chosen["bound_deg"] = (float(bound_deg),)
+    if judge_bounds is not None:
+        chosen["judge_bounds"] = tuple(map(float, judge_bounds))
+    request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, sizes, scalars)
+    subject = Subject(env, Common(as_policy_in(policy, env)), task=task, teacher=teacher, rows=rows, changes=changes)
+    outcome = dataclasses.replace(request, **chosen).run(subject, note=partial(warnings.warn, stacklevel=5))
+    found = outcome.found
+    if found.failed.any():
+        blame(found.of, teacher, found.block)
+        raise divergence_error()
+    if not found.judged.used.all():
+        warnings.warn(found.words[-1], stacklevel=3)
+    adapted, observation = found.policy(env).lane(0), getattr(env, "observation", ())
+    about = {"trained": RunConfig(config.task), "actions": space, "world": known}
+    return AdaptedPolicy(adapted, observation, **about, outcome=outcome, named=_called(policy))
 
 
 def _called(policy: Any) -> str:

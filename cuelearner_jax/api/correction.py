@@ -6,22 +6,21 @@ import dataclasses
 import os
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 
-from cuelearner_jax import config as configuration
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
-from cuelearner_jax.api.feedback import Labels, label_path, labels_of, rows_of
+from cuelearner_jax.api.feedback import Labels, LabelSet, labels_from_file, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, load_policy
 from cuelearner_jax.api.worlds import World
-from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.config import GuideSizes, Scalars, from_json
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
@@ -30,21 +29,10 @@ from cuelearner_jax.guides.reading import KIND
 from cuelearner_jax.policies import in_space
 from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
-from cuelearner_jax.storage import label_files
 from cuelearner_jax.studies import agreement as study
 from cuelearner_jax.studies.agreement import Agreement
 from cuelearner_jax.tasks import logs
 from cuelearner_jax.tasks.logs import LogsConfig
-from cuelearner_jax.types import Label
-
-
-class GivenLabels(NamedTuple):
-    """Labels with the strength, space and recording that their file names."""
-
-    rows: Label
-    space: Space
-    eps: float | None  # strength of an answer in the space's unit; None: not known
-    config: LogsConfig | None = None  # digest of the recording that the labels are about; None: not known
 
 
 @user_code.report_user_errors
@@ -85,39 +73,23 @@ def correct(
         seed: seed of all random numbers.
 
     Raises:
-        UserError: labels or settings that make no sense, or with which the fit diverges.
+        UserError: labels or settings that cannot work, or with which the fit diverges.
     """
-    if policy is None:
-        raise UserError(
-            "policy is None: give the policy whose actions the labels are about; without a base policy, "
-            "cl.fit_feedback fits a model to the answers"
-        )
-    policy = (
-        load_policy(os.fspath(policy))
-        if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX)
-        else policy
-    )
+    if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX):
+        policy = load_policy(policy)
     before = _recording_of(policy)
-    if (
-        before is not None
-        and not isinstance(labels, str | os.PathLike)
-        and not any(map(_is_told, (space, cues, low, high)))
-    ):
+    arrays = not isinstance(labels, str | os.PathLike)
+    if before is not None and arrays and not _chosen(space=space, cues=cues, low=low, high=high):
         space = logs.space_of(before)  # the labels of a policy that was corrected before
-    found = _given(labels, space, cues, low, high)
-    eps = arguments.optional(arguments.amount, "eps", eps, found.space)
-    if found.eps is not None and eps is not None and not np.isclose(eps, found.eps, rtol=1e-6):
-        raise UserError(f"{labels} holds answers of {found.eps:g} {found.space.unit}: leave out eps")
-    world = world_of(found, before)
+    found = _labels(labels, space, cues, low, high)
     own = as_policy(policy)
-    # raises UserError where the policy returns something else than actions
-    CallablePolicy(in_space(own, found.space), actions=found.space)(found.rows.obs)
+    CallablePolicy(in_space(own, found.space), actions=found.space)(found.rows.obs)  # refuses what gives no actions
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
-        world,
+        world_of(found, before),
         labels=labels_of(found.rows),
-        bound_deg=arguments.optional(arguments.amount, "bound", bound, found.space),
-        eps_deg=found.eps if eps is None else eps,
+        bound_deg=bound,
+        eps_deg=found.strength(eps),
         guidance=guidance,
         sizes=sizes,
         scalars=scalars,
@@ -149,70 +121,43 @@ def agreement(
         UserError: labels that do not fit the policy, or no space.
     """
     own = as_policy(policy)
-    if space is None and isinstance(policy, CallablePolicy) and not isinstance(labels, str | os.PathLike):
-        space = policy.actions
     if space is None and not isinstance(labels, str | os.PathLike):
-        raise UserError("space is None, and arrays of labels name none: give space=, or a label file")
-    found = _given(labels, space, "", None, None)
-    strength = arguments.optional(arguments.amount, "eps", eps, found.space) or found.eps
-    if strength is None:
-        scalars = getattr(own, "scalars", None) or plain_scalars(found.space)
-        strength = float(scalars.eps_deg)
-    base = getattr(own, "base", None) if base is None else as_policy(base, "base")
+        if not isinstance(policy, CallablePolicy):
+            raise UserError("space is None, and arrays of labels name none: give space=, or a label file")
+        space = policy.actions
+    found = _labels(labels, space)
+    eps = found.eps if eps is None else eps
+    if eps is None:
+        eps = float((getattr(own, "scalars", None) or plain_scalars(found.space)).eps_deg)
+    base = getattr(own, "base", None) if base is None else as_policy(base)
     base = None if base is None else in_space(base, found.space)
-    return study.agreement(in_space(own, found.space), found.rows, found.space, strength, base)
+    return study.agreement(in_space(own, found.space), found.rows, found.space, eps, base)
 
 
-def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabels:
-    """Return checked labels with their space. Raises UserError for labels that make no sense."""
-    told = [name for name, value in (("cues", cues), ("low", low), ("high", high)) if _is_told(value)]
-    if space is not None and told:
-        raise UserError(f"{told[0]} is given beside space, which says it already: leave out one of them")
-    arguments.optional(arguments.instance, "space", space, Space, "a space of actions")
+def _chosen(**values: Any) -> list[str]:
+    """Return the names of the arguments that were given."""
+    return [
+        name for name, value in values.items() if not (value is None or (isinstance(value, str | tuple) and not value))
+    ]
+
+
+def _labels(labels: Any, space: Any, cues: Any = "", low: Any = None, high: Any = None) -> LabelSet:
+    """Return checked labels with their space. Raises UserError for labels that do not fit it."""
     if isinstance(labels, str | os.PathLike):
-        if told or space is not None:
-            raise UserError(f"{labels} says its own space of actions: leave out {told[0] if told else 'space'}")
-        return labels_from_file(label_path(labels))
-    rows = rows_of(labels)
+        if chosen := _chosen(space=space, cues=cues, low=low, high=high):
+            raise UserError(f"{labels} says its own space of actions: leave out {chosen[0]}")
+        return labels_from_file(Path(labels))
+    rows, note = rows_of(labels), partial(warnings.warn, stacklevel=5)
+    if space is not None and (chosen := _chosen(cues=cues, low=low, high=high)):
+        raise UserError(f"{chosen[0]} is given beside space, which says it already: leave out one of them")
     if space is None:
-        size = rows.action.shape[1]
-        low, high = arguments.optional(_numbers, "low", low), arguments.optional(_numbers, "high", high)
-        low, high = logs.bounds_of(
-            np.asarray(rows.action), low, high, note=lambda line: warnings.warn(line, stacklevel=5)
-        )
-        if len(low) != size or len(high) != size:
-            raise UserError(
-                f"low and high bound {len(low)} and {len(high)} entries, actions have {size}: give one an entry"
-            )
-        space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if _is_told(cues) else ())
+        low, high = (None if end is None else arguments.numbers("low and high", end).tolist() for end in (low, high))
+        low, high = logs.bounds_of(np.asarray(rows.action), low, high, note=note)
+        if not len(low) == len(high) == rows.action.shape[1]:
+            raise UserError(f"low and high bound {len(low)} and {len(high)} entries: give {rows.action.shape[1]} each")
+        space = Box(tuple(low), tuple(high), cues_from(cues) if _chosen(cues=cues) else ())
     external_labels.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
-    return GivenLabels(rows, space, None)
-
-
-def _is_told(value: Any) -> bool:
-    return value is not None and not (isinstance(value, str | tuple | list) and not value)
-
-
-def _numbers(name: str, value: Any) -> list[float]:
-    return arguments.numbers(name, value).reshape(-1).tolist()
-
-
-def labels_from_file(path: Path) -> GivenLabels:
-    """Return the labels of a file's first seed. Raises UserError for a file of other answers."""
-    file = label_files.read(path)
-    if file.answers != RELATIVE.name:
-        raise UserError(f"{path} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
-    external_labels.check_file(file, None, RELATIVE, str(path))
-    own = file.seeds == file.seeds[0]
-    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
-    config = None
-    if file.task.get("name") == logs.NAME:
-        values = {name: value for name, value in file.task.items() if name not in ("name", "from")}
-        try:
-            config = configuration.from_json(LogsConfig, values)
-        except UserError as error:
-            raise UserError(f"{path} does not name the situations of its labels: write the file again") from error
-    return GivenLabels(rows, file.space, file.eps, config)
+    return LabelSet(rows, space)
 
 
 def _recording_of(policy: Any) -> LogsConfig | None:
@@ -221,42 +166,36 @@ def _recording_of(policy: Any) -> LogsConfig | None:
     return config if isinstance(config, LogsConfig) else None
 
 
-def world_of(found: GivenLabels, before: LogsConfig | None = None) -> World:
+def world_of(found: LabelSet, before: LogsConfig | None = None) -> World:
     """Return the situations of labels as a world of the task `logs`, which names no folder.
 
     Networks of a policy that was corrected `before` keep their view. Raises UserError where that cannot be.
     """
-    config, size = found.config, found.rows.obs.shape[1]
-    if config is None or sum(config.entries) != size:
-        centre, spread = logs.scales_of(np.asarray(found.rows.obs))
-        config = LogsConfig(entries=(size,), centre=centre, spread=spread)
+    size, obs, space = found.rows.obs.shape[1], np.asarray(found.rows.obs), found.space
+    own = {name: value for name, value in found.task.items() if name not in ("name", "from")}
+    config = from_json(LogsConfig, own) if found.task.get("name") == logs.NAME else None
     if before is not None:
-        if logs.space_of(before) != found.space:
+        if logs.space_of(before) != space:
             raise UserError(
                 "the policy was corrected with other bounds or cues before: leave out cues, low, high and space"
             )
         config = before if sum(before.entries) == size else config
-    values = {} if logs.space_of(config) == found.space else _as_values(found.space)
-    plain = {"path": "", "digest": "", "order": "recorded", "rows": len(found.rows.obs)}
-    config = dataclasses.replace(config, **plain, **values)
-    if logs.space_of(config).to_json() != found.space.to_json():
-        raise UserError(
-            f"the space {found.space.name!r} is not one that a recording can have: give a box with plain cues"
+    if config is None or sum(config.entries) != size:
+        centre, spread = logs.scales_of(obs)
+        config = LogsConfig(entries=(size,), centre=centre, spread=spread)
+    config = dataclasses.replace(config, path="", digest="", order="recorded", rows=len(obs))
+    if logs.space_of(config) != space:
+        cues = space.cues if isinstance(space, Box | Choices) else ()
+        config = dataclasses.replace(
+            config,
+            actions=space.name,
+            low=space.low if isinstance(space, Box) else (0.0,) * space.size,
+            high=space.high if isinstance(space, Box) else (1.0,) * space.size,
+            cues=tuple(",".join(cue.words) for cue in cues),
+            cue_names=tuple(cue.name for cue in cues),
+            keys=tuple(",".join(cue.keys) for cue in cues),
         )
-    filled = lambda config, split: logs.filled(config, found.rows.obs, found.rows.action)  # noqa: E731
+    if logs.space_of(config).to_json() != space.to_json():
+        raise UserError(f"the space {space.name!r} is not one that a recording can have: give a box with plain cues")
+    filled = lambda config, split: logs.filled(config, obs, found.rows.action)  # noqa: E731
     return World(logs.configured(config, dataclasses.replace(logs.BODY, environment=filled)), config)
-
-
-def _as_values(space: Space) -> dict[str, Any]:
-    """Return a space as the fields of a configuration."""
-    bounds = {"low": (0.0,) * space.size, "high": (1.0,) * space.size}
-    if isinstance(space, Box):
-        bounds = {"low": space.low, "high": space.high}
-    own = [] if not isinstance(space, Box | Choices) else space.cues
-    return {
-        "actions": space.name,
-        **bounds,
-        "cues": tuple(",".join(cue.words) for cue in own),
-        "cue_names": tuple(cue.name for cue in own),
-        "keys": tuple(",".join(cue.keys) for cue in own),
-    }

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from cuelearner_jax import user_code
-from cuelearner_jax.api import arguments
-from cuelearner_jax.api.policies import as_policy_in, source_of
-from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.api.policies import as_policy_in, config_of
+from cuelearner_jax.api.worlds import World
+from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.studies import evaluate as study
 from cuelearner_jax.studies.evaluate import Measured
 
@@ -36,12 +37,9 @@ def measure(
         `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
 
     Raises:
-        UserError: a policy that cannot act there, or amounts that make no sense.
+        UserError: a policy that cannot act there, or amounts that cut episodes short.
     """
-    source = source_of(policy, a_world("world", world))
-    own = as_policy_in(policy, world.env)
-    amounts: dict[str, Any] = {"episodes": episodes, "steps": steps, "envs": envs}
-    amounts = {name: arguments.optional(arguments.whole, name, value, 1, study.MOST) for name, value in amounts.items()}
-    engine = arguments.optional(arguments.text, "engine", engine)
-    (found,) = study.run(source, study.EvaluateRequest(task=world.config, engine=engine, **amounts), policy=own)
+    source = PolicySource(world.task, config_of(policy, world), None, Path(world.task.name))
+    request = study.EvaluateRequest(task=world.config, episodes=episodes, steps=steps, envs=envs, engine=engine)
+    (found,) = study.run(source, request, policy=as_policy_in(policy, world.env))
     return found

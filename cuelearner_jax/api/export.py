@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from cuelearner_jax import user_code
-from cuelearner_jax.api import arguments
 from cuelearner_jax.api.policies import as_policy, as_policy_in
-from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.api.worlds import World
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions, runner
@@ -33,9 +32,8 @@ def export_policy(
     Raises:
         UserError: the folder is in use; the policy acts at random, asks a teacher, holds Python code, or does not fit.
     """
-    out, _ = arguments.path("out", out), as_policy(policy)
-    world = _world_of(policy, world)
-    contract.check_request(arguments.text("format", format), out)
+    world, out = _world_of(policy, world), Path(out)
+    contract.check_request(format, out)
     env = world.env
     acting = as_policy_in(policy, env)
     drawn = lambda: decisions.observations(env, acting)  # noqa: E731
@@ -61,19 +59,18 @@ def export_correction(policy: Any, out: str | Path, world: World | None = None, 
     Raises:
         UserError: the folder is in use; the policy corrects nothing, or cannot do it without its base.
     """
-    out, own = arguments.path("out", out), as_policy(policy)
-    world = _world_of(policy, world)
-    contract.check_request(arguments.text("format", format), out)
-    alone, seen = correction.correction_of(own, world.env)
+    world, out = _world_of(policy, world), Path(out)
+    contract.check_request(format, out)
+    alone, seen = correction.correction_of(as_policy(policy), world.env)
     return contract.write(alone, seen, lambda: correction.cases(world.env), format, out, _about(policy, world))
 
 
-def _world_of(policy: Any, world: Any) -> World:
+def _world_of(policy: Any, world: World | None) -> World:
     """Return where a policy acts. Raises UserError if it is not known."""
-    world = getattr(policy, "world", None) if world is None else world
+    world = world or getattr(policy, "world", None)
     if world is None:
         raise UserError("world is None, and this policy names none: give world=cl.make(...)")
-    return a_world("world", world)
+    return world
 
 
 def _about(policy: Any, world: World) -> dict[str, Any]:
@@ -89,7 +86,7 @@ def load_exported(folder: str | Path) -> runner.Decision:
         UserError: the folder is damaged, or cannot be run here.
     """
     try:
-        decide = runner.Decision(arguments.path("folder", folder))
+        decide = runner.Decision(Path(folder))
         decide.check()
     except runner.ContractError as error:
         raise UserError(str(error)) from error

@@ -24,10 +24,10 @@ from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.lanes import Adaptation, blame, product
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, entries_of
-from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in
+from cuelearner_jax.api.worlds import World
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
-from cuelearner_jax.environment import Quantity, Spaces, actions_of, spaces_of, view_of
+from cuelearner_jax.environment import Quantity, Spaces, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
@@ -62,6 +62,23 @@ class FeedbackModel:
     env: Any = None  # provides `features`, which the raw frame does not use
 
 
+class LabelSet(NamedTuple):
+    """Relative labels with what their file says of them."""
+
+    rows: Label
+    space: Space
+    eps: float | None = None  # strength of an answer in the space's unit; None: not known
+    task: dict[str, Any] = {}  # noqa: RUF012  # name and configuration of the labels' task; empty: not known
+
+    def strength(self, eps: float | None) -> float | None:
+        """Return the strength of the answers. Raises UserError for one that differs from the file's."""
+        if self.eps is None or eps is None:
+            return self.eps if eps is None else eps
+        if not math.isclose(eps, self.eps, rel_tol=1e-6):
+            raise UserError(f"the label file holds answers of {self.eps:g} {self.space.unit}: leave out eps")
+        return self.eps
+
+
 @user_code.report_user_errors
 def fit_feedback(
     labels: Labels | str | os.PathLike[str],
@@ -83,34 +100,21 @@ def fit_feedback(
         seed: seed of the network.
 
     Raises:
-        UserError: labels or settings that make no sense, or with which the fit diverges.
+        UserError: labels or settings that cannot work, or with which the fit diverges.
     """
-    seed = arguments.seed("seed", seed)
-    file = None if isinstance(labels, tuple) else label_files.read(label_path(labels))
-    space = arguments.instance("space", space, Space, "a space of actions") if file is None else file.space
-    sizes, scalars, eps_deg = check_settings(space, sizes, scalars, eps_deg)
-    if file is not None:
-        if file.answers != RELATIVE.name:
-            raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
-        external_labels.check_file(file, None, RELATIVE, str(labels))
-        if eps_deg is not None and not math.isclose(eps_deg, file.eps or 0.0, rel_tol=1e-6):
-            raise UserError(f"{labels} holds answers of {file.eps:g} {file.space.unit}: leave out eps_deg")
-        own = file.seeds == file.seeds[0]
-        eps_deg = file.eps
-        labels = labels_of(jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels))
-    rows = rows_of(labels)
+    found = LabelSet(rows_of(labels), space) if isinstance(labels, tuple) else labels_from_file(Path(labels))
+    rows, spaces = rows_of(labels_of(found.rows)), Spaces(found.rows.obs.shape[1], found.space)
     if len(rows.obs) < 2:
         raise UserError(f"{len(rows.obs)} labels are too few to fit a model: give more labels")
-    spaces = Spaces(rows.obs.shape[1], space)
     external_labels.check(rows, spaces, RELATIVE)
-    sizes, scalars = settings(space, sizes, scalars, eps_deg)
+    sizes, scalars = settings(found.space, sizes, scalars, found.strength(eps_deg))
     guidance = KIND.make(sizes, spaces)
     k_init, k_fit = jax.random.split(jax.random.key(seed))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
     model = fit(k_fit, jax.tree.map(jnp.asarray, rows), guidance.init(k_init), scalars)
     if not all_finite(model):
         raise divergence_error()
-    return FeedbackModel(guidance, model, scalars, labels_of(rows), sizes, space)
+    return FeedbackModel(guidance, model, scalars, labels_of(rows), sizes, found.space)
 
 
 @user_code.report_user_errors
@@ -141,19 +145,18 @@ def ask(
         seed: seed of all random numbers.
 
     Raises:
-        UserError: settings that make no sense, or with which the fit diverges.
+        UserError: settings that cannot work, or with which the fit diverges.
     """
-    as_policy(policy)
-    labels, seed = arguments.budget("labels", labels), arguments.seed("seed", seed)
-    a_world("world", world)
-    space = actions_of(world.env)
-    bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or by_model.usual_bound(space)
-    sizes, scalars = settings(space, *check_settings(space, sizes, scalars, eps_deg))
-    teacher = arguments.teacher("teacher", teacher, space)
-    check_teacher(teacher, scalars)
+    env, space = world.env, world.actions
+    sizes, scalars = settings(space, sizes, scalars, eps_deg)
+    bound = by_model.usual_bound(space) if bound_deg is None else bound_deg
     by_model.check_amounts(space, [bound], scalars)
-    env, guidance = world.env, KIND.make(sizes, spaces_of(world.env))
+    if labels < 1:
+        raise UserError(f"labels is {labels}: give a number above 0")
+    teacher = arguments.teacher_of_world(teacher, space)
+    check_teacher(teacher, scalars)
     user_code.answers_in("teacher", teacher, env)
+    guidance = KIND.make(sizes, spaces_of(env))
     of = Adaptation(guidance, sizes, scalars, env, Common(as_policy_in(policy, env)))
     block = by_model.learn_lanes(of, product(1, (seed,), (labels,), (bound,)), teacher)
     if block.failed.any():
@@ -161,13 +164,6 @@ def ask(
         raise divergence_error()
     guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
     return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, space, env)
-
-
-def labels_of(rows: Label) -> Labels:
-    """Return a lane's valid labels as arrays."""
-    given = jax.device_get(rows)
-    obs, action, answer = (np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer))
-    return Labels(obs, action, answer[:, 0] if answer.shape[1] == 1 else answer)
 
 
 @user_code.report_user_errors
@@ -182,57 +178,28 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
             least eps. A larger one is a warning: there the model was shown nothing.
 
     Raises:
-        UserError: a bound that is no positive angle.
+        UserError: a bound outside the space's reach, or a model of other observations.
     """
-    base = as_policy(policy)
-    arguments.instance("model", model, FeedbackModel, "a model, as cl.ask and cl.fit_feedback give it")
-    space = model.space
-    base = in_space(base, space)
-    bound_deg = arguments.optional(arguments.amount, "bound_deg", bound_deg, space)
-    labels = _checked_model(model).labels
-    width, seen = labels.obs.shape[1], entries_of(policy)
-    if seen not in (0, width):
+    space, labels, eps = model.space, model.labels, model.scalars.eps_deg
+    base, width = in_space(as_policy(policy), space), labels.obs.shape[1]
+    observation = getattr(policy, "observation", ()) or (Quantity("observation", width, ""),)
+    if width != (seen := sum(quantity.size for quantity in observation)):
         raise UserError(
-            f"model takes observations with {width} entries, the policy's have {seen}: give a model "
-            "fitted for this policy"
+            f"model takes observations with {width} entries, the policy's have {seen}: give a model fitted for it"
         )
-    reach = max(by_model.reach(space, base, labels.obs, labels.action), model.scalars.eps_deg)
-    if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
+    by_model.check_bounds(space, [] if bound_deg is None else [bound_deg])
+    reach = max(by_model.reach(space, base, labels.obs, labels.action), eps)
+    bound = reach if bound_deg is None else bound_deg
+    if bound > reach * 1.05 and bound > eps:
         warnings.warn(
             f"the labels lie within {reach:.3g} {space.unit} of this policy's own actions, and refinement may lead "
-            f"up to {bound_deg:g} away, where the model was shown nothing and may make the policy worse: ask in rounds "
+            f"up to {bound:g} away, where the model was shown nothing and may make the policy worse: ask in rounds "
             "(cuelearner_jax.ask), or leave out bound_deg",
             stacklevel=2,
         )
-    bound = space.from_unit(reach if bound_deg is None else bound_deg)
-    guided = Guided(base, model.model, view_of(model.env), model.scalars, model.guidance, bound, model.sizes)
-    return CallablePolicy(guided, policy.observation if seen else (Quantity("observation", width, ""),), actions=space)
-
-
-def _checked_model(model: FeedbackModel) -> FeedbackModel:
-    """Return a model whose parts are of the right types. Raises UserError for any other."""
-    for name, kind in (("guidance", Guide), ("scalars", Scalars), ("labels", Labels), ("model", GuidanceModel)):
-        arguments.instance(f"model.{name}", getattr(model, name), kind, "a model as cl.ask and cl.fit_feedback give it")
-    return model
-
-
-def check_settings(
-    space: Space, sizes: Any, scalars: Any, eps_deg: Any
-) -> tuple[GuideSizes | None, Scalars | None, float | None]:
-    """Return the arguments as given. Raises UserError for the first that is neither of its type nor None."""
-    return (
-        arguments.optional(arguments.settings, "sizes", sizes, GuideSizes),
-        arguments.optional(arguments.settings, "scalars", scalars, Scalars),
-        arguments.optional(arguments.amount, "eps_deg", eps_deg, space),
-    )
-
-
-def label_path(labels: Any) -> Path:
-    """Return the path of a label file. Raises UserError if no file lies there."""
-    path = arguments.path("labels", labels)
-    if not path.exists():
-        raise UserError(f"labels: there is no label file at {path}: give the path of a label file, or arrays")
-    return path
+    within = space.from_unit(bound)
+    guided = Guided(base, model.model, view_of(model.env), model.scalars, model.guidance, within, model.sizes)
+    return CallablePolicy(guided, observation, actions=space)
 
 
 def settings(
@@ -244,13 +211,18 @@ def settings(
     return sizes, scalars
 
 
-def rows_of(labels: Any) -> Label:
+def labels_of(rows: Label) -> Labels:
+    """Return a lane's valid labels as arrays."""
+    given = jax.device_get(rows)
+    obs, action, answer = (np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer))
+    return Labels(obs, action, answer[:, 0] if answer.shape[1] == 1 else answer)
+
+
+def rows_of(labels: Labels) -> Label:
     """Return labels as rows (labels, ...) of finite floats, without those that say nothing of any cue.
 
     Raises UserError unless they are three arrays of one length.
     """
-    if not isinstance(labels, tuple) or len(labels) != 3:
-        raise arguments.argument_error("labels", labels, "a label file, or Labels(obs, action, answer)")
     obs, action, answer = (
         arguments.numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True)
     )
@@ -264,6 +236,16 @@ def rows_of(labels: Any) -> Label:
     if not said.any():
         raise UserError("labels say nothing of any cue: give labels with answers")
     return Label(obs[said], action[said], answer[said], np.ones(said.sum(), bool))  # pyright: ignore[reportArgumentType]
+
+
+def labels_from_file(path: Path) -> LabelSet:
+    """Return the labels of a file's first seed. Raises UserError for a file of other answers."""
+    file = label_files.read(path)
+    if file.answers != RELATIVE.name:
+        raise UserError(f"{path} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
+    external_labels.check_file(file, None, RELATIVE, str(path))
+    own = file.seeds == file.seeds[0]
+    return LabelSet(jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels), file.space, file.eps, file.task)
 
 
 def divergence_error() -> UserError:

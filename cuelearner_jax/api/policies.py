@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,7 +17,7 @@ from cuelearner_jax.api import arguments
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name
+from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name, policy_of
 from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
@@ -49,7 +48,7 @@ class CallablePolicy:
 
     def __post_init__(self) -> None:
         """Make a policy of an object that acts. Raises UserError for any other."""
-        object.__setattr__(self, "policy", in_space(arguments.policy("policy", self.policy), self.actions))
+        object.__setattr__(self, "policy", in_space(policy_of(self.policy), self.actions))
 
     @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
@@ -67,9 +66,9 @@ class CallablePolicy:
         """
         if self.asks:
             raise UserError("this policy asks a teacher, who looks at the true state: call its act(key, states, obs)")
-        rows = arguments.observations("obs", obs, sum(quantity.size for quantity in self.observation) or None)
+        rows = arguments.observations(obs, sum(quantity.size for quantity in self.observation) or None)
         batch = rows[None] if rows.ndim == 1 else rows
-        key = jax.random.key(0) if key is None else arguments.key("key", key)
+        key = jax.random.key(0) if key is None else key
         # A copy, which the caller may write in.
         chosen = np.array(_act(self.policy, key, jnp.asarray(batch), self.actions))
         user_code.check_actions(chosen, policy_name(self.policy))
@@ -80,38 +79,26 @@ class CallablePolicy:
         return self.policy.act(key, states, obs)
 
 
-def as_policy(given: Any, name: str = "policy") -> Policy:
-    """Return anything that acts as a policy: a `CallablePolicy`, a policy folder, or what `policies.policy_of` takes.
-
-    Raises UserError, which says the argument's name, for what is none of them.
-    """
+def as_policy(given: Any) -> Policy:
+    """Return a policy of a `CallablePolicy`, of a policy folder, or of anything that `policies.policy_of` takes."""
     if isinstance(given, str | os.PathLike) and not str(given).endswith(FILES):
-        try:
-            given = load_policy(os.fspath(given))
-        except UserError as error:
-            raise UserError(f"{name}: {error}") from error
-    return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
-
-
-def entries_of(policy: Any) -> int:
-    """Return the number of entries of the observations that a policy expects, 0 where that is not known."""
-    return sum(quantity.size for quantity in policy.observation) if isinstance(policy, CallablePolicy) else 0
+        given = load_policy(given)
+    return given.policy if isinstance(given, CallablePolicy) else policy_of(given)
 
 
 def as_policy_in(given: Any, env: Any) -> Policy:
     """Return `as_policy` for a world. Raises UserError for a policy that cannot act there."""
-    policy = as_policy(given)
+    policy = in_space(as_policy(given), actions_of(env))
     if isinstance(given, CallablePolicy) and given.observation:
         check_layout("the policy", given.observation, given.actions, env)
-    policy = in_space(policy, actions_of(env))
     user_code.acts_in("policy", policy, env)
     return policy
 
 
-def source_of(policy: Any, world: World) -> trained.PolicySource:
-    """Return a policy's source for a study in a world: the configuration of its training, or a stand-in."""
+def config_of(policy: Any, world: World) -> RunConfig:
+    """Return the configuration of a policy's training, or a stand-in, in a world."""
     config = getattr(policy, "trained", None) or world.task.start()
-    return trained.PolicySource(world.task, dataclasses.replace(config, task=world.config), None, Path(world.task.name))
+    return dataclasses.replace(config, task=world.config)
 
 
 @user_code.report_user_errors
@@ -146,19 +133,16 @@ def load_policy(
     Raises:
         UserError: no such folder, lane or policy.
     """
-    path = shipped.folder_of(str(arguments.path("folder", folder)))
-    code = None if base is None else as_policy(base, "base")
-    if isinstance(task, str):
-        task = registry.resolve(task)
+    path = shipped.folder_of(os.fspath(folder))
     if not path.exists():
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
-    find = lambda name: task if task and task.name == name else registry.find(name)  # noqa: E731
-    source = trained.PolicySource.of_folder(path, find, code, changes)
+    own = registry.resolve(task) if isinstance(task, str) else task
+    find = lambda name: own if own and own.name == name else registry.find(name)  # noqa: E731
+    source = trained.PolicySource.of_folder(path, find, None if base is None else as_policy(base), changes)
     known, name = source.task, policy or source.default_policy
     changed = world.config if world else source.config.task
     source.check(name, changed)
     shape = shape_of(known, changed)
     found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
-    where = world or World(known, changed)
-    taught = trained.POLICIES[name].taught
+    where, taught = world or World(known, changed), trained.POLICIES[name].taught
     return CallablePolicy(found, shape.observation, taught, source.config, actions_of(shape), where)

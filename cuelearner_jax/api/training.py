@@ -6,6 +6,8 @@ import dataclasses
 import os
 import warnings
 from collections.abc import Sequence
+from operator import index
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,16 +16,14 @@ import pyarrow as pa
 from cuelearner_jax import config as configuration
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.feedback import label_path
 from cuelearner_jax.api.policies import CallablePolicy
-from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.api.worlds import World
 from cuelearner_jax.environment import view_of
 from cuelearner_jax.errors import UserError, suggestion
-from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import failures
-from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
+from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.order import TrainRequest
 from cuelearner_jax.runs.training import Training
 from cuelearner_jax.storage import label_files
@@ -53,9 +53,7 @@ class Run:
         Raises:
             UserError: there is no such lane.
         """
-        labels = arguments.optional(arguments.budget, "labels", labels, 0)
-        seed = arguments.optional(arguments.seed, "seed", seed)
-        name = list(self.trainings)[-1] if guidance is None else arguments.text("guidance", guidance)
+        name = list(self.trainings)[-1] if guidance is None else guidance
         if name not in self.trainings:
             raise UserError(f"no guidance {name!r} was trained{suggestion(name, self.trainings)}")
         training = self.trainings[name]
@@ -102,25 +100,19 @@ def train(
     Raises:
         UserError: settings that make no sense, no teacher where one is asked, or too little memory.
     """
-    a_world("world", world)
-    teacher = arguments.optional(arguments.teacher, "teacher", teacher, world.actions)
     if teacher is not None:
+        teacher = arguments.teacher_of_world(teacher, world.actions)
         user_code.answers_in("teacher", teacher, world.env)
-    guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
-    file = label_path(labels) if isinstance(labels, str | os.PathLike) else None
-    arguments.text("split", split, SPLITS)
-    arguments.flag("progress", progress)
+    file = Path(labels) if isinstance(labels, str | os.PathLike) else None
     request = _suggested(world, config, taught=teacher is not None or file is not None)
-    grid = request.grid
-    if guidance:
-        grid = dataclasses.replace(grid, guidance=tuple(guidance))
-    if file is not None:
-        grid = dataclasses.replace(grid, labels=(label_files.read(file).budget,))
+    grid = dataclasses.replace(request.grid, guidance=tuple(guidance or request.grid.guidance))
+    if isinstance(labels, str | os.PathLike):
+        grid = dataclasses.replace(grid, labels=(label_files.read(Path(labels)).budget,))
     elif labels is not None:
-        asked = arguments.several("labels", labels, "label budgets")
-        grid = dataclasses.replace(grid, labels=tuple(arguments.budget("labels", one) for one in asked))
+        grid = dataclasses.replace(grid, labels=tuple(map(index, labels)))
     if seeds is not None:
-        grid = dataclasses.replace(grid, seeds=_seeds(seeds))
+        own = seeds_of(0, seeds) if isinstance(seeds, int) else tuple(map(index, seeds))
+        grid = dataclasses.replace(grid, seeds=own)
     request = dataclasses.replace(request, grid=grid, labels_from=file, split=split)
     found = study.in_memory(request, world.env, world.environment(split), teacher, progress)
     failed = failures.summary(found.results)
@@ -131,25 +123,17 @@ def train(
 
 def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequest:
     """Return the defaults for this world."""
-    task = world.task
+    task, possible = world.task, guidances.possible(world.env, taught=taught)
     if isinstance(config, RunConfig):
         groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
         settled = {name: configuration.normalize_options(getattr(config, name), name) for name in groups}
-        config = dataclasses.replace(config, task=world.config, **settled)
-        kinds = guidances.possible(world.env, taught=taught)
-        return TrainRequest(task, config, Grid(kinds, tuple(range(SEEDS)), LABELS))
-    if not isinstance(config, str):
-        raise arguments.argument_error("config", config, "a RunConfig, or the name of a preset")
-    if config not in task.presets:
+        request = TrainRequest(
+            task, dataclasses.replace(config, **settled), Grid(possible, tuple(range(SEEDS)), LABELS)
+        )
+    elif config in task.presets:
+        request = study.suggested(task, task.presets[config])
+    else:
         raise UserError(f"config: unknown preset {config!r}{suggestion(config, task.presets)}")
-    request = study.suggested(task, task.presets[config])
-    possible = guidances.possible(world.env, taught=taught)
-    grid = dataclasses.replace(request.grid, guidance=tuple(kind for kind in request.grid.guidance if kind in possible))
-    return dataclasses.replace(request, config=dataclasses.replace(request.config, task=world.config), grid=grid)
-
-
-def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
-    """Return the seeds: of a number n the seeds 0 to n - 1, else the given ones."""
-    if isinstance(seeds, list | tuple | range | np.ndarray):
-        return tuple(arguments.seed("seeds", seed) for seed in arguments.several("seeds", seeds, "seeds"))
-    return tuple(range(arguments.whole("seeds", seeds, 1, LARGEST_SEED)))
+    kinds = tuple(kind for kind in request.grid.guidance if kind in possible)
+    grid, config = dataclasses.replace(request.grid, guidance=kinds), request.config
+    return dataclasses.replace(request, config=dataclasses.replace(config, task=world.config), grid=grid)

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.api import arguments
 from cuelearner_jax.api import arguments as checks
 from cuelearner_jax.config import normalize_options
 from cuelearner_jax.environment import Environment, Quantity, actions_of
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.evaluate import SPLITS
-from cuelearner_jax.policies import Teaching
+from cuelearner_jax.policies import Teaching, policy_of
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
@@ -34,11 +34,10 @@ class World:
 
     def __post_init__(self) -> None:
         """Raise UserError for a configuration of another task."""
-        arguments.instance("task", self.task, Task, "a task, as tasks.registry finds it")
-        arguments.instance("config", self.config, self.task.config, f"a {self.task.config.__name__}, or use cl.make")
+        if not isinstance(self.config, self.task.config):
+            wanted = f"a {self.task.config.__name__}, or use cl.make"
+            raise UserError(f"config is {format_value(self.config)}: give {wanted}")
         object.__setattr__(self, "config", normalize_options(self.config, "task"))
-        if self.scenario is not None:
-            self.task.scenario(arguments.text("scenario", self.scenario))
 
     @cached_property
     def env(self) -> Environment:
@@ -48,7 +47,9 @@ class World:
     @user_code.report_user_errors
     def environment(self, split: str) -> Environment:
         """Return the environment of a split: "training", "tuning" or "validation". Raises UserError for other names."""
-        return self.task.environment(self.config, arguments.text("split", split, ("training", *SPLITS)))
+        if split not in (splits := ("training", *SPLITS)):
+            raise UserError(f"split is {format_value(split)}: give one of {', '.join(splits)}")
+        return self.task.environment(self.config, split)
 
     @property
     def observation(self) -> tuple[Quantity, ...]:
@@ -62,13 +63,8 @@ class World:
 
     @user_code.report_user_errors
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
-        """Start an episode; return (state, observation). Raises UserError for a value that is not a key."""
-        return jax.jit(self.env.reset)(arguments.key("key", key))
-
-    @cached_property
-    def _state(self) -> Any:
-        """Return a state with shapes in place of arrays."""
-        return jax.eval_shape(self.env.reset, jax.random.key(0))[0]
+        """Start an episode; return (state, observation)."""
+        return jax.jit(self.env.reset)(key)
 
     @user_code.report_user_errors
     def step(
@@ -76,11 +72,9 @@ class World:
     ) -> tuple[EnvState, Step]:
         """Execute an action. Where an episode ends, a new one begins automatically.
 
-        Raises UserError for a bad key, a state of another world, or a bad action.
+        Raises UserError for an action outside the space.
         """
-        arguments.tree_like("state", state, self._state)
-        action = arguments.action("action", action, self.actions)
-        return jax.jit(self.env.step)(arguments.key("key", key), state, action)
+        return jax.jit(self.env.step)(key, state, checks.action(action, self.actions))
 
 
 @user_code.report_user_errors
@@ -97,10 +91,7 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     Raises:
         UserError: no such task, scenario, robot or field.
     """
-    task = registry.resolve(arguments.text("name", name)) if isinstance(name, str) else name
-    task = arguments.instance("name", task, Task, "the name of a task, or a task")
-    task = task.on(arguments.optional(arguments.text, "robot", robot))
-    arguments.optional(arguments.text, "scenario", scenario)
+    task = (registry.resolve(name) if isinstance(name, str) else name).on(robot)
     return World(task, task.configure(scenario, **changes), scenario)
 
 
@@ -138,24 +129,9 @@ def from_gymnasium(
     """
     from cuelearner_jax.tasks import gymnasium
 
-    count = checks.whole("num_envs", num_envs, 1, 100_000)
-    limit = checks.optional(checks.whole, "max_steps", max_steps, 1, 1_000_000)
-    task = gymnasium.task_from(
-        env,
-        arguments,
-        num_envs=count,
-        max_steps=limit,
-        processes=checks.whole("processes", processes, 0, gymnasium.MOST_PROCESSES),
-        cues=cues,
-        observation=observation,
-        units=units,
-    )
+    world = {"num_envs": num_envs, "max_steps": max_steps, "processes": processes}
+    task = gymnasium.task_from(env, arguments, **world, cues=cues, observation=observation, units=units)
     return World(task, task.plain())
-
-
-def a_world(name: str, value: Any) -> World:
-    """Return an argument that is a world. Raises UserError for anything else."""
-    return arguments.instance(name, value, World, "a world, as cl.make gives it")
 
 
 @user_code.report_user_errors
@@ -167,6 +143,5 @@ def teacher_of(source: World | Policy) -> Teacher:
     """
     if isinstance(source, World):
         return source.task.make_teacher(source.config, source.env)
-    if not hasattr(source, "policy"):  # `CallablePolicy` is above this module, so its `policy` is looked up by name
-        source = arguments.policy("source", source)
-    return Teaching(source)
+    # `CallablePolicy` is above this module, so its `policy` is looked up by name
+    return Teaching(source if hasattr(source, "policy") else policy_of(source))

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from cuelearner_jax.adaptation import changes
-from cuelearner_jax.api import correction
+from cuelearner_jax.api.correction import world_of
+from cuelearner_jax.api.feedback import labels_from_file
 from cuelearner_jax.cli.options import Finished, Flag, Kinds, about, look_ahead_of, out, parse
 from cuelearner_jax.cli.sources import code_of, is_code, source_of
 from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders
-from cuelearner_jax.studies import adapt
-from cuelearner_jax.studies.adapt import AdaptRequest, BaseLanes, Subject
+from cuelearner_jax.studies.adapt import AdaptRequest, BaseLanes, subject_of
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import logs
 from cuelearner_jax.terminal import progress_bars, watched_by
@@ -41,24 +42,20 @@ def run(arguments: list[str]) -> None:
     ahead = look_ahead_of(arguments, "adapt", Adapt)
     source, code = _source(ahead)
     named = ahead.base if code is None else ahead.words[0]
-    default = adapt.suggested(
-        source,
-        ahead.scenario,
-        ahead.guidance[0] if ahead.guidance else None,
-        ahead.judge_by,
-        None if ahead.labels_from is None else Path(ahead.labels_from),
-    )
+    kind = ahead.guidance[0] if ahead.guidance else None
+    file = None if ahead.labels_from is None else Path(ahead.labels_from)
+    default = Adapt.of(source.task, source.config, ahead.scenario, kind, ahead.judge_by, file)
     base, place = BaseLanes(policy=source.default_policy), Path("policies") / source.folder.name
-    default = Adapt(**vars(default), out=place, base=base)
+    default = replace(default, out=place, base=base)
     options = parse(Adapt, arguments, "adapt", default, about(Adapt, source.task, policies=True))
-    subject = Subject(source.on(options.robot), options.base, code, named)
-    # otherwise the changes stand for the folder's code
-    if options.changes is not None and (adapt.reads_evidence(options) or source.adapted is None):
-        subject = subject._replace(changes=changes.load(options.changes), changes_named=options.changes)
     with policy_folders.place_of(options.out, options.overwrite) as place, progress_bars() as bars:
-        outcome = adapt.run(subject, options, watched_by(bars))
+        subject = subject_of(source.on(options.robot), options.task, options.base, code, named)
+        # otherwise the changes stand for the folder's code
+        if options.changes is not None and (guidances.resolve(options.guidance).by_evidence or source.adapted is None):
+            subject = subject._replace(changes=changes.load(options.changes), changes_named=options.changes)
+        outcome = options.run(subject, watched_by(bars))
         outcome.write(place)
-    for line in adapt.sentences(outcome.found):
+    for line in outcome.found.words:
         out.print(line)
     measure = ["cuelearner", "evaluate", str(options.out), *_named_again(options, source.task, named)]
     out.print(f"wrote {options.out} (measure it with: {shlex.join(measure)})", soft_wrap=True)
@@ -93,11 +90,11 @@ def _source(ahead: Namespace) -> tuple[PolicySource, Any]:
 
 def _of_labels(named: str, path: str | None) -> PolicySource:
     """Return the situations of a label file as a task. Raises UserError unless its labels are about a recording."""
-    labels = None if path is None else correction.labels_from_file(Path(path))
-    if labels is None or labels.config is None:
+    labels = None if path is None else labels_from_file(Path(path))
+    if labels is None or labels.task.get("name") != logs.NAME:
         why = "" if path is None else f", since {path} does not hold labels of a recording"
         raise UserError(
             f"{named} needs a task to act in{why}: give one, for instance --task navigation or --env gymnasium:NAME"
         )
-    world = correction.world_of(labels)
+    world = world_of(labels)
     return PolicySource(world.task, world.task.start(), None, Path(world.task.name))

@@ -12,7 +12,7 @@ import pytest
 
 from cuelearner_jax.adaptation import by_model, judging
 from cuelearner_jax.adaptation.judging import Judging
-from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, ask_round, begin, one_each, product, rounds, side_by_side
+from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, ask_round, begin, product, rounds, side_by_side
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
@@ -80,7 +80,7 @@ def test_lanes_are_every_combination_or_one_each():
     assert {*zip(*(column.tolist() for column in LANES), strict=True)} == {
         (base, 3, budget, bound) for base in (0, 1) for budget in (30, 80) for bound in (10.0, 60.0)
     }
-    each = one_each((4, 7, 9), (30,), (60.0,))
+    each = product(3, (4, 7, 9), (30,), (60.0,), one_each=True)
     assert (each.base.tolist(), each.seed.tolist()) == ([0, 1, 2], [4, 7, 9])
 
 
@@ -219,7 +219,9 @@ def test_an_opaque_function_gives_what_the_same_in_jax_gives():
     assert [policy.on_host for policy in policies] == [True, False]
     blocks = [begin(of(), lanes)] * 2
     for _ in range(rounds(lanes, SIZES)):
-        blocks = [ask_round(of(Common(policy)), EXPERT, block) for policy, block in zip(policies, blocks, strict=True)]
+        blocks = [
+            ask_round(of(Common(policy)), EXPERT, block, MESH) for policy, block in zip(policies, blocks, strict=True)
+        ]
     assert blocks[0].guide.labels.valid.sum() == 30
     chex.assert_trees_all_equal(*blocks)
 
@@ -246,7 +248,7 @@ def test_what_is_a_policy():
     [
         ([0.0], {}, "bound_deg is 0"),
         ([float("nan")], {}, "bound_deg is nan"),
-        ([10.0, 10.0], {}, "give each bound once"),
+        ([10.0, 10.0], {}, "each once"),
         ([0.3], {}, "labels of 5 degrees say nothing within a bound of 0.3"),
         ([10.0], {"eps_deg": 0.2}, "give scalars.tau_deg 0.01"),
     ],

@@ -12,9 +12,9 @@ import pytest
 
 import cuelearner_jax as cl
 from cuelearner_jax.api import training
-from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Agent, Uniform
+from cuelearner_jax.policies import Agent, Heuristic, Uniform
 from cuelearner_jax.runs import lanes
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
@@ -148,7 +148,7 @@ def test_a_label_file_gives_what_its_arrays_give(tmp_path):
     of_arrays = cl.fit_feedback(labels, eps_deg=5.0, sizes=SIZES, scalars=SCALARS)
     for one, other in zip(jax.tree.leaves(of_file.model), jax.tree.leaves(of_arrays.model), strict=True):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(cl.UserError, match="leave out eps_deg"):
+    with pytest.raises(cl.UserError, match="leave out eps"):
         cl.fit_feedback(tmp_path / "labels.parquet", eps_deg=7.0)
 
 
@@ -156,20 +156,63 @@ def changed(**parts):
     return own_labels()._replace(**parts)
 
 
-NONSENSE = [  # that test_nonsense_calls.py does not have
+TABLE = cl.make("billiards")
+OF_BILLIARDS = cl.CallablePolicy(Heuristic(TABLE.env), TABLE.env.observation)
+WIDE = cl.Labels(np.ones((4, 5), np.float32), SEEN[:4], np.float32([1, 0, -1, 1]))
+FAST = GuideSizes(feedback_layers=(8,), fit_steps=20, fit_batch_size=8)
+# Each would lead to wrong numbers.
+WRONG = [
     (lambda: cl.fit_feedback(changed(answer=np.ones(7))), r"give observations \(n, obs\)"),
+    (lambda: cl.fit_feedback(changed(answer=np.full(200, 0.5))), "an answer is none of"),
+    (lambda: cl.fit_feedback(changed(action=SEEN * 2)), "actions are no"),
+    (lambda: cl.fit_feedback(changed(obs=np.full((200, 2), np.nan))), "not finite"),
+    (lambda: cl.fit_feedback(changed(obs=np.ma.masked_array(SEEN, SEEN > 0))), "masked"),
     (lambda: cl.fit_feedback(cl.Labels(SEEN[:1], SEEN[:1], np.ones(1))), "1 labels are too few"),
     (lambda: cl.fit_feedback(own_labels(), sizes=SIZES, scalars=WILD), "the fit of the feedback model diverged"),
+    (lambda: cl.refine(policy, cl.fit_feedback(WIDE, sizes=FAST), bound_deg=200.0), "bound_deg is 200"),
+    (lambda: cl.refine(OF_BILLIARDS, cl.fit_feedback(WIDE, sizes=FAST)), "with 5 entries, the policy's have"),
+    (lambda: cl.ask(OF_BILLIARDS, WORLD, TEACHER, labels=5, sizes=FAST), "this world has 2: give the world"),
+    (lambda: cl.ask(policy, WORLD, cl.teacher_of(OF_BILLIARDS), labels=5, sizes=FAST), "teacher"),
+    (lambda: cl.ask(policy, WORLD, TEACHER, labels=5, scalars=Scalars(eps_deg=float("nan"))), "scalars.eps_deg is nan"),
+    (lambda: cl.adapt(policy, WORLD, TEACHER, labels=5), "labels is 5: give at least 20"),
+    (lambda: cl.adapt(policy, WORLD, TEACHER, guidance="none"), "asks no questions"),
+    (lambda: cl.adapt(policy, WORLD, TEACHER, judge_by="luck"), "judge_by is 'luck'"),
+    (lambda: cl.adapt(policy, WORLD, TEACHER, sizes=GuideSizes(fit_steps=0.5)), "sizes.fit_steps is 0.5"),
+    (lambda: cl.adapt(policy, WORLD, TEACHER, judge_bounds=[2.0], guidance="relative"), "judge_bounds is 2"),
+    (lambda: cl.adapt(policy, WORLD), "teacher is None: give one"),
+    (lambda: cl.measure(policy, WORLD, steps=30, envs=4), "steps is 30: give a positive multiple of envs"),
     (lambda: cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], seeds=1), "asks a teacher: give one"),
     (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, guidance=["telepathy"]), "unknown guidance 'telepathy'"),
+    (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, seeds=[1, 1]), "seeds must be different"),
+    (lambda: WORLD.environment("test"), "split is 'test'"),
+    (lambda: WORLD.step(jax.random.key(0), SEEN[0], SEEN[0] * 0), "give an action of shape"),
+    (lambda: cl.load_policy("nowhere"), "folder nowhere does not exist"),
 ]
 
 
-@pytest.mark.parametrize(("call", "says"), NONSENSE, ids=[says for _, says in NONSENSE])
-def test_nonsense_is_refused_in_one_line(call, says):
+@pytest.mark.parametrize(("call", "says"), WRONG, ids=[says for _, says in WRONG])
+def test_what_would_lead_to_wrong_numbers_is_refused_in_one_line(call, says):
     with pytest.raises(cl.UserError, match=says) as refused:
         call()
-    assert "\n" not in str(refused.value)
+    assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize("labels", [10.5, 2**33])
+def test_a_number_of_labels_is_never_rounded(labels):
+    with pytest.raises((TypeError, OverflowError)):
+        cl.ask(policy, WORLD, TEACHER, labels=labels, sizes=FAST)
+
+
+@pytest.mark.parametrize(
+    "way", [lambda rows: jax.numpy.asarray(rows, "bfloat16"), lambda rows: rows.astype(">f8"), np.ndarray.tolist]
+)
+def test_observations_of_every_make_are_the_same_and_actions_can_be_written_in(way):
+    acting = cl.CallablePolicy(Heuristic(WORLD.env), WORLD.env.observation)
+    few = np.float32([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    actions = acting(way(few))
+    np.testing.assert_array_equal(actions, acting(few))
+    actions[:] = 0.0
+    assert acting(few).any()
 
 
 def rows_of(rows, columns):

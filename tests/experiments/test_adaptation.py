@@ -13,9 +13,8 @@ from cuelearner_jax.config import GuideSizes, check_guide
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import intent
 from cuelearner_jax.run_config import GROUPS, check
-from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import table as tables
-from cuelearner_jax.studies.adapt import suggested
+from cuelearner_jax.studies.adapt import AdaptRequest
 from cuelearner_jax.tasks import registry
 
 FOLDER = Path(__file__).parents[2] / "experiments"
@@ -55,7 +54,7 @@ def test_a_scenario_holds_the_recipe_that_is_reported(path, modules):
     (piece,) = [one for one in study.pieces if one.path == path]
     bench = bench_of(modules, study, known.scaled(piece, study.scales[REPORTED[path]]))
     piece = bench.piece
-    asked = suggested(PolicySource(bench.task, bench.config, None, Path()), piece.world)
+    asked = AdaptRequest.of(bench.task, bench.config, piece.world)
     assert asked.guidance == piece.method
     assert (asked.bound_deg, asked.judge_by) == ((piece.bound_deg,), piece.judge_by)
     assert asked.judge_bounds == piece.judge_bounds
