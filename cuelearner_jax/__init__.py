@@ -19,12 +19,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
-    from cuelearner_jax.api.correction import agreement, correct
-    from cuelearner_jax.api.evaluation import measure
-    from cuelearner_jax.api.export import export_correction, export_policy, load_exported
+    from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt, agreement, correct
     from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
-    from cuelearner_jax.api.policies import CallablePolicy, load_policy
+    from cuelearner_jax.api.policies import (
+        CallablePolicy,
+        export_correction,
+        export_policy,
+        load_exported,
+        load_policy,
+        measure,
+    )
     from cuelearner_jax.api.training import Run, train
     from cuelearner_jax.api.worlds import World, from_gymnasium, make, teacher_of
     from cuelearner_jax.errors import UserError
@@ -47,17 +51,17 @@ _PLACES = {
     "UserError": "errors",
     "World": "api.worlds",
     "adapt": "api.adaptation",
-    "agreement": "api.correction",
+    "agreement": "api.adaptation",
     "ask": "api.feedback",
-    "correct": "api.correction",
-    "export_correction": "api.export",
-    "export_policy": "api.export",
+    "correct": "api.adaptation",
+    "export_correction": "api.policies",
+    "export_policy": "api.policies",
     "fit_feedback": "api.feedback",
     "from_gymnasium": "api.worlds",
-    "load_exported": "api.export",
+    "load_exported": "api.policies",
     "load_policy": "api.policies",
     "make": "api.worlds",
-    "measure": "api.evaluation",
+    "measure": "api.policies",
     "refine": "api.feedback",
     "teacher_of": "api.worlds",
     "train": "api.training",

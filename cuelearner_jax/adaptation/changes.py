@@ -28,31 +28,22 @@ SAME = 1e-4  # largest difference of an entry in that check
 
 
 def load(reference: str) -> Any:
-    """Return the changes that `package.module:NAME` names. Raises UserError if the object is not a distortion."""
-    found = plugins.load(reference, object, "changes of the world")
-    if not (isinstance(found, Distortion | list | tuple) or callable(found)):
-        raise UserError(f"{reference} is {format_value(found)}: {WANTED}")
-    return found
-
-
-WANTED = "give a cuelearner_jax.Distortion, several, or a function of the environment that returns them"
+    """Return the changes that `package.module:NAME` names, for `family_of`."""
+    return plugins.load(reference, object, "changes of the world")
 
 
 def family_of(given: Any, env: Any) -> Family:
-    """Return the family of a user's distortions.
+    """Return the family of a user's distortions: one, a list of them, or a function of the environment that returns one
+    of these.
 
-    Args:
-        given: a distortion, a list of them, or a function of the environment that returns one of these.
-        env: the environment, or its view.
-
-    Raises:
-        UserError: it is something else, or a family that makes no sense.
+    Raises UserError for something else, or a family that makes no sense.
     """
     if callable(given):
         given = given(env)
     several = (given,) if isinstance(given, Distortion) else given
     if not isinstance(several, list | tuple) or not all(isinstance(one, Distortion) for one in several):
-        raise UserError(f"changes is {format_value(given)}: {WANTED}")
+        wanted = "give a cuelearner_jax.Distortion, several, or a function of the environment that returns them"
+        raise UserError(f"changes is {format_value(given)}: {wanted}")
     return check_family(several)
 
 
@@ -95,15 +86,11 @@ def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Fami
             f"--changes {code} (from Python changes=...) if you trust that code"
         )
     known = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env))}
-    if missing := [name for name in names if name not in known]:
+    family = tuple(known[name] for name in names if name in known)
+    units = [(one["name"], one["unit"]) for one in layer["changes"]]
+    if len(family) < len(names) or [(one.name, one.unit) for one in unknowns_of(family)] != units:
         raise UserError(
-            f"this policy corrects {missing[0]!r}, which {code or 'this world'} lacks: give the code "
-            "that made the policy"
-        )
-    family = tuple(known[name] for name in names)
-    told = [(one["name"], one["unit"]) for one in layer["changes"]]
-    if [(one.name, one.unit) for one in unknowns_of(family)] != told:
-        raise UserError(
-            f"the unknowns of {', '.join(names)} differ from this policy's: give the code that made the policy"
+            f"this policy corrects {', '.join(names)}, which {code or 'this world'} lacks or has otherwise: give the "
+            "code that made the policy"
         )
     return family

@@ -34,23 +34,16 @@ DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other 
 
 
 def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
-    """Return a policy, or a block of policies, as plain values; `named`: the reference of user code in the policy, if
-    any.
+    """Return a policy, or a block of policies, as plain values; `named`: the reference of user code in it, if any.
 
-    Raises UserError if the policy asks a teacher, or its refinement cannot be stored.
+    Raises UserError for a policy that cannot be stored.
     """
     described = describe(policy)
     for layer in layers(described):
         if layer.get("asks"):
-            raise UserError(
-                "a policy that asks a teacher cannot be stored in a folder: give one that acts without a teacher"
-            )
-        if layer["policy"] not in KINDS:
-            raise UserError(
-                f"a policy of kind {layer['policy']} cannot be stored in a folder: give a policy of another kind"
-            )
-        if layer["policy"] == "guided" and layer["sizes"] is None:
-            raise UserError("a policy under a guidance of unknown sizes cannot be stored in a folder: give its sizes")
+            raise UserError("a policy that asks a teacher cannot be stored: give one that acts without a teacher")
+        if layer["policy"] not in KINDS or (layer["policy"] == "guided" and layer["sizes"] is None):
+            raise UserError(f"a policy of kind {layer['policy']} cannot be stored in a folder: give another kind")
         if layer["policy"] == "code":
             layer["named"] = named or "code"
         for change in layer.get("changes", ()):

@@ -23,9 +23,8 @@ from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.lanes import Adaptation, blame, product
 from cuelearner_jax.agents.networks import all_finite
-from cuelearner_jax.api import arguments
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in
-from cuelearner_jax.api.worlds import World
+from cuelearner_jax.api.worlds import World, numbers, teacher_of_world
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
 from cuelearner_jax.environment import Quantity, Spaces, spaces_of, view_of
 from cuelearner_jax.errors import UserError
@@ -153,7 +152,7 @@ def ask(
     by_model.check_amounts(space, [bound], scalars)
     if labels < 1:
         raise UserError(f"labels is {labels}: give a number above 0")
-    teacher = arguments.teacher_of_world(teacher, space)
+    teacher = teacher_of_world(teacher, space)
     check_teacher(teacher, scalars)
     user_code.answers_in("teacher", teacher, env)
     guidance = KIND.make(sizes, spaces_of(env))
@@ -223,9 +222,7 @@ def rows_of(labels: Labels) -> Label:
 
     Raises UserError unless they are three arrays of one length.
     """
-    obs, action, answer = (
-        arguments.numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True)
-    )
+    obs, action, answer = (numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True))
     if obs.ndim != 2 or not obs.size or action.shape[:1] != (len(obs),) or answer.shape[:1] != (len(obs),):
         raise UserError(
             f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "

@@ -1,10 +1,11 @@
-"""Policies to call, on one observation or on many: read from a folder, or made from the caller's function."""
+"""Policies to call, on one observation or on many: loaded, measured and exported."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,15 +14,18 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.api import arguments
-from cuelearner_jax.api.worlds import World
+from cuelearner_jax.api.worlds import World, numbers
+from cuelearner_jax.config import to_json
 from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.export import contract, correction, decisions, runner
 from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name, policy_of
 from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space
+from cuelearner_jax.studies import evaluate
+from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.types import EnvState
@@ -66,7 +70,7 @@ class CallablePolicy:
         """
         if self.asks:
             raise UserError("this policy asks a teacher, who looks at the true state: call its act(key, states, obs)")
-        rows = arguments.observations(obs, sum(quantity.size for quantity in self.observation) or None)
+        rows = observations(obs, sum(quantity.size for quantity in self.observation) or None)
         batch = rows[None] if rows.ndim == 1 else rows
         key = jax.random.key(0) if key is None else key
         # A copy, which the caller may write in.
@@ -77,6 +81,15 @@ class CallablePolicy:
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Act as `types.Policy.act`."""
         return self.policy.act(key, states, obs)
+
+
+def observations(value: Any, size: int | None) -> Float[np.ndarray, "*n obs"]:
+    """Return one observation (size,) or many (n, size); `size` None: any size above 0."""
+    rows = numbers("obs", value)
+    width = rows.shape[-1] if size is None and rows.ndim else size
+    if rows.ndim not in (1, 2) or rows.shape[-1] != width or not width:
+        raise UserError(f"obs: observations have shape {rows.shape}: give ({width},) or (n, {width})")
+    return rows
 
 
 def as_policy(given: Any) -> Policy:
@@ -146,3 +159,115 @@ def load_policy(
     found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
     where, taught = world or World(known, changed), trained.POLICIES[name].taught
     return CallablePolicy(found, shape.observation, taught, source.config, actions_of(shape), where)
+
+
+@user_code.report_user_errors
+def measure(
+    policy: Any,
+    world: World,
+    *,
+    episodes: int | None = None,
+    steps: int | None = None,
+    envs: int | None = None,
+    engine: str | None = None,
+) -> Measured:
+    """Measure a policy on validation episodes of a world: the numbers of `cuelearner evaluate`.
+
+    Args:
+        policy: a policy, or any function of a batch of observations in NumPy.
+        world: the world that the policy acts in.
+        episodes: whole episodes, where the task counts episodes (default: 100).
+        steps: environment steps in place of episodes (default, where the task counts steps: 10,000).
+        envs: environments that share the steps (default: 100).
+        engine: other physics that the world's robot has (default: its own).
+
+    Returns:
+        `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
+
+    Raises:
+        UserError: a policy that cannot act there, or amounts that cut episodes short.
+    """
+    source = trained.PolicySource(world.task, config_of(policy, world), None, Path(world.task.name))
+    request = EvaluateRequest(task=world.config, episodes=episodes, steps=steps, envs=envs, engine=engine)
+    (found,) = evaluate.run(source, request, policy=as_policy_in(policy, world.env))
+    return found
+
+
+@user_code.report_user_errors
+def export_policy(
+    policy: Any, out: str | Path, world: World | None = None, format: str = "stablehlo"
+) -> dict[str, Any]:
+    """Write a policy's whole decision as a file, with a contract of its inputs and outputs.
+
+    Args:
+        policy: one that was loaded, adapted or refined, or anything else made of JAX functions that acts.
+        out: a new folder.
+        world: the world that names the slices of the observation and supplies golden cases (default:
+            where it was corrected).
+        format: "stablehlo", "onnx" or "numpy".
+
+    Returns:
+        The contract, with "difference": the largest difference of the file's golden cases.
+
+    Raises:
+        UserError: the folder is in use; the policy acts at random, asks a teacher, holds Python code, or does not fit.
+    """
+    world, out = _world_of(policy, world), Path(out)
+    contract.check_request(format, out)
+    env = world.env
+    acting = as_policy_in(policy, env)
+    drawn = lambda: decisions.observations(env, acting)  # noqa: E731
+    return contract.write(acting, env, drawn, format, out, _about(policy, world))
+
+
+@user_code.report_user_errors
+def export_correction(policy: Any, out: str | Path, world: World | None = None, format: str = "onnx") -> dict[str, Any]:
+    """Write the correction of a corrected policy alone: observation and base action in, action out.
+
+    It runs beside a base that stays where it is: `decide(observation, base_action)`. In ONNX its inputs are `obs` and
+    `base_action`, its output `action`.
+
+    Args:
+        policy: a policy from `correct`, `adapt` or `refine`, or loaded from a policy folder.
+        out: a new folder.
+        world: the world that the policy acts in (default: where it was corrected).
+        format: "onnx", "numpy" or "stablehlo".
+
+    Returns:
+        The contract, as `export_policy` does.
+
+    Raises:
+        UserError: the folder is in use; the policy corrects nothing, or cannot do it without its base.
+    """
+    world, out = _world_of(policy, world), Path(out)
+    contract.check_request(format, out)
+    alone, seen = correction.correction_of(as_policy(policy), world.env)
+    return contract.write(alone, seen, lambda: correction.cases(world.env), format, out, _about(policy, world))
+
+
+def _world_of(policy: Any, world: World | None) -> World:
+    """Return where a policy acts. Raises UserError if it is not known."""
+    world = world or getattr(policy, "world", None)
+    if world is None:
+        raise UserError("world is None, and this policy names none: give world=cl.make(...)")
+    return world
+
+
+def _about(policy: Any, world: World) -> dict[str, Any]:
+    return {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
+
+
+def load_exported(folder: str | Path) -> runner.Decision:
+    """Return an exported decision whose golden cases were replayed: call it as `decide(obs)`.
+
+    `decide.contract` is its contract, `decide.check()` replays the golden cases again.
+
+    Raises:
+        UserError: the folder is damaged, or cannot be run here.
+    """
+    try:
+        decide = runner.Decision(Path(folder))
+        decide.check()
+    except runner.ContractError as error:
+        raise UserError(str(error)) from error
+    return decide

@@ -15,9 +15,8 @@ import pyarrow as pa
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import user_code
-from cuelearner_jax.api import arguments
 from cuelearner_jax.api.policies import CallablePolicy
-from cuelearner_jax.api.worlds import World
+from cuelearner_jax.api.worlds import World, teacher_of_world
 from cuelearner_jax.environment import view_of
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.guides import registry as guidances
@@ -101,7 +100,7 @@ def train(
         UserError: settings that make no sense, no teacher where one is asked, or too little memory.
     """
     if teacher is not None:
-        teacher = arguments.teacher_of_world(teacher, world.actions)
+        teacher = teacher_of_world(teacher, world.actions)
         user_code.answers_in("teacher", teacher, world.env)
     file = Path(labels) if isinstance(labels, str | os.PathLike) else None
     request = _suggested(world, config, taught=teacher is not None or file is not None)
@@ -114,11 +113,11 @@ def train(
         own = seeds_of(0, seeds) if isinstance(seeds, int) else tuple(map(index, seeds))
         grid = dataclasses.replace(grid, seeds=own)
     request = dataclasses.replace(request, grid=grid, labels_from=file, split=split)
-    found = study.in_memory(request, world.env, world.environment(split), teacher, progress)
-    failed = failures.summary(found.results)
+    results, trainings = study.in_memory(request, world.env, world.environment(split), teacher, progress)
+    failed = failures.summary(results)
     if failed:
         warnings.warn(f"{failed}: leave out the rows with failed = 1", stacklevel=2)
-    return Run(world, found.request.config, found.results, found.trainings)
+    return Run(world, request.config, results, trainings)
 
 
 def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequest:

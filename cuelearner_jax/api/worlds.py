@@ -1,4 +1,4 @@
-"""Find worlds and teachers by name."""
+"""Worlds and teachers by name, and the arrays that callers give them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.api import arguments as checks
-from cuelearner_jax.config import normalize_options
+from cuelearner_jax.config import LARGEST_FLOAT, normalize_options
 from cuelearner_jax.environment import Environment, Quantity, actions_of
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.evaluate import SPLITS
-from cuelearner_jax.policies import Teaching, policy_of
+from cuelearner_jax.policies import Teaching, policy_of, teaching
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
@@ -74,7 +75,7 @@ class World:
 
         Raises UserError for an action outside the space.
         """
-        return jax.jit(self.env.step)(key, state, checks.action(action, self.actions))
+        return jax.jit(self.env.step)(key, state, action_in(action, self.actions))
 
 
 @user_code.report_user_errors
@@ -145,3 +146,35 @@ def teacher_of(source: World | Policy) -> Teacher:
         return source.task.make_teacher(source.config, source.env)
     # `CallablePolicy` is above this module, so its `policy` is looked up by name
     return Teaching(source if hasattr(source, "policy") else policy_of(source))
+
+
+def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
+    """Return numbers of any shape, all finite in single precision."""
+    found = np.asarray(value)
+    if found.dtype.kind not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):  # NumPy lacks bfloat16's kind
+        raise UserError(f"{name} is {format_value(value)}: give an array of real numbers")
+    if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
+        raise UserError(f"{name} is an array with masked numbers: leave these rows out")
+    if not (np.abs(found.astype(np.float64)) <= LARGEST_FLOAT).all():
+        raise UserError(f"{name} holds numbers that are not finite (in single precision): leave these rows out")
+    return found.astype(np.float32)
+
+
+def action_in(value: Any, space: Space) -> Any:
+    """Return one action, which may be traced."""
+    if isinstance(value, Tracer):
+        return value
+    found = numbers("action", value)
+    if found.shape != (space.size,) or not space.usable(found, np):
+        example = np.asarray(space.spread(4))[0].round(2).tolist()
+        raise UserError(
+            f"action is {format_value(value)}: give an action of shape ({space.size},), for instance {example}"
+        )
+    return found
+
+
+def teacher_of_world(value: Any, space: Space) -> Teacher:
+    """Return a teacher: the given one, or one that shows what a given policy does itself."""
+    if not callable(getattr(value, "best_action", None)):
+        value = getattr(value, "policy", value)  # a `CallablePolicy`, which is above this module
+    return teaching(value, space)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from cuelearner_jax.api import correction
+from cuelearner_jax.api.adaptation import agreement
 from cuelearner_jax.cli.options import Finished, look_ahead, out, parse
 from cuelearner_jax.cli.sources import code_of, is_code, source_and_options
 from cuelearner_jax.errors import UserError
@@ -111,19 +111,12 @@ def _print_measured(
 
 def _print_agreement(named: str, policy: Any, path: Any) -> None:
     """Print the share of a label file's answers that a policy agrees with."""
-    found = correction.agreement(policy, path)
+    found = agreement(policy, path)
     table = Table(
         "", "share of answers", "95% interval", title=f"{named}: agreement with {found.labels} labels of {path}"
     )
-    rows = (
-        ("the policy", found.policy),
-        ("the policy as it was", found.base),
-        ("always already right", found.right),
-        ("difference from the policy as it was", found.difference),
-    )
-    for name, share in rows:
-        if share is not None:
-            table.add_row(name, f"{share[0]:.3f}", f"{share[1]:.3f} to {share[2]:.3f}")
+    for name, share in found.rows():
+        table.add_row(name, f"{share[0]:.3f}", f"{share[1]:.3f} to {share[2]:.3f}")
     out.print(table)
 
 

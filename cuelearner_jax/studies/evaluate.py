@@ -1,4 +1,8 @@
-"""Evaluation as one request, filled alike by the command line and Python: policies on validation episodes."""
+"""Evaluation: policies on validation episodes, as one request of the command line and Python; and by answers alone.
+
+A policy agrees with an answer about a cue if it would give that answer itself: its own action lies at more, at less,
+or within eps / 2 of the action asked about. Use answers that were not used for its correction.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +10,30 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from cuelearner_jax import user_code
 from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, part_of, rollout_lanes
+from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, mean_interval, part_of, rollout_lanes
+from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Common, lanes_in
+from cuelearner_jax.policies import Common, lanes_in, policy_name
 from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource, blocks_of, make
+from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.task import Task
+from cuelearner_jax.types import Label
 
 TaskT = TypeVar("TaskT")
 
+Share = tuple[float, float, float]  # estimate, and the ends of its 95% interval
+
 MOST_ENVS = 100_000  # more do not fit into memory
 MOST_STEPS = 1_000_000  # per environment
-MOST = MOST_ENVS * MOST_STEPS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,18 +86,15 @@ def amount(task: Task, asked: EvaluateRequest[Any]) -> tuple[int, int]:
             raise UserError("episodes determines environments and steps: leave out steps and envs")
         if longest is None:
             raise UserError(f"{task.name} counts steps, not episodes: give steps in place of episodes")
-        if not 1 <= asked.episodes <= MOST_ENVS:
-            raise UserError(f"episodes is {asked.episodes}: give a number from 1 to {MOST_ENVS:,}")
-        return asked.episodes, asked.episodes * longest
-    envs = 100 if asked.envs is None else asked.envs
+    name = "envs" if asked.episodes is None else "episodes"
+    envs = next((number for number in (asked.episodes, asked.envs) if number is not None), 100)
     if not 1 <= envs <= MOST_ENVS:
-        raise UserError(f"envs is {envs}: give a number from 1 to {MOST_ENVS:,}")
-    default = 10_000 if longest is None else envs * longest
-    steps = default if asked.steps is None else asked.steps
-    if steps < 1 or steps % envs:
-        raise UserError(f"steps is {steps}: give a positive multiple of envs ({envs})")
-    if steps // envs > MOST_STEPS:
-        raise UserError(f"steps is {steps}: give at most {MOST_STEPS:,} for each of the environments (envs)")
+        raise UserError(f"{name} is {envs}: give a number from 1 to {MOST_ENVS:,}")
+    steps = asked.steps
+    if steps is None:
+        steps = 10_000 if longest is None else envs * longest
+    if steps < 1 or steps % envs or steps // envs > MOST_STEPS:
+        raise UserError(f"steps is {steps}: give a positive multiple of envs ({envs}), at most {MOST_STEPS:,} for each")
     task.check_whole(asked.task, envs, steps, "envs", "steps")
     return envs, steps
 
@@ -112,15 +121,15 @@ def run(
     num_envs, steps = amount(task, asked)
     engine, key = task.engine(asked.engine), episodes()
     env = task.environment(world, "validation")
-    named = POLICIES[name]
+    named, unit = POLICIES[name], actions_of(env).unit.replace("degrees", "deg")
     teacher = task.make_teacher(world, env) if policy is None and named.taught else None
-    if policy is not None or not named.kept:
+    if policy is None and named.kept:
+        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
+    else:
         policy = make(name, source.config, view_of(env), teacher, code=source.code) if policy is None else policy
         none = np.zeros(1, int)
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
-    else:
-        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
-    rows, unit = [], actions_of(env).unit.replace("degrees", "deg")
+    rows = []
     for block in blocks:
         count, is_shared = len(block.seeds), lanes_in(block.policy) is None
         tell = watch(name if block.guidance == "-" else block.guidance)
@@ -135,7 +144,78 @@ def run(
         for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
             own = (block.budgets == budget) & (block.bounds == bound)
             mine, apart = ({metric: np.asarray(of[metric])[place[own]] for metric in of} for of in (means, each))
-            bounded = bound or None
             variant = block.guidance, budget, block.step, block.seeds[own]
-            rows.append(Measured(*variant, mine, apart, bounded, is_shared, unit))
+            rows.append(Measured(*variant, mine, apart, bound or None, is_shared, unit))
     return rows
+
+
+class Agreement(NamedTuple):
+    """Shares of answers, with 95% bootstrap intervals over labels."""
+
+    labels: int
+    policy: Share  # answers that the policy agrees with
+    right: Share  # answers that are "already right"
+    base: Share | None = None  # answers that the uncorrected policy agrees with; None: unknown
+    difference: Share | None = None  # the policy's share less the base's, paired by label
+
+    def rows(self) -> list[tuple[str, Share]]:
+        """Return each share with its name."""
+        named = (
+            ("the policy", self.policy),
+            ("the policy as it was", self.base),
+            ("always already right", self.right),
+            ("difference from the policy as it was", self.difference),
+        )
+        return [(name, share) for name, share in named if share is not None]
+
+    def words(self) -> list[str]:
+        """Return the agreement in words, line by line."""
+        lines = ["{}: {:.3f} [{:.3f}, {:.3f}]".format(name, *share) for name, share in self.rows()]
+        return [*lines, f"shares of the answers of {self.labels} labels, with 95% bootstrap intervals over labels"]
+
+
+def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = None) -> Agreement:
+    """Return the share of answers that a policy agrees with. Labels that say nothing of any cue do not count.
+
+    Args:
+        policy: the acting policy, see `types.Policy`, called with observations only.
+        rows: relative labels (labels, ...) as arrays.
+        space: the actions' space.
+        eps: strength of an answer, in the space's unit.
+        base: the policy before its correction; None: unknown.
+
+    Raises:
+        UserError: a policy returns something other than actions, or no label says anything.
+    """
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(says_something(rows.answer))], rows)
+    if not len(rows.obs):
+        raise UserError("labels say nothing of any cue: give labels with answers")
+    answers = np.asarray(rows.answer)
+    told = np.asarray(is_answered(answers)) if len(space.cues) > 1 else np.ones(answers.shape, bool)
+
+    def agreed(own: Any) -> Float[np.ndarray, " labels"]:
+        return ((own == answers) & told).sum(-1) / told.sum(-1)
+
+    def interval(values: Float[np.ndarray, " labels"]) -> Share:
+        estimate, low, high = (float(value) for value in mean_interval(values))
+        return estimate, low, high
+
+    own, right = agreed(_says(policy, rows, space, eps)), interval(agreed(0))
+    if base is None:
+        return Agreement(len(own), interval(own), right)
+    before = agreed(_says(base, rows, space, eps))
+    return Agreement(len(own), interval(own), right, interval(before), interval(own - before))
+
+
+def _says(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarray, "labels cues"]:
+    """Return the answers (labels, cues) that a policy would give about the labels' actions."""
+
+    @jax.jit
+    def answered(policy: Any, obs: Any, action: Any) -> Any:
+        own = space.only_actions(policy.act(jax.random.key(0), None, obs))
+        strength = space.from_unit(eps)
+        return own, jax.vmap(lambda asked, own: relative_feedback(space, asked, own, strength))(action, own)
+
+    own, found = answered(policy, jnp.asarray(rows.obs), jnp.asarray(rows.action))
+    user_code.check_actions(own, policy_name(policy))
+    return np.asarray(found)

@@ -9,7 +9,8 @@ Kinds are trained in turn; the lanes of a kind (seeds x label budgets) are train
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +23,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import Grid, defaults, seeds_of
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.runs.order import Order, Plan, TrainRequest, labels_of, make_plan, resolve_request
+from cuelearner_jax.runs.order import Order, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.storage import formats
@@ -49,6 +50,17 @@ def _groups(request: TrainRequest, env: Any) -> list[LaneGroup]:
     return [LaneGroup(config, env, config.guide_in(env, kind), request.grid) for kind in request.grid.guidance]
 
 
+def _teacher(request: TrainRequest, groups: list[LaneGroup], labels: Any, find: Callable[[], Any]) -> Teacher | None:
+    """Return who answers; None where no kind asks, or labels answer. Raises UserError for one that cannot be asked."""
+    asking = [group.guidance.name for group in groups if group.guidance.asks]
+    if not asking or labels is not None:
+        return None
+    if (teacher := find()) is None:
+        raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")
+    check_teacher(teacher, request.config.scalars)
+    return place(lane_mesh(), teacher, SHARED)
+
+
 def run(order: Order) -> None:
     """Train every lane of the grid and write the results to the order's folder.
 
@@ -61,56 +73,28 @@ def run(order: Order) -> None:
     """
     release_programs()
     plan = make_plan(order)
-    order = plan.order
+    order, task, world = plan.order, plan.order.task, plan.order.config.task
     with progress_bars() as bars:
         waiting = bars.add_task("preparing", total=None, note="")
-        made = _made(order, plan)
+        env = place(lane_mesh(), task.environment(world), SHARED)
+        groups = _groups(order, env)
+        teacher = _teacher(order, groups, plan.labels, lambda: task.make_teacher(world, env))
+        examined = task.environment(world, order.split)
         with claimed(order.out), interruptible() as stopping:
             # Nobody else can change it any more.
-            check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(order.task))
+            check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(task))
             prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
             # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
             described = formats.read("config", order.out / CONFIG)
             bars.remove_task(waiting)
-            for group in made.groups:
-                runner = Runner(group, made.examined, order, described, stopping, bars)
-                runner.run(made.teacher, plan.labels)
-    groups = made.groups
+            for group in groups:
+                Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels)
     failures.check(order.out, [order.out / group.guidance.name for group in groups])
-
-
-class _Made(NamedTuple):
-    """The parts of a training before its first step."""
-
-    groups: list[LaneGroup]
-    teacher: Teacher | None
-    examined: Environment
-
-
-def _made(order: Order, plan: Plan) -> _Made:
-    """Return the worlds and the teacher. Raises UserError for a teacher that cannot be asked."""
-    task, config, mesh = order.task, order.config, lane_mesh()
-    env = place(mesh, task.environment(config.task), SHARED)
-    groups = _groups(order, env)
-    asked = any(group.guidance.asks for group in groups) and plan.labels is None
-    teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None
-    if asked:
-        check_teacher(teacher, config.scalars)
-    examined = task.environment(config.task, order.split)
-    return _Made(groups, teacher, examined)
-
-
-class Trained(NamedTuple):
-    """The result of a training in memory."""
-
-    request: TrainRequest
-    results: pa.Table  # a row per lane and evaluation: guidance, labels, seed, step, wall_s, failed and metrics
-    trainings: dict[str, Training]  # by kind of guidance, in their final state
 
 
 def in_memory(
     request: TrainRequest, env: Environment, examined: Environment, teacher: Teacher | None, progress: bool = True
-) -> Trained:
+) -> tuple[pa.Table, dict[str, Training]]:
     """Train every lane of the grid; write nothing.
 
     Args:
@@ -119,19 +103,18 @@ def in_memory(
         teacher: who answers; None where no kind asks.
         progress: show progress bars on standard error.
 
+    Returns:
+        A row per lane and evaluation (guidance, labels, seed, step, wall_s, failed and metrics); and the trainings by
+        kind of guidance, in their final state.
+
     Raises:
         UserError: invalid configuration, or no teacher where one is needed.
     """
     release_programs()
     request = resolve_request(request)
-    labels, mesh = labels_of(request), lane_mesh()
-    groups = _groups(request, place(mesh, env, SHARED))
-    asking = [group.guidance.name for group in groups if group.guidance.asks]
-    if asking and teacher is None and labels is None:
-        raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")
-    if asking and labels is None:
-        teacher = place(mesh, teacher, SHARED)
-        check_teacher(teacher, request.config.scalars)
+    labels = labels_of(request)
+    groups = _groups(request, place(lane_mesh(), env, SHARED))
+    teacher = _teacher(request, groups, labels, lambda: teacher)
     rows, trainings = [], {}
     with progress_bars(shown=progress) as bars:
         for group in groups:
@@ -149,12 +132,11 @@ def in_memory(
                 rows.append(_table(group, row))
                 bars.update(bar, completed=training.step, note=f"reward {mean_of_finite(row['reward'])}")
             trainings[name] = training
-    return Trained(request, pa.concat_tables(rows, promote_options="permissive"), trainings)
+    return pa.concat_tables(rows, promote_options="permissive"), trainings
 
 
 def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
     """Return the columns of one evaluation as a table with a row per lane."""
-    names = pa.array([group.guidance.name] * len(group.seeds))
-    columns = {name: np.broadcast_to(np.asarray(value), len(names)) for name, value in row.items()}
+    columns = {name: np.broadcast_to(np.asarray(value), len(group.seeds)) for name, value in row.items()}
     told = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}
-    return pa.table({"guidance": names, **told})
+    return pa.table({"guidance": pa.array([group.guidance.name] * len(group.seeds)), **told})
