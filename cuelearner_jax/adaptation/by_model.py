@@ -6,7 +6,6 @@ found.judged.used, found.policy(env)
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -120,7 +119,7 @@ def adapt(
     filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)
     if labels is not None:
         labels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
-    judge = Judge(of, lanes.rows(filled), how, mesh, watch)
+    judge = Judge(of, Lanes(*(column[filled] for column in lanes)), how, mesh, watch)
     block = learn_lanes(of, judge.lanes, teacher, labels, mesh, watch, judge.measure_if_due)
     judged, block = judge.judge_lanes(block)
     fitted = block.guide.model.fitted & jnp.asarray(judged.used)  # an unfitted model leaves actions unchanged
@@ -167,11 +166,8 @@ def check_bounds(space: Space, bounds: Sequence[float]) -> None:
         raise UserError(f"bound_deg is {given}: give numbers above 0, up to {space.reach:g} ({space.unit}), each once")
 
 
-def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> str:
-    """Return a hint if refinement cannot reach the largest bound, else an empty string.
-
-    Raises UserError for values from which nothing could be learned.
-    """
+def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> None:
+    """Raise UserError for amounts from which nothing could be learned."""
     eps = scalars.eps_deg
     check_bounds(space, bounds)
     if not space.grain <= eps <= min(bounds):
@@ -184,12 +180,6 @@ def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> st
             f"scalars.tau_deg is {scalars.tau_deg:g} and a pass moves an action by {eps:g}, after which refinement "
             f"would stop: give scalars.tau_deg {eps / PASSES:g}"
         )
-    if scalars.k_max * eps >= max(bounds):
-        return ""
-    return (
-        f"{scalars.k_max} passes of {eps:g} {space.unit} do not reach the bound of {max(bounds):g}: "
-        f"scalars.k_max {math.ceil(max(bounds) / eps)} would"
-    )
 
 
 def usual_bound(space: Space) -> float:

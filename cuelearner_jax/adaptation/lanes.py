@@ -50,10 +50,6 @@ class Lanes(NamedTuple):
         """The number of lanes."""
         return len(self.seed)
 
-    def rows(self, numbers: Any) -> Lanes:
-        """Return the lanes with these row numbers."""
-        return Lanes(*(column[numbers] for column in self))
-
 
 def product(
     bases: int, seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float], one_each: bool = False

@@ -155,9 +155,6 @@ def adapt(
             it is used within what is worth most (default: the scenario's, or none).
         changes: for guidance "reading", the possible changes, as `Distortion`s of your own, or a function of the
             environment that returns them (default: what the world declares).
-
-    Raises:
-        UserError: settings that cannot work, or with which the fit diverges.
     """
     if hasattr(world, "observation_space"):
         raise UserError("world is an environment of Gymnasium: give cl.from_gymnasium(its id, class or function)")
@@ -186,7 +183,7 @@ def adapt(
         chosen["judge_bounds"] = tuple(map(float, judge_bounds))
     request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, sizes, scalars)
     subject = Subject(env, Common(as_policy_in(policy, env)), task=task, teacher=teacher, rows=rows, changes=changes)
-    outcome = dataclasses.replace(request, **chosen).run(subject, note=partial(warnings.warn, stacklevel=5))
+    outcome = dataclasses.replace(request, **chosen).run(subject)
     found = outcome.found
     if found.failed.any():
         blame(found.of, teacher, found.block)
@@ -242,9 +239,6 @@ def correct(
         changes: for guidance "reading", the possible changes, as for `adapt`.
         sizes, scalars: settings of the model and its fitting.
         seed: seed of all random numbers.
-
-    Raises:
-        UserError: labels or settings that cannot work, or with which the fit diverges.
     """
     if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX):
         policy = load_policy(policy)
@@ -285,9 +279,6 @@ def agreement(
         base: the policy as it was (default: what a corrected policy corrects).
         eps: strength of an answer (default: the file's, the corrected policy's, or 1/36 of the range).
         space: space of the actions (default: the file's, or that of the corrected policy).
-
-    Raises:
-        UserError: labels that do not fit the policy, or no space.
     """
     own = as_policy(policy)
     if space is None and not isinstance(labels, str | os.PathLike):

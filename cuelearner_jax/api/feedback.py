@@ -97,9 +97,6 @@ def fit_feedback(
         sizes: sizes of the network and its fitting (default: small ones, the paper's are `config.GuideSizes()`).
         scalars: settings of fitting and of refinement.
         seed: seed of the network.
-
-    Raises:
-        UserError: labels or settings that cannot work, or with which the fit diverges.
     """
     found = LabelSet(rows_of(labels), space) if isinstance(labels, tuple) else labels_from_file(Path(labels))
     rows, spaces = rows_of(labels_of(found.rows)), Spaces(found.rows.obs.shape[1], found.space)
@@ -142,9 +139,6 @@ def ask(
         sizes: sizes of the network, of its fitting, and of a round of labels.
         scalars: settings of fitting, of refinement and of the teacher's faults.
         seed: seed of all random numbers.
-
-    Raises:
-        UserError: settings that cannot work, or with which the fit diverges.
     """
     env, space = world.env, world.actions
     sizes, scalars = settings(space, sizes, scalars, eps_deg)
@@ -175,9 +169,6 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
         bound_deg: how far refinement may lead from the policy's own actions, in the space's unit. By default as far as
             the labels reach: the distance within which 95% of the actions asked about lie from the policy's own, at
             least eps. A larger one is a warning: there the model was shown nothing.
-
-    Raises:
-        UserError: a bound outside the space's reach, or a model of other observations.
     """
     space, labels, eps = model.space, model.labels, model.scalars.eps_deg
     base, width = in_space(as_policy(policy), space), labels.obs.shape[1]

@@ -64,9 +64,6 @@ class CallablePolicy:
 
         Returns:
             Actions (action,) or (n, action); of directions unit vectors.
-
-        Raises:
-            UserError: observations of another size, numbers that are not finite, or a policy that asks a teacher.
         """
         if self.asks:
             raise UserError("this policy asks a teacher, who looks at the true state: call its act(key, states, obs)")
@@ -142,9 +139,6 @@ def load_policy(
         changes: the distortions of your own that a reading corrected: the folder names them, and does not hold them.
         task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
         world: the world to act in, for policies that need more than observations (default: as it was trained).
-
-    Raises:
-        UserError: no such folder, lane or policy.
     """
     path = shipped.folder_of(os.fspath(folder))
     if not path.exists():
@@ -183,9 +177,6 @@ def measure(
 
     Returns:
         `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
-
-    Raises:
-        UserError: a policy that cannot act there, or amounts that cut episodes short.
     """
     source = trained.PolicySource(world.task, config_of(policy, world), None, Path(world.task.name))
     request = EvaluateRequest(task=world.config, episodes=episodes, steps=steps, envs=envs, engine=engine)
@@ -208,9 +199,6 @@ def export_policy(
 
     Returns:
         The contract, with "difference": the largest difference of the file's golden cases.
-
-    Raises:
-        UserError: the folder is in use; the policy acts at random, asks a teacher, holds Python code, or does not fit.
     """
     world, out = _world_of(policy, world), Path(out)
     contract.check_request(format, out)
@@ -235,9 +223,6 @@ def export_correction(policy: Any, out: str | Path, world: World | None = None, 
 
     Returns:
         The contract, as `export_policy` does.
-
-    Raises:
-        UserError: the folder is in use; the policy corrects nothing, or cannot do it without its base.
     """
     world, out = _world_of(policy, world), Path(out)
     contract.check_request(format, out)
@@ -261,9 +246,6 @@ def load_exported(folder: str | Path) -> runner.Decision:
     """Return an exported decision whose golden cases were replayed: call it as `decide(obs)`.
 
     `decide.contract` is its contract, `decide.check()` replays the golden cases again.
-
-    Raises:
-        UserError: the folder is damaged, or cannot be run here.
     """
     try:
         decide = runner.Decision(Path(folder))

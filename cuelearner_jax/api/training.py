@@ -48,9 +48,6 @@ class Run:
             guidance: kind of guidance (default: the last).
             labels: label budget (default: the largest).
             seed: seed (default: the first).
-
-        Raises:
-            UserError: there is no such lane.
         """
         name = list(self.trainings)[-1] if guidance is None else guidance
         if name not in self.trainings:
@@ -95,9 +92,6 @@ def train(
         seeds: their number (0, 1, ...), or the seeds (default: the preset's; with a configuration, 8).
         split: episodes of the evaluations: "validation", or "tuning" for choosing settings.
         progress: show progress bars on standard error.
-
-    Raises:
-        UserError: settings that make no sense, no teacher where one is asked, or too little memory.
     """
     if teacher is not None:
         teacher = teacher_of_world(teacher, world.actions)

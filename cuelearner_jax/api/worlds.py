@@ -88,9 +88,6 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
         robot: the body that acts (default: the task's own): "anymal" in navigation, "pooltool" in billiards, "fetch" in
             arm.
         changes: fields of its configuration, as `cuelearner evaluate TASK --help` lists them under "task options".
-
-    Raises:
-        UserError: no such task, scenario, robot or field.
     """
     task = (registry.resolve(name) if isinstance(name, str) else name).on(robot)
     return World(task, task.configure(scenario, **changes), scenario)
@@ -124,9 +121,6 @@ def from_gymnasium(
         units: units of slices by name, in place of `observation`; a reading may shift slices in "m" and "rad".
         processes: number of processes that play (0: one for each processor; 1: this process plays).
         arguments: arguments of the environment.
-
-    Raises:
-        UserError: Gymnasium is not installed, the environment cannot be made, or its spaces are none that are served.
     """
     from cuelearner_jax.tasks import gymnasium
 
@@ -137,11 +131,7 @@ def from_gymnasium(
 
 @user_code.report_user_errors
 def teacher_of(source: World | Policy) -> Teacher:
-    """Return the teacher of a world, or a teacher that shows what a given policy does.
-
-    Raises:
-        UserError: the task has no teacher, or it cannot be had; what is neither a world nor a policy.
-    """
+    """Return the teacher of a world, or a teacher that shows what a given policy does."""
     if isinstance(source, World):
         return source.task.make_teacher(source.config, source.env)
     # `CallablePolicy` is above this module, so its `policy` is looked up by name

@@ -43,7 +43,6 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Scenario, Task
-from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Label, Teacher
 
 TaskT = TypeVar("TaskT")
@@ -213,15 +212,10 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             kinds=kinds,
         )
 
-    def run(
-        self,
-        subject: Subject,
-        watch: Callable[[str], Tell] = lambda what: ignore_progress,
-        note: Callable[[str], None] = console.print,
-    ) -> AdaptedStudy:
+    def run(self, subject: Subject, watch: Callable[[str], Tell] = lambda what: ignore_progress) -> AdaptedStudy:
         """Check the request and adapt; nothing is written. Raises UserError for an invalid or impossible request.
 
-        `watch`: given the name of a step, returns the function that reports its progress. `note`: called with warnings.
+        `watch`: given the name of a step, returns the function that reports its progress.
         """
         release_programs()
         env, bases, sizes, scalars = subject.env, subject.bases, self.sizes, self.scalars
@@ -244,8 +238,8 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         grid = Grid((kind.name,), seeds, self.labels if subject.rows is None else (len(subject.rows.obs),))
         file = self._labels(subject, guidance, grid)
         bounds = self._bounds(subject, guidance, file)
-        if not kind.by_evidence and (hint := by_model.check_amounts(actions_of(env), bounds, scalars)):
-            note(hint)
+        if not kind.by_evidence:
+            by_model.check_amounts(actions_of(env), bounds, scalars)
         lanes = product(1, seeds, grid.labels, bounds, one_each=not shared)
         how = self._judging(subject)
         rows, teacher = None, subject.teacher

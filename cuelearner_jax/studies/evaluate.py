@@ -112,9 +112,6 @@ def run(
         asked: the request, whose `task` is the world (a configuration).
         watch: given a kind of guidance, returns the function that reports the progress of its lanes.
         policy: a policy in place of one of the source's; None: use the source's.
-
-    Raises:
-        UserError: an invalid request, or a policy that is not available (`PolicySource.check` finds that sooner).
     """
     release_programs()
     task, world, name = source.task, asked.task, asked.policy
@@ -183,9 +180,6 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
         space: the actions' space.
         eps: strength of an answer, in the space's unit.
         base: the policy before its correction; None: unknown.
-
-    Raises:
-        UserError: a policy returns something other than actions, or no label says anything.
     """
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(says_something(rows.answer))], rows)
     if not len(rows.obs):

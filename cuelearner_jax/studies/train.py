@@ -106,9 +106,6 @@ def in_memory(
     Returns:
         A row per lane and evaluation (guidance, labels, seed, step, wall_s, failed and metrics); and the trainings by
         kind of guidance, in their final state.
-
-    Raises:
-        UserError: invalid configuration, or no teacher where one is needed.
     """
     release_programs()
     request = resolve_request(request)

@@ -198,7 +198,7 @@ def test_answers_too_weak_to_move_a_choice_are_refused_and_never_the_default():
     assert by_model.plain_scalars(GEARS).eps_deg == 1.0
     assert by_model.usual_bound(Choices(3, GEARS.order)) == 1.0
     weak = dataclasses.replace(scalars_of(GEARS), eps_deg=0.3, tau_deg=0.01)
-    with pytest.raises(UserError, match=r"scalars\.eps_deg is 0\.3 steps: give at least 1"):
+    with pytest.raises(UserError, match=r"labels of 0\.3 steps say nothing.* from 1 on"):
         by_model.check_amounts(GEARS, [2.0], weak)
     assert FRUIT.reach == 1.0
 
