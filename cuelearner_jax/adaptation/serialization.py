@@ -28,7 +28,13 @@ from cuelearner_jax.reading.policy import KIND as READING
 from cuelearner_jax.reading.policy import Read, unread
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
-KINDS = ("agent", "uniform", "heuristic", "guided", READING, "code")
+# the arrays of each kind that can be stored
+ARRAYS: dict[str, tuple[str, ...]] = {
+    "agent": ("params",),
+    "guided": ("model", "bound"),
+    READING: ("correction", "bound"),
+}
+ARRAYS |= {"uniform": (), "heuristic": (), "code": ()}
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # groups in a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other values and the arrays hold them already
 
@@ -42,7 +48,7 @@ def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
     for layer in layers(described):
         if layer.get("asks"):
             raise UserError("a policy that asks a teacher cannot be stored: give one that acts without a teacher")
-        if layer["policy"] not in KINDS or (layer["policy"] == "guided" and layer["sizes"] is None):
+        if layer["policy"] not in ARRAYS or (layer["policy"] == "guided" and layer["sizes"] is None):
             raise UserError(f"a policy of kind {layer['policy']} cannot be stored in a folder: give another kind")
         if layer["policy"] == "code":
             layer["named"] = named or "code"
@@ -56,14 +62,9 @@ def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
 def arrays_of(policy: Any) -> Any:
     """Return the arrays of a policy, or of a block of policies."""
     kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # `Common` holds it as `policy`
-    if kind == "agent":
-        return {"params": policy.params}
-    if kind == "guided":
-        bound = {} if policy.bound is None else {"bound": policy.bound}
-        return {"base": arrays_of(policy.base), "model": policy.model, **bound}
-    if kind == READING:
-        return {"base": arrays_of(policy.base), "correction": policy.correction, "bound": policy.bound}
-    return {}
+    arrays = {name: getattr(policy, name) for name in ARRAYS.get(kind, ())}
+    below = {"base": arrays_of(policy.base)} if hasattr(policy, "base") else {}
+    return {**{name: array for name, array in arrays.items() if array is not None}, **below}
 
 
 def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None, changes: Any = None) -> Any:

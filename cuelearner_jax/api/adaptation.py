@@ -172,16 +172,18 @@ def adapt(
         user_code.answers_in("teacher", teacher, env)
     elif file is None and rows is None:
         raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
-    sizes, scalars = sizes and normalize_options(sizes, "sizes"), scalars and normalize_options(scalars, "scalars")
+    scalars = scalars and normalize_options(scalars, "scalars")
     task, scenario = (known.task, known.scenario) if known else (None, None)
     chosen: dict[str, Any] = {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
     if file is None and rows is None and labels is not None:
         chosen["labels"] = (labels,)
+    if sizes is not None:
+        chosen["sizes"] = normalize_options(sizes, "sizes")
     if bound_deg is not None:
         chosen["bound_deg"] = (float(bound_deg),)
     if judge_bounds is not None:
         chosen["judge_bounds"] = tuple(map(float, judge_bounds))
-    request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, sizes, scalars)
+    request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, scalars)
     subject = Subject(env, Common(as_policy_in(policy, env)), task=task, teacher=teacher, rows=rows, changes=changes)
     outcome = dataclasses.replace(request, **chosen).run(subject)
     found = outcome.found
@@ -236,9 +238,7 @@ def correct(
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         low, high: bounds of the actions, a number an entry (default: the range of the labels' actions).
         space: the space of the actions, such as `cuelearner_jax.spaces.DIRECTIONS`, in place of cues, low and high.
-        changes: for guidance "reading", the possible changes, as for `adapt`.
-        sizes, scalars: settings of the model and its fitting.
-        seed: seed of all random numbers.
+        changes, sizes, scalars, seed: as for `adapt`.
     """
     if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX):
         policy = load_policy(policy)

@@ -94,9 +94,7 @@ def fit_feedback(
         labels: arrays, or a label file (its first seed's).
         space: space of the actions in arrays; a file names its own.
         eps_deg: strength of an answer in the space's unit (default: of arrays 5 degrees, of a file the file's).
-        sizes: sizes of the network and its fitting (default: small ones, the paper's are `config.GuideSizes()`).
-        scalars: settings of fitting and of refinement.
-        seed: seed of the network.
+        sizes, scalars, seed: as for `adapt` (the paper's sizes are `config.GuideSizes()`).
     """
     found = LabelSet(rows_of(labels), space) if isinstance(labels, tuple) else labels_from_file(Path(labels))
     rows, spaces = rows_of(labels_of(found.rows)), Spaces(found.rows.obs.shape[1], found.space)
@@ -129,16 +127,12 @@ def ask(
     """Ask a teacher about a policy's actions in rounds, each about actions refined by the model so far (DAgger).
 
     Args:
-        policy: the policy to correct: a policy, or any function of a batch of observations in NumPy.
-        world: the world that the policy acts in.
-        teacher: the teacher who answers; a function of observations, or another policy, teaches what it does.
+        policy, world, teacher: as for `adapt`.
         labels: number of questions.
         bound_deg: refined actions that are asked about stay within this of the policy's own, in the space's unit
             (default: a quarter of its reach, 45 degrees).
         eps_deg: strength of an answer in the space's unit (default: the scalars').
-        sizes: sizes of the network, of its fitting, and of a round of labels.
-        scalars: settings of fitting, of refinement and of the teacher's faults.
-        seed: seed of all random numbers.
+        sizes, scalars, seed: as for `adapt`.
     """
     env, space = world.env, world.actions
     sizes, scalars = settings(space, sizes, scalars, eps_deg)

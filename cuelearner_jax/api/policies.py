@@ -18,7 +18,6 @@ from cuelearner_jax.api.worlds import World, numbers
 from cuelearner_jax.config import to_json
 from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.export import contract, correction, decisions, runner
 from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name, policy_of
 from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import RunConfig
@@ -200,6 +199,8 @@ def export_policy(
     Returns:
         The contract, with "difference": the largest difference of the file's golden cases.
     """
+    from cuelearner_jax.export import contract, decisions  # only exports need it
+
     world, out = _world_of(policy, world), Path(out)
     contract.check_request(format, out)
     env = world.env
@@ -224,6 +225,8 @@ def export_correction(policy: Any, out: str | Path, world: World | None = None, 
     Returns:
         The contract, as `export_policy` does.
     """
+    from cuelearner_jax.export import contract, correction
+
     world, out = _world_of(policy, world), Path(out)
     contract.check_request(format, out)
     alone, seen = correction.correction_of(as_policy(policy), world.env)
@@ -242,11 +245,13 @@ def _about(policy: Any, world: World) -> dict[str, Any]:
     return {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
 
 
-def load_exported(folder: str | Path) -> runner.Decision:
+def load_exported(folder: str | Path) -> Any:
     """Return an exported decision whose golden cases were replayed: call it as `decide(obs)`.
 
     `decide.contract` is its contract, `decide.check()` replays the golden cases again.
     """
+    from cuelearner_jax.export import runner
+
     try:
         decide = runner.Decision(Path(folder))
         decide.check()

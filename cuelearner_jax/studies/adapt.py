@@ -158,7 +158,6 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         judge_by: str | None = None,
         labels_from: Path | None = None,
         eps_deg: float | None = None,
-        sizes: GuideSizes | None = None,
         scalars: Scalars | None = None,
     ) -> Any:
         """Return the default request; the only place where the rules of scenarios are applied.
@@ -172,7 +171,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             labels_from: a label file, which determines budget and strength of answers.
             eps_deg: strength of an answer [deg]; None: the file's, that of given scalars, the scenario's, or the
                 training's.
-            sizes, scalars: complete values in place of the defaults.
+            scalars: complete values in place of the defaults.
         """
         rules = task.scenario(scenario) if task and scenario else AS_IT_IS
         kind = guidances.resolve(guidance or rules.guidance or KIND.name)
@@ -207,7 +206,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             labels_from=labels_from,
             judge_by=judge_by or rules.judge_by or by,
             judge_bounds=() if judge_by == judging.LABELS else rules.judge_bounds,
-            sizes=sizes or replace(by_model.SIZES, **{**frame, **rules.sizes}),
+            sizes=replace(by_model.SIZES, **{**frame, **rules.sizes}),
             scalars=scalars,
             kinds=kinds,
         )

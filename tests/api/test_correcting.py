@@ -134,8 +134,12 @@ def test_it_can_be_corrected_again(better, tmp_path):
 
 @pytest.mark.long
 def test_a_constant_change_is_found_by_a_reading():
-    labels = asked(150, reach=0.1)
-    found = cl.correct(off, labels, low=LOW, high=HIGH, eps=EPS)
+    @jax.jit
+    def compiled(obs):
+        means = [0.06 * obs[:, 0], 0.06 * obs[:, 1], 0.6 * jnp.tanh(obs[:, 2] * obs[:, 0])]
+        return jnp.stack(means, -1) + OFFSET
+
+    found = cl.correct(compiled, asked(60, reach=0.1), low=LOW, high=HIGH, eps=EPS)
     assert found.used
     assert error(found) < 0.25 * ERROR
     assert "shares" in found.words[0]

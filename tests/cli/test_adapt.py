@@ -4,15 +4,20 @@ import importlib
 import json
 import shutil
 import sys
+import traceback
 from functools import partial
+from itertools import pairwise
+from pathlib import Path
 
 import chex
 import numpy as np
 import pytest
+from test_house import ROW
 
 import cuelearner_jax as cl
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.guides import base
 from cuelearner_jax.policies import Guided
 from cuelearner_jax.storage import formats, label_files, policy_folders, results
 from cuelearner_jax.studies.adapt import AdaptRequest
@@ -330,3 +335,20 @@ def test_of_two_adaptations_at_once_the_second_is_refused_before_it_works(home, 
     with policy_folders.place_of(tmp_path / "new", overwrite=False):
         refused([*CODE, "--out", tmp_path / "new"], "is being written by another process", tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_way_from_the_command_line_to_the_fit_is_short(home, tmp_path, monkeypatch, capsys):
+    way = []
+
+    def fit(*arguments, **options):
+        for frame in traceback.extract_stack():
+            package, _, module = frame.filename.rpartition("/cuelearner_jax/")
+            if package and way[-1:] != [module]:
+                way.append(module)
+        raise cl.UserError("enough")
+
+    monkeypatch.setattr(base, "fit_least_squares", fit)
+    assert main([*CODE, "--labels", "20", "--out", str(tmp_path / "new")]) == 2
+    rows = [ROW[Path(module).parts[0].removesuffix(".py")] for module in way]
+    assert len({*way}) <= 11
+    assert sum(above < below for above, below in pairwise(rows)) <= 3
