@@ -172,7 +172,7 @@ def adapt(
         user_code.answers_in("teacher", teacher, env)
     elif file is None and rows is None:
         raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
-    scalars = scalars and normalize_options(scalars, "scalars")
+    scalars, eps_deg = scalars and normalize_options(scalars, "scalars"), eps_deg and float(eps_deg)
     task, scenario = (known.task, known.scenario) if known else (None, None)
     chosen: dict[str, Any] = {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
     if file is None and rows is None and labels is not None:

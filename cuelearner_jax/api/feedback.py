@@ -25,7 +25,7 @@ from cuelearner_jax.adaptation.lanes import Adaptation, blame, product
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in
 from cuelearner_jax.api.worlds import World, numbers, teacher_of_world
-from cuelearner_jax.config import GuideSizes, Scalars, check_guide
+from cuelearner_jax.config import GuideSizes, Scalars, check_guide, normalize_options
 from cuelearner_jax.environment import Quantity, Spaces, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
@@ -190,7 +190,8 @@ def settings(
     space: Space, sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None
 ) -> tuple[GuideSizes, Scalars]:
     """Return sizes and scalars, by default those of `by_model`. Raises UserError for values that cannot work."""
-    sizes, scalars = sizes or by_model.SIZES, by_model.settling(scalars or by_model.plain_scalars(space), eps_deg)
+    sizes = normalize_options(sizes or by_model.SIZES, "sizes")
+    scalars = normalize_options(by_model.settling(scalars or by_model.plain_scalars(space), eps_deg), "scalars")
     check_guide(sizes, scalars)
     return sizes, scalars
 
