@@ -70,11 +70,11 @@ class AdaptationResult:
             _, seed, budget, bound = (column[lane] for column in self.lanes)
             result = self.results[lane] if self.results else None
             within = "" if result else f" within {bound:g} {unit}"
-            told = result.words() if result else []
+            sentences = result.words() if result else []
             if result is None or result.changed:
-                told.append(self._verdict(lane, unit))
+                sentences.append(self._verdict(lane, unit))
             lane_of = f", seed {seed}" if self.lanes.number > 1 else ""
-            lines += [f"{budget} labels{within}{lane_of}: {line}" for line in told]
+            lines += [f"{budget} labels{within}{lane_of}: {line}" for line in sentences]
         return lines
 
     def _verdict(self, lane: int, unit: str) -> str:

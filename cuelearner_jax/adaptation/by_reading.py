@@ -107,11 +107,11 @@ def adapt(
         reading = Reading(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation)
         if labels is None:
             progress = lambda count, before=asked: tell(before + count, total)  # noqa: E731
-            told, policies = _asked(of, reading, seed, budget, teacher, progress)
+            own, policies = _asked(of, reading, seed, budget, teacher, progress)
         else:
-            told, policies = jax.tree.map(lambda leaf: np.asarray(leaf)[len(rows)], labels), []
-            reading.read_in_batches(*(part[told.valid] for part in (told.obs, told.action, told.answer)))
-        rows.append(told)
+            own, policies = jax.tree.map(lambda leaf: np.asarray(leaf)[len(rows)], labels), []
+            reading.read_in_batches(*(part[own.valid] for part in (own.obs, own.action, own.answer)))
+        rows.append(own)
         steps.append([policy.correction for policy in policies])
         results.append(reading.result())
         asked += budget

@@ -93,8 +93,8 @@ class Judge:
 
     def measure(self, block: Any) -> None:
         """Roll out the lanes' current policies, and add a row to the learning curve."""
-        found = self._rolled(self.of.policy(block, self.how.env), "the adapted policy")
-        self.curve.append({"asked": np.asarray(block.asked), "failed": np.asarray(block.failed), **found.means})
+        rollout = self._rolled(self.of.policy(block, self.how.env), "the adapted policy")
+        self.curve.append({"asked": np.asarray(block.asked), "failed": np.asarray(block.failed), **rollout.means})
 
     def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
         """Return the judgement of the finished lanes, and the lanes with the bounds that are used.
@@ -103,10 +103,10 @@ class Judge:
         """
         how, lanes = self.how, self.lanes
         if how.by == LABELS:
-            found = judged_by_labels(self.of, block)
+            judgement = judged_by_labels(self.of, block)
             if how.env is not None:
                 self.measure(block)
-            return found, block
+            return judgement, block
         if how.every:
             self.measure(block)
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
@@ -138,13 +138,13 @@ class Judge:
         spent = np.zeros(self.lanes.number, int)
         best, value = block.bound, np.full(self.lanes.number, -np.inf)
         for share in (1.0, *self.how.bounds) if self.how.bounds else ():
-            tried = block.replace(bound=share * block.bound)
+            within = block.replace(bound=share * block.bound)
             what = f"the adapted policy within {share:g} of its bound"
-            found = self._rolled(self.of.policy(tried, self.how.env), what)
-            spent = spent + self._played(found, self.how.num_envs)
-            better = np.asarray(found.means[self.how.by]) > value
-            value = np.where(better, found.means[self.how.by], value)
-            best = jnp.where(jnp.asarray(better), tried.bound, best)
+            rollout = self._rolled(self.of.policy(within, self.how.env), what)
+            spent = spent + self._played(rollout, self.how.num_envs)
+            better = np.asarray(rollout.means[self.how.by]) > value
+            value = np.where(better, rollout.means[self.how.by], value)
+            best = jnp.where(jnp.asarray(better), within.bound, best)
         return block.replace(bound=best), spent
 
     def _rolled(self, policy: PolicyBlock, what: str, key: Any = None, num_envs: int | None = None) -> Rollout:

@@ -174,27 +174,27 @@ def adapt(
         raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
     scalars, eps_deg = scalars and normalize_options(scalars, "scalars"), eps_deg and float(eps_deg)
     task, scenario = (known.task, known.scenario) if known else (None, None)
-    chosen: dict[str, Any] = {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
+    options: dict[str, Any] = {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
     if file is None and rows is None and labels is not None:
-        chosen["labels"] = (labels,)
+        options["labels"] = (labels,)
     if sizes is not None:
-        chosen["sizes"] = normalize_options(sizes, "sizes")
+        options["sizes"] = normalize_options(sizes, "sizes")
     if bound_deg is not None:
-        chosen["bound_deg"] = (float(bound_deg),)
+        options["bound_deg"] = (float(bound_deg),)
     if judge_bounds is not None:
-        chosen["judge_bounds"] = tuple(map(float, judge_bounds))
+        options["judge_bounds"] = tuple(map(float, judge_bounds))
     request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, scalars)
     subject = Subject(env, Common(as_policy_in(policy, env)), task=task, teacher=teacher, rows=rows, changes=changes)
-    outcome = dataclasses.replace(request, **chosen).run(subject)
-    found = outcome.found
-    if found.failed.any():
-        blame(found.of, teacher, found.block)
+    outcome = dataclasses.replace(request, **options).run(subject)
+    result = outcome.found
+    if result.failed.any():
+        blame(result.of, teacher, result.block)
         raise divergence_error()
-    if not found.judged.used.all():
-        warnings.warn(found.words[-1], stacklevel=3)
-    adapted, observation = found.policy(env).lane(0), getattr(env, "observation", ())
+    if not result.judged.used.all():
+        warnings.warn(result.words[-1], stacklevel=3)
+    inner, observation = result.policy(env).lane(0), getattr(env, "observation", ())
     about = {"trained": RunConfig(config.task), "actions": space, "world": known}
-    return AdaptedPolicy(adapted, observation, **about, outcome=outcome, named=_called(policy))
+    return AdaptedPolicy(inner, observation, **about, outcome=outcome, named=_called(policy))
 
 
 def _called(policy: Any) -> str:
@@ -244,15 +244,16 @@ def correct(
         policy = load_policy(policy)
     before = getattr(getattr(policy, "trained", None), "task", None)
     before = before if isinstance(before, LogsConfig) else None
-    found = _labels(labels, space, cues, low, high, before)
+    label_set = _labels(labels, space, cues, low, high, before)
     own = as_policy(policy)
-    CallablePolicy(in_space(own, found.space), actions=found.space)(found.rows.obs)  # refuses what gives no actions
+    acting = CallablePolicy(in_space(own, label_set.space), actions=label_set.space)
+    acting(label_set.rows.obs)  # refuses what gives no actions
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
-        world_of(found, before),
-        labels=labels_of(found.rows),
+        world_of(label_set, before),
+        labels=labels_of(label_set.rows),
         bound_deg=bound,
-        eps_deg=found.strength(eps),
+        eps_deg=label_set.strength(eps),
         guidance=guidance,
         sizes=sizes,
         scalars=scalars,
@@ -285,13 +286,13 @@ def agreement(
         if not isinstance(policy, CallablePolicy):
             raise UserError("space is None, and arrays of labels name none: give space=, or a label file")
         space = policy.actions
-    found = _labels(labels, space)
-    eps = found.eps if eps is None else eps
+    label_set = _labels(labels, space)
+    eps = label_set.eps if eps is None else eps
     if eps is None:
-        eps = float((getattr(own, "scalars", None) or plain_scalars(found.space)).eps_deg)
+        eps = float((getattr(own, "scalars", None) or plain_scalars(label_set.space)).eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base)
-    base = None if base is None else in_space(base, found.space)
-    return agreement_of(in_space(own, found.space), found.rows, found.space, eps, base)
+    base = None if base is None else in_space(base, label_set.space)
+    return agreement_of(in_space(own, label_set.space), label_set.rows, label_set.space, eps, base)
 
 
 def _labels(
@@ -322,14 +323,14 @@ def _labels(
     return LabelSet(rows, space)
 
 
-def world_of(found: LabelSet, before: LogsConfig | None = None) -> World:
+def world_of(label_set: LabelSet, before: LogsConfig | None = None) -> World:
     """Return the situations of labels as a world of the task `logs`, which names no folder.
 
     Networks of a policy that was corrected `before` keep their view. Raises UserError where that cannot be.
     """
-    size, obs, space = found.rows.obs.shape[1], np.asarray(found.rows.obs), found.space
-    own = {name: value for name, value in found.task.items() if name not in ("name", "from")}
-    config = from_json(LogsConfig, own) if found.task.get("name") == logs.NAME else None
+    size, obs, space = label_set.rows.obs.shape[1], np.asarray(label_set.rows.obs), label_set.space
+    own = {name: value for name, value in label_set.task.items() if name not in ("name", "from")}
+    config = from_json(LogsConfig, own) if label_set.task.get("name") == logs.NAME else None
     if before is not None:
         if logs.space_of(before) != space:
             raise UserError(
@@ -353,5 +354,5 @@ def world_of(found: LabelSet, before: LogsConfig | None = None) -> World:
         )
     if logs.space_of(config).to_json() != space.to_json():
         raise UserError(f"the space {space.name!r} is not one that a recording can have: give a box with plain cues")
-    filled = lambda config, split: logs.filled(config, obs, found.rows.action)  # noqa: E731
+    filled = lambda config, split: logs.filled(config, obs, label_set.rows.action)  # noqa: E731
     return World(logs.configured(config, dataclasses.replace(logs.BODY, environment=filled)), config)

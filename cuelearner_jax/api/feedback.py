@@ -96,19 +96,19 @@ def fit_feedback(
         eps_deg: strength of an answer in the space's unit (default: of arrays 5 degrees, of a file the file's).
         sizes, scalars, seed: as for `adapt` (the paper's sizes are `config.GuideSizes()`).
     """
-    found = LabelSet(rows_of(labels), space) if isinstance(labels, tuple) else labels_from_file(Path(labels))
-    rows, spaces = rows_of(labels_of(found.rows)), Spaces(found.rows.obs.shape[1], found.space)
+    label_set = LabelSet(rows_of(labels), space) if isinstance(labels, tuple) else labels_from_file(Path(labels))
+    rows, spaces = rows_of(labels_of(label_set.rows)), Spaces(label_set.rows.obs.shape[1], label_set.space)
     if len(rows.obs) < 2:
         raise UserError(f"{len(rows.obs)} labels are too few to fit a model: give more labels")
     external_labels.check(rows, spaces, RELATIVE)
-    sizes, scalars = settings(found.space, sizes, scalars, found.strength(eps_deg))
+    sizes, scalars = settings(label_set.space, sizes, scalars, label_set.strength(eps_deg))
     guidance = KIND.make(sizes, spaces)
     k_init, k_fit = jax.random.split(jax.random.key(seed))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
     model = fit(k_fit, jax.tree.map(jnp.asarray, rows), guidance.init(k_init), scalars)
     if not all_finite(model):
         raise divergence_error()
-    return FeedbackModel(guidance, model, scalars, labels_of(rows), sizes, found.space)
+    return FeedbackModel(guidance, model, scalars, labels_of(rows), sizes, label_set.space)
 
 
 @user_code.report_user_errors

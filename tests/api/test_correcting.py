@@ -137,7 +137,7 @@ def test_a_constant_change_is_found_by_a_reading():
     @jax.jit
     def compiled(obs):
         means = [0.06 * obs[:, 0], 0.06 * obs[:, 1], 0.6 * jnp.tanh(obs[:, 2] * obs[:, 0])]
-        return jnp.stack(means, -1) + OFFSET
+        return jnp.stack(means, -1) + OFFSET[None]
 
     found = cl.correct(compiled, asked(60, reach=0.1), low=LOW, high=HIGH, eps=EPS)
     assert found.used
