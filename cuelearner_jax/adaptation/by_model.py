@@ -120,7 +120,8 @@ def adapt(
     if labels is not None:
         labels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
     judge = Judge(of, Lanes(*(column[filled] for column in lanes)), how, mesh, watch)
-    block = learn_lanes(of, judge.lanes, teacher, labels, mesh, watch, judge.measure_if_due)
+    due = lambda block, asked: judge.measure(block) if how.every and asked % how.every == 0 else None  # noqa: E731
+    block = learn_lanes(of, judge.lanes, teacher, labels, mesh, watch, due)
     judged, block = judge.judge_lanes(block)
     fitted = block.guide.model.fitted & jnp.asarray(judged.used)  # an unfitted model leaves actions unchanged
     block = block.replace(guide=block.guide.replace(model=block.guide.model.replace(fitted=fitted)))

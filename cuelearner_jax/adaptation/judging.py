@@ -86,11 +86,6 @@ class Judge:
         self.mesh = mesh if mesh.size > 1 else None
         self.curve: list[dict[str, np.ndarray]] = []
 
-    def measure_if_due(self, block: Any, asked: int) -> None:
-        """Add a row to the learning curve if enough labels came since the last row."""
-        if self.how.every and asked % self.how.every == 0:
-            self.measure(block)
-
     def measure(self, block: Any) -> None:
         """Roll out the lanes' current policies, and add a row to the learning curve."""
         rollout = self._rolled(self.of.policy(block, self.how.env), "the adapted policy")
