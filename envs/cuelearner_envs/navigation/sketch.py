@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from cuelearner_envs import svg
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
-from cuelearner_envs.navigation.robot import Robot
+from cuelearner_envs.navigation.robot import Robot, hull
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Reel, Sketch
@@ -148,10 +148,5 @@ def _goal(at: np.ndarray, radius: float, away: float) -> str:
 
 
 def _robot(robot: Robot) -> str:
-    radius, offset = float(robot.disc_radius), float(robot.disc_offset)
-    bend = np.linspace(-math.pi / 2, math.pi / 2, 13)
-    front = np.stack([np.cos(bend), np.sin(bend)], axis=-1) * radius + [offset, 0.0]
-    hull = svg.polygon(np.concatenate([front, -front]), "fill:var(--body);stroke:#222222;stroke-width:0.04")
-    tip = offset + 0.6 * radius
-    back = tip - 1.1 * radius
-    return hull + svg.polygon([(tip, 0.0), (back, 0.6 * radius), (back, -0.6 * radius)], "fill:#222222")
+    body, chevron = hull(robot)
+    return svg.polygon(body, "fill:var(--body);stroke:#222222;stroke-width:0.04") + svg.polygon(chevron, "fill:#222222")

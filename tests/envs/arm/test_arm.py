@@ -12,13 +12,13 @@ from PIL import Image
 from cuelearner_envs.arm import drawing, physics, recording
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm.config import ArmConfig
-from cuelearner_envs.arm.environment import ACTIONS, Camera
+from cuelearner_envs.arm.environment import Camera
 from cuelearner_envs.arm.places import BASE, HOME
 from cuelearner_envs.arm.scripts import act
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.reading import declared_distortions
 from cuelearner_jax.reading.families import undo_observation
-from cuelearner_jax.tasks.arm import ARM, observation_of
+from cuelearner_jax.tasks.arm import ARM
 from cuelearner_jax.testing import check_task
 
 F = jnp.float32
@@ -93,19 +93,6 @@ def test_a_declared_family_names_the_turn_and_the_offset(skill):
     assert np.allclose(found, true, atol=1e-5)
 
 
-@pytest.mark.parametrize("skill", ["reach", "push", "pick"])
-def test_observations_have_fetchs_names_and_sizes(skill):
-    layout = observation_of(skill)
-    assert sum(quantity.size for quantity in layout) == (16 if skill == "reach" else 31)
-    assert ARM.environment(ARM.configure(skill=skill)).obs_size == (16 if skill == "reach" else 31)
-    assert [cue.words for cue in ACTIONS.cues] == [
-        ("forward", "backward"),
-        ("left", "right"),
-        ("up", "down"),
-        ("open", "close"),
-    ]
-
-
 def test_the_teacher_sees_true_places_and_the_heuristic_what_is_seen():
     config = ARM.configure("turned_camera", skill="reach")
     env = ARM.environment(config)
@@ -164,17 +151,3 @@ def test_a_picture_shows_cube_post_and_goal(tmp_path):
     assert left[0] < 0
     assert up == (0.0, -1.0)
     assert fingers is None
-
-
-def test_a_clip_holds_the_action_for_five_steps():
-    env = ARM.environment(ARM.configure(skill="reach"))
-    state, _ = env.reset(jax.random.key(3))
-    reel = recording.reel(env, state, jnp.array([0.0, 0.0, 1.0, 0.0]))
-    assert len(reel.pictures) == 6  # the situation, and where each step leads
-    assert len({*reel.pictures}) == 6
-    assert reel.period == recording.PERIOD
-
-
-def test_faces_look_outward():
-    for face in drawing._box(np.zeros(3), (1.0, 2.0, 3.0)):
-        assert drawing._normal(face) @ face.mean(0) > 0.9

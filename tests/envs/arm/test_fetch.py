@@ -12,7 +12,6 @@ import cuelearner_jax as cl
 from cuelearner_envs.arm import scripts
 from cuelearner_envs.arm.config import ArmConfig
 from cuelearner_envs.arm.environment import Camera
-from cuelearner_envs.arm.fetch import FetchArm
 from cuelearner_envs.arm.teacher import ScriptTeacher
 from cuelearner_jax.environment import WholeObservations
 from cuelearner_jax.errors import UserError
@@ -131,15 +130,6 @@ def test_what_fetch_cannot_be_is_refused_in_one_line(monkeypatch):
     monkeypatch.setattr(arm, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"is not installed: pip install 'cuelearner-jax\[gymnasium\]'"):
         cl.make("arm", robot="fetch").env  # noqa: B018
-
-
-def test_policies_of_the_gripper_act_in_fetch(monkeypatch):
-    monkeypatch.setattr(arm, "find_spec", lambda name: object())
-    for skill in arm.FETCH:
-        ours, theirs = (cl.make("arm", robot=name, skill=skill) for name in ("gripper", "fetch"))
-        assert ours.observation == theirs.observation
-        assert ours.actions == theirs.actions
-        assert isinstance(theirs.env, FetchArm)
 
 
 @pytest.mark.long

@@ -14,7 +14,6 @@ from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.lidar import BEAMS, scan
 from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
 from cuelearner_envs.navigation.worlds import FARTHEST
-from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.config import GuideSizes, to_json
 from cuelearner_jax.environment import spaces_of
@@ -66,12 +65,6 @@ def test_in_an_empty_hall_every_way_leads_on_to_the_goal():
     np.testing.assert_allclose(detour[6], first + beyond - 4.0, atol=1e-3)
     # Straight back there is no station nearer than LEAST: so far and back again.
     np.testing.assert_allclose([leg[36], detour[36]], [LEAST, 2 * LEAST], atol=1e-3)
-
-
-def test_a_goal_nearer_than_every_station_is_no_reason_to_go_past_it():
-    left, detour, leg = ahead(seen(jnp.full(BEAMS, 10.0), (0.0, 1.0)))
-    np.testing.assert_allclose([left[0], detour[0]], 0.0, atol=1e-3)
-    np.testing.assert_allclose(leg[0], 1.0, atol=1e-3)
 
 
 # 3 m ahead a wall with a doorway from y = 1.5 to 3.5; the goal lies 6 m straight ahead.
@@ -139,13 +132,6 @@ def test_a_turned_scene_has_the_same_features(beams):
     assert np.ptp(here, 1).min() > 0.5  # of several metres, not all alike
 
 
-def test_a_mirrored_scene_has_mirrored_features():
-    rng = np.random.default_rng(1)
-    ranges = rng.uniform(1.0, 7.0, BEAMS)
-    one, other = ahead(seen(ranges, (4.0, 2.0))), ahead(seen(ranges[::-1].copy(), (4.0, -2.0)))
-    np.testing.assert_allclose(one, np.roll(other[:, ::-1], 1, axis=1), atol=2e-3)
-
-
 def test_unless_it_is_asked_for_aims_are_what_they_were():
     rng = np.random.default_rng(2)
     obs = seen(rng.uniform(0.5, 9.0, BEAMS), (3.0, 1.0))
@@ -177,14 +163,6 @@ def kept(guidance, look_ahead):
     return PolicySource(registry.find("navigation"), config, None, Path(), adapted=adapted)
 
 
-def test_weights_of_ways_are_kept_with_their_width():
-    source = kept("intent", True)
-    assert source.adapted is not None
-    shapes = serialization.shapes_of(source.adapted.values["policy"], shape_of(source.task, source.config.task))
-    kernels = [leaf.shape for leaf in jax.tree.leaves(shapes["model"]) if leaf.shape[-1:] == (8,) and leaf.ndim > 1]
-    assert kernels == [(PLAINLY + 3, 8)]
-
-
 @pytest.mark.parametrize("policy", ["adapted", "base"])
 def test_who_weighs_ways_is_refused_where_they_tell_something_else(policy):
     for before in (False, True):
@@ -193,10 +171,3 @@ def test_who_weighs_ways_is_refused_where_they_tell_something_else(policy):
         with pytest.raises(UserError, match=f"uses aims of {PLAINLY + 3 * before} features"):
             source.check(policy, world(look_ahead=not before))
     kept("relative", False).check(policy, world(look_ahead=True))  # who asks nothing of ways does not mind
-
-
-def test_agents_do_not_mind_what_ways_tell():
-    folder = Path(__file__).parents[3] / "docs" / "data" / "navigation_agent"
-    source = PolicySource.of_run(folder, registry.find)
-    for policy in ("agent", "corrected"):
-        source.check(policy, world(look_ahead=True))
