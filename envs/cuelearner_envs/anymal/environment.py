@@ -161,16 +161,5 @@ def make_environment(
     """
     plain = make_navigation(config, split)
     noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
-    return LeggedNavigation(
-        worlds=plain.worlds,
-        robot=plain.robot,
-        lidar=plain.lidar.replace(noise=noise),
-        max_steps=plain.max_steps,
-        period=plain.period,
-        goal_radius=plain.goal_radius,
-        goal_rotation=plain.goal_rotation,
-        mirrors=plain.mirrors,
-        sides=plain.sides,
-        look_ahead=plain.look_ahead,
-        walking=walking_policy.load() if walking is None else walking,
-    )
+    walking = walking_policy.load() if walking is None else walking
+    return LeggedNavigation(**{**vars(plain), "lidar": plain.lidar.replace(noise=noise)}, walking=walking)

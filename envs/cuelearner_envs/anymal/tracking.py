@@ -36,6 +36,15 @@ def steps_of(seconds: float) -> int:
     return max(1, round(seconds / robot.CONTROL_PERIOD / HELD)) * HELD
 
 
+def _chosen(
+    policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, index: Array, qpos: Array, qvel: Array, last: Array
+) -> tuple[Array, Array, PRNGKeyArray]:
+    """Return a robot's action and command in a step, and the key of its pushes."""
+    command = random_command(jax.random.fold_in(key, index // HELD), trial)
+    k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
+    return policy(add_noise(k_noise, observe(qpos, qvel, last, command), trial.noise)), command, k_push
+
+
 @partial(jax.jit, static_argnames=("robots", "steps"))
 def walk(
     policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, robots: int, steps: int
@@ -46,10 +55,7 @@ def walk(
 
     def one(ground: Ground, key: PRNGKeyArray, state: tuple, index: jax.Array) -> tuple[tuple, tuple]:
         body, last_action, down = state
-        command = random_command(jax.random.fold_in(key, index // HELD), trial)
-        k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
-        obs = add_noise(k_noise, observe(body.qpos, body.qvel, last_action, command), trial.noise)
-        action = policy(obs)
+        action, command, k_push = _chosen(policy, trial, key, index, body.qpos, body.qvel, last_action)
         after, felt = control(push_randomly(k_push, body, trial), action, ground)
         down = down | felt.fallen
         body = jax.tree.map(partial(jnp.where, down), body, after)  # a fallen robot stays where it is
@@ -80,9 +86,7 @@ def walk_in_mujoco(
         """Actions, commands and pushes of a step."""
 
         def one(key: PRNGKeyArray, qpos: jax.Array, qvel: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
-            command = random_command(jax.random.fold_in(key, index // HELD), trial)
-            k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
-            action = policy(add_noise(k_noise, observe(qpos, qvel, last, command), trial.noise))
+            action, command, k_push = _chosen(policy, trial, key, index, qpos, qvel, last)
             after = push_randomly(k_push, Body(qpos, qvel, qvel), trial).qvel
             return action, command, after[:2] - qvel[:2]
 

@@ -24,7 +24,7 @@ from cuelearner_envs import canvas
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import Frame
 from cuelearner_envs.navigation.robot import Robot, hull
-from cuelearner_envs.navigation.world import FAR_AWAY, World
+from cuelearner_envs.navigation.world import World, tallness, used
 from cuelearner_jax import pictures
 
 # Okabe and Ito's palette, as in the figures of results: told apart with any colour vision.
@@ -39,7 +39,6 @@ WORDS = {
 }
 CHOSEN, ASKED = "direction chosen", "direction in question"  # what an arrow means
 FLOOR, LOW, TALL = "#fbfaf7", "#c9ccd1", "#5d636b"
-LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
 WIDTH_INCHES, STRIP_INCHES, MARGIN = 7.0, 0.4, 0.35  # the strip below the floor is for words; margin in [m]
 ARROW_REACH = (0.55, 1.6)  # beginning and end of an arrow, from the middle of the body [m]
 GHOSTS_APART = 1.4  # between the bodies of a still [m]
@@ -52,8 +51,8 @@ def draw_world(axes: Axes, world: World) -> None:
     axes.set(xlim=(-half[0] - MARGIN, half[0] + MARGIN), ylim=(-half[1] - MARGIN, half[1] + MARGIN), aspect="equal")
     axes.axis("off")
     axes.add_patch(Rectangle((-half[0], -half[1]), *(2 * half), facecolor=FLOOR, edgecolor="none", zorder=0))
-    solids = [(height, _box(row)) for row, height in _used(world.boxes, world.box_heights)]
-    solids += [(height, Circle((row[0], row[1]), row[2])) for row, height in _used(world.circles, world.circle_heights)]
+    solids = [(height, _box(row)) for row, height in used(world.boxes, world.box_heights)]
+    solids += [(height, Circle((row[0], row[1]), row[2])) for row, height in used(world.circles, world.circle_heights)]
     for height, patch in sorted(solids, key=lambda solid: solid[0]):  # from above, the tall covers the low
         patch.set(facecolor=shade(height), edgecolor="none", zorder=1)
         axes.add_patch(patch)
@@ -110,8 +109,8 @@ def animate(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str],
 
 def shade(height: float) -> str:
     """Colour of a solid of some height [m], a hexadecimal code."""
-    share = np.clip((height - LOWEST) / (TALLEST - LOWEST), 0.0, 1.0)
-    return to_hex((1 - share) * np.array(to_rgb(LOW)) + share * np.array(to_rgb(TALL)))
+    share = tallness(height)
+    return to_hex((1 - share) * np.array(to_rgb(LOW)) + share * np.array(to_rgb(TALL)))  # pyright: ignore[reportArgumentType]
 
 
 def outline(robot: Robot, pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "points 2"]:
@@ -131,12 +130,6 @@ def _to_world(pose: np.ndarray, points: Float[np.ndarray, "points 2"]) -> Float[
     x, y, yaw = np.asarray(pose, float)
     cos, sin = math.cos(yaw), math.sin(yaw)
     return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
-
-
-def _used(rows: Any, heights: Any) -> list[tuple[np.ndarray, float]]:
-    """Solids with their heights, without those that only fill the arrays."""
-    pairs = zip(np.asarray(rows, float), np.asarray(heights, float), strict=True)
-    return [(row, float(height)) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
 
 
 def _box(row: Float[np.ndarray, "5"]) -> Polygon:

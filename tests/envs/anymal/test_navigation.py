@@ -65,17 +65,6 @@ def test_every_end_has_its_name(walked):
 
 
 @pytest.mark.long
-def test_after_an_end_an_episode_begins_anew_standing_on_a_route(env, walked):
-    (_, following, _, _), _ = walked
-    for number in (1, 2, 3):
-        start = env.worlds.starts[following.world[number], following.route[number]]
-        np.testing.assert_allclose(following.body.qpos[number, :2], start)
-        assert int(following.steps[number]) == 0
-        assert not bool(following.fallen[number])
-    assert int(following.steps[0]) == 1
-
-
-@pytest.mark.long
 def test_replay_recalls_what_was_seen(env, walked):
     states, steps = walked
     state = jax.tree.map(lambda leaf: leaf[0], states[1])

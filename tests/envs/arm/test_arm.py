@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from cuelearner_envs.anymal.model import rotation
 from cuelearner_envs.arm import drawing, physics, recording
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm.config import ArmConfig
@@ -127,7 +128,7 @@ def test_rotations_are_told_by_fetchs_angles():
         axis, angle = int(np.argmax(np.abs(turn))), sum(turn)
         quaternion = np.zeros(4)
         quaternion[0], quaternion[1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
-        assert np.allclose(physics.euler(physics.rotation(jnp.asarray(quaternion, F))), turn, atol=1e-6)
+        assert np.allclose(physics.euler(rotation(jnp.asarray(quaternion, F))), turn, atol=1e-6)
 
 
 def test_a_picture_shows_cube_post_and_goal(tmp_path):

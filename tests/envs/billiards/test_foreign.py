@@ -50,9 +50,3 @@ def test_a_step_is_scored_by_the_rules_of_the_task():
     right, left = jnp.array([1.0, 0.0]), jnp.array([-1.0, 0.0])
     earned = jax.jit(lambda action: env_of(Still()).step(jax.random.key(0), state, action)[1].reward)
     assert [float(earned(action)) for action in (right, left)] == [1.0, 0.0]
-
-
-def test_worlds_of_equal_engines_are_one_world_to_compiled_programs():
-    same, other = (jax.tree.structure(env_of(Still(moved))) for moved in (0.01, 0.02))
-    assert jax.tree.structure(env_of(Still())) == same
-    assert same != other

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from cuelearner_envs.billiards import Table, physics, positions_at, simulate, simulate_many, trace
 from cuelearner_envs.billiards.impacts import normal_impulse, tangential_impulse
-from cuelearner_envs.billiards.table import Cloth, cushions, rack
+from cuelearner_envs.billiards.table import cushions, rack
 
 RATE = -math.log(0.7)  # of the drag, lambda [1/s]
 REACH = (0.5 - 0.05) / RATE  # how far a free ball rolls until a shot is over [m]
@@ -263,22 +263,3 @@ def test_trace_follows_simulate():
         np.testing.assert_array_equal(gone[-1], shot.pocketed)
         strides = np.linalg.norm(np.diff(where, axis=0), axis=-1)[~np.diff(gone, axis=0)]
         assert strides.max() <= 0.55 * float(times[1] - times[0])  # no ball jumps, except into its parking place
-
-
-def test_on_cloth_a_cut_throws_nothing_balls_roll_on_and_cushions_take_speed():
-    table = Table.one_ball().replace(cloth=Cloth(throw=0.0, roll=2 / 7, rebound=0.6))
-    before, contact, n = random_collisions(table, 500)
-    after = jax.vmap(physics.impact, (None, 0, 0, None))(table, before, contact, 0.0)
-    met, left = (np.stack([m.ux, m.uy], -1) for m in (before, after))
-    exchanged = ((met[:, 0] - met[:, 1]) * n).sum(-1, keepdims=True) * n  # equal spheres, without friction
-    np.testing.assert_allclose(left[:, 0], met[:, 0] - 5 / 7 * exchanged, atol=1e-6)
-    np.testing.assert_allclose(left[:, 1], met[:, 1] + 5 / 7 * exchanged, atol=1e-6)
-    path = history(table, jnp.array([[[0.3, 0.0], [-0.3, 0.1]]]), jnp.zeros(1), 2)  # straight at a cushion
-    np.testing.assert_allclose(path.ux[0, 1, 0], -0.6 * 0.5, rtol=1e-5)
-
-
-def test_cloth_like_the_plain_table_plays_like_it():
-    table = Table.regulation()
-    places, angles = scattered(table, 64)
-    plain, covered = (play(t, places, angles) for t in (table, table.replace(cloth=Cloth())))
-    jax.tree.map(np.testing.assert_array_equal, plain, covered)

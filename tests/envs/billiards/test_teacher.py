@@ -1,4 +1,3 @@
-import dataclasses
 import re
 
 import jax
@@ -29,15 +28,6 @@ def degrees(actions):
     return np.rad2deg(np.asarray(directions.to_angle(actions)))
 
 
-def margins(wins, actions):
-    """How many winning directions lie to the right and to the left of each of the directions chosen."""
-    found = []
-    for row, index in zip(wins, np.round(degrees(actions) / 360 * DIRECTIONS).astype(int), strict=True):
-        assert row[index % DIRECTIONS]
-        found.append([next(n for n in range(100) if not row[(index + s * n) % DIRECTIONS]) for s in (-1, 1)])
-    return np.array(found)
-
-
 @pytest.fixture(scope="module")
 def chosen():
     return best(SearchTeacher(ONE, AIM, HABIT), STATES, OBS)
@@ -62,14 +52,6 @@ def test_a_habit_makes_the_teacher_consistent(chosen):
     left, right = jumping[jumping > 0], jumping[jumping < 0]  # mirror-image windows
     assert min(len(left), len(right)) > RACKS / 10
     assert left.min() - right.max() > 50
-
-
-def test_an_imperfect_aim_prefers_wide_windows_and_their_middle(chosen, wins):
-    right, left = margins(wins, chosen).T
-    assert (np.abs(left - right) <= 1).mean() > 0.9
-    perfect = margins(wins, best(SearchTeacher(ONE, jnp.array(0.0), HABIT), STATES, OBS)).sum(1)
-    assert (left + right >= perfect).all()
-    assert (left + right > perfect).mean() > 0.3  # a perfect aim is content with a narrow window that comes first
 
 
 def test_it_knows_of_a_changed_world(chosen):
@@ -104,21 +86,6 @@ def easy():
     return states, alone
 
 
-def test_a_learned_teacher_looks_at_the_table_and_not_at_the_sensor(easy):
-    states, clean = easy
-    env, teacher = learned(observation_bias=(0.0071, 0.0071))
-    seen = jax.vmap(env.observe)(states)
-    assert (seen != jax.vmap(learned()[0].observe)(states)).any()
-    np.testing.assert_array_equal(best(teacher, states, seen), clean)
-
-
-def test_a_configuration_names_the_search_near_a_networks_proposals():
-    for changes in ({"teacher": "local_search"}, {"teacher": "learned", "acceleration": (0.0, 0.005)}):
-        config = dataclasses.replace(BilliardsConfig("easy"), **changes)
-        assert isinstance(make_teacher(config, make_environment(config)), LocalSearchTeacher)
-    assert isinstance(learned(action_turn_deg=0.8)[1], Transferred)
-
-
 @pytest.fixture(scope="module", params=long_but(["turned_strike"], SCENARIOS))
 def near(request, easy):
     """In a changed world: the search near proposals, the search of all directions, what these are worth, the states."""
@@ -130,9 +97,6 @@ def near(request, easy):
     full = SearchTeacher(env, local.aim_error, local.habit, PROPOSALS)
     states = easy[0]
     return local, full, searched(full, states), states, jax.vmap(env.observe)(states)
-
-
-favourites = jax.jit(lambda teacher, states: jax.lax.map(lambda state: teacher.proposed(state)[0], states))
 
 
 searched = jax.jit(lambda teacher, states: jax.lax.map(teacher.rewards, states))
@@ -152,14 +116,6 @@ def test_shots_near_proposals_are_as_good_as_all_of_them_in_every_changed_world(
     assert found.sum() > 0.95 * worth.max(1).sum()  # 0.99 measured
     unchanged = np.round(degrees(best(local.replace(env=local.own), states, obs)) / 360 * PROPOSALS).astype(int)
     assert worth[np.arange(len(worth)), unchanged % PROPOSALS].sum() <= found.sum()  # it knows of the change
-
-
-def test_where_no_shot_succeeds_the_networks_favourite_stays(near):
-    """The cue ball stops before it reaches anything."""
-    local, _, _, states, obs = near
-    still = local.replace(env=local.env.replace(table=local.env.table.replace(strike_speed=0.06)))
-    wanted = directions.evenly_spaced(PROPOSALS)[favourites(still, states)]
-    np.testing.assert_allclose(best(still, states, obs), wanted, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Navigation pictures, looked at pixel by pixel, and the records behind them: what is drawn is what happened."""
 
-import itertools
 import math
 from typing import Any
 
@@ -17,7 +16,7 @@ from rooms import room
 
 from cuelearner_envs.navigation import drawing, scan
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_envs.navigation.recording import ENDS, record, situation
+from cuelearner_envs.navigation.recording import record, situation
 from cuelearner_envs.navigation.robot import Robot, discs
 from cuelearner_jax.policies import Heuristic
 
@@ -51,27 +50,6 @@ def looker(image, strip):
         return image[round(middle - y * dots), round(image.shape[1] / 2 + x * dots)]
 
     return pixel
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [name for name in ENDS if name != "fall"])  # the simple robot does not fall
-def test_frames_follow_each_other_and_end_as_the_rewards_say(records, name):
-    frames, rewards = records[name]
-    assert len(frames) == len(rewards) == STEPS
-    assert {frame.outcome for frame in frames} == {"", name}
-    assert frames[0].episode == 0
-    for frame, following in itertools.pairwise(frames):
-        same = following.episode == frame.episode
-        assert same == (frame.outcome == "")
-        if same:
-            np.testing.assert_array_equal(following.pose, frame.next_pose)
-            assert following.seconds == pytest.approx(frame.seconds + 0.2, abs=1e-4)
-        else:
-            assert following.episode == frame.episode + 1
-            assert following.seconds == pytest.approx(0.2)
-            np.testing.assert_array_equal(following.pose[:2], frame.world.starts[0])
-    paid = {"": 0.0, "success": 10.0, "collision": -10.0, "timeout": 0.0}
-    assert rewards == [paid[frame.outcome] for frame in frames]
 
 
 def test_an_episode_ends_where_it_ends_not_where_the_next_begins(records):

@@ -12,7 +12,6 @@ import pytest
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.worlds import generate_many
-from cuelearner_jax.agents.replay import buffer_for
 from cuelearner_jax.spaces import directions
 
 KEY = jax.random.key(0)
@@ -125,21 +124,6 @@ def test_remembered_steps_rebuild_what_was_seen_before_and_after(plays, kind):
     assert ended.sum() > 20
     assert np.abs(recalled - result.obs)[ended].max(-1).min() > 1e-3  # what a reset shows is something else
     np.testing.assert_array_equal(recalled[:, PREVIOUS], result.final_obs[:, PREVIOUS])
-
-
-def test_a_stored_transition_takes_80_bytes():
-    for env in (worlds(), worlds().replace(lidar=FAULTS, mirrors=True)):
-        rows = buffer_for(env, bootstraps=True).empty(10)
-        assert rows.nbytes / 10 <= 80
-
-
-def test_the_number_of_a_world_survives_being_stored(plays):
-    env, (states, obs, *_) = plays["plain"]
-    state = jax.tree.map(lambda leaf: leaf[0, 0], states)
-    for number in (0, 1023, 2**20 + 1):
-        memory = env.remember(state.replace(world=jnp.int32(number)), obs[0, 0])
-        assert memory.dtype == jnp.float32
-        assert int(memory[11]) == number
 
 
 SIGNS = jnp.array([1.0, -1.0, -1.0, 1.0, 1.0])  # of x, y, yaw and two lengths when left and right are exchanged

@@ -114,14 +114,6 @@ def test_noise_has_the_deviation_asked_for_and_no_bias():
     assert (np.abs(error) < 0.05).mean() == pytest.approx(0.6827, abs=0.01)
 
 
-def test_the_same_pose_reads_the_same():
-    solids, poses = world(walls=12.0), some_poses(5)
-    lidar = Lidar(noise=0.05, dropout=0.1)
-    first, second = (np.asarray(read_many(lidar, solids, poses)) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-    np.testing.assert_allclose(np.asarray(read(lidar, solids, poses[3])), first[3], rtol=1e-6)
-
-
 def test_drop_outs_read_the_range_at_the_share_asked_for():
     solids, poses = world(walls=12.0), some_poses(200)
     true = np.asarray(read_many(Lidar(), solids, poses))

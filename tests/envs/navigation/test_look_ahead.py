@@ -16,13 +16,11 @@ from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.config import GuideSizes, to_json
-from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.spaces.directions import from_angle
-from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 
 PLAINLY = 45  # features of a way without look-ahead
@@ -103,13 +101,6 @@ def test_an_l_shaped_passage_is_walked_in_two_legs():
     assert left[0] > 2.0  # straight at the goal: the passage's wall
 
 
-def test_where_the_first_leg_is_blocked_nothing_follows():
-    """A wall touches the disc: whatever lies behind it cannot be had that way."""
-    left, detour, leg = ahead(among([[RADIUS + 0.15, 0, 0, 0.1, 3.0]], (6.0, 0.0)))
-    np.testing.assert_allclose([left[0], detour[0], leg[0]], [6.0, 3.0 * SCALE, 0.0], atol=1e-3)
-    assert left[18] < 0.1  # along the wall and round its end, 3 m away
-
-
 def test_what_is_seen_of_a_wall_stops_a_second_leg_and_what_is_not_seen_does_not():
     """Behind a screen the free-space assumption holds: the hidden wall counts only for who sees it."""
     goal, screen, hidden = (6.5, 0.0), [3.0, 0.0, 0, 0.1, 1.0], [5.0, 0.0, 0, 0.1, 1.6]
@@ -144,14 +135,6 @@ def test_unless_it_is_asked_for_aims_are_what_they_were():
 
 def world(**changes):
     return NavigationConfig(worlds=1, **changes)
-
-
-def test_the_option_widens_aims_and_leaves_observations_alone():
-    task = registry.find("navigation")
-    plain, more = (spaces_of(shape_of(task, world(look_ahead=on))) for on in (False, True))
-    assert (plain.aims, more.aims) == (PLAINLY, PLAINLY + 3)
-    assert plain._replace(aims=None) == more._replace(aims=None)
-    assert not NavigationConfig().look_ahead
 
 
 def kept(guidance, look_ahead):

@@ -11,12 +11,11 @@ from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.geometry import line_clearance
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
-from cuelearner_envs.navigation.roadmap import RoadMapTeacher, SidedTeacher, make_sided_teacher
+from cuelearner_envs.navigation.roadmap import make_sided_teacher
 from cuelearner_envs.navigation.sides import closed, count_passed
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
-from cuelearner_jax.tasks.navigation import make_teacher
 
 # A corridor of 20 m by 4.6 m with a box in the middle, a circle at x = 5 and the walls of all worlds.
 BOX, CIRCLE, SIZE = [0, 0.1, 0.3, 0.4, 0.3], [5.0, 0.0, 0.4], (20.0, 4.6)
@@ -89,17 +88,6 @@ def test_a_teacher_passes_where_it_is_wanted(wish, side):
     found = walked(make_sided_teacher(TWO, jnp.float32(side)), TWO)
     assert found["success"] == 1
     assert found[f"passed_{wish}"] == 1
-
-
-def test_a_wish_chooses_the_teacher_and_corridors_count_sides():
-    def made(**changes):
-        config = NavigationConfig(worlds=4, **changes)
-        env = jax.eval_shape(lambda: make_environment(config))
-        return env.sides, type(jax.eval_shape(lambda env: make_teacher(config, env), env))
-
-    assert made(style="corridor", preferred_side="left") == (True, SidedTeacher)
-    assert made(style="corridor") == (True, RoadMapTeacher)
-    assert made() == (False, RoadMapTeacher)
 
 
 @pytest.mark.parametrize(

@@ -99,20 +99,6 @@ def test_spin_comes_from_the_cloth(env):
 
 
 @needs_pooltool
-def test_balls_never_overlap_nor_lie_beside_the_table(env):
-    key = jax.random.key(1)
-    states, _ = jax.jit(jax.vmap(env.reset))(jax.random.split(key, 24))
-    turns = jax.random.uniform(key, (24,), minval=-0.3, maxval=0.3)
-    shots = jax.jit(jax.vmap(env.shot))(states, turns)
-    for places, out in zip(np.asarray(shots.positions), np.asarray(shots.pocketed), strict=True):
-        left = places[~out]
-        assert (np.abs(left) < np.array([0.441, 0.221])).all()
-        apart = np.linalg.norm(left[:, None] - left[None], axis=-1)[np.triu_indices(len(left), 1)]
-        assert (apart > 2 * env.engine.outline.ball_radius - 1e-6).all()
-    assert float(jnp.abs(shots.positions - states.positions).max()) > 0.1  # they were played
-
-
-@needs_pooltool
 @pytest.mark.slow
 def test_processes_play_the_same_shots(env):
     positions = np.repeat(LINE[None], 6, axis=0)
