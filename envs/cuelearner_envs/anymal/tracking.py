@@ -22,18 +22,14 @@ from cuelearner_envs.anymal.physics import Body, Ground, control, standing
 from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe
 
 HELD, SETTLING = 200, 100  # control steps for which a command is held, and how many of them are not yet settled
-SECONDS = 20.0  # a robot walks for
+STEPS = 1000  # of control that a robot walks: 20 s
 
-CLEAN = Trial()
-DISTURBED = Trial(noise=1.0, push=0.5)
-VARIED = Trial(friction=(0.5, 1.25), payload=6.0)
 ENGINES = ("mjx", "mujoco")
-TRIALS = {"clean": CLEAN, "disturbed": DISTURBED, "varied": VARIED}
-
-
-def steps_of(seconds: float) -> int:
-    """Steps of control, whole commands of them."""
-    return max(1, round(seconds / robot.CONTROL_PERIOD / HELD)) * HELD
+TRIALS = {
+    "clean": Trial(),
+    "disturbed": Trial(noise=1.0, push=0.5),
+    "varied": Trial(friction=(0.5, 1.25), payload=6.0),
+}
 
 
 def _chosen(
@@ -134,11 +130,6 @@ def figures(
     }
 
 
-def measure_training(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> dict[str, float]:
-    """Figures of undisturbed walking in MJX."""
-    return measure(policy, "mjx", CLEAN, key, robots)
-
-
 def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> Iterator[tuple[str, dict[str, float]]]:
     """Figures of every trial of `TRIALS` in both engines, one after the other as they are measured."""
     for engine in ENGINES:
@@ -149,4 +140,4 @@ def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> Iterator[t
 def measure(policy: WalkingPolicy, engine: str, trial: Trial, key: PRNGKeyArray, robots: int) -> dict[str, float]:
     """Figures of 20 s of random commands in `mjx` or `mujoco`."""
     play = {"mjx": walk, "mujoco": walk_in_mujoco}[engine]
-    return figures(*jax.device_get(play(policy, trial, key, robots=robots, steps=steps_of(SECONDS))))
+    return figures(*jax.device_get(play(policy, trial, key, robots=robots, steps=STEPS)))

@@ -43,15 +43,9 @@ def draw_table(
     angle: float | None = None,
     path: Trajectory | None = None,
 ) -> None:
-    """Draw a table and its balls, filling the axes.
+    """Draw a table and its balls, filling the axes; pocketed balls lie in the tray below the table.
 
-    Args:
-        axes: matplotlib axes; their limits and aspect are set and their frame is hidden.
-        table: one table (no batch).
-        positions: places of the balls [m], ball 0 is the cue ball.
-        pocketed: balls in the tray below the table.
-        angle: direction of a proposed shot, drawn as an arrow from the cue ball [rad, counterclockwise from +x].
-        path: a shot from `trace`, drawn as one line for each ball that it moves.
+    A proposed shot's `angle` is drawn as an arrow from the cue ball [rad]; of a `path` each ball's line.
     """
     _draw_room(axes, table)
     if path is not None:

@@ -9,31 +9,17 @@ import numpy as np
 
 from cuelearner_envs.billiards.config import BilliardsConfig
 from cuelearner_envs.billiards.config import make_environment as make_billiards
-from cuelearner_envs.billiards.foreign import ForeignBilliards
-from cuelearner_envs.billiards.processes import Played
+from cuelearner_envs.billiards.foreign import ForeignBilliards, Played
 from cuelearner_envs.billiards.table import CORNER_GAP, Table
+from cuelearner_envs.pooltool import Outline
 from cuelearner_jax.errors import UserError
 
 # With it a free ball comes to rest after 1.3 m, as on our table, where it leaves with 0.5 m/s [m/s].
 STRIKE_SPEED = 0.7
 
 
-class Outline(NamedTuple):
-    """A table and a strike, in plain numbers; as `billiards.Table` has them."""
-
-    width: float  # [m]
-    height: float  # [m]
-    ball_radius: float  # [m]
-    hole_width: float  # half the opening of a pocket [m]
-    corner_gap: float  # between a corner and the cushions that end before it [m]
-    cushion_radius: float  # [m]
-    pocket_margin: float  # how far outside a ball's centre is pocketed [m]
-    side_pockets: bool
-    strike_speed: float  # of the cue ball, which leaves without spin [m/s]
-
-
 class Pooltool(NamedTuple):
-    """Pooltool's physics on a table (`cuelearner_envs.billiards.processes.Engine`)."""
+    """Pooltool's physics on a table (`cuelearner_envs.billiards.foreign.Engine`)."""
 
     outline: Outline
 

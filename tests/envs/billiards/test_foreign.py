@@ -8,8 +8,7 @@ import numpy as np
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Balls
-from cuelearner_envs.billiards.foreign import ForeignBilliards
-from cuelearner_envs.billiards.processes import Played
+from cuelearner_envs.billiards.foreign import ForeignBilliards, Played
 from cuelearner_envs.billiards.table import parking
 
 OWN = make_environment(BilliardsConfig("regulation"))

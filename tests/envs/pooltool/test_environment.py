@@ -11,8 +11,7 @@ import cuelearner_jax as cl
 from cuelearner_envs.billiards.config import BilliardsConfig
 from cuelearner_envs.billiards.config import make_environment as make_billiards
 from cuelearner_envs.billiards.environment import Balls
-from cuelearner_envs.billiards.foreign import ForeignBilliards
-from cuelearner_envs.billiards.processes import play_many
+from cuelearner_envs.billiards.foreign import ForeignBilliards, play_many
 from cuelearner_envs.billiards.teacher import NearbyTeacher
 from cuelearner_envs.pooltool import environment as foreign
 from cuelearner_jax.errors import UserError
