@@ -266,26 +266,13 @@ def simulate_many(
 ) -> Shot:
     """`vmap(simulate)` in blocks: working memory stays in cache, and a long shot holds up only its block.
 
-    Every field of the result leads with (shots,). Any field of the table may lead with (shots,) too; others are shared.
+    Every field of the result leads with (shots,).
     """
     shots, block = len(angles), min(block, len(angles))
-    fields, tree = jax.tree.flatten(table.replace(acceleration=jnp.asarray(table.acceleration)))
-    ranks = jax.tree.leaves(tree.unflatten([0] * len(fields)).replace(acceleration=1))
-    own = [jnp.ndim(field) > rank for field, rank in zip(fields, ranks, strict=True)]
-
-    def blocks(leaf: Array) -> Array:  # the last block is filled up with copies of the last shot
-        filled = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -shots % block, axis=0)])
-        return filled.reshape(-1, block, *leaf.shape[1:])
-
-    def play(batch: tuple[list[Array], Array, Array, Array]) -> Shot:
-        changed, *scene = batch
-        values, each = iter(changed), [0 if is_own else None for is_own in own]
-        mixed = tree.unflatten([next(values) if is_own else field for field, is_own in zip(fields, own, strict=True)])
-        return jax.vmap(simulate, in_axes=(tree.unflatten(each), 0, 0, 0))(mixed, *scene)
-
-    batch = [field for field, is_own in zip(fields, own, strict=True) if is_own], positions, pocketed, angles
-    result = jax.lax.map(play, jax.tree.map(lambda leaf: blocks(jnp.asarray(leaf)), batch))
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:shots], result)
+    rows = np.minimum(np.arange(-(-shots // block) * block), shots - 1)  # the last block is filled up
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], (positions, pocketed, angles))
+    result = jax.lax.map(lambda one: simulate(table, *one), scene, batch_size=block)
+    return jax.tree.map(lambda leaf: leaf[:shots], result)
 
 
 def trace(
