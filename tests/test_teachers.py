@@ -51,7 +51,7 @@ def test_a_folder_without_a_teacher_is_refused(tmp_path):
 def test_a_teacher_of_another_task_is_refused(made, tmp_path):
     teachers.save(tmp_path, made, ABOUT)
     probes.edit_json(tmp_path / "teacher.json", lambda about: about["config"].update(layers=[32]))
-    with pytest.raises(UserError, match="another version of the program"):
+    with pytest.raises(UserError, match="another configuration or version of the program"):
         teachers.load(tmp_path, ENV, 0.0, 0.0)
 
 
