@@ -21,7 +21,7 @@ POLICY = cl.CallablePolicy(Uniform(), WORLD.env.observation)
 ADAPTED = cl.AdaptedPolicy(Uniform(), WORLD.env.observation, outcome=None, named="chance")
 MODEL = cl.FeedbackModel(None, None, Scalars(), LABELS, GuideSizes())
 RUN = cl.Run(WORLD, probes.CONFIG, None, {})
-NAN, INF, HUGE, ESCAPE = float("nan"), float("inf"), 10**5000, "\x1b[31mred\nline"
+NAN, INF, HUGE, ESCAPE = float("nan"), float("inf"), 10**30, "\x1b[31mred\nline"
 
 
 class Broken:
