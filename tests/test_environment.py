@@ -23,7 +23,7 @@ from cuelearner_jax.environment import (
 )
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Box
-from cuelearner_jax.spaces.directions import difference, evenly_spaced, rotate
+from cuelearner_jax.spaces.directions import difference, rotate
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 
@@ -114,10 +114,6 @@ def test_shapes_in_place_of_arrays_offer_the_same():
     assert spaces_of(shapes) == spaces_of(probes.Window())
 
 
-def test_environments_without_a_mirror_have_the_identity_alone():
-    assert [symmetries_of(env) for env in PROBES.values()] == [1, 4, 1, 1]
-
-
 def test_actions_are_directions_where_nothing_else_is_said():
     assert actions_of(probes.Window()) is DIRECTIONS
     assert spaces_of(probes.Chain())[:2] == (2, DIRECTIONS)
@@ -130,14 +126,6 @@ def test_actions_are_directions_where_nothing_else_is_said():
 
 
 # Symmetries.
-
-
-@pytest.mark.parametrize("env", [probes.Window(), probes.Chain()], ids=["not asked for", "none"])
-def test_without_symmetries_rows_stay_the_very_arrays(env):
-    rows, vectors = np.ones((ROWS, 2), np.float32), np.zeros((ROWS, 2), np.float32)
-    image = random_symmetries(jax.random.key(0), env, ROWS)
-    assert image(rows, vectors)[0] is rows
-    assert image(rows, vectors)[1] is vectors
 
 
 def test_every_symmetry_is_drawn_and_maps_a_row_as_a_whole():
@@ -154,16 +142,6 @@ def test_every_symmetry_is_drawn_and_maps_a_row_as_a_whole():
     again, further = image(obs, other)
     np.testing.assert_array_equal(again, seen)
     np.testing.assert_allclose(further, rotate(other, turns), atol=1e-5)
-
-
-def test_a_key_always_draws_the_same_symmetries_and_another_key_others():
-    obs = jnp.tile(evenly_spaced(4), (ROWS // 4, 1))
-    one, same, other = (
-        np.asarray(random_symmetries(jax.random.key(seed), probes.Window(mirrors=True), ROWS)(obs, obs)[0])
-        for seed in (0, 0, 1)
-    )
-    np.testing.assert_array_equal(one, same)
-    assert (np.abs(one - other).max(-1) > 0.5).mean() > 0.5
 
 
 def test_environments_of_equal_fields_have_spaces_of_their_own():

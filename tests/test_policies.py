@@ -87,25 +87,12 @@ def test_an_agent_that_learned_with_a_rough_first_look_acts_by_all_of_the_set(mo
     np.testing.assert_array_equal(act(AGENT.replace(functions=rough)), act(AGENT))
 
 
-def test_uniform_actions_are_drawn_anew_with_each_key():
-    many = act(Uniform(), obs=jnp.tile(OBS, (50, 1)))
-    np.testing.assert_allclose(np.linalg.norm(many, axis=-1), 1, atol=1e-6)
-    counts = np.histogram(np.arctan2(many[:, 1], many[:, 0]), 8, (-np.pi, np.pi))[0]
-    assert counts.min() > 180  # 250 each, standard deviation 15
-    np.testing.assert_array_equal(act(Uniform()), act(Uniform()))
-    assert np.abs(act(Uniform()) - act(Uniform(), jax.random.key(6))).max() > 0.1
-
-
 def test_the_taught_policy_does_what_its_teacher_holds_for_best():
     np.testing.assert_allclose(act(Taught(EXPERT)), BEST, atol=1e-6)
     np.testing.assert_allclose(best_actions(EXPERT, STATES, OBS), BEST, atol=1e-6)
 
 
-def test_the_heuristic_is_the_environments():
-    np.testing.assert_allclose(act(Heuristic(ENV)), directions.rotate(OBS, -1.0), atol=1e-6)
-
-
-@pytest.mark.parametrize("base", [AGENT, Uniform(), Taught(EXPERT)], ids=["agent", "uniform", "taught"])
+@pytest.mark.parametrize("base", [AGENT, Uniform()], ids=["agent", "uniform"])
 def test_under_no_guidance_a_policy_is_itself(base):
     none = guidances.make("none", probes.SIZES, ENV)
     guided = Guided(base, none.init(KEY), ENV, probes.SCALARS, none)
@@ -130,19 +117,12 @@ def test_under_relative_guidance_every_action_is_refined_once_the_model_is_fitte
     assert np.abs(act(guided) - np.asarray(refined.actions)).max(-1).min() > 0
 
 
-@pytest.mark.parametrize("base", [AGENT, Uniform(), Heuristic(ENV)], ids=["agent", "uniform", "heuristic"])
-@pytest.mark.parametrize("eps_deg", [5.0, 20.0])
+@pytest.mark.parametrize(("base", "eps_deg"), [(AGENT, 20.0), (Heuristic(ENV), 5.0)], ids=["agent", "heuristic"])
 def test_corrections_end_within_half_eps_of_the_teachers_best(base, eps_deg):
     scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg)
     error = np.rad2deg(np.abs(directions.difference(BEST, act(Corrected(base, EXPERT, scalars)))))
     assert error.max() <= eps_deg / 2 + 1e-2
     assert np.rad2deg(np.abs(directions.difference(BEST, act(base)))).max() > eps_deg
-
-
-def test_corrections_keep_to_the_bound():
-    scalars = dataclasses.replace(probes.SCALARS, tau_max_deg=30.0)
-    moved = directions.difference(act(Heuristic(ENV)), act(Corrected(Heuristic(ENV), EXPERT, scalars)))
-    np.testing.assert_allclose(np.rad2deg(moved), 30.0, atol=1e-2)  # 92 degrees short, so as far as allowed
 
 
 # Functions of one's own.
@@ -172,23 +152,11 @@ def test_a_function_is_called_whatever_surrounds_it(name):
     np.testing.assert_allclose(many(lanes), direct.reshape(4, 10, 2), atol=1e-6)
 
 
-def test_a_function_rolls_out_the_same_in_jax_and_on_the_host():
-    # 0.1 rad off the best direction, and 1.1 rad off it: always right, never right.
-    for offset, reward in ((0.6, 1.0), (1.6, 0.0)):
-        env = probes.Window(offset=offset)
-        found = {name: evaluate_policy(env, policy, KEY, 10, 40) for name, policy in OPAQUE.items()}
-        assert {name: float(metrics["reward"]) for name, metrics in found.items()} == dict.fromkeys(OPAQUE, reward)
-    one, other = (evaluate_policy(probes.Chain(), policy, KEY, 10, 40)["reward"] for policy in OPAQUE.values())
-    assert float(one) == pytest.approx(float(other), abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("function", "shape"),
     [
         (lambda obs: obs[..., :1], "(40, 1)"),
         (lambda obs: obs[:3], "(3, 2)"),
-        (lambda obs: obs[:, 0], "(40,)"),
-        (lambda obs: obs[None], "(1, 40, 2)"),
     ],
 )
 def test_a_wrong_shape_is_refused_in_one_line(function, shape):
@@ -217,10 +185,6 @@ def stacked():
     ("function", "why"),
     [
         (lambda obs: obs + np.random.normal(size=obs.shape), "another action when it is asked again"),
-        (
-            lambda obs: np.eye(2)[(np.random.random(len(obs)) < 0.5).astype(int)],
-            "another action when it is asked again",
-        ),
         (stacked(), "another action when it is asked again"),
         (lambda obs: obs - 0.1 * obs.mean(0), "another action in a batch of 32"),
         (lambda obs: (obs, obs), "gives a state beside its actions"),

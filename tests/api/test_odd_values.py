@@ -149,11 +149,6 @@ def test_a_message_is_one_line_whatever_a_path_holds(name):
         assert str(refused.value).isprintable()
 
 
-class Wordless(Exception):
-    def __str__(self):
-        raise RuntimeError
-
-
 @pytest.mark.parametrize("error", [ValueError("\x1b[31mred\n" * 1000)], ids=["red"])
 def test_what_a_function_raises_is_told_in_one_line(error):
     def failing(obs):
