@@ -45,7 +45,6 @@ ROW = ("obs", "action", "answer")  # columns that hold lists
 PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of a person's rows
 SCHEMA = tables.Schema(
     stem="labels",
-    mark="action",
     required=("seed", "obs", "action"),
     strings=("said", "who", "when"),
     integers=("seed", "item"),

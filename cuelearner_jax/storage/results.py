@@ -47,7 +47,6 @@ from cuelearner_jax.storage.table import PathLike
 
 SCHEMA = tables.Schema(
     stem="results",
-    mark="step",
     required=("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash"),
     strings=("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command"),
     integers=("labels", "seed", "step"),
@@ -55,7 +54,6 @@ SCHEMA = tables.Schema(
 )
 GUIDES = tables.Schema(
     stem="guide",
-    mark="asked",
     required=(*SCHEMA.required, "asked", "round"),
     strings=SCHEMA.strings,
     integers=(*SCHEMA.integers, "asked", "round"),

@@ -31,6 +31,7 @@ from cuelearner_jax.storage.whole import replacing
 
 META = b"cuelearner"  # Parquet metadata key of the table's description
 DIGEST = b"cuelearner.sha256"  # Parquet metadata key of the digest of the contents
+HEADS = {"about", "constants"}  # keys of lines that are no rows
 
 PathLike = str | os.PathLike[str]
 Row = dict[str, Any]
@@ -42,7 +43,6 @@ class Schema:
     """Column types of a kind of table. Columns that are not named here hold floats."""
 
     stem: str  # of the file names; messages call the rows so
-    mark: str  # a JSON line with this key is a row
     required: tuple[str, ...]
     strings: tuple[str, ...] = ()
     integers: tuple[str, ...] = ()
@@ -89,18 +89,15 @@ class TableWriter:
             constants: columns with one value for all rows to come; None: no such columns.
             about: the description written at the head of a new table; an existing table keeps its own.
         """
-        self.path = Path(folder) / schema.jsonl
-        self._schema, self._columns = schema, set(constants or ())
+        self.path, self._schema = Path(folder) / schema.jsonl, schema
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        _reopen(self.path, schema)
-        rows = _lines(self.path, schema) if self.path.exists() else []
+        rows = _reopened(self.path, schema)
         self._file = self.path.open("ab", buffering=0)
         self._file.truncate(self.path.read_bytes().rfind(b"\n") + 1)
         if about is not None and not any("about" in row for row in rows):
             self._put([{"about": about}])
-        constants = None if constants is None else {name: _plain(value) for name, value in constants.items()}
         last = next((row["constants"] for row in reversed(rows) if "constants" in row), None)
-        if constants is not None and constants != last:
+        if constants is not None and (constants := _plain(constants)) != last:
             self._put([{"constants": constants}])
 
     def append(self, **columns: Any) -> None:
@@ -111,23 +108,16 @@ class TableWriter:
                 axis, all of one length. For instance `append(step=1000, seed=seeds, reward=rewards)`.
 
         Raises:
-            ValueError: a required column is missing or the lengths differ.
             OSError: the disk refuses the rows. None of them is in the table, now or later; the call may be repeated.
         """
-        missing = [name for name in self._schema.required if name not in columns and name not in self._columns]
-        if missing:
-            raise ValueError(f"a row of {self._schema.stem} needs the columns {', '.join(missing)}")
         arrays = {name: np.asarray(value) for name, value in columns.items()}
-        # one value for all rows
-        own = {name: array.ndim == (name in self._schema.lists) for name, array in arrays.items()}
-        lengths = {len(array) for name, array in arrays.items() if not own[name]}
-        if len(lengths) > 1:
-            raise ValueError(f"columns of one append must have one length, got {sorted(lengths)}")
+        many = {name for name, array in arrays.items() if array.ndim > (name in self._schema.lists)}
+        (count,) = {len(arrays[name]) for name in many} or {1}
         # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
         values = {name: array.tolist() for name, array in arrays.items()}
         self._put(
-            {name: _plain(value if own[name] else value[row]) for name, value in values.items()}
-            for row in range(lengths.pop() if lengths else 1)
+            {name: _plain(value[row] if name in many else value) for name, value in values.items()}
+            for row in range(count)
         )
 
     def _put(self, rows: Iterable[Row]) -> None:
@@ -156,9 +146,8 @@ class TableWriter:
 def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
     """Drop a folder's rows for which `keep` is false, and a torn last line; do nothing without a table."""
     path = Path(folder) / schema.jsonl
-    _reopen(path, schema)
-    if path.exists():
-        _rewrite(path, [row for row in _lines(path, schema) if schema.mark not in row or keep(row)])
+    if rows := _reopened(path, schema):
+        _rewrite(path, [row for row in rows if row.keys() & HEADS or keep(row)])
 
 
 def finish(folder: PathLike, schema: Schema) -> Path:
@@ -252,6 +241,8 @@ def _finished(path: Path, schema: Schema) -> pa.Table:
 
 def _plain(value: Any) -> Any:
     """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, list):
         return [_plain(entry) for entry in value]
     value = value.item() if isinstance(value, np.generic) else value
@@ -266,15 +257,12 @@ def _text(rows: Iterable[Row]) -> bytes:
 def _lines(path: Path, schema: Schema) -> list[Row]:
     """Return the parsed whole lines of a JSONL file. Raises UserError if the file is damaged."""
     *lines, _torn = path.read_bytes().split(b"\n")
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = json.loads(line)
-        except ValueError as error:
-            raise _damaged(path, schema, f"line {number}: it is not JSON") from error
-        if not isinstance(row, dict) or not row.keys() & {"about", "constants", schema.mark}:
-            raise _damaged(path, schema, f"line {number}: it is not a row of {schema.stem}")
-        rows.append(row)
+    try:
+        rows = [json.loads(line) for line in lines]
+    except ValueError as error:
+        raise _damaged(path, schema, error) from error
+    if not all(isinstance(row, dict) for row in rows):
+        raise _damaged(path, schema, "a line is no row")
     return rows
 
 
@@ -283,16 +271,15 @@ def _rewrite(path: Path, rows: Iterable[Row]) -> None:
         file.write(_text(rows))
 
 
-def _reopen(path: Path, schema: Schema) -> None:
-    """Convert a finished table back to JSONL, so that it can be continued."""
+def _reopened(path: Path, schema: Schema) -> list[Row]:
+    """Return a table's lines; convert a finished table back to JSONL, so that it can be continued."""
     whole = path.with_name(schema.parquet)
-    if not whole.exists():
-        return
-    if not path.exists():
+    if whole.exists() and not path.exists():
         table = read(whole, schema)
         head = [] if (about := about_of(table)) is None else [{"about": about}]
         _rewrite(path, [*head, *({k: v for k, v in row.items() if v is not None} for row in table.to_pylist())])
-    whole.unlink()
+    whole.unlink(missing_ok=True)
+    return _lines(path, schema) if path.exists() else []
 
 
 def _growing(path: Path, schema: Schema) -> pa.Table:
@@ -301,9 +288,9 @@ def _growing(path: Path, schema: Schema) -> pa.Table:
     constants: Row = {}
     rows = []
     for line in _lines(path, schema):
-        if schema.mark in line:
-            rows.append(constants | line)
         about, constants = line.get("about", about), line.get("constants", constants)
+        if not line.keys() & HEADS:
+            rows.append(constants | line)
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: [row.get(name) for row in rows] for name in names}
     # Integers are cast last, since Arrow would truncate a fractional value.

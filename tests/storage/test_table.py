@@ -16,7 +16,6 @@ from cuelearner_jax.storage import table as tables
 ROOT = Path(__file__).parents[2]
 SCHEMA = tables.Schema(
     stem="catches",
-    mark="fish",
     required=("fish", "weights"),
     strings=("fish",),
     integers=("count",),
@@ -42,10 +41,8 @@ def test_rows_have_the_types_of_their_columns_and_come_back_bit_by_bit(tmp_path)
     with tables.TableWriter(tmp_path, SCHEMA) as writer:
         writer.append(fish=["pike", "eel"], weights=values[:2], spots=[1.0, float("inf")], count=[0, 1])
         writer.append(fish=["carp", "perch"], weights=[5.0, float("nan")])  # one list for all rows
-        with pytest.raises(ValueError, match="one length"):
+        with pytest.raises(ValueError, match="too many values"):
             writer.append(fish=["pike", "eel"], weights=np.zeros((3, 2)))
-        with pytest.raises(ValueError, match="a row of catches needs the columns weights"):
-            writer.append(fish="pike")
     growing = read(tmp_path)
     finished = tables.read(tables.finish(tmp_path, SCHEMA), SCHEMA)
     for table in (growing, finished):
@@ -136,9 +133,9 @@ def test_a_table_that_was_written_anew_by_others_is_not_ours(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('{\n{"fish": "pike", "weights": [1.0]}\n', "(line 1: it is not JSON)"),
-        ("[]\n", "(line 1: it is not a row of catches)"),
-        ('{"bird": 1}\n', "(line 1: it is not a row of catches)"),
+        ('{\n{"fish": "pike", "weights": [1.0]}\n', "is wet: dry it"),
+        ("[]\n", "a line is no row"),
+        ('{"bird": 1}\n', "lacks the columns fish, weights: it is not a table of catches"),
         ('{"about": {}}\n{"constants": 3}\n{"fish": "pike"}\n', "is wet: dry it"),
         ('{"fish": "pike", "weights": 3}\n', "is wet: dry it"),
         ('{"fish": "pike"}\n', "lacks the columns weights"),
