@@ -68,7 +68,10 @@ def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
 
 def animate(frames: Sequence[Source], file: str | os.PathLike[str], fps: float = 25.0) -> None:
     """Write all frames as a film; raises UserError unless its name ends in .gif or .mp4."""
-    check_film(file, fps)
+    try:
+        check_film(file, fps)
+    except ValueError as error:
+        raise UserError(str(error)) from error
 
     def even(rate: float) -> Iterator[Picture]:
         for number in range(max(1, round(len(frames) * rate / fps))):
@@ -127,7 +130,7 @@ def write_film(
     """Write a film of pictures that are made one by one: GIF with one exact palette, or MP4.
 
     Args:
-        file: a name that ends in .gif or .mp4; else UserError.
+        file: a name that ends in .gif or .mp4; else ValueError.
         fps: pictures a second; a GIF counts in hundredths of a second and takes the nearest rate it can have.
         pictures: makes them for the rate that it gets.
         palette: a GIF's colours, see `palette_of`.
@@ -141,11 +144,9 @@ def write_film(
 
 
 def check_film(file: str | os.PathLike[str], fps: float) -> None:
-    """Raise UserError if such a film cannot be written."""
+    """Raise ValueError if such a film cannot be written."""
     if Path(file).suffix.lower() not in KINDS or fps <= 0:
-        raise UserError(
-            f"cannot animate to {file} at {fps:g} a second: give a name in .gif or .mp4, and a positive fps"
-        )
+        raise ValueError(f"cannot animate to {file} at {fps:g}: give a name in .gif or .mp4, and a positive fps")
 
 
 def palette_of(specimen: Picture, colours: int, exactly: Sequence[str] = ()) -> list[int]:
