@@ -121,7 +121,8 @@ def _table_in(path: Path) -> Path:
         return path
     found = [path / f"{STEM}{suffix}" for suffix in SUFFIXES if (path / f"{STEM}{suffix}").is_file()]
     if len(found) != 1:
-        there = f"holds {' and '.join(table.name for table in found)}" if found else "is no LeRobot dataset either"
+        other = "is no LeRobot dataset either" if path.exists() else "does not exist"
+        there = f"holds {' and '.join(table.name for table in found)}" if found else other
         raise UserError(
             f"{path} {there}: give the path of one table, or a folder with one {STEM}.parquet, .csv or .npz with the "
             f"columns {OBSERVATION} and {ACTION}"
