@@ -20,7 +20,7 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -35,7 +35,6 @@ HEADS = {"about", "constants"}  # keys of lines that are no rows
 
 PathLike = str | os.PathLike[str]
 Row = dict[str, Any]
-Writer = TypeVar("Writer", bound="TableWriter")
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class Schema:
         return pa.list_(pa.float32()) if name in self.lists else pa.float64()
 
 
-class TableWriter:
+class TableWriter(contextlib.AbstractContextManager):
     """Appends rows to the JSONL file of one table; each append is on disk when the call returns.
 
     Opening an existing table continues it: a torn last line is dropped first, and a finished table (Parquet) becomes
@@ -135,9 +134,6 @@ class TableWriter:
     def close(self) -> None:
         """Close the file; the table stays JSONL until `finish`."""
         self._file.close()
-
-    def __enter__(self: Writer) -> Writer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
