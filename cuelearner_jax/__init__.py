@@ -33,22 +33,35 @@ if TYPE_CHECKING:
 
 __version__ = "1.0.0"
 
-# The names of each module, loaded at first use: tasks import only the lowest modules of this package, and each command
+# The module of each name, loaded at first use: tasks import only the lowest modules of this package, and each command
 # needs few modules.
-_MODULES = {
-    "api.adaptation": ("AdaptedPolicy", "adapt"),
-    "api.correction": ("agreement", "correct"),
-    "api.evaluation": ("measure",),
-    "api.export": ("export_correction", "export_policy", "load_exported"),
-    "api.feedback": ("FeedbackModel", "Labels", "ask", "fit_feedback", "refine"),
-    "api.policies": ("CallablePolicy", "load_policy"),
-    "api.training": ("Run", "train"),
-    "api.worlds": ("World", "from_gymnasium", "make", "teacher_of"),
-    "errors": ("UserError",),
-    "reading": ("Distortion", "Unknown"),
-    "spaces": ("UNSAID",),
+_PLACES = {
+    "AdaptedPolicy": "api.adaptation",
+    "CallablePolicy": "api.policies",
+    "Distortion": "reading",
+    "FeedbackModel": "api.feedback",
+    "Labels": "api.feedback",
+    "Run": "api.training",
+    "UNSAID": "spaces",
+    "Unknown": "reading",
+    "UserError": "errors",
+    "World": "api.worlds",
+    "adapt": "api.adaptation",
+    "agreement": "api.correction",
+    "ask": "api.feedback",
+    "correct": "api.correction",
+    "export_correction": "api.export",
+    "export_policy": "api.export",
+    "fit_feedback": "api.feedback",
+    "from_gymnasium": "api.worlds",
+    "load_exported": "api.export",
+    "load_policy": "api.policies",
+    "make": "api.worlds",
+    "measure": "api.evaluation",
+    "refine": "api.feedback",
+    "teacher_of": "api.worlds",
+    "train": "api.training",
 }
-_PLACES = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
     "UNSAID",

@@ -9,7 +9,6 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.bridges.brax import from_brax, to_brax
 from cuelearner_jax.environment import (
     UNKNOWN_UNIT,
     Features,
@@ -32,7 +31,6 @@ PROBES = {
     "window": probes.Window(),
     "mirrored window": probes.Window(mirrors=True),
     "chain": probes.Chain(),
-    "chain through brax": from_brax(to_brax(probes.Chain())),
 }
 SHAPES = {
     **{
@@ -114,6 +112,10 @@ def test_shapes_in_place_of_arrays_offer_the_same():
     assert spaces_of(shapes) == spaces_of(probes.Window())
 
 
+def test_environments_without_a_mirror_have_the_identity_alone():
+    assert [symmetries_of(env) for env in PROBES.values()] == [1, 4, 1]
+
+
 def test_actions_are_directions_where_nothing_else_is_said():
     assert actions_of(probes.Window()) is DIRECTIONS
     assert spaces_of(probes.Chain())[:2] == (2, DIRECTIONS)
@@ -126,6 +128,14 @@ def test_actions_are_directions_where_nothing_else_is_said():
 
 
 # Symmetries.
+
+
+@pytest.mark.parametrize("env", [probes.Window(), probes.Chain()], ids=["not asked for", "none"])
+def test_without_symmetries_rows_stay_the_very_arrays(env):
+    rows, vectors = np.ones((ROWS, 2), np.float32), np.zeros((ROWS, 2), np.float32)
+    image = random_symmetries(jax.random.key(0), env, ROWS)
+    assert image(rows, vectors)[0] is rows
+    assert image(rows, vectors)[1] is vectors
 
 
 def test_every_symmetry_is_drawn_and_maps_a_row_as_a_whole():

@@ -121,8 +121,9 @@ def _table_in(path: Path) -> Path:
         return path
     found = [path / f"{STEM}{suffix}" for suffix in SUFFIXES if (path / f"{STEM}{suffix}").is_file()]
     if len(found) != 1:
-        other = "is no LeRobot dataset either" if path.exists() else "does not exist"
-        there = f"holds {' and '.join(table.name for table in found)}" if found else other
+        if not path.exists():
+            raise UserError(f"there is no folder of situations at {path}: give one that holds {STEM}.parquet")
+        there = f"holds {' and '.join(table.name for table in found)}" if found else "is no LeRobot dataset either"
         raise UserError(
             f"{path} {there}: give the path of one table, or a folder with one {STEM}.parquet, .csv or .npz with the "
             f"columns {OBSERVATION} and {ACTION}"

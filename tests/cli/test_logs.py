@@ -93,7 +93,7 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(there, capsys):
         (["evaluate", "own_arm:narrow", "--labels-from", "labels"], "returned actions of shape"),
         (["evaluate", "own_arm:policy", "--labels-from", "labels", "--steps", "5"], "leave out the other options"),
         (["evaluate", "logs"], "is a family of tasks: name one of its environments, as logs:NAME"),
-        (["evaluate", "logs:absent"], "absent does not exist: give"),
+        (["evaluate", "logs:absent"], "there is no folder of situations at absent"),
         (
             ["export", "logs:situations", "--policy", "uniform", "--only-correction", "--out", "p"],
             "has no correction",
