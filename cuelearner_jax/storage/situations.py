@@ -137,7 +137,7 @@ def _columns(table: Path) -> dict[str, Any]:
         if table.suffix == ".npz":
             with np.load(table, allow_pickle=False) as stored:
                 return {name: stored[name] for name in stored.files}
-        rows: pa.Table = csv.read_csv(table) if table.suffix == ".csv" else pq.read_table(table)
+        rows: pa.Table = csv.read_csv(table) if table.suffix == ".csv" else pq.ParquetFile(table).read()
     except (pa.ArrowException, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         why = " ".join(str(error).split())[:120]
         raise UserError(
