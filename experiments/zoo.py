@@ -123,7 +123,8 @@ def read(world: Any, labels: Labels, evidence: jax.Array, plain: Hypothesis, smo
     """Read all labels so far; start from the hypotheses of the fit before."""
     fits = reader_of(world.robot).read(labels, plain, smooth)
     best, nothing = fitting.pick(fits, fitting.best_of(fits)), fitting.pick(fits, 0)
-    return Asked(labels, *fitting.again(fits), best, nothing, evidence)
+    plain, smooth = fitting.again(fits)
+    return Asked(labels, plain, smooth, best, nothing, evidence)
 
 
 def begun(world: Any, labels: int) -> Asked:
