@@ -8,7 +8,6 @@ import os
 import shlex
 import webbrowser
 from argparse import Namespace
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -326,9 +325,10 @@ def _server() -> Any:
 
 def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, commands: Any) -> Any:
     """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
-    from cuelearner_jax.labelling.opening import Opening
+    from cuelearner_jax.labelling.record import Record
     from cuelearner_jax.labelling.session import Session
 
+    Record(plan, options.out).close()  # refuses the file of another session before anything is compiled
     leads_there = options.out / "open.html"  # command lines, unlike this file, can be read by every user of the machine
 
     def open_page(address: str) -> None:
@@ -342,13 +342,12 @@ def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, c
     def tell(words: str) -> None:
         console.print(f"{words} ...")
 
-    def make(tell: Callable[[str], None]) -> Session:
+    def make() -> Session:
         return Session(plan, options.out, tell, practice=PRACTICE if options.practice else 0)
 
-    with Opening(make, stopping.set, tell) as opening, contextlib.ExitStack() as end:
+    with contextlib.ExitStack() as end:
         end.callback(leads_there.unlink, missing_ok=True)
-        opening.wait_for_files()
-        return server.serve(opening, f"label {plan.task.name}", port, stopping, open_page, commands)
+        return server.serve(make, f"label {plan.task.name}", port, stopping, open_page, commands)
 
 
 def _following(task: Task, preset: str, config: RunConfig, options: Label, labels: int) -> str:

@@ -13,7 +13,7 @@ from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.labelling import controls, pointing
 from cuelearner_jax.labelling.arrows import HAIR, arrow, ends, line
 from cuelearner_jax.labelling.controls import Control
-from cuelearner_jax.labelling.session import Item
+from cuelearner_jax.labelling.questions import Item
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Reel, Sketch
 

@@ -161,9 +161,10 @@ def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_w
     session, stopping = opened(), threading.Event()
     commands = Commands("cuelearner label mine", lambda labels: f"cuelearner train <{labels}>")
     pages = set()
-    last = server._Last(session, pages, stopping, commands)
+    last = server._Last(pages, stopping, commands)
+    last.session = session
     app = FastAPI()
-    last.routes(app)
+    last.route(app)
 
     async def seen(kind, address):
         async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://page") as client:
@@ -186,12 +187,11 @@ def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_w
         with told_browser(user) as told_it:
             await page._end()
         assert told_it == [f'location.replace("{server.ADDRESS}")']
+        assert not stopping.is_set()  # until a browser has shown it
         text = (await seen("GET", server.ADDRESS)).text
         place = str(tmp_path / "labels" / label_files.PARQUET)
         for words in (f"2 of 20 labels are saved, in {place}", "cuelearner train &lt;2&gt;", "cuelearner label mine"):
             assert words in text
-        assert not stopping.is_set()  # until a browser has shown it
-        await seen("POST", server.SEEN)
         assert stopping.is_set()
 
     shown(session, acts, last.finish)
@@ -236,10 +236,9 @@ def test_arrows_point_where_actions_do(opened):
     assert keys["left"] > 0.3  # of an arrow that points down the left key moves the tip to the right of the screen
     assert keys["right"] < -0.3
     assert [re.search(rf'class="arrow {name}">.*?<text [^>]*>(.)', down)[1] for name in WAYS] == ["←", "→"]
-    session._pictures = session._pictures._replace(
-        trails=lambda env, state, actions: [f"<{a[0]:.2f}>" for a in actions]
-    )
-    trails = session._trails(item)
+    made = session.questions
+    made.pictures = made.pictures._replace(trails=lambda env, state, actions: [f"<{a[0]:.2f}>" for a in actions])
+    trails = made.draw(item._replace(trails=None)).trails
     assert [*trails] == ["asked", *WAYS]
     assert trails["left"] == f"<{turned_by(item.action, 20.0)[0]:.2f}>"
     shown = view.picture(item._replace(trails=trails), RELATIVE, 20.0)
@@ -279,8 +278,9 @@ def test_small_turns_are_drawn_larger_and_the_page_says_so(opened):
 
 def test_a_film_shows_what_the_action_leads_to(opened):
     session = opened()
-    best = np.asarray(session.env.best(session.item.guide.obs))
-    assert session.film(0, best).words == "True"
-    assert session.film(0, turned_by(best, 90.0)).words == "False"
-    film = json.loads(view.film(session.item, session.film(0, best)))
+    item, made = session.item, session.questions
+    best = np.asarray(made.env.best(item.guide.obs))
+    assert made.film(item, best).words == "True"
+    assert made.film(item, turned_by(best, 90.0)).words == "False"
+    film = json.loads(view.film(item, made.film(item, best)))
     assert (film["item"], film["frames"][-1]) == (0, {"dot": None})

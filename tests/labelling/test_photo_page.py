@@ -17,7 +17,8 @@ from cuelearner_jax.cli.sources import recorded_or_task, with_cues
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.labelling import controls, pointing, view
-from cuelearner_jax.labelling.session import Item, Session
+from cuelearner_jax.labelling.questions import Item
+from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.spaces import UNSAID, Box, cues_from
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import fetch_layout
