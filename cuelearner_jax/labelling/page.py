@@ -45,7 +45,6 @@ class Page:
         self._said: dict[int, float] = {}  # parts of the answer chosen so far, by the cue's index
         self._said_of = session.number
         self._drawn: Item | None = None  # the item on the screen
-        self._loop = asyncio.get_running_loop()
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
         keys = {key: name for name, control in self.controls.items() for key in control.keys}
@@ -55,7 +54,9 @@ class Page:
         rows = len(self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0  # of cues to choose from
         with ui.element("main").classes("label-page many" if rows else "label-page").style(f"--rows: {rows}"):
             with ui.column().classes("asking w-full gap-2"):
-                self._practice()
+                with ui.element("div").classes("practice") as self._practising:
+                    self._practice_words = ui.label()
+                    ui.button("skip practice", on_click=self._skip, color=None).props("flat dense").mark("skip")
                 ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")
                 self._asked = ui.label(controls.question(self.form, self.space)).classes("big")
                 self._note = ui.label().classes("note")
@@ -64,10 +65,15 @@ class Page:
                 self._answers()
             with ui.element("aside").classes("side"):
                 self._side()
-        self._help, self._early = self._overlay(), self._ask_early()
+        with ui.dialog() as self._help, ui.card().classes("gap-1"):
+            ui.label("Help").classes("big")
+            for line in controls.help_lines(self.form, self.space, self.controls.values()):
+                ui.label(line)
+            ui.button("close", on_click=self._help.close)
         ui.on("cue", self._heard)
         pages.add(self)
-        stop = session.listen(self._model_changed)
+        loop = asyncio.get_running_loop()
+        stop = session.listen(lambda: loop.call_soon_threadsafe(self.refresh))
         self._client.on_delete(lambda: (pages.discard(self), stop()))
         self.refresh()
 
@@ -84,11 +90,6 @@ class Page:
             js_handler=f"event => cue.send({json.dumps(control.name)}, {{clicks: event.detail}})",
         )
         return button
-
-    def _practice(self) -> None:
-        with ui.element("div").classes("practice") as self._practising:
-            self._practice_words = ui.label()
-            ui.button("skip practice", on_click=self._skip, color=None).props("flat dense").mark("skip")
 
     def _answers(self) -> None:
         own = controls.answers(self.form, self.space, self._one_cue)
@@ -130,29 +131,10 @@ class Page:
             for name in ("undo", "film", "film-refined", "help"):
                 if name in self.controls:
                     self._tools[name] = self._button(self.controls[name], props="flat dense")
-            dark = ui.dark_mode(None)
-            ui.button("light or dark", on_click=lambda: dark.set_value(not dark.value), color=None).props("flat dense")
         self._saved = ui.label().classes("text-caption")
         self._trouble = ui.label().classes("trouble")
         if self._finish is not None:
-            ui.button("finish", on_click=self._ask_finish, color="grey-7").mark("finish")
-
-    def _overlay(self) -> ui.dialog:
-        with ui.dialog() as dialog, ui.card().classes("gap-1"):
-            ui.label("Help").classes("big")
-            for line in controls.help_lines(self.form, self.space, self.controls.values()):
-                ui.label(line)
-            ui.button("close", on_click=dialog.close)
-        return dialog
-
-    def _ask_early(self) -> ui.dialog:
-        with ui.dialog() as dialog, ui.card():
-            ui.label("Finish early?").classes("big")
-            self._early_words = ui.label()
-            with ui.row():
-                ui.button("go on labelling", on_click=dialog.close).mark("go-on")
-                ui.button("finish now", on_click=self._end, color="grey-7").mark("finish-now")
-        return dialog
+            ui.button("finish", on_click=self._end, color="grey-7").mark("finish")
 
     # --- events ------------------------------------------------------------------------------------------------
 
@@ -173,7 +155,7 @@ class Page:
         if pressed is None and not (name == "point" and self.form.is_action and angle is not None):
             return
         taken, why = False, LATE
-        if self._help.value or self._early.value:  # the browser may not know yet that the window opened
+        if self._help.value:  # the browser may not know yet that the window opened
             why = "a window lies over the question: close it first"
         elif pressed is not None and pressed.picks and pressed.answer and number == self.session.number:
             self._said_about(number)[pressed.cue or 0] = pressed.answer[0]  # stored until the answer is sent
@@ -207,21 +189,8 @@ class Page:
         await run.io_bound(self.session.skip_practice)
         self._refresh_all()
 
-    async def _ask_finish(self) -> None:
-        """Finish if all labels are given; otherwise ask first."""
-        status = self.session.status()
-        if self.session.done:
-            await self._end()
-            return
-        self._early_words.text = (
-            f"{status.answered} of {status.labels} labels are given and saved. They can be used now, and the "
-            "same command continues later."
-        )
-        self._early.open()
-
     async def _end(self) -> None:
         assert self._finish is not None
-        self._early.close()
         try:
             await self._finish()
         except UserError as error:
@@ -243,10 +212,6 @@ class Page:
     def goto(self, address: str) -> None:
         """Make the browser open another page of this server."""
         self._script(f"location.replace({json.dumps(address)})")
-
-    def _model_changed(self) -> None:
-        """Refresh the page; may be called from any thread."""
-        self._loop.call_soon_threadsafe(self.refresh)
 
     def refresh(self) -> None:
         """Show the session's current state."""

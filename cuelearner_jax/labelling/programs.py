@@ -107,21 +107,14 @@ def programs(guidance: Guide) -> Programs:
     )
 
 
-class _Holds:
+class _Holds(NamedTuple):
     """A teacher with one fixed best action."""
 
-    def __init__(self, action: Array) -> None:
-        self.action = action
+    action: Array
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the fixed action (action,)."""
         return self.action
-
-
-def faultless(scalars: Scalars) -> Scalars:
-    """Return `scalars` without a simulated teacher's mistakes, silence, indifference and bias."""
-    none = {"mistake_probability": 0.0, "silence_probability": 0.0, "indifference_deg": 0.0, "teacher_bias_deg": 0.0}
-    return dataclasses.replace(scalars, answer="best", says="all", **none)
 
 
 def as_teacher(
@@ -133,8 +126,10 @@ def as_teacher(
     obs: Float[Array, " obs"],
     action: Float[Array, " action"],
 ) -> Float[Array, " answer"]:
-    """Return the answer of a teacher without mistakes."""
-    return form.answer(jax.random.key(0), env, teacher, state, obs, action, faultless(scalars))[0]
+    """Return the answer of a teacher without a simulated one's mistakes, silence, indifference and bias."""
+    none = {"mistake_probability": 0.0, "silence_probability": 0.0, "indifference_deg": 0.0, "teacher_bias_deg": 0.0}
+    scalars = dataclasses.replace(scalars, answer="best", says="all", **none)
+    return form.answer(jax.random.key(0), env, teacher, state, obs, action, scalars)[0]
 
 
 class Agreement(NamedTuple):
@@ -156,9 +151,10 @@ def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.nda
     """Compare answers (n, width) to the same questions; a cue counts where both sets say something."""
     space = actions_of(env)
     if form.is_action:
-        apart = np.asarray(space.to_unit(space.distance(jnp.asarray(one), jnp.asarray(other))))
-        return Agreement(float(apart.mean()) if len(one) else 0.0, len(one), space.unit)
-    alike = one == other
-    if form.by_eps and len(space.cues) > 1:
-        alike |= (one == UNSAID) | (other == UNSAID)
-    return Agreement(float(alike.all(-1).mean()) if len(one) else 0.0, len(one), "%")
+        values = np.asarray(space.to_unit(space.distance(jnp.asarray(one), jnp.asarray(other))))
+    else:
+        alike = one == other
+        if form.by_eps and len(space.cues) > 1:
+            alike |= (one == UNSAID) | (other == UNSAID)
+        values = alike.all(-1)
+    return Agreement(float(values.mean()) if len(one) else 0.0, len(one), space.unit if form.is_action else "%")

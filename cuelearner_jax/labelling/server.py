@@ -58,24 +58,14 @@ class Ending(NamedTuple):
 def last_page(told: Ending) -> str:
     """Return the last page as HTML, which needs no server once shown."""
     line, following, again = (html.escape(text) for text in (told.line, told.following, told.again))
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>finished</title><style>
-:root {{ color-scheme: light dark; }}
+    return f"""<!doctype html><html lang="en"><head><meta charset="utf-8"><title>finished</title>
+<meta name="viewport" content="width=device-width"><style>:root {{ color-scheme: light dark; }}
 body {{ font: 1.1rem/1.6 system-ui, sans-serif; max-width: 46rem; margin: 3rem auto; padding: 0 1rem; }}
-pre {{ background: #80808022; padding: 0.8rem; border-radius: 6px; white-space: pre-wrap; overflow-wrap: anywhere; }}
-button {{ font: inherit; padding: 0.2rem 0.8rem; }}
-</style></head><body>
-<h1>Finished. Thank you.</h1>
-<p class="saved">{line}</p>
-<h2>What to type next</h2>
-<pre id="next">{following}</pre>
-<p><button onclick="navigator.clipboard.writeText(document.getElementById('next').textContent);
-this.textContent = 'copied'">copy</button></p>
-<h2>To add labels later</h2>
-<pre>{again}</pre>
-<p>The command in the terminal has ended by itself. You may close this tab.</p>
-</body></html>"""
+pre {{ background: #80808022; padding: 0.8rem; white-space: pre-wrap; overflow-wrap: anywhere; }}</style></head><body>
+<h1>Finished. Thank you.</h1><p class="saved">{line}</p>
+<h2>What to type next</h2><pre id="next">{following}</pre>
+<h2>To add labels later</h2><pre>{again}</pre>
+<p>The command in the terminal has ended by itself. You may close this tab.</p></body></html>"""
 
 
 def bind(port: int) -> socket.socket:

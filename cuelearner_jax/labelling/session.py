@@ -67,7 +67,7 @@ class Session:
         # answers are handled one at a time; whoever waits for an item holds no other lock
         self._acting, self._lock = threading.Lock(), threading.RLock()
         self._ahead = ThreadPoolExecutor(1, thread_name_prefix="ahead")  # the only thread that makes items
-        self._listeners: list[Callable[[], None]] = []
+        self._listeners: list[Callable[[], object]] = []
         self._items: dict[int, Item] = {}
         self._finished: Path | None = None
         self.number = self._furthest = 0  # the current question, and the last one that was shown
@@ -238,7 +238,7 @@ class Session:
         counts = answered, self.record.count(UNSURE), self.plan.labels
         return Status(*counts, pace, left, learner.running, learner.newest, self.record.trouble)
 
-    def listen(self, heard: Callable[[], None]) -> Callable[[], None]:
+    def listen(self, heard: Callable[[], object]) -> Callable[[], None]:
         """Register a function that is called, from any thread, when a fit begins or a new model is in use.
 
         Returns a function that ends the registration.

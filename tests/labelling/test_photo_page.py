@@ -125,7 +125,7 @@ def test_a_key_of_a_cue_is_no_other_controls():
     keys = [key for control in known.values() for key in control.keys]
     assert len(keys) == len(set(keys))
     assert (known["unsure"].shown, known["rest"].shown) == ("S", "space")
-    assert "press S: it costs nothing. F shows a film" in controls.hint(1, known)
+    assert "press S: it costs nothing." in controls.hint(1, known)
     assert known["pick-0-less"].keys == ("ArrowRight", "d", "D")
     assert "film" not in controls.controls(RELATIVE, box(CUES), films=False)
     assert "film-refined" not in controls.controls(RELATIVE, box(CUES), simulated=False)
