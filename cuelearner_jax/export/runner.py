@@ -61,12 +61,12 @@ class Decision:
         sizes = self.contract["observation"]["size"] - self._base, self._base
         given = [_numbers(obs), *([_numbers(base_action)] if self._base else [])]
         rows = given[0].shape[:-1]
-        if len(rows) > 1 or any(part.shape != (*rows, size) for part, size in zip(given, sizes, strict=False)):
-            shapes, wanted = (
-                " and ".join(str(shape) for shape in parts)
-                for parts in ((part.shape for part in given), ((size,) for size in sizes if size))
-            )
-            raise ContractError(f"observations have shape {shapes}: the contract says {wanted}, or equally many rows")
+        for part, size in zip(given, sizes, strict=False):
+            if len(rows) > 1 or part.shape != (*rows, size):
+                raise ContractError(
+                    f"observations or base actions have shape {part.shape}: the contract says ({size},), or equally "
+                    f"many rows (n, {size})"
+                )
         batch = [np.ascontiguousarray(part if rows else part[None]) for part in given]
         if not all(np.isfinite(part).all() for part in batch):
             raise ContractError("an observation holds numbers that are not finite, or beyond single precision")

@@ -115,7 +115,7 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     """Concatenate the labels of several files; return the merged file and the number of duplicates left out.
 
     A label is a duplicate if an earlier file has a label of equal observation, action and answer, and of equal person
-    and time where both files record them.
+    and time where all files record them.
 
     Raises UserError if the files differ in task, world, form or strength, or if one file holds several seeds' labels.
     """
@@ -134,27 +134,20 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
                 )
     if len({(file.labels.obs.shape[1], file.labels.action.shape[1]) for file in files}) > 1:
         raise UserError("the files' observations differ in size: merge files of one world")
-    kept = _new(files)
+    by_people = all(file.people is not None for file in files)
+    there: set[Any] = set()
+    kept: Any = []
+    for file in files:
+        keys = [(question, answer.tobytes()) for question, answer in _questions(file)]
+        if by_people and file.people is not None:
+            keys = list(zip(keys, file.people.who.tolist(), file.people.when.tolist(), strict=True))
+        kept += [key not in there for key in keys]
+        there.update(keys)
+    kept = np.array(kept, bool)
     labels = jax.tree.map(lambda *leaves: np.concatenate(leaves)[kept], *(file.labels for file in files))
     people = None
-    if all(file.people is not None for file in files):
+    if by_people:
         columns = [np.concatenate(each)[kept] for each in zip(*(file.people or () for file in files), strict=True)]
         people = label_files.People(np.arange(len(labels.valid)), *columns[1:])
     seeds = np.zeros(len(labels.valid), np.int64)
     return LabelFile(first.task, first.answers, first.space, first.eps, seeds, labels, people), int((~kept).sum())
-
-
-def _new(files: list[LabelFile]) -> np.ndarray:
-    """Return a mask of all files' labels, in order: those that no earlier file has."""
-    there: dict[bytes, set[Any]] = {}
-    kept = []
-    for file in files:
-        keys = [question + answer.tobytes() for question, answer in _questions(file)]
-        people = file.people
-        by = [None] * len(keys) if people is None else list(zip(people.who.tolist(), people.when.tolist(), strict=True))
-        for key, who in zip(keys, by, strict=True):
-            before = there.get(key, set())
-            kept.append(not (before and (who is None or who in before or None in before)))
-        for key, who in zip(keys, by, strict=True):
-            there.setdefault(key, set()).add(who)
-    return np.array(kept, bool)

