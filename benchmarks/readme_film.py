@@ -133,7 +133,6 @@ def labelled(folder: Path, browser: str, labels: int) -> tuple[list[str], list[S
         "reading",
         "--labels",
         str(labels),
-        "--no-practice",
         "--out",
         str(folder),
     ]

@@ -54,7 +54,6 @@ from cuelearner_jax.terminal import Interrupted, console, interruptible
 
 UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
 REACH = 1.5  # distance of questions from an aim, in turns by eps
-PRACTICE = len(controls.PRACTICE)  # number of practice questions
 MOST_LABELS = 100_000
 UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch`, or choose another --robot"
 
@@ -102,8 +101,6 @@ class Label(Outside):
     changes: str | None = None
     """For guidance reading: package.module:NAME of your own distortions (default: those that the world
     declares)."""
-    practice: Flag[bool] = True
-    """Begin a new file with three practice questions, whose answers are not saved."""
     port: int = 0
     """Port on 127.0.0.1 (0: any free port)."""
     open: Flag[bool] = False
@@ -343,7 +340,7 @@ def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, c
         console.print(f"{words} ...")
 
     def make() -> Session:
-        return Session(plan, options.out, tell, practice=PRACTICE if options.practice else 0)
+        return Session(plan, options.out, tell)
 
     with contextlib.ExitStack() as end:
         end.callback(leads_there.unlink, missing_ok=True)

@@ -17,11 +17,6 @@ WALKED = ("more to the left", "more to the right")
 BESIDE = {"ArrowLeft": "aA", "ArrowRight": "dD"}  # the same answers' keys for the other hand
 SHOWN = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # how the page writes these keys
 SHOWN |= {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
-PRACTICE = (  # the hint of each practice question, in order
-    "Compare the action with what is wanted, then answer by key, button or click.",
-    "Where you cannot tell, press {unsure}: it costs nothing.",
-    "An answer can be taken back with {undo}. After this one it counts.",
-)
 
 
 def shown(key: str) -> str:
@@ -189,12 +184,6 @@ def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list
         "knowing costs nothing.",
         "A key pressed while no question is ready is ignored, and the page says so.",
     ]
-
-
-def hint(number: int, known: Mapping[str, Control]) -> str:
-    """Return the hint of a practice question, counted from 0."""
-    told = {name: known[name].shown or known[name].words for name in ("unsure", "undo")}
-    return PRACTICE[min(number, len(PRACTICE) - 1)].format(**told)
 
 
 def answer_of(

@@ -54,9 +54,6 @@ class Page:
         rows = len(self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0  # of cues to choose from
         with ui.element("main").classes("label-page many" if rows else "label-page").style(f"--rows: {rows}"):
             with ui.column().classes("asking w-full gap-2"):
-                with ui.element("div").classes("practice") as self._practising:
-                    self._practice_words = ui.label()
-                    ui.button("skip practice", on_click=self._skip, color=None).props("flat dense").mark("skip")
                 ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")
                 self._asked = ui.label(controls.question(self.form, self.space)).classes("big")
                 self._note = ui.label().classes("note")
@@ -174,20 +171,13 @@ class Page:
         if not taken:
             why = "there is nothing to take back" if name == "undo" and number == self.session.number else why
             self._script(f"cue.refused({json.dumps(why)})")
-        self._refresh_all()
+        for page in list(self._pages):
+            page.refresh()
 
     def _script(self, code: str) -> None:
         """Run a script in the browser."""
         with self._client:
             ui.run_javascript(code)
-
-    def _refresh_all(self) -> None:
-        for page in list(self._pages):
-            page.refresh()
-
-    async def _skip(self) -> None:
-        await run.io_bound(self.session.skip_practice)
-        self._refresh_all()
 
     async def _end(self) -> None:
         assert self._finish is not None
@@ -225,15 +215,11 @@ class Page:
         self._mark()
         if "film-refined" in self._tools:
             self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
-        self._practising.set_visibility(item is not None and item.number < 0)
         if item is None:
             self._asked.text = "All labels are given. Thank you. Press finish, or undo to change the last one."
         else:
             self._asked.text = controls.question(self.form, self.space)
             self._words.text = item.sketch.words if item.sketch else ""
-            number, count = self.session.practice + item.number, self.session.practice
-            hint = controls.hint(number, self.controls)
-            self._practice_words.text = f"Practice {number + 1} of {count}, nothing is saved. {hint}"
         for button in self._pressable:
             button.set_enabled(item is not None)
         self._tell(self.session.status())

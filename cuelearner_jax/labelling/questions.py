@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
@@ -20,13 +19,11 @@ from cuelearner_jax.labelling.programs import advance, begin, keys_of
 from cuelearner_jax.policies import policy_name
 from cuelearner_jax.types import Reel, Sketch
 
-NUMBERS = 2**31  # practice questions have numbers below 0, whose random numbers are counted down from this
-
 
 class Item(NamedTuple):
     """A question: a situation and an action in it."""
 
-    number: int  # from 0; below 0: a practice question
+    number: int  # from 0
     guide: GuideState  # the guide's state in that situation
     action: np.ndarray  # (action,)
     sketch: Sketch | None = None  # None: not needed yet
@@ -52,10 +49,6 @@ class Questions:
         state, obs = begin(self.env, key)
         return self.blank.replace(env=state, obs=obs)
 
-    def practice_start(self, number: int) -> GuideState:
-        """Return the situation of a practice question, in an episode of its own."""
-        return self.start(jax.random.fold_in(self.keys.start, number % NUMBERS))
-
     def after(self, item: Item) -> GuideState:
         """Return the situation that follows an item's action."""
         key = asking.question_keys(self.keys.session, item.number).env
@@ -64,9 +57,9 @@ class Questions:
 
     def ask(self, number: int, guide: GuideState) -> Item:
         """Choose the action to ask about in a situation. Raises UserError for a policy without valid actions."""
-        if 0 <= number < len(self.plan.again):
+        if number < len(self.plan.again):
             return Item(number, guide, self.plan.again[number])
-        action = self.learner.question(guide, asking.question_keys(self.keys.session, number % NUMBERS))
+        action = self.learner.question(guide, asking.question_keys(self.keys.session, number))
         user_code.check_actions(np.isfinite(action), policy_name(self.plan.base.policy))
         return Item(number, guide, action)
 

@@ -44,17 +44,13 @@ class Status(NamedTuple):
 class Session:
     """Asks questions, saves answers and fits models. Its methods may be called from any thread."""
 
-    def __init__(
-        self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None, practice: int = 0
-    ) -> None:
+    def __init__(self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None) -> None:
         """Open the label file and prepare the first questions; only the thread that fits may still compile then.
 
         Args:
             plan: the session's settings.
             folder: the folder of `labels.jsonl`. Keep the folder claimed (`storage.folders.claimed`).
             tell: called with progress lines.
-            practice: number of practice questions before the first one; their answers are not saved. None are asked
-                where the file holds answers already.
 
         Raises:
             UserError: the folder holds labels of another session, or the task cannot be drawn here.
@@ -72,8 +68,6 @@ class Session:
         self._finished: Path | None = None
         self.number = self._furthest = 0  # the current question, and the last one that was shown
         self._replay(tell)
-        self.practice = 0 if self.record.rows else practice
-        self.number -= self.practice
         tell("preparing questions")
         self._ensure(self.number)
         self._ensure(self.number + 1)
@@ -113,8 +107,7 @@ class Session:
         item = self._items.get(number)
         made = self.questions
         if item is None:
-            guide = made.practice_start(number) if number < 0 else made.after(self._items[number - 1])
-            item = made.ask(number, guide)
+            item = made.ask(number, made.after(self._items[number - 1]))
         self._items[number] = made.draw(item)
 
     def _show(self, number: int) -> None:
@@ -150,20 +143,10 @@ class Session:
         enough = self.record.count(ANSWERED) >= self.plan.labels or 0 < len(self.plan.again) <= self.number
         return enough or self._finished is not None
 
-    def skip_practice(self) -> None:
-        """Go to the first question that counts; do nothing after practice."""
-        with self._acting:
-            self._next.result()
-            if self.number < 0:
-                self._ahead.submit(self._ensure, 0).result()
-                self._show(0)
-
     # --- answer ------------------------------------------------------------------------------------------------------
 
     def answer(self, number: int, answer: np.ndarray | None, seconds: float | None = None) -> bool:
         """Save an answer and move on. Return False if another question is current: the answer came too late.
-
-        Answers to practice questions are not saved.
 
         Args:
             number: number of the item that was on the screen.
@@ -186,8 +169,7 @@ class Session:
         return True
 
     def _save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
-        if item.number >= 0:
-            self.record.save(item.number, Said(said, np.asarray(item.guide.obs), item.action, answer, seconds))
+        self.record.save(item.number, Said(said, np.asarray(item.guide.obs), item.action, answer, seconds))
 
     def _labels(self) -> Label:
         """Return the answers in the order of their items, as a padded `Label`."""
@@ -207,8 +189,7 @@ class Session:
     def undo(self, number: int) -> bool:
         """Take back the answer before this question and ask it again.
 
-        Return False if there is no such answer, or another question is current. The first question has no way back to
-        the practice questions. Raises UserError if the change cannot be saved.
+        Return False if there is no such answer, or another question is current. Raises UserError on a full disk.
         """
         with self._acting:
             with self._lock:

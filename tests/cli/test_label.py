@@ -154,7 +154,7 @@ def test_what_is_labelled_by_default_trains_in_minutes(monkeypatch, tmp_path, ca
     asked, plan, commands = asked_for(monkeypatch, "billiards", "--out", str(place), "--who", "Ada B")
     preset = tasks.find("billiards").presets["quickstart"]
     assert (asked.task, asked.labels, plan.eps) == (preset.config.task, 100, preset.config.scalars.eps_deg)
-    assert (plan.base.name, asked.practice) == ("near_aims", True)
+    assert plan.base.name == "near_aims"
     assert commands.again == f"cuelearner label billiards --out '{place}' --who 'Ada B'"
     following = "cuelearner train billiards --preset quickstart --guidance relative --labels-from"
     assert commands.following(40) == f"{following} '{place}' --labels 40 --out 'runs/my labels'"

@@ -131,21 +131,6 @@ def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
     assert controls.answer_of(DIRECTIONS, controls.UNSURE, None, {}) is None
 
 
-def test_practice_is_marked_and_can_be_skipped(opened, tmp_path):
-    session = opened(practice=3)
-
-    async def acts(user, pages):
-        await user.should_see("Practice 1 of 3, nothing is saved. Compare the action")
-        await press(user, "+1", lambda: session.number == -2)
-        await user.should_see("Practice 2 of 3, nothing is saved. Where you cannot tell, press ↓")
-        await press(user, "skip", lambda: session.number == 0)
-        await user.should_not_see("Practice")
-        await press(user, "+1", lambda: session.number == 1)
-
-    shown(session, acts)
-    assert label_files.read(tmp_path / "labels").people.item.tolist() == [0]
-
-
 def test_every_page_ends_where_it_says_what_was_saved(opened, tmp_path):
     session, stopping = opened(), threading.Event()
     commands = Commands("cuelearner label mine", lambda labels: f"cuelearner train <{labels}>")

@@ -27,7 +27,7 @@ from cuelearner_jax.types import Sketch
 pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
 
 CUES = "left,right;up,down;open,close"
-SMALL = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20", "--no-practice")
+SMALL = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20")
 BOUNDS = ("--task.low", "-0.5", "0", "-1", "--task.high", "0.5", "0.4", "1")
 GOAL = np.array([0.25, 0.3, 0.0])
 PHOTO = Sketch((0, 0, 640, 480), "<image class='photo'/>", {}, {}, (320, 240), (0, 120), 0.0)
@@ -125,7 +125,6 @@ def test_a_key_of_a_cue_is_no_other_controls():
     keys = [key for control in known.values() for key in control.keys]
     assert len(keys) == len(set(keys))
     assert (known["unsure"].shown, known["rest"].shown) == ("S", "space")
-    assert "press S: it costs nothing." in controls.hint(1, known)
     assert known["pick-0-less"].keys == ("ArrowRight", "d", "D")
     assert "film" not in controls.controls(RELATIVE, box(CUES), films=False)
     assert "film-refined" not in controls.controls(RELATIVE, box(CUES), simulated=False)

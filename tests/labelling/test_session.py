@@ -193,28 +193,6 @@ def test_where_the_disk_takes_no_more_nothing_moves_on_and_nothing_is_saved_late
     assert [(row["item"], row["answer"]) for row in rows][1:] == [(1, [1.0])]
 
 
-def test_practice_comes_first_is_not_saved_and_changes_nothing(opened, tmp_path):
-    plain = opened("plain")
-    session = opened(practice=3)
-    assert (session.number, session.practice) == (-3, 3)
-    assert session.answer(-3, np.ones(1))
-    assert session.answer(-2, None)
-    assert session.undo(-1)
-    seen = [session.item, plain.item]
-    assert seen[0].number == -2
-    assert np.abs(seen[0].action - seen[1].action).max() > 1e-3  # no question that counts is given away
-    session.skip_practice()
-    session.skip_practice()
-    assert session.number == 0
-    assert not session.undo(0)
-    assert (lines(tmp_path / "labels"), session.status().answered, session.status().per_minute) == (0, 0, None)
-    for mine, theirs in zip(give(session, 3), give(plain, 3), strict=True):
-        np.testing.assert_array_equal(mine.guide.obs, theirs.guide.obs)
-        np.testing.assert_array_equal(mine.action, theirs.action)
-    session.close()
-    assert opened(practice=3).number == 3  # who labels already needs none
-
-
 def test_a_session_is_finished_once_and_takes_nothing_afterwards(opened, tmp_path):
     session = opened()
     with pytest.raises(UserError, match="no answer to save yet"):
