@@ -88,40 +88,15 @@ def test_a_browser_is_told_a_file_that_others_cannot_read(tmp_path, monkeypatch)
         (["--guidance", "heuristic"], "guidance 'heuristic' asks for no labels: give --guidance relative or"),
         (["--sizes.candidates", "3", "--sizes.ensemble", "2"], "--sizes.candidates is above 1"),
         (["--bound-deg", "0"], "--bound-deg is 0: give a number above 0 and up to 180"),
-        (["--port", "70000"], "--port is 70000: give a number"),
         (["--base.seed", "1"], "--base.… chooses a folder's lane, but no folder is given"),
-        (["--one-cue"], "--one-cue is for relative answers about several cues: leave it out"),
-        (["--cues", "left,right"], "has its own: leave it out"),
-        (["--robot", "anymal"], "has no robots to choose from"),
         (["--again", "nothing"], "no label file at nothing"),
         (["--questions", "near_aims"], "--questions is near_aims, but wandering has no aims in this world"),
-        (["--scalars.eps-deg", "-1"], "eps_deg"),
         (["--guidance", "reading"], "reading asks about a policy: name one after the task"),
     ],
 )
 def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(["label", OWN, "--out", "labels", *more], says, tmp_path)
-
-
-def test_a_preset_whose_labels_are_executed_is_refused(refused, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    says = "keeps labelled steps, but the page executes none: give another --preset"
-    refused(["label", "arm", "--preset", "corrected", "--out", "labels"], says, tmp_path)
-
-
-def test_a_task_that_nobody_draws_is_refused_before_anything_is_made(refused, tmp_path, monkeypatch):
-    pytest.importorskip("nicegui")
-    code, work = tmp_path / "code", tmp_path / "work"  # Python may write the module's bytecode beside it
-    code.mkdir()
-    work.mkdir()
-    monkeypatch.chdir(work)
-    monkeypatch.syspath_prepend(code)
-    bare = "import dataclasses, page_task\nTASK = dataclasses.replace(page_task.TASK, bodies=("
-    bare += "page_task.TASK.bodies[0].__class__('point', '', page_task._world),), name='undrawn')\n"
-    (code / "undrawn.py").write_text(bare)
-    says = "has no pictures of point: the page has nothing to show; give its Body `pictures`"
-    refused(["label", "undrawn:TASK", "--out", "labels"], says, work)
 
 
 def test_a_port_in_use_is_refused_before_anything_is_made(refused, tmp_path):

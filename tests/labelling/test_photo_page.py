@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import recorded_situations as recorded
-from page_answers import labelled, pressed
+from page_answers import labelled
 
 pytest.importorskip("nicegui")
 from page_user import press, shown
@@ -120,23 +120,12 @@ def test_the_action_and_its_correction_are_arrows_from_the_middle_and_the_correc
     assert drawn(space).count('class="arrow asked"') == 0  # the middle is nowhere to point to
 
 
-def test_a_key_of_a_cue_is_no_other_controls():
-    known = controls.controls(RELATIVE, box(CUES))
-    keys = [key for control in known.values() for key in control.keys]
-    assert len(keys) == len(set(keys))
-    assert (known["unsure"].shown, known["rest"].shown) == ("S", "space")
-    assert known["pick-0-less"].keys == ("ArrowRight", "d", "D")
-    assert "film" not in controls.controls(RELATIVE, box(CUES), films=False)
-    assert "film-refined" not in controls.controls(RELATIVE, box(CUES), simulated=False)
-
-
 def test_one_press_about_one_cue_says_nothing_of_the_others():
     known = controls.controls(RELATIVE, box(CUES), one_cue=True)
     said = {name: controls.answer_of(box(CUES), one, None, {}) for name, one in known.items() if one.answer}
     assert said.keys() == {f"only-{cue}-{way}" for cue in range(3) for way in ("more", "less")} | {"rest"}
     np.testing.assert_array_equal(said["only-1-less"], [UNSAID, -1.0, UNSAID])
     np.testing.assert_array_equal(said["rest"], [0.0, 0.0, 0.0])
-    assert pressed(known, np.array([UNSAID, -1.0, UNSAID])) == ["only-1-less"]
 
 
 @pytest.mark.long
