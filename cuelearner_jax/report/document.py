@@ -78,7 +78,6 @@ def report(
     groups = read_groups(folders, metric, split, by_run)
     variants = variants_of(groups, metric)
     rows = tables.summary(variants, lower_is_better)
-    rows += tables.of_failed_alone(rows, groups)
     counts = sorted({len(variant.seeds) for variant in variants})
     seeds = f"{counts[0]} seed{'s' * (counts[0] > 1)}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds"
     title = f"{groups[0].table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {seeds}"

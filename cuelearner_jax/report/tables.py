@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -11,8 +10,7 @@ import numpy as np
 
 from cuelearner_jax.report import escaping
 from cuelearner_jax.report.statistics import steps_to_reach, stretches_apart
-from cuelearner_jax.report.variants import Group, Variant
-from cuelearner_jax.storage import results
+from cuelearner_jax.report.variants import Variant
 
 Row = dict[str, str | int | float]  # of a table
 
@@ -58,20 +56,6 @@ def named(variant: Variant) -> Row:
     return row | {"guidance": variant.guidance, "labels": variant.labels}
 
 
-def of_failed_alone(rows: Sequence[Row], groups: Sequence[Group]) -> list[Row]:
-    """Return summary rows for variants whose lanes have all failed, which have no other rows."""
-    blank = dict.fromkeys(rows[0], "")
-    more: list[Row] = []
-    for group in groups:
-        there = {(row["guidance"], row["labels"]) for row in rows if row.get("run", "") == group.name}
-        lanes = Counter(key[:2] for key in results.failures(group.failed) if key[:2] not in there)
-        run = {"run": group.name} if group.name else {}
-        more += [
-            {**blank, **run, "guidance": key[0], "labels": key[1], "seeds": 0, "failed": n} for key, n in lanes.items()
-        ]
-    return more
-
-
 def curve_rows(variants: Sequence[Variant]) -> list[Row]:
     """Return one row for each variant and evaluation: the values of the curves."""
     return [
@@ -91,15 +75,16 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
-    """Return the lines of a Markdown table; cells are Markdown already, and short rows are padded."""
-    lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
-    for cells in rows:
-        lines.append(f"| {' | '.join(map(str, cells))} |" + " |" * (len(header) - len(cells)))
-    return lines
+    """Return the lines of a Markdown table; cells are Markdown already."""
+    return [
+        f"| {' | '.join(header)} |",
+        "|" + "---|" * len(header),
+        *(f"| {' | '.join(map(str, row))} |" for row in rows),
+    ]
 
 
 def summary_lines(rows: Sequence[Row]) -> list[str]:
-    """Return the summary as a table in Markdown; a row of failed lanes alone is short."""
+    """Return the summary as a table in Markdown."""
     header = ["guidance", "labels", "seeds", "last step", "final", "mean over the curve", "best (at step)"]
     header += ["reaches the unguided final", "interval above the unguided", "interval below the unguided"]
     return markdown_table(["run"] * ("run" in rows[0]) + header, [_summary_cells(row) for row in rows])
@@ -110,8 +95,6 @@ def _summary_cells(row: Row) -> list[object]:
     seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
     cells: list[object] = [escaping.markdown(row[name]) for name in ("run", "guidance") if name in row]
     cells += [f"{row['labels']:,}", seeds]
-    if not row["seeds"]:
-        return cells
     cells.append(f"{row['last_step']:,}")
     for key in ("final", "mean"):
         bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""
