@@ -44,41 +44,34 @@ def status_of(address, **headers):
         return error.code, error.headers, error.read().decode()
 
 
-def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refused):
+def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refused, monkeypatch):
+    """A browser is told a file that others cannot read."""
     pytest.importorskip("nicegui")
-    with served(tmp_path / "labels") as (process, address):
+    browser, told, leads_there = tmp_path / "browser", tmp_path / "told", tmp_path / "labels/open.html"
+    browser.write_text(f'#!/bin/sh\necho "$@" > {told}.new\nmv {told}.new {told}\n')
+    browser.chmod(0o700)
+    monkeypatch.setenv("BROWSER", str(browser))
+    with served(tmp_path / "labels", "--open") as (process, address):
         place = address.partition("?")[0]
         assert place.startswith("http://127.0.0.1:")
         status, headers, text = status_of(address)
         assert status == 200
         assert "Which way should the middle arrow turn?" in text
         assert status_of(place, Cookie=headers["set-cookie"].partition(";")[0])[0] == 200
-        for told in ({}, {"Cookie": "x=1"}, {"Host": "evil.example"}, {"Origin": "http://evil.example"}):
-            assert status_of(address if told.keys() & {"Host", "Origin"} else place, **told)[0] == 403
+        for given in ({}, {"Cookie": "x=1"}, {"Host": "evil.example"}, {"Origin": "http://evil.example"}):
+            assert status_of(address if given.keys() & {"Host", "Origin"} else place, **given)[0] == 403
+        while not told.exists():
+            time.sleep(0.05)
+        assert told.read_text().split() == [leads_there.as_uri()]
+        assert f"url={address}" in leads_there.read_text()
+        assert leads_there.stat().st_mode & 0o777 == 0o600
         again = ["label", OWN, "--out", tmp_path / "labels"]
         refused(again, "is being written by another process", tmp_path / "labels")
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
         assert "every answer is in" in process.stderr.read()
-    assert label_files.history(tmp_path / "labels" / label_files.JSONL) == []
-
-
-def test_a_browser_is_told_a_file_that_others_cannot_read(tmp_path, monkeypatch):
-    pytest.importorskip("nicegui")
-    browser = tmp_path / "browser"
-    browser.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/told.new\nmv {tmp_path}/told.new {tmp_path}/told\n')
-    browser.chmod(0o700)
-    monkeypatch.setenv("BROWSER", str(browser))
-    leads_there = tmp_path / "labels/open.html"
-    with served(tmp_path / "labels", "--open") as (process, address):
-        while not (tmp_path / "told").exists():
-            time.sleep(0.05)
-        assert (tmp_path / "told").read_text().split() == [leads_there.as_uri()]
-        assert f"url={address}" in leads_there.read_text()
-        assert leads_there.stat().st_mode & 0o777 == 0o600
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 130
     assert not leads_there.exists()
+    assert label_files.history(tmp_path / "labels" / label_files.JSONL) == []
 
 
 @pytest.mark.parametrize(
