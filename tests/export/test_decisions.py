@@ -171,23 +171,6 @@ def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_
         contract.replay_golden_cases(there)
 
 
-def test_of_two_exports_at_once_the_second_is_refused(folder, tmp_path):
-    out = tmp_path / "new"
-    second = []
-
-    def meanwhile():
-        with pytest.raises(UserError, match="is being written by another process") as refused:
-            write(Heuristic(ENV), "numpy", out)
-        second.append(str(refused.value))
-        return DRAWN
-
-    contract.write(Heuristic(ENV), ENV, meanwhile, "numpy", out, {})
-    assert len(second) == 1
-    assert "\n" not in second[0]
-    assert contract.replay_golden_cases(out) <= 1e-5
-    assert [path.name for path in tmp_path.iterdir()] == ["new"]
-
-
 def test_a_decision_that_is_another_one_is_found_by_its_golden_cases(folder, tmp_path):
     there = copied(folder / "numpy", tmp_path)
     with np.load(there / runner.GOLDEN) as golden:
