@@ -93,9 +93,9 @@ class _Server(uvicorn.Server):
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, then call `after_startup`; browsers wait for their first answer meanwhile."""
+        """Start, then call `after_startup` in a thread of its own: what it opens may need an event loop too."""
         await super().startup(sockets)
-        self.after_startup()
+        await asyncio.to_thread(self.after_startup)
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether the server should stop."""
