@@ -2,7 +2,7 @@
 
 contract.json    inputs and outputs with units; versions; digests of the other files and of the contract itself
 decision.*       the decision
-golden.npz       observations (cases, obs) and JAX's actions for them (cases, action)
+golden.npz       observations (cases, obs), the last ones extreme, and JAX's actions for them (cases, action)
 decide.py        `runner`, which runs the decision
 """
 
@@ -79,7 +79,7 @@ def write(
         base = getattr(env, "base_size", 0)  # only for a correction alone
         traced = trace_policy(policy, env.obs_size)
         file, contents, about = _artefact(format, policy, traced, env.obs_size, actions_of(env).size, base)
-        golden, cases = golden_cases(policy, drawn()), io.BytesIO()
+        golden, cases = golden_cases(policy, drawn(), traced=traced), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {file: contents, runner.GOLDEN: cases.getvalue(), "decide.py": inspect.getsource(runner).encode()}
         ends = list(itertools.accumulate(quantity.size for quantity in env.observation))
@@ -97,7 +97,7 @@ def write(
             "policy": describe(policy),
             "source": source,
             "golden": {"cases": len(golden.obs), "tolerance": TOLERANCE}
-            | {"drawn": golden.drawn, "steady": golden.steady},
+            | {"drawn": golden.drawn, "steady": golden.steady, "extreme": golden.extreme},
             "files": {name: hashlib.sha256(contents).hexdigest() for name, contents in files.items()},
             **provenance(),
         }

@@ -15,11 +15,16 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import rules
 from cuelearner_jax.export.graph import Traced, trace
+from cuelearner_jax.export.runner import compile_ops
 from cuelearner_jax.policies import Policy, describe, layers, policy_name
 
 TOLERANCE = 1e-5  # largest allowed difference of an action's entry on another machine
 NUDGE = 1e-6  # relative change of an observation's entry, as large as rounding may cause
-NUDGES, CASES = 4, 64
+NUDGES, CASES, MIXED = 4, 64, 5
+ROUNDING = 1e-6  # relative error of an operation, larger than any library's
+SUMS = {"matmul", "sum", "cumsum"}  # whose error is that of their largest part
+INEXACT = SUMS | {*("add", "sub", "mul", "div", "rem", "prod", "pow", "square", "sqrt", "rsqrt", "exp", "expm1", "log")}
+INEXACT |= {"log1p", "sin", "cos", "tan", "tanh", "atan", "atan2", "logistic"}
 WALKERS, STEPS = 32, 4  # environments and steps that observations for golden cases come from
 CALLBACKS = {"pure_callback", "io_callback", "python_callback"}
 
@@ -83,29 +88,69 @@ class Golden(NamedTuple):
     actions: Float[np.ndarray, "cases action"]  # computed by JAX
     drawn: int  # number of observations that they were chosen from
     steady: int  # number of these observations whose decision is insensitive to rounding
+    extreme: int  # number of golden cases, the last ones, that no episode led to
 
 
-def golden_cases(policy: Policy, drawn: Float[np.ndarray, "n obs"], most: int = CASES) -> Golden:
+def extreme_observations(drawn: Float[np.ndarray, "n obs"]) -> Float[np.ndarray, "extreme obs"]:
+    """Return observations at the bounds of those drawn and far outside: zero, tiny, large, negative, and mixed."""
+    low, high = drawn.min(0), drawn.max(0)
+    far = (np.full_like(low, number) for number in (1e10, -1e10, 0.0, 1e-30, -1e-30))
+    rows = np.stack([*far, low, high, -low, -high, 100 * low, 100 * high])
+    mixed = np.random.default_rng(1).integers(len(rows), size=(MIXED, len(low)))
+    return np.concatenate([rows, np.take_along_axis(rows, mixed, 0)])
+
+
+def is_steady(traced: Traced, obs: Float[np.ndarray, " obs"]) -> bool:
+    """Return whether a graph's decision stays when every inexact operation errs as by rounding.
+
+    Entries far outside swallow all others, so that values tie for JAX, which nudged observations do not show.
+    """
+    steps, random = [(compile_ops([op]), *op[:3:2]) for op in traced.graph.ops], np.random.default_rng(2)
+    (result,), actions = traced.graph.outputs, []
+    for size in (0.0, *[ROUNDING] * NUDGES):
+        values = {**traced.constants, "obs": obs}
+        for run, name, outputs in steps:
+            run(values)
+            value = values[outputs[0]]
+            if name in INEXACT and value.dtype == np.float32:
+                error = size * random.uniform(-1, 1, value.shape) * (np.abs(value).max() if name in SUMS else value)
+                values[outputs[0]] = np.asarray(value + error, np.float32)
+        actions.append(values[result])
+    return bool(np.ptp(actions, axis=0).max() <= TOLERANCE)
+
+
+def golden_cases(
+    policy: Policy, drawn: Float[np.ndarray, "n obs"], most: int = CASES, traced: Traced | None = None
+) -> Golden:
     """Return the first observations whose decision does not change under perturbations as small as rounding.
 
     An argmax jumps where two values tie, and another machine may choose the other one, so such cases verify nothing.
+    Given the policy's graph, up to a quarter of the cases are extreme observations, where a policy may give no action.
 
     Raises UserError if there is no insensitive case among the drawn observations.
     """
-    obs = np.asarray(drawn, np.float32)
+    drawn = np.asarray(drawn, np.float32)
+    beyond = extreme_observations(drawn)[: most // 4 if traced is not None and not traced.missing else 0]
+    obs = np.concatenate([drawn, beyond])
     decide = jax.jit(row_by_row(policy))
     actions = np.asarray(decide(jnp.asarray(obs)))
-    user_code.check_actions(actions, policy_name(policy))
+    user_code.check_actions(actions[: len(drawn)], policy_name(policy))
     random = np.random.default_rng(0)
-    steady = np.ones(len(obs), bool)
+    apart = np.zeros(len(obs))
     for _ in range(NUDGES):
         nudge = NUDGE * random.uniform(-1, 1, obs.shape) * np.maximum(np.abs(obs), 1.0)
         nudged = np.asarray(decide(jnp.asarray(obs + nudge, jnp.float32)))
-        steady &= np.abs(nudged - actions).max(-1) <= TOLERANCE
-    if not steady.any():
+        apart = np.maximum(apart, np.abs(nudged - actions).max(-1))
+    steady = apart <= TOLERANCE  # never where an action is not finite
+    with np.errstate(all="ignore"):
+        for place in range(len(drawn), len(obs)):  # zero is no direction
+            steady[place] &= traced is not None and actions[place].any() and is_steady(traced, obs[place])
+    count, extreme = int(steady[: len(drawn)].sum()), int(steady[len(drawn) :].sum())
+    if not count:
         raise UserError(
             f"all {len(drawn)} decisions change with the last digits of their "
             f"observation, so none can serve as a golden case"
         )
-    places = np.flatnonzero(steady)[:most]
-    return Golden(obs[places], actions[places], len(drawn), int(steady.sum()))
+    places = np.flatnonzero(steady)
+    places = np.concatenate([places[:count][: most - extreme], places[count:]])
+    return Golden(obs[places], actions[places], len(drawn), count, extreme)

@@ -20,6 +20,7 @@ from cuelearner_jax.api.policies import CallablePolicy
 from cuelearner_jax.environment import Quantity, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, onnx_graph, runner
+from cuelearner_jax.export.graph import RULES
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, layers, uniform_in
 
@@ -235,6 +236,26 @@ def test_golden_cases_are_those_that_rounding_does_not_turn():
     assert len(DRAWN) - 1 <= golden.steady <= len(DRAWN) + 8  # of the twenty near the jump, chance may leave a few
     with pytest.raises(UserError, match="change with the last digits"):
         decisions.golden_cases(policy, drawn[9:11])
+
+
+def test_a_difference_that_no_episode_leads_to_is_noticed_when_the_file_is_written(tmp_path, monkeypatch):
+    """A cast that does not saturate turns only observations above 2^31, and no drawn one is above 1."""
+    policy = Opaque(lambda obs: jnp.where(obs[:, 1:].astype(jnp.int32) > 5, 1.0, -1.0) * jnp.array([[0.6, 0.8]]))
+    told = write(policy, "numpy", tmp_path / "sound")
+    assert told["golden"]["extreme"] > 10
+    with np.load(tmp_path / "sound" / runner.GOLDEN) as golden:
+        extreme = golden["obs"][-told["golden"]["extreme"] :]
+    assert {np.float32(1e10), np.float32(-1e10), np.float32(1e-30), np.float32(0)} <= set(extreme[:, 0].tolist())
+    plain = lambda builder, equation, given: [  # noqa: E731
+        builder.add(
+            "cast", given, given[0].shape, str(equation.params["new_dtype"]), dtype=str(equation.params["new_dtype"])
+        )
+    ]
+    monkeypatch.setitem(RULES, "convert_element_type", plain)
+    for format in ("numpy", "onnx"):
+        with pytest.raises(UserError, match="golden cases differ by"):
+            write(policy, format, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_observations_are_starts_and_what_follows():
