@@ -226,10 +226,7 @@ def test_what_does_not_fit_a_folder_is_told_in_one_line(folder, given, told):
         recorded_or_task(look_ahead([str(folder), *given]))
 
 
-def test_cues_and_one_cue_need_a_space_that_has_several(tmp_path):
+def test_a_task_with_cues_of_its_own_takes_no_others():
     task = recorded_or_task(look_ahead(["navigation"]))
     with pytest.raises(UserError, match="navigation has its own: leave it out"):
         with_cues(task, task.plain(), "left,right")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match="is empty"):
-        recorded_or_task(look_ahead([str(tmp_path / "empty")]))
