@@ -87,7 +87,7 @@ def served(asked: argparse.Namespace, task: str, folder: Path, *more: str) -> It
     named = [str(asked.photos), "--cues", CUES] if task == PHOTOS else [task]
     preset = asked.preset or ("" if task == PHOTOS or ":" in task else "paper")
     command = [sys.executable, "-m", "cuelearner_jax.cli", "label", *named, *(["--preset", preset] if preset else [])]
-    command += ["--no-practice", "--out", str(folder), *shlex.split(asked.more), *more]
+    command += ["--out", str(folder), *shlex.split(asked.more), *more]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"})
     try:
         assert process.stdout is not None

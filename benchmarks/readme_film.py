@@ -68,13 +68,13 @@ def keys_for(page: Page, asked: Watched) -> list[tuple[str, str]]:
     item = asked.item
     assert item is not None
     best = reach(np.asarray(item.guide.obs)[None])[0]
-    eps = float(asked.space.from_unit(asked.plan.eps))
-    said = np.asarray(relative_feedback(asked.space, jnp.asarray(item.action), jnp.asarray(best), eps))
+    eps = float(asked.questions.space.from_unit(asked.plan.eps))
+    said = np.asarray(relative_feedback(asked.questions.space, jnp.asarray(item.action), jnp.asarray(best), eps))
     keys: dict[str, str] = {}
     for key, name in page.evaluate("cue.keys").items():
         keys.setdefault(name, key)
     pressed = []
-    for number, cue in enumerate(asked.space.cues):
+    for number, cue in enumerate(asked.questions.space.cues):
         if said[number]:
             more = said[number] > 0
             pressed.append((keys[f"pick-{number}-{'more' if more else 'less'}"], cue.words[0 if more else 1]))
@@ -133,7 +133,6 @@ def labelled(folder: Path, browser: str, labels: int) -> tuple[list[str], list[S
         "reading",
         "--labels",
         str(labels),
-        "--no-practice",
         "--out",
         str(folder),
     ]

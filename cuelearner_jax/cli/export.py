@@ -10,7 +10,6 @@ from cuelearner_jax.cli.sources import source_and_options
 from cuelearner_jax.config import digest, to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions
-from cuelearner_jax.export.formats import FORMATS
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.runs import trained
 
@@ -42,7 +41,7 @@ def run(arguments: list[str]) -> None:
         assert options.check is not None  # tyro
         _check(options.check)
         return
-    formats = "\n".join(f"  {name:<11}{one.about}" for name, one in FORMATS.items())
+    formats = "\n".join(f"  {name:<11}{about}" for name, about in contract.FORMATS.items())
     source, options = source_and_options(arguments, "export", Export, f"\n\nformats (--format):\n{formats}")
     name = options.name_in(source, options.task)
     if trained.POLICIES[name].taught:
@@ -73,6 +72,4 @@ def run(arguments: list[str]) -> None:
 
 def _check(folder: Path) -> None:
     difference = contract.replay_golden_cases(folder)
-    if others := contract.unlisted_files(folder):
-        out.print(f"{folder} also holds files that its contract does not list: {', '.join(others)}")
     out.print(f"{folder} is unchanged since its export; golden cases replayed, largest difference {difference:.1e}")

@@ -8,7 +8,6 @@ import os
 import shlex
 import webbrowser
 from argparse import Namespace
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -55,7 +54,6 @@ from cuelearner_jax.terminal import Interrupted, console, interruptible
 
 UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
 REACH = 1.5  # distance of questions from an aim, in turns by eps
-PRACTICE = len(controls.PRACTICE)  # number of practice questions
 MOST_LABELS = 100_000
 UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch`, or choose another --robot"
 
@@ -103,8 +101,6 @@ class Label(Outside):
     changes: str | None = None
     """For guidance reading: package.module:NAME of your own distortions (default: those that the world
     declares)."""
-    practice: Flag[bool] = True
-    """Begin a new file with three practice questions, whose answers are not saved."""
     port: int = 0
     """Port on 127.0.0.1 (0: any free port)."""
     open: Flag[bool] = False
@@ -326,9 +322,10 @@ def _server() -> Any:
 
 def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, commands: Any) -> Any:
     """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
-    from cuelearner_jax.labelling.opening import Opening
+    from cuelearner_jax.labelling.record import Record
     from cuelearner_jax.labelling.session import Session
 
+    Record(plan, options.out).close()  # refuses the file of another session before anything is compiled
     leads_there = options.out / "open.html"  # command lines, unlike this file, can be read by every user of the machine
 
     def open_page(address: str) -> None:
@@ -342,13 +339,12 @@ def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, c
     def tell(words: str) -> None:
         console.print(f"{words} ...")
 
-    def make(tell: Callable[[str], None]) -> Session:
-        return Session(plan, options.out, tell, practice=PRACTICE if options.practice else 0)
+    def make() -> Session:
+        return Session(plan, options.out, tell)
 
-    with Opening(make, stopping.set, tell) as opening, contextlib.ExitStack() as end:
+    with contextlib.ExitStack() as end:
         end.callback(leads_there.unlink, missing_ok=True)
-        opening.wait_for_files()
-        return server.serve(opening, f"label {plan.task.name}", port, stopping, open_page, commands)
+        return server.serve(make, f"label {plan.task.name}", port, stopping, open_page, commands)
 
 
 def _following(task: Task, preset: str, config: RunConfig, options: Label, labels: int) -> str:

@@ -3,7 +3,7 @@
 contract.json    inputs and outputs with units; versions; digests of the other files and of the contract itself
 decision.*       the decision
 golden.npz       observations (cases, obs), the last ones extreme, and JAX's actions for them (cases, action)
-decide.py        runs the decision: `runner`, with `operations` in place of their import
+decide.py        `runner`, which runs the decision
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import inspect
 import io
 import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from cuelearner_jax.environment import Quantity, action_of, actions_of
+from cuelearner_jax.environment import action_of, actions_of
 from cuelearner_jax.errors import UserError, suggestion
-from cuelearner_jax.export import operations, runner
-from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
-from cuelearner_jax.export.formats import FORMATS, trace_policy
+from cuelearner_jax.export import onnx_graph, runner
+from cuelearner_jax.export.decisions import TOLERANCE, golden_cases, row_by_row, trace_policy
+from cuelearner_jax.export.graph import Traced
 from cuelearner_jax.policies import Policy, describe
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
@@ -37,6 +37,12 @@ BASE = (
     "other slices, as decide(observation, base_action)"
 )
 ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise (from x to y)"
+PLATFORMS = ("cpu", "cuda")  # platforms of a decision in StableHLO
+FORMATS = {
+    "stablehlo": "for JAX: the compiler's own language, for CPUs and NVIDIA GPUs",
+    "onnx": "for onnxruntime and what else reads ONNX (extra `onnx`)",
+    "numpy": "for NumPy alone: the parameters, and a file of Python that runs them",
+}
 
 
 def check_request(format: str, out: Path) -> None:
@@ -71,16 +77,20 @@ def write(
     with place_of(out, _check_free) as place:
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
         base = getattr(env, "base_size", 0)  # only for a correction alone
-        sizes = env.obs_size, actions_of(env).size, base
         traced = trace_policy(policy, env.obs_size)
-        artefact = FORMATS[format].make(policy, traced, *sizes)
+        file, contents, about = _artefact(format, policy, traced, env.obs_size, actions_of(env).size, base)
         golden, cases = golden_cases(policy, drawn(), traced=traced), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
-        files = {artefact.file: artefact.contents, runner.GOLDEN: cases.getvalue(), "decide.py": decide_source()}
+        files = {file: contents, runner.GOLDEN: cases.getvalue(), "decide.py": inspect.getsource(runner).encode()}
+        ends = list(itertools.accumulate(quantity.size for quantity in env.observation))
+        slices = [
+            {"name": q.name, "from": end - q.size, "to": end, "size": q.size, "unit": q.unit, "about": q.about}
+            for q, end in zip(env.observation, ends, strict=True)
+        ]
         contract = {
             "version": runner.VERSION,
-            "artefact": {"format": format, "file": artefact.file, **artefact.about},
-            "observation": {"size": env.obs_size, "dtype": "float32", "slices": _slices(env.observation)},
+            "artefact": {"format": format, "file": file, **about},
+            "observation": {"size": env.obs_size, "dtype": "float32", "slices": slices},
             "action": _action(env, describe(policy)),
             **({"base": {"size": base, "about": BASE}} if base else {}),
             "batch": "observations (n, size), any n; every row is decided by itself",
@@ -95,8 +105,8 @@ def write(
         sealed = json.dumps({**contract, runner.DIGEST: runner.digest(contract)}, indent=1) + "\n"
         with place.writing() as folder:
             for name, contents in {**files, runner.CONTRACT: sealed.encode()}.items():
-                with replacing(folder / name, "wb") as file:
-                    file.write(contents)
+                with replacing(folder / name, "wb") as written:
+                    written.write(contents)
             return {**contract, "difference": replay_golden_cases(folder)}
 
 
@@ -110,19 +120,34 @@ def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
     return {**told, "clip_radius": radius, "clip_radius_unit": space.unit}
 
 
-def decide_source() -> bytes:
-    """Return `runner` with the contents of `operations` in place of their import: one file that needs only NumPy."""
-    own, other = (inspect.getsource(module) for module in (runner, operations))
-    imported = "from cuelearner_jax.export.operations import ContractError, compile_ops\n"
-    return own.replace(imported, other.partition("from __future__ import annotations\n\n")[2]).encode()
+def _artefact(
+    format: str, policy: Policy, traced: Traced, obs_size: int, action_size: int, base_size: int
+) -> tuple[str, bytes, dict[str, Any]]:
+    """Return a decision's file, its contents, and the contract's entry.
 
-
-def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:
-    ends = list(itertools.accumulate(quantity.size for quantity in observation))
-    return [
-        {"name": q.name, "from": end - q.size, "to": end, "size": q.size, "unit": q.unit, "about": q.about}
-        for q, end in zip(observation, ends, strict=True)
-    ]
+    For a correction alone, the last `base_size` entries of the observation are the base's action.
+    """
+    if format == "stablehlo":
+        decide, (count,) = row_by_row(policy), jax.export.symbolic_shape("n")
+        parts = [obs_size - base_size, base_size] if base_size else [obs_size]
+        shapes = [jax.ShapeDtypeStruct((count, size), jnp.float32) for size in parts]
+        together = jax.jit(lambda *seen: decide(jnp.concatenate(seen, -1)))
+        exported = jax.export.export(together if base_size else jax.jit(decide), platforms=PLATFORMS)(*shapes)
+        about = {"needs": "jax", "jax": jax.__version__, "platforms": list(PLATFORMS)}
+        return "decision.stablehlo", bytes(exported.serialize()), about
+    if traced.missing:
+        raise UserError(
+            f"--format {format} does not support {', '.join(traced.missing)}, which this policy needs: "
+            "give --format stablehlo"
+        )
+    if format == "onnx":
+        contents = onnx_graph.serialize(traced, obs_size, action_size, base_size)
+        about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET, "input": "obs", "output": "action"}
+        return "decision.onnx", contents, about | ({"base_input": onnx_graph.BASE} if base_size else {})
+    graph, stored = np.frombuffer(json.dumps(traced.graph.as_json()).encode(), np.uint8), io.BytesIO()
+    arrays: dict[str, Any] = {"graph": graph, **traced.constants}
+    np.savez(stored, **arrays)
+    return "decision.npz", stored.getvalue(), {"needs": "numpy"}
 
 
 def replay_golden_cases(folder: Path) -> float:
@@ -132,13 +157,5 @@ def replay_golden_cases(folder: Path) -> float:
     """
     try:
         return runner.Decision(folder).check()
-    except runner.ContractError as error:
-        raise UserError(str(error)) from error
-
-
-def unlisted_files(folder: Path) -> list[str]:
-    """Return the names of files in a folder that its contract does not list. Raises UserError if it is damaged."""
-    try:
-        return runner.Decision(folder).unlisted
     except runner.ContractError as error:
         raise UserError(str(error)) from error

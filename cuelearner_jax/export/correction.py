@@ -5,7 +5,7 @@ Such a decision takes observation and base action. In the contract, the observat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -55,29 +55,14 @@ class CorrectionAlone(PolicyNode):
         return describe(_over(self.corrected, Given(jnp.zeros((1, self.space.size)))))
 
 
-@dataclass(frozen=True)
-class Beside:
-    """Observation and action of a correction alone, with the attributes that export needs of an environment."""
-
-    observation: tuple[Quantity, ...]
-    actions: Space
-    action: Quantity
-    base_size: int  # number of entries at the end of the input that are the base's action
-
-    @property
-    def obs_size(self) -> int:
-        """Number of entries of the input."""
-        return sum(quantity.size for quantity in self.observation)
-
-
 def _over(policy: Any, base: Any) -> Any:
     """Return a corrected policy with its innermost base replaced."""
     below = policy.base
     return policy.replace(base=_over(below, base) if getattr(below, "base", None) is not None else base)
 
 
-def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Beside]:
-    """Return a policy's correction alone, and a description of its input and output.
+def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Any]:
+    """Return a policy's correction alone, and what export needs to know of its input and output in place of a world.
 
     Raises UserError for a policy without a correction, or one that changes its base's observations.
     """
@@ -94,7 +79,10 @@ def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Beside]:
     space, action = actions_of(env), action_of(env)
     seen = Quantity(BASE, space.size, action.unit, "what the base, which is elsewhere, would do")
     without = jax.tree.map(jnp.asarray, _over(policy, Given(jnp.zeros((1, space.size)))))
-    return CorrectionAlone(without, space), Beside((*env.observation, seen), space, action, space.size)
+    size = env.obs_size + space.size
+    beside = SimpleNamespace(observation=(*env.observation, seen), obs_size=size, actions=space, action=action)
+    beside.base_size = space.size  # number of entries at the end of the input that are the base's action
+    return CorrectionAlone(without, space), beside
 
 
 def cases(env: Any) -> Float[np.ndarray, "n seen"]:

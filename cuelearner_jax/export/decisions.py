@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.export.graph import Traced
-from cuelearner_jax.export.operations import compile_ops
+from cuelearner_jax.export import rules
+from cuelearner_jax.export.graph import Traced, trace
+from cuelearner_jax.export.runner import compile_ops
 from cuelearner_jax.policies import Policy, describe, layers, policy_name
 
 TOLERANCE = 1e-5  # largest allowed difference of an action's entry on another machine
@@ -61,6 +62,23 @@ def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS)
 
     seen = np.asarray(walked(jax.random.key(count)))
     return seen.reshape(-1, seen.shape[-1])[:count]
+
+
+def trace_policy(policy: Policy, obs_size: int) -> Traced:
+    """Trace a policy's decision as a graph.
+
+    Raises UserError for a policy with random actions, or with code other than JAX's.
+    """
+    assert rules.RULES  # importing `rules` registers them
+    found = trace(decision_of(policy), obs_size)
+    if CALLBACKS & set(found.missing):
+        raise UserError(
+            "this policy calls a Python function, which cannot be exported: export a policy of JAX "
+            "functions, or the correction alone (--only-correction, cl.export_correction)"
+        )
+    if found.random:
+        raise UserError("this policy acts at random, which cannot be exported: export a deterministic policy")
+    return found
 
 
 class Golden(NamedTuple):

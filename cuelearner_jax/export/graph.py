@@ -116,7 +116,6 @@ class Builder:
         self.constants: dict[str, np.ndarray] = {}
         self.kinds: dict[str, str] = {}
         self._done_before: dict[str, Value] = {}  # results by operation and inputs
-        self._narrow: dict[str, Value] = {}  # by the name of a broadcast value: the value before broadcasting
         self._named: dict[int, tuple[Any, str]] = {}  # by identity; keeping the array reserves its identity
         self._numbers = itertools.count()
 
@@ -171,22 +170,12 @@ class Builder:
 
     def add(self, op: str, inputs: list[Known], shape: tuple[int, ...], kind: str, /, **attributes: Any) -> Value:
         """Add an operation with one output, or reuse an equal earlier one."""
-        if op in WIDENING:
-            inputs = self._narrowed(inputs, tuple(shape))
         names = [self.name(value) for value in inputs]
         done = json.dumps([op, names, attributes])
         if done not in self._done_before:
             output = self._done_before[done] = self.new(shape, kind)
             self.ops.append([op, names, [output.name], attributes])
-            if op == "broadcast" and isinstance(inputs[0], Value):
-                self._narrow[output.name] = inputs[0]
         return self._done_before[done]
-
-    def _narrowed(self, inputs: list[Known], shape: tuple[int, ...]) -> list[Known]:
-        """Return inputs before broadcasting, where another input has the result's shape anyway."""
-        narrow = [self._narrow.get(value.name) if isinstance(value, Value) else None for value in inputs]
-        wide = any(found is None and tuple(value.shape) == shape for value, found in zip(inputs, narrow, strict=True))
-        return [found if wide and found else value for value, found in zip(inputs, narrow, strict=True)]
 
     def name(self, value: Known) -> str:
         """Return the name of a value; a known value becomes a constant."""
@@ -261,11 +250,6 @@ def _called(equation: Any) -> Any:
     return None
 
 
-# Operations that broadcast their inputs themselves.
-WIDENING = {
-    *("add", "sub", "mul", "div", "rem", "pow", "atan2", "max", "min", "and", "or", "xor", "select"),
-    *("eq", "ne", "lt", "le", "gt", "ge"),
-}
 # Operations that compute in bfloat16 if their result has that type; the others only move or select numbers.
 ROUNDED = {
     *("add", "sub", "mul", "div", "dot_general", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan"),

@@ -93,8 +93,7 @@ def between(one: LabelFile, other: LabelFile, env: Any) -> Agreement:
     form = form_of(one)
     if form is None or (one.answers, one.space, one.eps) != (other.answers, other.space, other.eps):
         raise UserError(f"the files hold {_called(one)} and {_called(other)} answers: give two of one form")
-    theirs = _by_question(other)
-    mine = _by_question(one)
+    mine, theirs = dict(_questions(one)), dict(_questions(other))
     both = [question for question in mine if question in theirs]
     width = form.width(one.space)
     pairs = np.array([(mine[question], theirs[question]) for question in both], np.float32).reshape(-1, 2, width)
@@ -103,10 +102,6 @@ def between(one: LabelFile, other: LabelFile, env: Any) -> Agreement:
 
 def _called(file: LabelFile) -> str:
     return file.answers if file.eps is None else f"{file.answers} ({file.eps:g} {file.space.unit})"
-
-
-def _by_question(file: LabelFile) -> dict[bytes, np.ndarray]:
-    return dict(_questions(file))
 
 
 def _questions(file: LabelFile) -> Iterator[tuple[bytes, np.ndarray]]:
@@ -120,7 +115,7 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     """Concatenate the labels of several files; return the merged file and the number of duplicates left out.
 
     A label is a duplicate if an earlier file has a label of equal observation, action and answer, and of equal person
-    and time where both files record them.
+    and time where all files record them.
 
     Raises UserError if the files differ in task, world, form or strength, or if one file holds several seeds' labels.
     """
@@ -139,39 +134,20 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
                 )
     if len({(file.labels.obs.shape[1], file.labels.action.shape[1]) for file in files}) > 1:
         raise UserError("the files' observations differ in size: merge files of one world")
-    new = _new(files)
-    files = [_rows(file, kept) for file, kept in zip(files, new, strict=True)]
-    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(file.labels for file in files))
-    told = [file.people for file in files if file.people is not None]
-    people = None
-    if len(told) == len(files):
-        parts = [np.concatenate(columns) for columns in zip(*told, strict=True)]
-        people = label_files.People(np.arange(len(parts[0])), *parts[1:])
-    seeds = np.zeros(len(labels.valid), np.int64)
-    left_out = sum(int((~kept).sum()) for kept in new)
-    return LabelFile(first.task, first.answers, first.space, first.eps, seeds, labels, people), left_out
-
-
-def _new(files: list[LabelFile]) -> list[np.ndarray]:
-    """Return for each file a mask (labels,) of the labels that no earlier file has."""
-    there: dict[bytes, set[Any]] = {}
-    found = []
+    by_people = all(file.people is not None for file in files)
+    there: set[Any] = set()
+    kept: Any = []
     for file in files:
-        keys = [question + answer.tobytes() for question, answer in _questions(file)]
-        people = file.people
-        by = [None] * len(keys) if people is None else list(zip(people.who.tolist(), people.when.tolist(), strict=True))
-        kept = []
-        for key, who in zip(keys, by, strict=True):
-            before = there.get(key, set())
-            kept.append(not (before and (who is None or who in before or None in before)))
-        for key, who in zip(keys, by, strict=True):
-            there.setdefault(key, set()).add(who)
-        found.append(np.array(kept, bool))
-    return found
-
-
-def _rows(file: LabelFile, kept: np.ndarray) -> LabelFile:
-    """Select a file's labels by a mask (labels,)."""
-    people = None if file.people is None else label_files.People(*(column[kept] for column in file.people))
-    labels = jax.tree.map(lambda leaf: np.asarray(leaf)[kept], file.labels)
-    return file._replace(seeds=file.seeds[kept], labels=labels, people=people)
+        keys = [(question, answer.tobytes()) for question, answer in _questions(file)]
+        if by_people and file.people is not None:
+            keys = list(zip(keys, file.people.who.tolist(), file.people.when.tolist(), strict=True))
+        kept += [key not in there for key in keys]
+        there.update(keys)
+    kept = np.array(kept, bool)
+    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves)[kept], *(file.labels for file in files))
+    people = None
+    if by_people:
+        columns = [np.concatenate(each)[kept] for each in zip(*(file.people or () for file in files), strict=True)]
+        people = label_files.People(np.arange(len(labels.valid)), *columns[1:])
+    seeds = np.zeros(len(labels.valid), np.int64)
+    return LabelFile(first.task, first.answers, first.space, first.eps, seeds, labels, people), int((~kept).sum())

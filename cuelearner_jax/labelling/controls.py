@@ -17,11 +17,11 @@ WALKED = ("more to the left", "more to the right")
 BESIDE = {"ArrowLeft": "aA", "ArrowRight": "dD"}  # the same answers' keys for the other hand
 SHOWN = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # how the page writes these keys
 SHOWN |= {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
-PRACTICE = (  # the hint of each practice question, in order
-    "Compare the action with what is wanted, then answer by key, button or click.",
-    "Where you cannot tell, press {unsure}: it costs nothing.{film}",
-    "An answer can be taken back with {undo}. After this one it counts.",
-)
+
+
+def shown(key: str) -> str:
+    """Return a key as the page writes it."""
+    return SHOWN.get(key, key.upper() if len(key) == 1 else key)
 
 
 class Control(NamedTuple):
@@ -42,7 +42,7 @@ class Control(NamedTuple):
     @property
     def shown(self) -> str:
         """The first key, as the page writes it."""
-        return _shown(self.keys[0]) if self.keys else ""
+        return shown(self.keys[0]) if self.keys else ""
 
 
 UNSURE = Control("unsure", "don't know", ("ArrowDown", "s", "S"))
@@ -54,10 +54,6 @@ AS_IT_IS = Control("0", "already right", ("ArrowUp", "w", "W", " "), (0.0,), "as
 REST_UNSAID = Control("send", "send, nothing is said of the others", ("Enter",), (UNSAID,))
 REST_RIGHT = Control("rest", "send, the others are already right", (" ", "ArrowUp"), (0.0,))
 ALL_RIGHT = REST_RIGHT._replace(words="all already right", colour="asked")
-
-
-def _shown(key: str) -> str:
-    return SHOWN.get(key, key.upper() if len(key) == 1 else key)
 
 
 def _cases(key: str) -> tuple[str, ...]:
@@ -127,14 +123,8 @@ def controls(
 
     `films`: whether the task films a situation. `simulated`: whether it can film the outcome of any action.
     """
-    own, filmed = answers(form, space, one_cue), ()
-    if films:
-        filmed = (FILM, CORRECTED) if simulated else (FILM,)
-    if films and simulated and form.by_eps and len(space.cues) == 1:
-        filmed += tuple(
-            Control(f"film-{control.colour}", f"film of {control.words}", _cases(key))
-            for control, key in ((own[0], "q"), (own[2], "e"))
-        )
+    own = answers(form, space, one_cue)
+    filmed = (*[FILM] * films, *[CORRECTED] * (films and simulated))
     taken = {key for control in own for key in control.keys}
     others = (
         control._replace(keys=tuple(key for key in control.keys if key not in taken))
@@ -154,7 +144,7 @@ def check(form: AnswerForm, space: Space) -> None:
         raise UserError(f"the space {space.name} has no cues to ask about: give --guidance scalar")
     keys = [key for control in answers(form, space) for key in control.keys]
     if twice := [key for key in keys if keys.count(key) > 1]:
-        raise UserError(f"the key {_shown(twice[0])!r} stands for two answers: give the space's cues different keys")
+        raise UserError(f"the key {shown(twice[0])!r} stands for two answers: give the space's cues different keys")
 
 
 def question(form: AnswerForm, space: Space) -> str:
@@ -171,15 +161,17 @@ def question(form: AnswerForm, space: Space) -> str:
 
 def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list[str]:
     """Return the lines of the page's help about these controls."""
-    told = list(known)
-    names = [f"{space.cues[one.cue].name}: " if one.cue is not None else "" for one in told]
-    lines = [f"{name}{one.words}: {keys_of(one)}" for name, one in zip(names, told, strict=True) if one.keys]
+    lines, picks = [], False
+    for one in known:
+        name = f"{space.cues[one.cue].name}: " if one.cue is not None else ""
+        lines += [f"{name}{one.words}: {', '.join(dict.fromkeys(map(shown, one.keys)))}"] if one.keys else []
+        picks = picks or one.picks
     if form.by_eps and space == DIRECTIONS:
         lines.append(
             "Left and right are meant for somebody who walks along the arrow: left turns it counterclockwise. "
             "Two arrows in the picture show both turns, each in the colour of its button and with its key."
         )
-    if form.by_eps and len(space.cues) > 1 and any(one.picks for one in told):
+    if picks:
         lines.append(
             "Say which way each cue should change, then send. An answer that says nothing of any "
             "cue counts as: don't know."
@@ -192,18 +184,6 @@ def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list
         "knowing costs nothing.",
         "A key pressed while no question is ready is ignored, and the page says so.",
     ]
-
-
-def hint(number: int, known: Mapping[str, Control]) -> str:
-    """Return the hint of a practice question, counted from 0."""
-    film = f" {known['film'].shown} shows a film." if "film" in known else ""
-    told = {name: known[name].shown or known[name].words for name in ("unsure", "undo")}
-    return PRACTICE[min(number, len(PRACTICE) - 1)].format(film=film, **told)
-
-
-def keys_of(control: Control) -> str:
-    """Return all keys of a control, as the page writes them."""
-    return ", ".join(dict.fromkeys(map(_shown, control.keys)))
 
 
 def answer_of(

@@ -11,6 +11,8 @@ import secrets
 from typing import Any
 
 from fastapi.requests import HTTPConnection
+from fastapi.responses import PlainTextResponse
+from starlette.websockets import WebSocketClose
 
 HEADERS = (
     (b"referrer-policy", b"no-referrer"),  # the address contains the token
@@ -36,12 +38,9 @@ class Gate:
         if refusal is None:
             await self.app(scope, receive, self._marked(send, entering) if scope["type"] == "http" else send)
         elif scope["type"] == "websocket":
-            await receive()
-            await send({"type": "websocket.close", "code": 1008, "reason": refusal})
+            await WebSocketClose(1008, refusal)(scope, receive, send)
         else:
-            start = {"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]}
-            await send(start)
-            await send({"type": "http.response.body", "body": f"{refusal}\n".encode()})
+            await PlainTextResponse(f"{refusal}\n", 403)(scope, receive, send)
 
     def refusal(self, scope: Any) -> tuple[str | None, bool]:
         """Return why a connection is refused (None: admitted), and whether its address carried the token."""

@@ -14,7 +14,8 @@ from nicegui.events import GenericEventArguments
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls, view
 from cuelearner_jax.labelling.controls import Control
-from cuelearner_jax.labelling.session import Item, Session, Status
+from cuelearner_jax.labelling.questions import Item
+from cuelearner_jax.labelling.session import Session, Status
 from cuelearner_jax.spaces import UNSAID
 
 HERE = Path(__file__).parent
@@ -36,15 +37,14 @@ class Page:
             again: the command that opens the session once more.
         """
         self.session, self._pages, self._finish = session, pages, finish
-        self.form, self.space = session.plan.form, session.space
+        self.form, self.space = session.plan.form, session.questions.space
         self._by_evidence = session.plan.guidance.kind.by_evidence
         self._one_cue = session.plan.one_cue
-        films = session.films, session.simulates
+        films = session.films, session.questions.pictures.simulates
         self.controls = controls.controls(self.form, self.space, self._one_cue, *films)
         self._said: dict[int, float] = {}  # parts of the answer chosen so far, by the cue's index
         self._said_of = session.number
         self._drawn: Item | None = None  # the item on the screen
-        self._loop = asyncio.get_running_loop()
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
         keys = {key: name for name, control in self.controls.items() for key in control.keys}
@@ -54,7 +54,6 @@ class Page:
         rows = len(self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0  # of cues to choose from
         with ui.element("main").classes("label-page many" if rows else "label-page").style(f"--rows: {rows}"):
             with ui.column().classes("asking w-full gap-2"):
-                self._practice()
                 ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")
                 self._asked = ui.label(controls.question(self.form, self.space)).classes("big")
                 self._note = ui.label().classes("note")
@@ -63,10 +62,15 @@ class Page:
                 self._answers()
             with ui.element("aside").classes("side"):
                 self._side()
-        self._help, self._early = self._overlay(), self._ask_early()
+        with ui.dialog() as self._help, ui.card().classes("gap-1"):
+            ui.label("Help").classes("big")
+            for line in controls.help_lines(self.form, self.space, self.controls.values()):
+                ui.label(line)
+            ui.button("close", on_click=self._help.close)
         ui.on("cue", self._heard)
         pages.add(self)
-        stop = session.listen(self._model_changed)
+        loop = asyncio.get_running_loop()
+        stop = session.listen(lambda: loop.call_soon_threadsafe(self.refresh))
         self._client.on_delete(lambda: (pages.discard(self), stop()))
         self.refresh()
 
@@ -83,11 +87,6 @@ class Page:
             js_handler=f"event => cue.send({json.dumps(control.name)}, {{clicks: event.detail}})",
         )
         return button
-
-    def _practice(self) -> None:
-        with ui.element("div").classes("practice") as self._practising:
-            self._practice_words = ui.label()
-            ui.button("skip practice", on_click=self._skip, color=None).props("flat dense").mark("skip")
 
     def _answers(self) -> None:
         own = controls.answers(self.form, self.space, self._one_cue)
@@ -123,48 +122,29 @@ class Page:
             refined = "the corrected policy" if self._by_evidence else "the model's correction"
             for name, about in {**swatches, "refined": refined}.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
-            ui.label(self.session.legend).classes("text-caption")
+            ui.label(self.session.questions.pictures.legend).classes("text-caption")
         self._tools: dict[str, ui.button] = {}
         with ui.element("div").classes("tools"):
             for name in ("undo", "film", "film-refined", "help"):
                 if name in self.controls:
                     self._tools[name] = self._button(self.controls[name], props="flat dense")
-            dark = ui.dark_mode(None)
-            ui.button("light or dark", on_click=lambda: dark.set_value(not dark.value), color=None).props("flat dense")
         self._saved = ui.label().classes("text-caption")
         self._trouble = ui.label().classes("trouble")
         if self._finish is not None:
-            ui.button("finish", on_click=self._ask_finish, color="grey-7").mark("finish")
-
-    def _overlay(self) -> ui.dialog:
-        with ui.dialog() as dialog, ui.card().classes("gap-1"):
-            ui.label("Help").classes("big")
-            for line in controls.help_lines(self.form, self.space, self.controls.values()):
-                ui.label(line)
-            ui.button("close", on_click=dialog.close)
-        return dialog
-
-    def _ask_early(self) -> ui.dialog:
-        with ui.dialog() as dialog, ui.card():
-            ui.label("Finish early?").classes("big")
-            self._early_words = ui.label()
-            with ui.row():
-                ui.button("go on labelling", on_click=dialog.close).mark("go-on")
-                ui.button("finish now", on_click=self._end, color="grey-7").mark("finish-now")
-        return dialog
+            ui.button("finish", on_click=self._end, color="grey-7").mark("finish")
 
     # --- events ------------------------------------------------------------------------------------------------
 
     async def _heard(self, event: GenericEventArguments, name: str | None = None) -> None:
         """Handle a control's event; without an item from the browser, it is about the current question."""
         told = event.args if isinstance(event.args, dict) and "name" in event.args else {"name": name}
-        if told["name"] == "help":
-            self._help.open() if not self._help.value else self._help.close()
-            return
         item = told.get("item")
         await self._act(str(told["name"]), self.session.number if item is None else int(item), told)
 
     async def _act(self, name: str, number: int, told: dict[str, Any]) -> None:
+        if name == "help":
+            self._help.value = not self._help.value
+            return
         if name.startswith("film"):
             await self._show_film(name, number)
             return
@@ -172,14 +152,13 @@ class Page:
         if pressed is None and not (name == "point" and self.form.is_action and angle is not None):
             return
         taken, why = False, LATE
-        if self._help.value or self._early.value:  # the browser may not know yet that the window opened
+        if self._help.value:  # the browser may not know yet that the window opened
             why = "a window lies over the question: close it first"
-        elif pressed is not None and pressed.cue is not None and pressed.answer is not None and pressed.picks:
-            if taken := number == self.session.number:
-                self._said_about(number)[pressed.cue] = pressed.answer[0]  # stored until the answer is sent
-                self._mark()
-                return
-        else:
+        elif pressed is not None and pressed.picks and pressed.answer and number == self.session.number:
+            self._said_about(number)[pressed.cue or 0] = pressed.answer[0]  # stored until the answer is sent
+            self._mark()
+            return
+        elif pressed is None or not pressed.picks:
             try:
                 if name == "undo":
                     taken = await run.io_bound(self.session.undo, number)
@@ -191,31 +170,17 @@ class Page:
                 why = str(error)
         if not taken:
             why = "there is nothing to take back" if name == "undo" and number == self.session.number else why
-            with self._client:
-                ui.run_javascript(f"cue.refused({json.dumps(why)})")
+            self._script(f"cue.refused({json.dumps(why)})")
         for page in list(self._pages):
             page.refresh()
 
-    async def _skip(self) -> None:
-        await run.io_bound(self.session.skip_practice)
-        for page in list(self._pages):
-            page.refresh()
-
-    async def _ask_finish(self) -> None:
-        """Finish if all labels are given; otherwise ask first."""
-        status = self.session.status()
-        if self.session.done:
-            await self._end()
-            return
-        self._early_words.text = (
-            f"{status.answered} of {status.labels} labels are given and saved. They can be used now, and the "
-            "same command continues later."
-        )
-        self._early.open()
+    def _script(self, code: str) -> None:
+        """Run a script in the browser."""
+        with self._client:
+            ui.run_javascript(code)
 
     async def _end(self) -> None:
         assert self._finish is not None
-        self._early.close()
         try:
             await self._finish()
         except UserError as error:
@@ -223,32 +188,25 @@ class Page:
                 ui.notify(str(error), type="negative", timeout=0, close_button="close")
 
     async def _show_film(self, name: str, number: int) -> None:
-        item = self.session.item
+        item, of = self.session.item, name.removeprefix("film-")
         if item is None or item.number != number:
             return
-        of = name.removeprefix("film-")
-        shown = item.refined if of == "refined" else self.session.outcomes(item).get(of, item.action)
+        made = self.session.questions
+        shown = item.refined if of == "refined" else made.outcomes(item).get(of, item.action)
         if shown is None:  # there is no correction yet
             return
-        reel = await run.io_bound(self.session.film, number, shown)
+        reel = await run.io_bound(made.film, item, shown)
         if reel is not None:
-            with self._client:
-                ui.run_javascript(f"cue.play({view.film(item, reel)})")
+            self._script(f"cue.play({view.film(item, reel)})")
 
     def goto(self, address: str) -> None:
         """Make the browser open another page of this server."""
-        with self._client:
-            ui.run_javascript(f"location.replace({json.dumps(address)})")
-
-    def _model_changed(self) -> None:
-        """Refresh the page; may be called from any thread."""
-        self._loop.call_soon_threadsafe(self.refresh)
+        self._script(f"location.replace({json.dumps(address)})")
 
     def refresh(self) -> None:
         """Show the session's current state."""
-        status, item = self.session.status(), self.session.item
-        plan = self.session.plan
-        how = self.form, plan.config.scalars.eps_deg, self.space
+        item = self.session.item
+        how = self.form, self.session.plan.config.scalars.eps_deg, self.space
         if item is not self._drawn:  # chosen parts of an answer do not change the picture
             self._drawn = item
             self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
@@ -257,19 +215,14 @@ class Page:
         self._mark()
         if "film-refined" in self._tools:
             self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
-        self._practising.set_visibility(item is not None and item.number < 0)
         if item is None:
             self._asked.text = "All labels are given. Thank you. Press finish, or undo to change the last one."
         else:
             self._asked.text = controls.question(self.form, self.space)
             self._words.text = item.sketch.words if item.sketch else ""
-        if item is not None and item.number < 0:
-            number, count = self.session.practice + item.number, self.session.practice
-            hint = controls.hint(number, self.controls)
-            self._practice_words.text = f"Practice {number + 1} of {count}, nothing is saved. {hint}"
         for button in self._pressable:
             button.set_enabled(item is not None)
-        self._tell(status)
+        self._tell(self.session.status())
 
     def _said_about(self, number: int) -> dict[int, float]:
         """Return the parts chosen for a question; empty for a new question."""
@@ -283,15 +236,15 @@ class Page:
         for control, button in self._picks.items():
             button.classes(**{"add" if control.name in picked else "remove": "picked"})
         if self._picks:
-            with self._client:
-                ui.run_javascript(f"cue.mark({json.dumps(sorted(picked))})")
+            self._script(f"cue.mark({json.dumps(sorted(picked))})")
 
     def _tell(self, status: Status) -> None:
         unsure = f", {status.unsure} not known" if status.unsure else ""
         self._count.text = f"{status.answered} of {status.labels}{unsure}"
         self._bar.value = status.answered / status.labels
         self._pace.text = f"{status.per_minute:.0f} labels a minute" if status.per_minute else "no labels yet"
-        self._left.text = _left(status.minutes_left)
+        left = status.minutes_left
+        self._left.text = "" if left is None else "nearly done" if left < 1 else f"{left:.0f} minutes left"
         newest = status.newest
         what, doing = ("estimate", "reading") if self._by_evidence else ("model", "fitting")
         fitted = f"{what} {newest.number}, of {newest.labels} labels" if newest.number else f"no {what} yet"
@@ -300,15 +253,7 @@ class Page:
             self._model.text = f"{fitted}; {newest.problem}"
         apart = f"agreement with held-out labels: {newest.quality}" if newest.quality else ""
         self._quality.text = "\n".join(newest.told) or apart
-        place = "/".join(self.session.place.parts[-2:])
+        place = "/".join(self.session.record.path.parts[-2:])
         self._saved.text = f"{place}: {status.answered + status.unsure} answers saved"
         self._trouble.text = status.trouble
         self._trouble.set_visibility(bool(status.trouble))
-
-
-def _left(minutes: float | None) -> str:
-    if minutes is None:
-        return ""
-    if minutes < 1.5:
-        return "about a minute left" if minutes > 0.5 else "nearly done"
-    return f"{minutes:.0f} minutes left"

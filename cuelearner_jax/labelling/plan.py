@@ -30,15 +30,13 @@ class Base:
     @property
     def digest(self) -> str:
         """Short hash of the policy's parameters; empty for a policy without JAX arrays."""
-        found = hashlib.sha256()
-        count = 0
-        for path, leaf in jax.tree_util.tree_leaves_with_path(self.policy):
-            if any(getattr(part, "name", "") in APART for part in path):
-                continue
-            array = np.asarray(leaf)
-            found.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
-            count += 1
-        return found.hexdigest()[:12] if count else ""
+        leaves = [
+            np.asarray(leaf)
+            for path, leaf in jax.tree_util.tree_leaves_with_path(self.policy)
+            if not any(getattr(part, "name", "") in APART for part in path)
+        ]
+        contents = b"".join(f"{leaf.dtype}{leaf.shape}".encode() + leaf.tobytes() for leaf in leaves)
+        return hashlib.sha256(contents).hexdigest()[:12] if leaves else ""
 
 
 @dataclass(frozen=True)

@@ -31,15 +31,10 @@ LARGER = 1.5  # factor on strokes and keys of cues' arrows, compared with those 
 
 def by_words(cue: Cue) -> Direction | None:
     """Return the screen direction for "more" of a cue by its words; None: the words give none, or contradict."""
-    found = [_direction(words) for words in cue.words]
-    more, less = found[0], None if found[1] is None else (-found[1][0], -found[1][1])
-    if more is not None and less is not None and more != less:
-        return None
-    return more or less
-
-
-def _direction(words: str) -> Direction | None:
-    said = {WORDS[word] for word in words.lower().replace("-", " ").split() if word in WORDS}
+    said: set[Direction] = set()
+    for words, sign in zip(cue.words, (1.0, -1.0), strict=True):
+        ways = (WORDS.get(word) for word in words.lower().replace("-", " ").split())
+        said |= {(sign * way[0], sign * way[1]) for way in ways if way}
     return said.pop() if len(said) == 1 else None
 
 
@@ -114,14 +109,9 @@ def change_words(space: Space, change: np.ndarray) -> str:
 
     `change` is in the space's unit.
     """
-    of_range = space.unit == SHARE
-    told = [
-        f"{cue.words[0 if part > 0 else 1]} by {_amount(abs(part), space.unit)}"
-        for cue, part in zip(space.cues, np.asarray(change, float), strict=True)
-        if abs(part) >= 0.005 * space.reach
-    ]
-    return f"{', '.join(told)}{' of the range' if of_range else ''}" if told else "as it is"
-
-
-def _amount(value: float, unit: str) -> str:
-    return f"{100 * value:.0f}%" if unit == SHARE else f"{value:.2g} {unit}"
+    told, shares = [], space.unit == SHARE
+    for cue, part in zip(space.cues, np.asarray(change, float), strict=True):
+        if abs(part) >= 0.005 * space.reach:
+            amount = f"{100 * abs(part):.0f}%" if shares else f"{abs(part):.2g} {space.unit}"
+            told.append(f"{cue.words[0 if part > 0 else 1]} by {amount}")
+    return f"{', '.join(told)}{' of the range' * shares}" if told else "as it is"

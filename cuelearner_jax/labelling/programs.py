@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -70,58 +70,42 @@ def lived(
     yield state, obs
 
 
-class Programs(NamedTuple):
-    """The compiled functions for one kind of guidance; each is always called with the same array shapes."""
-
-    question: Callable[..., Array]  # (env, scalars, base, guide, keys, bound) -> the action to ask about (action,)
-    fit: Callable[..., GuideState]  # (env, scalars, guide, lane_key, times) -> guide with a model of its labels
-    refined: Callable[..., Array]  # (env, scalars, model, obs, action) -> the action refined by the model (action,)
-    # (env, scalars, model, labels) -> the answers that the model predicts (labels, width)
-    answers: Callable[..., Array]
+fit = jax.jit(asking.fit, static_argnums=0)  # (guidance, env, scalars, guide, lane_key, times) -> guide with a model
 
 
-@cache
-def programs(guidance: Guide) -> Programs:
-    """Return the jitted functions of a kind of guidance; cached, so that each compiles once per kind."""
-
-    def refined(env: Any, scalars: Any, model: Any, obs: Array, action: Array) -> Array:
-        return guidance.act(model, env, obs[None], action[None], jnp.ones(1, bool), scalars).actions[0]
-
-    def answers(env: Any, scalars: Scalars, model: Any, labels: Label) -> Array:
-        assert guidance.form is not None
-
-        def one(obs: Array, action: Array) -> Array:
-            best = refined(env, scalars, model, obs, action)
-            return as_teacher(guidance.form, env, scalars, _Holds(best), None, obs, action)  # pyright: ignore[reportArgumentType]
-
-        return jax.vmap(one)(jnp.asarray(labels.obs), jnp.asarray(labels.action))
-
-    def question(env: Any, scalars: Any, base: Any, guide: Any, keys: Any, bound: Any) -> Array:
-        return asking.question(asking.Inquiry(guidance, env, scalars, base, bound), guide, keys)[0]
-
-    return Programs(
-        question=jax.jit(question),
-        fit=jax.jit(partial(asking.fit, guidance)),
-        refined=jax.jit(refined),
-        answers=jax.jit(answers),
-    )
+@partial(jax.jit, static_argnums=0)
+def question(guidance: Guide, env: Any, scalars: Scalars, base: Any, guide: GuideState, keys: Any, bound: Any) -> Array:
+    """Return the action to ask about (action,)."""
+    return asking.question(asking.Inquiry(guidance, env, scalars, base, bound), guide, keys)[0]
 
 
-class _Holds:
+@partial(jax.jit, static_argnums=0)
+def refined(guidance: Guide, env: Any, scalars: Scalars, model: Any, obs: Array, action: Array) -> Array:
+    """Return an action refined by the model (action,)."""
+    return guidance.act(model, env, obs[None], action[None], jnp.ones(1, bool), scalars).actions[0]
+
+
+@partial(jax.jit, static_argnums=0)
+def answers(guidance: Guide, env: Any, scalars: Scalars, model: Any, labels: Label) -> Array:
+    """Return the answers that the model predicts (labels, width)."""
+    form = guidance.form
+    assert form is not None
+
+    def one(obs: Array, action: Array) -> Array:
+        best = _Holds(refined(guidance, env, scalars, model, obs, action))
+        return as_teacher(form, env, scalars, best, None, obs, action)  # pyright: ignore[reportArgumentType]
+
+    return jax.vmap(one)(jnp.asarray(labels.obs), jnp.asarray(labels.action))
+
+
+class _Holds(NamedTuple):
     """A teacher with one fixed best action."""
 
-    def __init__(self, action: Array) -> None:
-        self.action = action
+    action: Array
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the fixed action (action,)."""
         return self.action
-
-
-def faultless(scalars: Scalars) -> Scalars:
-    """Return `scalars` without a simulated teacher's mistakes, silence, indifference and bias."""
-    none = {"mistake_probability": 0.0, "silence_probability": 0.0, "indifference_deg": 0.0, "teacher_bias_deg": 0.0}
-    return dataclasses.replace(scalars, answer="best", says="all", **none)
 
 
 def as_teacher(
@@ -133,8 +117,10 @@ def as_teacher(
     obs: Float[Array, " obs"],
     action: Float[Array, " action"],
 ) -> Float[Array, " answer"]:
-    """Return the answer of a teacher without mistakes."""
-    return form.answer(jax.random.key(0), env, teacher, state, obs, action, faultless(scalars))[0]
+    """Return the answer of a teacher without a simulated one's mistakes, silence, indifference and bias."""
+    none = {"mistake_probability": 0.0, "silence_probability": 0.0, "indifference_deg": 0.0, "teacher_bias_deg": 0.0}
+    scalars = dataclasses.replace(scalars, answer="best", says="all", **none)
+    return form.answer(jax.random.key(0), env, teacher, state, obs, action, scalars)[0]
 
 
 class Agreement(NamedTuple):
@@ -156,9 +142,10 @@ def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.nda
     """Compare answers (n, width) to the same questions; a cue counts where both sets say something."""
     space = actions_of(env)
     if form.is_action:
-        apart = np.asarray(space.to_unit(space.distance(jnp.asarray(one), jnp.asarray(other))))
-        return Agreement(float(apart.mean()) if len(one) else 0.0, len(one), space.unit)
-    alike = one == other
-    if form.by_eps and len(space.cues) > 1:
-        alike |= (one == UNSAID) | (other == UNSAID)
-    return Agreement(float(alike.all(-1).mean()) if len(one) else 0.0, len(one), "%")
+        values = np.asarray(space.to_unit(space.distance(jnp.asarray(one), jnp.asarray(other))))
+    else:
+        alike = one == other
+        if form.by_eps and len(space.cues) > 1:
+            alike |= (one == UNSAID) | (other == UNSAID)
+        values = alike.all(-1)
+    return Agreement(float(values.mean()) if len(one) else 0.0, len(one), space.unit if form.is_action else "%")

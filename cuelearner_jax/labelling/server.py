@@ -16,10 +16,10 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 from nicegui import run, ui
+from starlette.background import BackgroundTask
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling.gate import Gate
-from cuelearner_jax.labelling.opening import Opening, waiting_page
 from cuelearner_jax.labelling.page import Page
 from cuelearner_jax.labelling.session import Session
 
@@ -28,7 +28,7 @@ SHOWN_WITHIN = 10.0  # time for all browsers to load the last page before the se
 RECONNECT = 60.0  # time for which the page of a broken connection is kept [s]
 
 
-ADDRESS, SEEN = "/finished", "/finished/seen"  # the last page, and the address its script requests once it is shown
+ADDRESS = "/finished"  # of the last page
 
 
 class Commands(NamedTuple):
@@ -56,27 +56,16 @@ class Ending(NamedTuple):
 
 
 def last_page(told: Ending) -> str:
-    """Return the last page as HTML. It needs no server once shown, and its script reports that it is shown."""
+    """Return the last page as HTML, which needs no server once shown."""
     line, following, again = (html.escape(text) for text in (told.line, told.following, told.again))
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>finished</title><style>
-:root {{ color-scheme: light dark; }}
+    return f"""<!doctype html><html lang="en"><head><meta charset="utf-8"><title>finished</title>
+<meta name="viewport" content="width=device-width"><style>:root {{ color-scheme: light dark; }}
 body {{ font: 1.1rem/1.6 system-ui, sans-serif; max-width: 46rem; margin: 3rem auto; padding: 0 1rem; }}
-pre {{ background: #80808022; padding: 0.8rem; border-radius: 6px; white-space: pre-wrap; overflow-wrap: anywhere; }}
-button {{ font: inherit; padding: 0.2rem 0.8rem; }}
-</style></head><body>
-<h1>Finished. Thank you.</h1>
-<p class="saved">{line}</p>
-<h2>What to type next</h2>
-<pre id="next">{following}</pre>
-<p><button onclick="navigator.clipboard.writeText(document.getElementById('next').textContent);
-this.textContent = 'copied'">copy</button></p>
-<h2>To add labels later</h2>
-<pre>{again}</pre>
-<p>The command in the terminal has ended by itself. You may close this tab.</p>
-<script>fetch("{SEEN}", {{method: "POST", keepalive: true}});</script>
-</body></html>"""
+pre {{ background: #80808022; padding: 0.8rem; white-space: pre-wrap; overflow-wrap: anywhere; }}</style></head><body>
+<h1>Finished. Thank you.</h1><p class="saved">{line}</p>
+<h2>What to type next</h2><pre id="next">{following}</pre>
+<h2>To add labels later</h2><pre>{again}</pre>
+<p>The command in the terminal has ended by itself. You may close this tab.</p></body></html>"""
 
 
 def bind(port: int) -> socket.socket:
@@ -104,9 +93,9 @@ class _Server(uvicorn.Server):
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, then call `after_startup`."""
+        """Start, then call `after_startup` in a thread of its own: what it opens may need an event loop too."""
         await super().startup(sockets)
-        self.after_startup()
+        await asyncio.to_thread(self.after_startup)
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether the server should stop."""
@@ -114,24 +103,21 @@ class _Server(uvicorn.Server):
 
 
 class _Last:
-    """Ends the session: saves its labels, sends every browser to the last page, stops the server once shown."""
+    """Ends the session: saves its labels, sends every browser to the last page, stops the server once sent."""
 
-    def __init__(
-        self, session: Session | None, pages: set[Page], stopping: threading.Event, commands: Commands
-    ) -> None:
+    session: Session
+
+    def __init__(self, pages: set[Page], stopping: threading.Event, commands: Commands) -> None:
         self.told: Ending | None = None
-        self.session = session  # None: it is not there yet
         self._pages, self._stopping, self._commands = pages, stopping, commands
         self._waited_for = 0
 
     async def finish(self) -> None:
         """Finish the session. Raises UserError if its labels cannot be saved; the session then continues."""
-        session = self.session
-        assert session is not None  # the button is on the session's page
-        file = await run.io_bound(session.finish)
+        file = await run.io_bound(self.session.finish)
         if file is None or self.told is not None:  # the program ends, or another page was first
             return
-        status = session.status()
+        status = self.session.status()
         counts, following = (status.answered, status.unsure, status.labels), self._commands.following(status.answered)
         self.told = Ending(file.resolve(), *counts, following, self._commands.again)
         asyncio.get_running_loop().call_later(SHOWN_WITHIN, self._stopping.set)
@@ -139,71 +125,59 @@ class _Last:
         for page in list(self._pages):
             page.goto(ADDRESS)
 
-    def routes(self, app: FastAPI) -> None:
-        """Add the last page, and the address by which its script reports that it is shown."""
+    def route(self, app: FastAPI) -> None:
+        """Add the last page."""
 
         @app.get(ADDRESS)
         def show() -> HTMLResponse:
             if self.told is None:
                 return HTMLResponse("nothing is finished yet", 404)
-            return HTMLResponse(last_page(self.told))
+            return HTMLResponse(last_page(self.told), background=BackgroundTask(self._sent))
 
-        @app.post(SEEN)
-        def seen() -> None:
-            if self.told is None:
-                return
-            self._waited_for -= 1
-            if self._waited_for <= 0:
-                self._stopping.set()
+    def _sent(self) -> None:
+        self._waited_for -= 1
+        if self._waited_for <= 0:
+            self._stopping.set()
 
 
 def serve(
-    opening: Opening,
+    make: Callable[[], Session],
     title: str,
     taken: socket.socket,
     stopping: threading.Event,
     tell: Callable[[str], None],
     commands: Commands,
 ) -> Ending | None:
-    """Serve the page on a socket of `bind` until the session ends; show the progress until the session is opened.
+    """Serve a session's page on a socket of `bind` until the session ends; close the session.
 
     Args:
-        opening: the session being prepared.
+        make: opens the session. It is called once the server has started: NiceGUI then lists every object that Python's
+            garbage collector knows, also tuples that a session's threads are just building, which CPython refuses to
+            finish (see the documentation of `gc.get_referrers`).
         title: of the page.
         taken: the socket to listen on.
         stopping: set it to stop the server.
         tell: called with the page's address, which contains a secret token.
         commands: what the last page shows for copying.
 
-    Returns how a person finished the session; None if `stopping` was set before. Raises what `opening` raised.
+    Returns how a person finished the session; None if `stopping` was set before. Raises what `make` raises.
     """
     token, port = secrets.token_urlsafe(18), taken.getsockname()[1]
     pages: set[Page] = set()
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-    last = _Last(opening.session, pages, stopping, commands)
-    last.routes(app)
+    last = _Last(pages, stopping, commands)
+    last.route(app)
+    with contextlib.ExitStack() as end:
 
-    def root() -> None:
-        if opening.session is None:
-            waiting_page(opening)
-            return
-        last.session = opening.session
-        Page(opening.session, pages, last.finish, commands.again)
+        def opened() -> None:
+            last.session = end.enter_context(make())
+            tell(f"http://{HOST}:{port}/?token={token}")
 
-    ui.run_with(
-        app,
-        root=root,
-        title=title,
-        dark=None,
-        reconnect_timeout=RECONNECT,
-        show_welcome_message=False,
-    )
-    # uvloop would take over the signal wake-up that the thread of `signals` waits for.
-    how = {"log_level": "warning", "ws": "wsproto", "loop": "asyncio", "timeout_graceful_shutdown": 1}
-    settings = uvicorn.Config(Gate(app, port, token), **how)
-    server = _Server(settings)
-    server.ends, server.after_startup = stopping, opening.proceed
-    tell(f"http://{HOST}:{port}/?token={token}")
-    server.run(sockets=[taken])
-    opening.check()
-    return last.told
+        look = {"title": title, "dark": None, "reconnect_timeout": RECONNECT, "show_welcome_message": False}
+        ui.run_with(app, root=lambda: Page(last.session, pages, last.finish, commands.again) and None, **look)
+        # uvloop would take over the signal wake-up that the thread of `signals` waits for.
+        how = {"log_level": "warning", "ws": "wsproto", "loop": "asyncio", "timeout_graceful_shutdown": 1}
+        server = _Server(uvicorn.Config(Gate(app, port, token), **how))
+        server.ends, server.after_startup = stopping, opened
+        server.run(sockets=[taken])
+        return last.told

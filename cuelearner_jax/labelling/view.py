@@ -13,7 +13,7 @@ from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.labelling import controls, pointing
 from cuelearner_jax.labelling.arrows import HAIR, arrow, ends, line
 from cuelearner_jax.labelling.controls import Control
-from cuelearner_jax.labelling.session import Item
+from cuelearner_jax.labelling.questions import Item
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Reel, Sketch
 
@@ -27,10 +27,16 @@ WIDEST = 60.0  # and a refined action no farther away than this, unless its true
 LEAST_TURN = 1.0  # smallest drawn turn for which the refined action is shown [deg]
 
 
+def drawn(item: Item) -> Sketch:
+    """Return the sketch of an item that the page shows."""
+    assert item.sketch is not None
+    return item.sketch
+
+
 def magnified(item: Item, eps_deg: float) -> int:
     """Return the factor by which turns of an item's action are magnified, so that a turn by eps is visible."""
-    assert item.sketch is not None
-    sketch, hair = item.sketch, item.sketch.box[2] * HAIR
+    sketch = drawn(item)
+    hair = sketch.box[2] * HAIR
     far = ends(sketch, angle_of(item.action), _farthest(item))[1]
     seen = min(math.degrees(math.asin(min(TIPS * hair / far, 1.0))), STEEPEST)
     return math.ceil(seen / eps_deg) if eps_deg < 0.75 * seen else 1
@@ -62,14 +68,14 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
     Directions are drawn as arrows. For other actions the picture shows their outcomes, where the task draws them, and
     the cues that have a direction on the screen. `one_cue`: see `controls.answers`.
     """
-    assert item.sketch is not None
-    sketch, planar = item.sketch, space == DIRECTIONS
+    sketch, planar = drawn(item), space == DIRECTIONS
     parts = [f'<g class="still">{sketch.still}</g>']
-    for name, drawn in reversed((item.trails or {}).items()):
-        parts += [f'<g class="trail halo">{drawn}</g>', f'<g class="trail {name}">{drawn}</g>']
+    for name, trail in reversed((item.trails or {}).items()):
+        parts += [f'<g class="trail halo">{trail}</g>', f'<g class="trail {name}">{trail}</g>']
     for name, body in sketch.movers.items():
-        place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
-        parts.append(f"<g {place}>{body}</g>")
+        x, y, turn = sketch.places[name]
+        moved = f"translate({x:.4f} {y:.4f}) rotate({turn:.2f})"
+        parts.append(f'<g class="mover" data-mover="{html.escape(name)}" transform="{moved}">{body}</g>')
     parts += _arrows(item, form, eps_deg) if planar else _cues(item, space, controls.answers(form, space, one_cue))
     data = {
         "item": item.number,
@@ -93,15 +99,14 @@ def angle_of(action: np.ndarray) -> float:
 
 def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
     """Return the arrows of the asked direction, of the answers' outcomes, of the model's action, and the pointer."""
-    assert item.sketch is not None
-    sketch, angle = item.sketch, angle_of(item.action)
+    sketch, angle = drawn(item), angle_of(item.action)
     parts, times = [], magnified(item, eps_deg) if form.by_eps else 1
     if form.by_eps:
-        drawn = times * eps_deg
-        longer = min(max(APART / drawn, TURNED_REACH[0]), _farthest(item))
+        turn = times * eps_deg
+        longer = min(max(APART / turn, TURNED_REACH[0]), _farthest(item))
         for one in controls.answers(form, DIRECTIONS):
             if one.answer and one.answer[0]:
-                parts.append(arrow(sketch, angle + one.answer[0] * drawn, one.colour, longer, one.shown))
+                parts.append(arrow(sketch, angle + one.answer[0] * turn, one.colour, longer, one.shown))
     parts.append("" if item.trails else line(sketch, angle))
     parts.append(arrow(sketch, angle, "asked"))
     if item.refined is not None:
@@ -116,21 +121,16 @@ def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
 
 def _cues(item: Item, space: Space, answers: Sequence[Control]) -> list[str]:
     """Return the arrows of the cues' answers and of the actions, for cues with a screen direction."""
-    assert item.sketch is not None
-    ways, middle = pointing.ways_of(space, item.sketch), space.middle()
-    parts = pointing.answers_drawn(item.sketch, ways, answers)
+    sketch, middle = drawn(item), space.middle()
+    ways = pointing.ways_of(space, sketch)
+    parts = pointing.answers_drawn(sketch, ways, answers)
     for name, action in (("asked", item.action), ("refined", item.refined)):
         if action is not None and middle is not None:
             shares = np.asarray(space.to_unit(space.log(middle, action))) / (space.reach / 2)
-            parts.append(pointing.from_foot(item.sketch, ways, shares, name))
+            parts.append(pointing.from_foot(sketch, ways, shares, name))
     return parts
 
 
 def film(item: Item, reel: Reel) -> str:
     """Return a film as JSON for the page's script."""
     return json.dumps({"item": item.number, **reel._asdict()})
-
-
-def _moved(sketch: Sketch, name: str) -> str:
-    x, y, turn = sketch.places[name]
-    return f"translate({x:.4f} {y:.4f}) rotate({turn:.2f})"

@@ -8,12 +8,10 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-import scipy.optimize
 from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from cuelearner_jax.guides import registry
 from cuelearner_jax.report.escaping import one_line
@@ -35,32 +33,31 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "text.parse_math": False,  # dollar signs in a name are not mathematics
 }
-DWARFED = 5.0  # the first evaluation is off the scale if it would make the span this many times larger
-APART = 0.09  # least distance of two labelled ticks, as a share of the axis over label budgets
 
 
 def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
-    """Draw learning curves: interquartile means with interval bands, each curve named at its right end."""
+    """Draw learning curves: interquartile means with interval bands, named in the order of their ends."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5), layout="constrained")
         axes = figure.add_subplot()
-        colours = colours_of(variants)
-        for variant, colour in zip(variants, colours, strict=True):
+        pairs = zip(variants, colours_of(variants), strict=True)
+        for variant, colour in sorted(pairs, key=lambda pair: -pair[0].curve.estimate[-1]):
             steps, estimate, lower, upper = variant.curve
-            marker = "o" if len(steps) == 1 else ""
             axes.fill_between(steps, lower, upper, color=colour, alpha=0.18 if len(variants) < 6 else 0.12, linewidth=0)
-            axes.plot(steps, estimate, color=colour, linewidth=1.8, marker=marker, solid_capstyle="round")
-        end = max(int(variant.curve.steps[-1]) for variant in variants)
-        axes.set_xlim(0, max(end, 1))
-        left_out = _scale(axes, variants)
-        _mark_failed(axes, variants, colours)
+            marker = "o" if len(steps) == 1 else ""
+            axes.plot(steps, estimate, color=colour, linewidth=1.8, marker=marker, label=variant.name)
+            at = np.minimum(variant.failed, steps[-1])
+            axes.plot(at, np.interp(at, steps, estimate), "x", color=colour, markersize=8, clip_on=False)
+        if any(len(variant.failed) for variant in variants):
+            axes.plot([], [], "x", color="#595959", label="a failed seed, left out")
+        axes.set_xlim(0, max(1, *(int(variant.curve.steps[-1]) for variant in variants)))
         axes.set_xlabel("environment steps of a seed")
         axes.set_ylabel(axis_name(metric))
         axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
         axes.set_title(one_line(title), fontweight="bold", fontsize=11, pad=20)
-        note = f"interquartile mean over seeds, band: its 95% bootstrap interval{left_out}"
+        note = "interquartile mean over seeds, band: its 95% bootstrap interval"
         axes.text(0, 1.025, note, transform=axes.transAxes, color="#595959", fontsize=9)
-        _name_ends(axes, variants, colours)
+        figure.legend(loc="outside right upper", fontsize=9 if len(variants) < 20 else 6)
     return figure
 
 
@@ -103,20 +100,10 @@ def draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[In
             axes.errorbar(labels, estimate, bars, color=colour, label=name, marker="o", capsize=3 + 2 * place)
     budgets = sorted({variant.labels for variant in variants if variant.labels})
     axes.set_xscale("log")
-    axes.set_xticks(budgets, names_of(budgets))
+    axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets], rotation=45)
     axes.minorticks_off()
     axes.set_xlabel("labels")
     axes.set_title(panel, fontsize=10)
-
-
-def names_of(budgets: Sequence[int]) -> list[str]:
-    """Return budgets as labels of a logarithmic axis; empty for a budget too near a larger one."""
-    names: list[str] = []
-    last, least = np.inf, APART * np.log(max(budgets) / min(budgets)) if budgets else 0.0
-    for budget in reversed(budgets):
-        names.append(f"{budget:,}" if last - np.log(budget) >= least else "")
-        last = np.log(budget) if names[-1] else last
-    return names[::-1]
 
 
 def save_figure(figure: Figure, stem: Path) -> None:
@@ -141,90 +128,6 @@ def colours_of(variants: Sequence[Variant]) -> list[tuple[float, float, float]]:
         red, green, blue = ((1 - pale) * channel + pale for channel in to_rgb(colour_of(variant.guidance)))
         colours.append((red, green, blue))
     return colours
-
-
-def _scale(axes: Axes, variants: Sequence[Variant]) -> str:
-    """Set the vertical scale; return words about points beyond it.
-
-    The first evaluation, before learning, is left out where it would compress all others to less than a fifth of the
-    height: agents that still collide all the time would hide the differences between those that seldom do.
-    """
-    first = [_extremes([row[:1] for row in variant.curve[1:]]) for variant in variants]
-    later = [_extremes([row[1:] for row in variant.curve[1:]]) for variant in variants if len(variant.curve.steps) > 2]
-    if not later:
-        return ""
-    low, high = min(pair[0] for pair in later), max(pair[1] for pair in later)
-    least, most = min(pair[0] for pair in first), max(pair[1] for pair in first)
-    span = high - low
-    if not 0 < DWARFED * span < max(high, most) - min(low, least):
-        return ""
-    axes.set_ylim(low - 0.05 * span, high + 0.05 * span)
-    steps = sorted({int(variant.curve.steps[0]) for variant in variants})
-    where = f"step {steps[0]:,}" if len(steps) == 1 else "the first evaluations"
-    return f"; {where} (from {least:.2g} to {most:.2g}) not on the scale"
-
-
-def _mark_failed(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
-    """Draw a cross for each failed lane, on its variant's curve or at the edge of the scale."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high)
-    for variant, colour in zip(variants, colours, strict=True):
-        if not len(variant.failed):
-            continue
-        at = np.minimum(variant.failed, variant.curve.steps[-1])
-        heights = np.clip(np.interp(at, variant.curve.steps, variant.curve.estimate), low, high)
-        axes.plot(at, heights, "x", color=colour, markersize=8, clip_on=False)
-    if any(len(variant.failed) for variant in variants):
-        cross = Line2D([], [], linestyle="", marker="x", color="#595959", label="a failed seed, left out")
-        axes.legend(handles=[cross], loc="best", fontsize=9)
-
-
-def _extremes(rows: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Return the least and largest finite values; a single seed has no interval."""
-    values = np.concatenate(rows)
-    return float(np.nanmin(values)), float(np.nanmax(values))
-
-
-def separate_heights(heights: np.ndarray, gap: float, low: float, high: float) -> np.ndarray:
-    """Return heights (n,) at least a gap apart, in the order of the given ones and as near to them as possible.
-
-    They are an isotonic regression of the heights less the gaps below them. All lie between `low` and `high`, which
-    must leave room for n - 1 gaps.
-    """
-    order, rank = np.argsort(heights, kind="stable"), gap * np.arange(len(heights))
-    moved = scipy.optimize.isotonic_regression(heights[order] - rank).x
-    found = np.empty(len(heights))
-    found[order] = np.clip(moved, low, high - rank[-1]) + rank
-    return found
-
-
-def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
-    """Write each curve's name to the right of the axes, ordered by the curves' ends and without overlap."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high)
-    right = axes.get_xlim()[1]
-    ends = np.array([variant.curve.estimate[-1] for variant in variants])
-    height = 0.055 * (high - low)  # height of a line of text with its spacing
-    gap = min((high - low) / len(variants), height)
-    for place, height_of_name in enumerate(separate_heights(ends, gap, low, high)):
-        variant, colour = variants[place], colours[place]
-        last = float(variant.curve.steps[-1])
-        # The leader is dotted, since it shows no data. It is level within the axes, so that the leaders keep the
-        # order of the names and never cross.
-        leader = {"color": colour, "linewidth": 1, "linestyle": ":", "clip_on": False}
-        if last < right:
-            axes.plot([last, right], [ends[place]] * 2, **leader)
-            axes.plot([last], [ends[place]], color=colour, marker="o", markersize=4)
-        axes.plot([1, 1.025], [ends[place], height_of_name], transform=axes.get_yaxis_transform(), **leader)
-        axes.text(
-            1.03,
-            height_of_name,
-            variant.name,
-            transform=axes.get_yaxis_transform(),
-            color=tuple(0.85 * channel for channel in colour),
-            fontsize=10 * gap / height,
-            va="center",
-        )
 
 
 def axis_name(metric: str) -> str:

@@ -69,23 +69,21 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
 
 
 def _counterpart(row: Measured, others: Sequence[Measured]) -> Measured:
-    if len(others) == 1:
-        return others[0]
-    alike = [other for other in others if variant(other) == variant(row)]
+    alike = others if len(others) == 1 else [other for other in others if variant(other) == variant(row)]
     if len(alike) == 1:
         return alike[0]
-    known = "; ".join(variant(other) for other in others)
-    wanted = variant(row) or "without labels"
+    known, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
     raise UserError(f"--compare has {len(others)} variants ({known}), but not {wanted}: give a policy of one variant")
 
 
 def _difference(row: Measured, other: Measured) -> Difference:
-    metrics = {}
-    for name in row.metrics.keys() & other.metrics.keys():
-        if np.isfinite(row.metrics[name]).all() and np.isfinite(other.metrics[name]).all():
-            metrics[name] = _less(row, other, name)
-    ordered = {name: metrics[name] for name in row.metrics if name in metrics}
-    return Difference(row, other, EPISODES if is_single(row) and is_single(other) else SEEDS, ordered)
+    finite = [
+        name
+        for name, values in row.metrics.items()
+        if name in other.metrics and np.isfinite(values).all() and np.isfinite(other.metrics[name]).all()
+    ]
+    over = EPISODES if is_single(row) and is_single(other) else SEEDS
+    return Difference(row, other, over, {name: _less(row, other, name) for name in finite})
 
 
 def _less(row: Measured, other: Measured, name: str) -> Interval:
@@ -99,13 +97,9 @@ def _less(row: Measured, other: Measured, name: str) -> Interval:
     return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(drawn, [0.025, 0.975]))
 
 
-def _finite(value: Any) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _plain(found: Interval | None) -> list[float | None] | None:
-    """Return (estimate, lower, upper) for JSON."""
-    return None if found is None else [_finite(value) for value in found]
+def _plain(found: Sequence[Any] | np.ndarray | None) -> list[float | None] | None:
+    """Return numbers for JSON, those that are not finite as None."""
+    return None if found is None else [float(value) if math.isfinite(value) else None for value in found]
 
 
 def _row(row: Measured) -> dict[str, Any]:
@@ -115,7 +109,7 @@ def _row(row: Measured) -> dict[str, Any]:
         **({} if row.bound_deg is None else {"bound_deg": float(f"{row.bound_deg:g}")}),
         "trained_steps": row.step,
         "seeds": row.seeds.tolist(),
-        **{metric: [_finite(value) for value in values.tolist()] for metric, values in row.metrics.items()},
+        **{metric: _plain(values) for metric, values in row.metrics.items()},
         "intervals": {"over": over(row), **{metric: _plain(spread(row, metric)) for metric in row.metrics}},
     }
 
@@ -148,18 +142,12 @@ def write(
     }
     if compared is not None:
         name, found = compared
-        contents["compared"] = {
-            "with": name,
-            "differences": [
-                {
-                    "of": variant(one.row),
-                    "less": _row(one.other),
-                    "over": one.over,
-                    "difference": {metric: _plain(value) for metric, value in one.metrics.items()},
-                }
-                for one in found
-            ],
-        }
+        told = [
+            {"of": variant(one.row), "less": _row(one.other), "over": one.over}
+            | {"difference": {metric: _plain(value) for metric, value in one.metrics.items()}}
+            for one in found
+        ]
+        contents["compared"] = {"with": name, "differences": told}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         file.write(json.dumps(contents, indent=1) + "\n")

@@ -58,48 +58,32 @@ def interquartile_mean(values: ArrayLike, axis: int = 0) -> Float[np.ndarray, "*
     return np.asarray(scipy.stats.trim_mean(np.asarray(values, dtype=float), 0.25, axis=axis))
 
 
-def interval(
-    *strata: Float[np.ndarray, "seeds *steps"], confidence: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
-) -> Interval:
-    """Return the interquartile mean over all seeds with its stratified percentile bootstrap interval.
+def interval(values: Float[np.ndarray, "seeds *steps"], resamples: int = RESAMPLES) -> Interval:
+    """Return the interquartile mean over seeds with its 95% percentile bootstrap interval.
 
-    Seeds are drawn with replacement, whole curves at a time, within each stratum (for instance each task) separately.
-    The interquartile mean is taken over the seeds of all strata together. One stratum gives the ordinary bootstrap.
+    Seeds are drawn with replacement, whole curves at a time; equal data gives equal intervals. The bounds are NaN for a
+    single seed. With few seeds the interval is too narrow: on normal data it covered the truth in 75% of 4,000 trials
+    with 3 seeds, in 90% with 5, and in 94% with 10 or more.
 
-    With few seeds the interval is too narrow. On normal data a nominal 95% interval covered the truth in 75% of 4,000
-    trials with 3 seeds, in 90% with 5, and in 94% with 10 or more.
-
-    Args:
-        strata: arrays of shape (seeds, *steps); only the number of seeds may differ.
-        confidence: nominal coverage of the interval.
-        resamples: number of bootstrap samples.
-        seed: seed of the resampling; equal data gives equal intervals.
-
-    Returns:
-        Arrays of shape (*steps); the bounds are NaN if a stratum has a single seed.
-
-    Raises:
-        ValueError: there are no seeds, or a value is NaN.
+    Raises ValueError if there are no seeds, or a value is NaN.
     """
-    data = tuple(np.moveaxis(np.asarray(stratum, dtype=float), 0, -1) for stratum in strata)
-    if not data or min(stratum.shape[-1] for stratum in data) == 0:
-        raise ValueError("an interval needs at least one seed in each stratum")
-    if any(np.isnan(stratum).any() for stratum in data):
+    data = np.moveaxis(np.asarray(values, dtype=float), 0, -1)
+    if not data.shape[-1]:
+        raise ValueError("an interval needs at least one seed")
+    if np.isnan(data).any():
         raise ValueError("values are NaN: leave out evaluations that are missing")
-    estimate = interquartile_mean(np.concatenate(data, axis=-1), axis=-1)
-    if min(stratum.shape[-1] for stratum in data) == 1:
+    estimate = interquartile_mean(data, axis=-1)
+    if data.shape[-1] == 1:
         return Interval(estimate, np.full_like(estimate, np.nan), np.full_like(estimate, np.nan))
-    size = max(1, sum(stratum.size for stratum in data))
     result = scipy.stats.bootstrap(
-        data,
-        lambda *samples, axis: interquartile_mean(np.concatenate(samples, axis=axis), axis=axis),
+        (data,),
+        interquartile_mean,
         n_resamples=resamples,
-        batch=min(resamples, max(1, _BATCH_ELEMENTS // size)),
+        batch=min(resamples, max(1, _BATCH_ELEMENTS // data.size)),
         vectorized=True,
         axis=-1,
-        confidence_level=confidence,
         method="percentile",
-        rng=np.random.default_rng(seed),
+        rng=np.random.default_rng(0),
     )
     bounds = result.confidence_interval
     return Interval(estimate, np.asarray(bounds.low), np.asarray(bounds.high))
@@ -120,20 +104,9 @@ def drawn(
     return outer[..., None], np.concatenate([own, inner])
 
 
-def interval_of_groups(values: Float[np.ndarray, "groups members"], seed: int = 0) -> Interval:
-    """Return the interquartile mean over the groups' means, with a 95% bootstrap interval over groups and members."""
-    if values.shape[1] == 1:
-        return interval(values[:, 0], seed=seed)
-    means = interquartile_mean(values[drawn(*values.shape, seed=seed)].mean(-1), axis=1)
-    lower, upper = np.quantile(means[1:], [0.025, 0.975]) if len(values) > 1 else (np.nan, np.nan)
-    return Interval(means[0], np.asarray(lower), np.asarray(upper))
-
-
-def curve(
-    steps: Int[np.ndarray, "steps"], *strata: Float[np.ndarray, "seeds steps"], confidence: float = 0.95, seed: int = 0
-) -> Curve:
+def curve(steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]) -> Curve:
     """Return the interval at each evaluation, see `interval`."""
-    return Curve(np.asarray(steps), *interval(*strata, confidence=confidence, seed=seed))
+    return Curve(np.asarray(steps), *interval(values))
 
 
 def stretches_apart(curve_a: Curve, curve_b: Curve) -> list[tuple[int, int]]:
@@ -151,22 +124,16 @@ def stretches_apart(curve_a: Curve, curve_b: Curve) -> list[tuple[int, int]]:
     return [(int(steps[start]), int(steps[end - 1])) for start, end in edges.reshape(-1, 2)]
 
 
-def area_under_curve(
-    steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]
-) -> Float[np.ndarray, "seeds"]:
-    """Return the area under each seed's curve by the trapezoidal rule [metric times environment steps]."""
-    return np.trapezoid(values, np.asarray(steps, dtype=float), axis=-1)
-
-
 def mean_over_curve(
     steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]
 ) -> Float[np.ndarray, "seeds"]:
-    """Return the mean of each seed's curve over its steps: the area over the span, correct for uneven steps too.
+    """Return the mean of each seed's curve over its steps: the area by the trapezoidal rule over the span.
 
     The mean of a curve with one evaluation is its value.
     """
     span = float(steps[-1] - steps[0])
-    return area_under_curve(steps, values) / span if span > 0 else np.asarray(values, dtype=float)[..., 0]
+    area = np.trapezoid(values, np.asarray(steps, dtype=float), axis=-1)
+    return area / span if span > 0 else np.asarray(values, dtype=float)[..., 0]
 
 
 def steps_to_reach(

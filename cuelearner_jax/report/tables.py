@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import csv
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from cuelearner_jax.report import escaping
 from cuelearner_jax.report.statistics import steps_to_reach, stretches_apart
-from cuelearner_jax.report.variants import Group, Variant
-from cuelearner_jax.storage import results
+from cuelearner_jax.report.variants import Variant
 
 Row = dict[str, str | int | float]  # of a table
 
@@ -28,23 +26,20 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
     rows = []
     for variant in variants:
         unguided = unguided_of(variant, variants)
-        goodness = sign * variant.curve.estimate
-        steps, best = variant.curve.steps, int(goodness.argmax())
+        steps, estimate, lower, upper = variant.curve
+        goodness = sign * estimate
+        best = int(goodness.argmax())
         row: Row = {**named(variant), "seeds": len(variant.seeds), "failed": len(variant.failed)}
-        row |= {"last_step": int(steps[-1])}
-        row |= {"final": variant.curve.estimate[-1], "final_lower": variant.curve.lower[-1]}
-        row |= {"final_upper": variant.curve.upper[-1], "mean": float(variant.mean.estimate)}
-        row |= {"mean_lower": float(variant.mean.lower), "mean_upper": float(variant.mean.upper)}
-        row |= {"best_step": int(steps[best]), "best": variant.curve.estimate[best]}
+        row |= {"last_step": steps[-1], "final": estimate[-1], "final_lower": lower[-1], "final_upper": upper[-1]}
+        row |= dict(zip(("mean", "mean_lower", "mean_upper"), map(float, variant.mean), strict=True))
+        row |= {"best_step": steps[best], "best": estimate[best]}
         row |= {"reaches_unguided_final": "", "above_unguided": "", "below_unguided": ""}
         if unguided is not None:
             reached = steps_to_reach(steps, goodness[None], sign * unguided.curve.estimate[-1])[0]
             row["reaches_unguided_final"] = int(reached) if np.isfinite(reached) else "never"
-            for column, apart in (
-                ("above_unguided", stretches_apart(variant.curve, unguided.curve)),
-                ("below_unguided", stretches_apart(unguided.curve, variant.curve)),
-            ):
-                row[column] = "; ".join(f"{start}-{end}" for start, end in apart) if variant is not unguided else ""
+            for column, pair in (("above", (variant, unguided)), ("below", (unguided, variant))):
+                apart = stretches_apart(*(each.curve for each in pair)) if variant is not unguided else []
+                row[f"{column}_unguided"] = "; ".join(f"{start}-{end}" for start, end in apart)
         rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
     return rows
 
@@ -59,20 +54,6 @@ def named(variant: Variant) -> Row:
     """Return the columns that identify a variant; `run` is among them where runs are reported separately."""
     row: Row = {"run": variant.run} if variant.run else {}
     return row | {"guidance": variant.guidance, "labels": variant.labels}
-
-
-def of_failed_alone(rows: Sequence[Row], groups: Sequence[Group]) -> list[Row]:
-    """Return summary rows for variants whose lanes have all failed, which have no other rows."""
-    blank = dict.fromkeys(rows[0], "")
-    more: list[Row] = []
-    for group in groups:
-        there = {(row["guidance"], row["labels"]) for row in rows if row.get("run", "") == group.name}
-        lanes = Counter(key[:2] for key in results.failures(group.failed) if key[:2] not in there)
-        run = {"run": group.name} if group.name else {}
-        more += [
-            {**blank, **run, "guidance": key[0], "labels": key[1], "seeds": 0, "failed": n} for key, n in lanes.items()
-        ]
-    return more
 
 
 def curve_rows(variants: Sequence[Variant]) -> list[Row]:
@@ -94,34 +75,26 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
-    """Return the lines of a Markdown table; cells are Markdown already, and short rows are padded."""
-    lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
-    for cells in rows:
-        lines.append(f"| {' | '.join(map(str, cells))} |" + " |" * (len(header) - len(cells)))
-    return lines
+    """Return the lines of a Markdown table; cells are Markdown already."""
+    return [
+        f"| {' | '.join(header)} |",
+        "|" + "---|" * len(header),
+        *(f"| {' | '.join(map(str, row))} |" for row in rows),
+    ]
 
 
 def summary_lines(rows: Sequence[Row]) -> list[str]:
-    """The summary as a table in Markdown."""
-    header, cells = summary_table(rows, escaping.markdown)
-    return markdown_table(header, cells)
-
-
-def summary_table(rows: Sequence[Row], escape: Callable[[object], str] = str) -> tuple[list[str], list[list[object]]]:
-    """The summary's header and cells; `escape`: what is made of names. A row of failed lanes alone is short."""
+    """Return the summary as a table in Markdown."""
     header = ["guidance", "labels", "seeds", "last step", "final", "mean over the curve", "best (at step)"]
     header += ["reaches the unguided final", "interval above the unguided", "interval below the unguided"]
-    by_run = "run" in rows[0]
-    return ["run"] * by_run + header, [_summary_cells(row, by_run, escape) for row in rows]
+    return markdown_table(["run"] * ("run" in rows[0]) + header, [_summary_cells(row) for row in rows])
 
 
-def _summary_cells(row: Row, by_run: bool, escape: Callable[[object], str]) -> list[object]:
+def _summary_cells(row: Row) -> list[object]:
     reached, failed = row["reaches_unguided_final"], int(row["failed"])
     seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
-    cells: list[object] = [escape(row["run"])] if by_run else []
-    cells += [escape(row["guidance"]), f"{row['labels']:,}", seeds]
-    if not row["seeds"]:
-        return cells
+    cells: list[object] = [escaping.markdown(row[name]) for name in ("run", "guidance") if name in row]
+    cells += [f"{row['labels']:,}", seeds]
     cells.append(f"{row['last_step']:,}")
     for key in ("final", "mean"):
         bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +12,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, one_line
 from cuelearner_jax.guides import registry
-from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval, curve, interval, mean_over_curve
 from cuelearner_jax.runs import failures
 from cuelearner_jax.storage import results
@@ -42,20 +41,13 @@ class Variant(NamedTuple):
         """The variant's name in a legend."""
         name = guidance_name(self.guidance)
         name = f"{name}, {self.labels:,} labels" if self.labels else name
-        return f"{shortened(self.run)}: {name}" if self.run else name
+        return (f"{self.run}: {name}" if self.run else name)[:LONGEST_NAME]
 
 
 def guidance_name(guidance: str) -> str:
     """Return the name of a kind of guidance in figures, known here or not."""
     kind = registry.find_or_none(guidance)
-    return shortened(kind.title if kind and kind.title else guidance)
-
-
-def shortened(name: str) -> str:
-    """Return a name for a figure: one line of bounded length."""
-    name = one_line(name)
-    name = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
-    return f" {name}" if name.startswith("_") else name  # Matplotlib omits names with a leading underscore from legends
+    return one_line(kind.title if kind and kind.title else guidance)
 
 
 class Group(NamedTuple):
@@ -73,32 +65,28 @@ class Group(NamedTuple):
         return pa.concat_tables([self.table, self.failed])
 
 
-def read_groups(folders: Sequence[PathLike], task: str | None, metric: str, split: str, by_run: bool) -> list[Group]:
+def read_groups(folders: Sequence[PathLike], metric: str, split: str, by_run: bool) -> list[Group]:
     """Read the results of folders, together or (`by_run`) each folder by itself under its name.
 
     Raises:
         UserError: results are missing, damaged, of several tasks, without the metric or the split, or have failed lanes
             only; or two folders that are to be reported separately have one name.
     """
-    if not by_run:
-        return [_group("", folders, task, metric, split)]
-    names = [Path(os.path.abspath(folder)).name for folder in folders]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise UserError(f"--by-run: several folders are called {twice[0]}: give them different names")
-    groups = [_group(name, [folder], task, metric, split) for name, folder in zip(names, folders, strict=True)]
+    named = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
+    if by_run and len(named) < len(folders):
+        raise UserError("--by-run: several folders have the same name: give them different names")
+    groups = []
+    for name, own in named.items():
+        guides, column = results.read_guides(own), f"guide_{metric}"
+        if guides is not None and column in guides.column_names:
+            guides = guides.filter((pc.field("split") == split) & pc.field(column).is_valid())
+        else:
+            guides = None
+        groups.append(Group(name, *_select(results.read(own), metric, split), guides))
     tasks = sorted({group.table["task"][0].as_py() for group in groups})
     if len(tasks) > 1:
         raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: choose one of them")
     return groups
-
-
-def _group(name: str, folders: Sequence[PathLike], task: str | None, metric: str, split: str) -> Group:
-    selected = _select(results.read(folders, task), metric, split)
-    guides = results.read_guides(folders, task)
-    column = f"guide_{metric}"
-    if guides is None or column not in guides.column_names:
-        return Group(name, *selected, None)
-    return Group(name, *selected, guides.filter((pc.field("split") == split) & pc.field(column).is_valid()))
 
 
 def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int]:
@@ -127,53 +115,41 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
     Raises:
         UserError: a seed occurs twice, or the seeds of a variant have no step in common.
     """
-    raw = {(group.name, *key): matrix for group in groups for key, matrix in _matrices(group, metric).items()}
-    failed: Mapping[str, Mapping[results.LaneKey, int]]
-    failed = {group.name: results.failures(group.failed) for group in groups}
-    shared = min(steps[-1] for _, steps, _, _ in raw.values())
+    found = []
+    for group in groups:
+        failed = results.failures(group.failed)
+        keys = group.table.group_by(["guidance", "labels"]).aggregate([]).to_pylist()
+        for kind, labels in sorted((tuple(key.values()) for key in keys), key=lambda key: (key[0] != "none", *key)):
+            of_variant = (pc.field("guidance") == kind) & (pc.field("labels") == labels)
+            rows = group.table.filter(of_variant)
+            seeds, steps, values = _matrix(rows, metric, kind, labels)
+            lost = np.array([step for lane, step in failed.items() if lane[:2] == (kind, labels)], int)
+            guide = _guides(rows, metric, None if group.guides is None else group.guides.filter(of_variant))
+            found.append((kind, labels, seeds, steps, values, lost, group.name, guide if len(guide) else None))
+    shared = min(steps[-1] for _, _, _, steps, *_ in found)
     variants = []
-    for (run, kind, budget), (seeds, steps, values, guide) in raw.items():
+    for kind, labels, seeds, steps, values, *others in found:
         until = max(1, int(np.searchsorted(steps, shared, side="right")))
         mean = interval(mean_over_curve(steps[:until], values[:, :until]))
-        lost = np.array([step for lane, step in failed[run].items() if lane[:2] == (kind, budget)], int)
-        known = guide if len(guide) else None
-        variants.append(Variant(kind, budget, seeds, values, curve(steps, values), mean, lost, run, known))
+        variants.append(Variant(kind, labels, seeds, values, curve(steps, values), mean, *others))
     return variants
 
 
-Matrix = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
-def _matrices(group: Group, metric: str) -> dict[tuple[str, int], Matrix]:
-    """Return by kind of guidance and label budget: seeds, steps, values (see `_matrix`) and the guides' metric."""
-    table = group.table
-    guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
-    keys = set(zip(guidance.tolist(), labels.tolist(), strict=True))
-    found = {}
-    for key in sorted(keys, key=lambda key: (key[0] != "none", key[0], key[1])):
-        rows = table.filter(pa.array((guidance == key[0]) & (labels == key[1])))
-        found[key] = (*_matrix(rows, metric, key), _guides(rows, metric, group.guides, key))
-    return found
-
-
-def _guides(rows: pa.Table, metric: str, guides: pa.Table | None, key: tuple[str, int]) -> np.ndarray:
+def _guides(rows: pa.Table, metric: str, guides: pa.Table | None) -> np.ndarray:
     """Return the metric of each seed's guide after its last label, (seeds,)."""
-    column = f"guide_{metric}"
+    column, seeds = f"guide_{metric}", set(rows["seed"].to_pylist())  # without failed lanes
     latest: dict[int, float] = {}
-    if column in rows.column_names:
-        measured = rows.filter(pc.field(column).is_valid()).sort_by("step")
-        latest = dict(zip(measured["seed"].to_pylist(), measured[column].to_pylist(), strict=True))
-    if guides is not None:
-        own = guides.filter((pc.field("guidance") == key[0]) & (pc.field("labels") == key[1])).sort_by("asked")
-        seeds = set(rows["seed"].to_pylist())  # without failed lanes
-        pairs = zip(own["seed"].to_pylist(), own[column].to_pylist(), strict=True)
+    for table, mark in ((rows, "step"), (guides, "asked")):
+        if table is None or column not in table.column_names:
+            continue
+        measured = table.filter(pc.field(column).is_valid()).sort_by(mark)
+        pairs = zip(measured["seed"].to_pylist(), measured[column].to_pylist(), strict=True)
         latest |= {seed: value for seed, value in pairs if seed in seeds}
     return np.array([latest[seed] for seed in sorted(latest)])
 
 
-def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return seeds (seeds,), steps (steps,) and values (seeds, steps) of a variant, at the steps that all seeds
-    have."""
+def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a variant's seeds (seeds,), the steps (steps,) that all seeds have, and values (seeds, steps)."""
     seeds, row = np.unique(table["seed"].to_numpy(), return_inverse=True)
     steps, column = np.unique(table["step"].to_numpy(), return_inverse=True)
     count = np.zeros((len(seeds), len(steps)), int)
@@ -182,7 +158,7 @@ def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndar
         twice = seeds[(count > 1).any(axis=1)][0]
         where = sorted(set(table.filter(pc.field("seed") == int(twice))["folder"].to_pylist()))
         raise UserError(
-            f"seed {twice} of {key[0]} guidance with {key[1]} labels occurs twice, in {' and '.join(where)}: "
+            f"seed {twice} of {kind} guidance with {labels} labels occurs twice, in {' and '.join(where)}: "
             "leave one of them out, or name each folder and add --by-run"
         )
     values = np.full(count.shape, np.nan)
@@ -190,7 +166,7 @@ def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndar
     whole = (count == 1).all(axis=0)
     if not whole.any():
         raise UserError(
-            f"the seeds of {key[0]} guidance with {key[1]} labels have no step in common: wait until all have one, or "
+            f"the seeds of {kind} guidance with {labels} labels have no step in common: wait until all have one, or "
             "leave out the run that was evaluated at other steps"
         )
     return seeds, steps[whole], values[:, whole]

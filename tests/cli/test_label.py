@@ -44,44 +44,34 @@ def status_of(address, **headers):
         return error.code, error.headers, error.read().decode()
 
 
-def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refused):
+def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refused, monkeypatch):
+    """A browser is told a file that others cannot read."""
     pytest.importorskip("nicegui")
-    with served(tmp_path / "labels") as (process, address):
+    browser, told, leads_there = tmp_path / "browser", tmp_path / "told", tmp_path / "labels/open.html"
+    browser.write_text(f'#!/bin/sh\necho "$@" > {told}.new\nmv {told}.new {told}\n')
+    browser.chmod(0o700)
+    monkeypatch.setenv("BROWSER", str(browser))
+    with served(tmp_path / "labels", "--open") as (process, address):
         place = address.partition("?")[0]
         assert place.startswith("http://127.0.0.1:")
         status, headers, text = status_of(address)
-        while "The questions are being prepared." in text:  # the page is open before they are
-            time.sleep(0.2)
-            status, headers, text = status_of(address)
         assert status == 200
         assert "Which way should the middle arrow turn?" in text
         assert status_of(place, Cookie=headers["set-cookie"].partition(";")[0])[0] == 200
-        for told in ({}, {"Cookie": "x=1"}, {"Host": "evil.example"}, {"Origin": "http://evil.example"}):
-            assert status_of(address if told.keys() & {"Host", "Origin"} else place, **told)[0] == 403
+        for given in ({}, {"Cookie": "x=1"}, {"Host": "evil.example"}, {"Origin": "http://evil.example"}):
+            assert status_of(address if given.keys() & {"Host", "Origin"} else place, **given)[0] == 403
+        while not told.exists():
+            time.sleep(0.05)
+        assert told.read_text().split() == [leads_there.as_uri()]
+        assert f"url={address}" in leads_there.read_text()
+        assert leads_there.stat().st_mode & 0o777 == 0o600
         again = ["label", OWN, "--out", tmp_path / "labels"]
         refused(again, "is being written by another process", tmp_path / "labels")
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
         assert "every answer is in" in process.stderr.read()
-    assert label_files.history(tmp_path / "labels" / label_files.JSONL) == []
-
-
-def test_a_browser_is_told_a_file_that_others_cannot_read(tmp_path, monkeypatch):
-    pytest.importorskip("nicegui")
-    browser = tmp_path / "browser"
-    browser.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/told.new\nmv {tmp_path}/told.new {tmp_path}/told\n')
-    browser.chmod(0o700)
-    monkeypatch.setenv("BROWSER", str(browser))
-    leads_there = tmp_path / "labels/open.html"
-    with served(tmp_path / "labels", "--open") as (process, address):
-        while not (tmp_path / "told").exists():
-            time.sleep(0.05)
-        assert (tmp_path / "told").read_text().split() == [leads_there.as_uri()]
-        assert f"url={address}" in leads_there.read_text()
-        assert leads_there.stat().st_mode & 0o777 == 0o600
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 130
     assert not leads_there.exists()
+    assert label_files.history(tmp_path / "labels" / label_files.JSONL) == []
 
 
 @pytest.mark.parametrize(
@@ -91,40 +81,15 @@ def test_a_browser_is_told_a_file_that_others_cannot_read(tmp_path, monkeypatch)
         (["--guidance", "heuristic"], "guidance 'heuristic' asks for no labels: give --guidance relative or"),
         (["--sizes.candidates", "3", "--sizes.ensemble", "2"], "--sizes.candidates is above 1"),
         (["--bound-deg", "0"], "--bound-deg is 0: give a number above 0 and up to 180"),
-        (["--port", "70000"], "--port is 70000: give a number"),
         (["--base.seed", "1"], "--base.… chooses a folder's lane, but no folder is given"),
-        (["--one-cue"], "--one-cue is for relative answers about several cues: leave it out"),
-        (["--cues", "left,right"], "has its own: leave it out"),
-        (["--robot", "anymal"], "has no robots to choose from"),
         (["--again", "nothing"], "no label file at nothing"),
         (["--questions", "near_aims"], "--questions is near_aims, but wandering has no aims in this world"),
-        (["--scalars.eps-deg", "-1"], "eps_deg"),
         (["--guidance", "reading"], "reading asks about a policy: name one after the task"),
     ],
 )
 def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(["label", OWN, "--out", "labels", *more], says, tmp_path)
-
-
-def test_a_preset_whose_labels_are_executed_is_refused(refused, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    says = "keeps labelled steps, but the page executes none: give another --preset"
-    refused(["label", "arm", "--preset", "corrected", "--out", "labels"], says, tmp_path)
-
-
-def test_a_task_that_nobody_draws_is_refused_before_anything_is_made(refused, tmp_path, monkeypatch):
-    pytest.importorskip("nicegui")
-    code, work = tmp_path / "code", tmp_path / "work"  # Python may write the module's bytecode beside it
-    code.mkdir()
-    work.mkdir()
-    monkeypatch.chdir(work)
-    monkeypatch.syspath_prepend(code)
-    bare = "import dataclasses, page_task\nTASK = dataclasses.replace(page_task.TASK, bodies=("
-    bare += "page_task.TASK.bodies[0].__class__('point', '', page_task._world),), name='undrawn')\n"
-    (code / "undrawn.py").write_text(bare)
-    says = "has no pictures of point: the page has nothing to show; give its Body `pictures`"
-    refused(["label", "undrawn:TASK", "--out", "labels"], says, work)
 
 
 def test_a_port_in_use_is_refused_before_anything_is_made(refused, tmp_path):
@@ -157,7 +122,7 @@ def test_what_is_labelled_by_default_trains_in_minutes(monkeypatch, tmp_path, ca
     asked, plan, commands = asked_for(monkeypatch, "billiards", "--out", str(place), "--who", "Ada B")
     preset = tasks.find("billiards").presets["quickstart"]
     assert (asked.task, asked.labels, plan.eps) == (preset.config.task, 100, preset.config.scalars.eps_deg)
-    assert (plan.base.name, asked.practice) == ("near_aims", True)
+    assert plan.base.name == "near_aims"
     assert commands.again == f"cuelearner label billiards --out '{place}' --who 'Ada B'"
     following = "cuelearner train billiards --preset quickstart --guidance relative --labels-from"
     assert commands.following(40) == f"{following} '{place}' --labels 40 --out 'runs/my labels'"

@@ -11,7 +11,7 @@ from probes import AGENT, SIZES
 
 import cuelearner_jax as cl
 from cuelearner_jax.environment import spaces_of
-from cuelearner_jax.export import contract, formats, runner
+from cuelearner_jax.export import contract, runner
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Opaque
 
@@ -19,6 +19,7 @@ ENV = Reach(GRIPPER)
 ANGLES = np.linspace(0.0, 6.0, 24)
 DRAWN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
 BOUND = 0.2
+GRAPHS = ("numpy", "onnx")
 
 
 def guided(kind="relative"):
@@ -33,12 +34,12 @@ def guided(kind="relative"):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     home = tmp_path_factory.mktemp("exported")
-    for format in formats.FORMATS:
+    for format in GRAPHS:
         contract.write(guided()[0], ENV, lambda: DRAWN, format, home / format, {"subject": "test"})
     return home
 
 
-@pytest.mark.parametrize("format", formats.FORMATS)
+@pytest.mark.parametrize("format", GRAPHS)
 def test_a_decision_in_a_box_is_the_policys_within_its_bound(folder, format):
     policy, base = guided()
     wanted, own = (np.asarray(one.act(jax.random.key(0), None, jnp.asarray(DRAWN))) for one in (policy, base))

@@ -7,11 +7,9 @@ import os
 import shutil
 import subprocess
 import sys
-import warnings
 
 import jax
 import jax.numpy as jnp
-import json_ways
 import numpy as np
 import onnxruntime
 import pytest
@@ -19,9 +17,9 @@ from probes import AGENT, SCALARS, SIZES, Aimed, Expert, Window, WindowConfig, e
 
 import cuelearner_jax as cl
 from cuelearner_jax.api.policies import CallablePolicy
-from cuelearner_jax.environment import Quantity, action_of, spaces_of
+from cuelearner_jax.environment import Quantity, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.export import contract, decisions, formats, onnx_graph, operations, runner
+from cuelearner_jax.export import contract, decisions, onnx_graph, runner
 from cuelearner_jax.export.graph import RULES
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, layers, uniform_in
@@ -62,7 +60,7 @@ def write(policy, format, out, drawn=DRAWN):
 def folder(tmp_path_factory):
     """One decision in every format."""
     home = tmp_path_factory.mktemp("exported")
-    for format in formats.FORMATS:
+    for format in contract.FORMATS:
         write(guided("relative", bound_deg=7.0, base=agent()), format, home / format)
     return home
 
@@ -72,8 +70,8 @@ def test_numpy_and_onnx_decide_as_jax_does(name):
     policy = POLICIES[name]()
     wanted = np.asarray(jax.jit(policy.act)(jax.random.key(0), None, jnp.asarray(DRAWN)))
     assert np.ptp(wanted, 0).max() > 0.1
-    traced = formats.trace_policy(policy, DRAWN.shape[1])
-    run, (result,) = operations.compile_ops(traced.graph.ops, set(traced.graph.outputs)), traced.graph.outputs
+    traced = decisions.trace_policy(policy, DRAWN.shape[1])
+    run, (result,) = runner.compile_ops(traced.graph.ops), traced.graph.outputs
     found = []
     for obs in DRAWN:
         values = {**traced.constants, "obs": obs}
@@ -86,16 +84,16 @@ def test_numpy_and_onnx_decide_as_jax_does(name):
 
 
 def test_a_batch_of_any_size_is_decided_row_by_row(folder):
-    for format in formats.FORMATS:
+    for format in contract.FORMATS:
         decide = runner.Decision(folder / format)
         whole = decide(DRAWN)
         np.testing.assert_array_equal(decide(DRAWN[:7]), whole[:7])
         np.testing.assert_array_equal(decide(DRAWN[3]), whole[3])
         np.testing.assert_allclose(decide.angle(DRAWN[3]), np.arctan2(whole[3, 1], whole[3, 0]))
         assert decide(DRAWN[:0]).shape == (0, 2)
-        for wrong in (np.zeros(3), np.zeros((2, 2, 2)), np.array([np.nan, 0.0])):
-            with pytest.raises(runner.ContractError, match="observation"):
-                decide(wrong)
+    for wrong in (np.zeros(3), np.zeros((2, 2, 2)), [np.nan, 0.0], [1e39, 0.0], ["1.0", "0.0"], [1j, 0.0]):
+        with pytest.raises(runner.ContractError, match="observation"):
+            decide(wrong)
 
 
 def test_the_contract_says_what_goes_in_and_what_comes_out(folder):
@@ -117,7 +115,7 @@ def test_the_contract_says_what_goes_in_and_what_comes_out(folder):
 
 def test_the_bound_holds_in_the_exported_decision(folder):
     base = np.asarray(agent().act(jax.random.key(0), None, jnp.asarray(DRAWN)))
-    for format in formats.FORMATS:
+    for format in contract.FORMATS:
         found = runner.Decision(folder / format)(DRAWN)
         turn = np.rad2deg(np.arccos(np.clip((found * base).sum(-1), -1, 1)))
         assert 1.0 < turn.max() <= 7.01
@@ -161,93 +159,6 @@ def test_a_folder_that_is_damaged_or_changed_is_refused(folder, tmp_path):
         contract.replay_golden_cases(tmp_path / "nowhere")
 
 
-JUNK = [None, -1, 1e30, True, "/etc/passwd", [], {"a": 1}, float("nan")]
-NEEDED = {"version", "artefact", "files"} | {"observation", "action", "golden"}
-
-
-@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.long)])
-def test_nonsense_in_a_contract_is_refused_in_one_line_wherever_it_stands(tmp_path, every):
-    """Whoever writes it signs it too; what is not refused decides as before."""
-    there = tmp_path / "small"
-    write(Heuristic(ENV), "numpy", there)
-    whole = json.loads((there / runner.CONTRACT).read_text())
-    whole.pop(runner.DIGEST)
-    wanted, refused, taken = runner.Decision(there)(DRAWN[:3]), 0, set()
-    ways = [way for way in json_ways.ways(whole) if way[0] in NEEDED and "space" not in way]  # its cues are words
-    for way in ways[::every]:
-        for junk in (*JUNK, json_ways.GONE):
-            if json_ways.at(whole, way) == junk:
-                continue
-            told = json_ways.changed(whole, way, junk)
-            (there / runner.CONTRACT).write_text(json.dumps({**told, runner.DIGEST: runner.digest(told)}))
-            try:
-                decide = runner.Decision(there)
-                if way not in taken:
-                    np.testing.assert_array_equal(decide(DRAWN[:3]), wanted)
-                    assert decide.check() <= 1e-5
-                taken.add(way)
-            except runner.ContractError as error:
-                refused += 1
-                assert "\n" not in str(error)
-    words = {"about", "name", "unit", "dtype", "angle", "clip_radius_deg", "drawn", "steady", "extreme", "needs"} | {
-        "tolerance"
-    }
-    assert {way for way in taken if way[-1] not in words} <= {("files", "decide.py")}
-    assert refused > 150 / every
-
-
-@pytest.mark.parametrize("name", ["../decision.npz", "/decision.npz", "sub/decision.npz", "other.npz"])
-def test_an_artefact_is_a_file_that_the_contract_lists(folder, tmp_path, name):
-    there = copied(folder / "numpy", tmp_path)
-    for place in (tmp_path, there):
-        for other in ("decision.npz", "other.npz"):
-            if not (place / other).exists():
-                shutil.copy(folder / "numpy" / "decision.npz", place / other)
-    edit_contract(there, lambda told: told["artefact"].update(file=name))
-    with pytest.raises(UserError, match="is invalid"):
-        contract.replay_golden_cases(there)
-
-
-def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(folder, tmp_path):
-    there = copied(folder / "numpy", tmp_path)
-    with np.load(there / runner.GOLDEN) as golden:
-        obs, actions = golden["obs"], golden["actions"]
-    for spoiled in (
-        {"obs": obs},
-        {"obs": obs[:0], "actions": actions[:0]},
-        {"obs": obs, "actions": actions[:3]},
-        {"obs": obs, "actions": actions * np.nan},
-        {"obs": obs.astype(str), "actions": actions},
-        {"obs": obs.astype(object), "actions": actions},
-    ):
-        np.savez(there / runner.GOLDEN, **spoiled)
-        edit_contract(there)
-        with pytest.raises(UserError, match="cannot be run here"):
-            contract.replay_golden_cases(there)
-    np.savez(there / runner.GOLDEN, obs=obs, actions=actions)
-    with np.load(there / "decision.npz") as stored:
-        arrays = dict(stored)
-    graph = json.loads(arrays["graph"].tobytes())
-    for change in (
-        lambda: graph.update(ops=3),
-        lambda: graph.update(ops=[["add", ["no"], ["thing"], {}]]),
-        lambda: graph.update(ops=[], outputs=graph["inputs"]),
-        lambda: graph.pop("inputs"),
-    ):
-        change()
-        np.savez(there / "decision.npz", **{**arrays, "graph": np.frombuffer(json.dumps(graph).encode(), np.uint8)})
-        edit_contract(there)
-        with pytest.raises(UserError, match=r"cannot be run|cases differ|not give finite numbers|is not a direction"):
-            contract.replay_golden_cases(there)
-
-
-def test_what_the_contract_does_not_list_is_told(folder, tmp_path):
-    there = copied(folder / "numpy", tmp_path)
-    assert contract.unlisted_files(there) == []
-    (there / "helper.py").write_text("print()")
-    assert contract.unlisted_files(there) == ["helper.py"]
-
-
 def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_path):
     there = copied(folder / "stablehlo", tmp_path)
     exported = jax.export.deserialize(bytearray((there / "decision.stablehlo").read_bytes()))
@@ -259,23 +170,6 @@ def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_
     edit_contract(there)
     with pytest.raises(UserError, match="calls Python functions"):
         contract.replay_golden_cases(there)
-
-
-def test_of_two_exports_at_once_the_second_is_refused(folder, tmp_path):
-    out = tmp_path / "new"
-    second = []
-
-    def meanwhile():
-        with pytest.raises(UserError, match="is being written by another process") as refused:
-            write(Heuristic(ENV), "numpy", out)
-        second.append(str(refused.value))
-        return DRAWN
-
-    contract.write(Heuristic(ENV), ENV, meanwhile, "numpy", out, {})
-    assert len(second) == 1
-    assert "\n" not in second[0]
-    assert contract.replay_golden_cases(out) <= 1e-5
-    assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
 def test_a_decision_that_is_another_one_is_found_by_its_golden_cases(folder, tmp_path):
@@ -311,9 +205,8 @@ def test_what_this_program_cannot_run_is_told_in_one_line(folder, tmp_path):
     ],
 )
 def test_policies_that_no_file_can_hold_are_refused(policy, says, tmp_path):
-    for format in formats.FORMATS:
-        with pytest.raises(UserError, match=says):
-            write(policy(), format, tmp_path / "out")
+    with pytest.raises(UserError, match=says):
+        write(policy(), "numpy", tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -371,50 +264,12 @@ def test_observations_are_starts_and_what_follows():
     np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, rtol=1e-6)
 
 
-def test_actions_have_words_of_their_own_or_the_default():
-    class Named(Window):
-        action = Quantity("way", 2, "1", "in the robot's frame")
-
-    assert action_of(Named()).name == "way"
-    assert action_of(Window()).about.startswith("unit vector")
-
-
-def test_every_operation_can_be_said_in_onnx():
-    assert set(onnx_graph.NODES) == set(operations.OPERATIONS) | set(operations.SETTLED)
-
-
-def test_the_runner_is_what_lies_beside_a_decision(folder):
-    assert (folder / "onnx" / "decide.py").read_bytes() == contract.decide_source()
-
-
-ODD = (1e39, -1e39, np.inf, np.nan, 1j, "1.0", None, object())
-
-
-@pytest.mark.parametrize("format", formats.FORMATS)
-def test_observations_that_are_no_numbers_of_single_precision_are_refused(folder, format):
-    decide = runner.Decision(folder / format)
-    size = decide.contract["observation"]["size"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for odd in ODD:
-            with pytest.raises(runner.ContractError, match=r"not finite, or beyond single precision|give real numbers"):
-                decide([odd] + [0.0] * (size - 1))
-    with pytest.raises(runner.ContractError, match="give real numbers"):
-        decide([[0.0], [0.0, 1.0]])
-
-
-@pytest.mark.parametrize("given", [(np.nan, 0.0), (0.0, 0.0), (np.inf, 1.0)])
+@pytest.mark.parametrize("given", [(np.nan, 0.0), (0.0, 0.0)])
 def test_a_decision_that_is_no_direction_is_refused(folder, monkeypatch, given):
     decide = runner.Decision(folder / "numpy")
     monkeypatch.setattr(decide, "_decide", lambda batch: np.tile(np.float32(given), (len(batch), 1)))
-    with pytest.raises(runner.ContractError, match=r"not a direction|not give finite numbers"):
-        decide(np.zeros(decide.contract["observation"]["size"]))
-
-
-def test_a_policy_that_gives_no_actions_is_not_exported():
-    nothing = Opaque(lambda obs: obs[:, :2] * jnp.nan)
-    with pytest.raises(UserError, match=r"policy .*lambda.* gave actions that are not finite"):
-        decisions.golden_cases(nothing, np.ones((3, 2), np.float32))
+    with pytest.raises(runner.ContractError, match="no direction"):
+        decide(np.zeros(2))
 
 
 def test_from_python(tmp_path):
@@ -429,20 +284,3 @@ def test_from_python(tmp_path):
         cl.export_policy(narrow, tmp_path / "other", world)
     with pytest.raises(UserError, match="cannot be read"):
         cl.load_exported(tmp_path / "other")
-
-
-def test_what_declares_more_than_a_decision_has_is_refused_before_it_is_unpacked(folder, tmp_path, monkeypatch):
-    there = copied(folder / "numpy", tmp_path)
-    monkeypatch.setattr(runner, "LARGEST_FILE", 200_000)  # bytes, unpacked
-    np.savez_compressed(there / "golden.npz", obs=np.zeros((50_000, 2)), actions=np.zeros((1, 2)))
-    edit_contract(there)
-    monkeypatch.setattr(runner, "RUNNERS", dict.fromkeys(runner.RUNNERS, lambda *_: lambda batch: batch))
-    monkeypatch.setattr(np, "load", None)
-    with pytest.raises(UserError, match=r"golden.npz declares more than 200,000 bytes"):
-        contract.replay_golden_cases(there)
-    monkeypatch.setattr(runner, "LARGEST_CONTRACT", 100)
-    with pytest.raises(UserError, match=r"contract.json is damaged or was changed"):
-        contract.replay_golden_cases(there)
-    for name, attributes in (("broadcast", {"shape": [1 << 33, 2]}), ("pad", {"low": [0], "high": [1 << 40]})):
-        with pytest.raises(runner.ContractError, match=r"makes an array of [\d,]* entries"):
-            operations.compile_ops([[name, ["obs", "zero"], ["wide"], attributes]])

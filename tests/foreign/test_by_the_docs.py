@@ -119,7 +119,7 @@ def on_page(folder, wanted, count):
 
     space = Box(recorded.LOW, recorded.HIGH)
     bounds = ["--task.low", *map(str, recorded.LOW), "--task.high", *map(str, recorded.HIGH)]
-    how = [*bounds, "--scalars.eps-deg", str(EPS), "--no-practice"]
+    how = [*bounds, "--scalars.eps-deg", str(EPS)]
     assert COMMANDS["label"][COMMANDS["label"].index("--labels") + 1] == str(count)
     ask = lambda obs, action: told(space, wanted, obs[None], action[None])[0]  # noqa: E731
     assert labelled([*COMMANDS["label"][1:], *how], ask) == folder

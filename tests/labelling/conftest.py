@@ -12,9 +12,9 @@ def opened(tmp_path):
     """Opens sessions in the test's folder, and closes them."""
     sessions = []
 
-    def open_one(folder="labels", practice=0, **asked):
+    def open_one(folder="labels", **asked):
         with jax.numpy_rank_promotion("allow"):
-            sessions.append(Session(plan(**asked), tmp_path / folder, practice=practice))
+            sessions.append(Session(plan(**asked), tmp_path / folder))
         return sessions[-1]
 
     yield open_one

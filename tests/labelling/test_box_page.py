@@ -37,6 +37,8 @@ def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():
     assert known["film"].keys == ("v", "V")  # F is the second cue's
     assert "height: down: F" in controls.help_lines(RELATIVE, GRIPPER, known.values())
     assert "ArrowDown" in known["unsure"].keys
+    assert "film" not in controls.controls(RELATIVE, GRIPPER, films=False)
+    assert "film-refined" not in controls.controls(RELATIVE, GRIPPER, simulated=False)
 
 
 def test_what_is_picked_and_sent_is_the_answer_and_nothing_picked_is_no_answer():

@@ -42,7 +42,7 @@ def test_every_key_is_in_the_file_once(browser, tmp_path):
     rng, folder = np.random.default_rng(0), tmp_path / "labels"
     values = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0, "ArrowDown": None, "a": 1.0, " ": 0.0, "D": -1.0}
     pressed = []
-    with served(folder, "--no-practice") as (_, address):
+    with served(folder) as (_, address):
         page = entered(browser, address)
         for number in range(12):
             assert page.evaluate(ITEM) == number
@@ -93,7 +93,7 @@ def test_a_picture_has_the_width_and_words_of_six_cues_lie_beside_it(browser, tm
     pictures = np.array([f"pictures/{row}.png" for row in range(12)])
     (tmp_path / "situations/situations.parquet").unlink()
     np.savez(tmp_path / "situations/situations.npz", picture=pictures, **rows)
-    with served(tmp_path / "labels", "--no-practice", *cues, task=f"logs:{tmp_path / 'situations'}") as (_, address):
+    with served(tmp_path / "labels", *cues, task=f"logs:{tmp_path / 'situations'}") as (_, address):
         page = entered(browser, address, 1280)
         box = "one => { const b = one.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; }"
         left, _, right, bottom = page.locator("svg.scene image").evaluate(box)
@@ -108,7 +108,7 @@ def test_a_picture_has_the_width_and_words_of_six_cues_lie_beside_it(browser, tm
 
 def test_a_picture_its_arrows_and_its_film_fit_a_phone(browser, tmp_path):
     folder = tmp_path / "labels"
-    with served(folder, "--no-practice", task="photo_task:TASK") as (_, address):
+    with served(folder, task="photo_task:TASK") as (_, address):
         page = entered(browser, address, 390, 844, has_touch=True)
         assert page.evaluate("() => document.documentElement.scrollWidth") == 390
         sizes = "one => [one.offsetWidth, one.offsetHeight]"
@@ -136,7 +136,7 @@ def test_a_picture_its_arrows_and_its_film_fit_a_phone(browser, tmp_path):
 
 def test_pointing_shows_what_to_do_instead(browser, tmp_path):
     folder = tmp_path / "labels"
-    with served(folder, "--no-practice", "--guidance", "demonstration") as (process, address):
+    with served(folder, "--guidance", "demonstration") as (process, address):
         page = entered(browser, address)
         box = page.locator("svg.scene").bounding_box()
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -156,7 +156,6 @@ def test_every_press_is_saved_or_told_and_the_end_outlives_the_command(browser, 
     dropped = "() => cue.dropped"
     with served(folder) as (process, address):
         page = entered(browser, address)
-        page.get_by_text("skip practice").click()
         page.wait_for_function(f"({ITEM})() === 0 && cue.ready()")
         for number in range(30):  # faster than anybody sees and answers, whatever the page shows
             page.keyboard.press(["ArrowLeft", "ArrowDown"][number % 2])
@@ -175,8 +174,6 @@ def test_every_press_is_saved_or_told_and_the_end_outlives_the_command(browser, 
         moved(page, saved)
         assert (page.evaluate(ITEM), page.evaluate(dropped)) == (saved + 1, told + 2)
         page.get_by_role("button", name="finish").click()
-        page.get_by_text("labels are given and saved").wait_for()
-        page.get_by_role("button", name="finish now").click()
         page.locator(".saved").wait_for()
         assert process.wait(30) == 0
         assert str(folder / label_files.PARQUET) in page.locator(".saved").inner_text()

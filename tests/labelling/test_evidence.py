@@ -30,7 +30,7 @@ def estimate(status):
     return [float(number) for number in found.groups()]
 
 
-def test_the_estimate_narrows_the_page_shows_it_the_policy_follows_and_a_restart_goes_on(opened):
+def test_the_estimate_narrows_the_page_shows_it_and_the_policy_follows(opened):
     pytest.importorskip("nicegui")
     from page_user import shown
 
@@ -53,13 +53,6 @@ def test_the_estimate_narrows_the_page_shows_it_the_policy_follows_and_a_restart
     best = np.asarray(ENV.best(item.guide.obs))
     assert float(item.refined @ best) > np.cos(np.deg2rad(12))
     shown(session, acts)
-    session.close()
-    again = opened(**SETTINGS)
-    assert again.number == 20
-    np.testing.assert_allclose(again.item.guide.obs, item.guide.obs, atol=1e-6)
-    mean, low, high = estimate(again.status())
-    assert again.status().newest.labels == 20
-    assert low < 34.4 < high
 
 
 def test_an_answer_taken_back_is_forgotten_and_a_policy_that_is_right_is_told_to_be(opened):
@@ -73,6 +66,11 @@ def test_an_answer_taken_back_is_forgotten_and_a_policy_that_is_right_is_told_to
     give(session, 11, EPS_DEG)
     status = settled(session, fits=2)
     assert status.newest.labels == 20
-    answers = [answer for _, _, answer in session._learner._rows]
+    answers = [answer for _, _, answer in session.questions.learner._rows]
     np.testing.assert_array_equal(answers, np.asarray(session._labels().answer)[:20])
     assert status.newest.told == ("The answers ask for no change.",)
+    item = session.item
+    session.close()
+    again = opened(**{**SETTINGS, "base": right})  # a restart goes on
+    np.testing.assert_allclose(again.item.guide.obs, item.guide.obs, atol=1e-6)
+    assert (again.number, again.status().newest.labels, again.status().newest.told) == (20, 20, status.newest.told)

@@ -1,6 +1,5 @@
 """The page without a browser: what it shows and what its buttons do, for each form of feedback."""
 
-import asyncio
 import contextlib
 import html
 import json
@@ -72,8 +71,8 @@ def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, t
     assert file.said == {"answer": 10, "unsure": 1, "undone": 1}
 
 
-def test_an_answer_names_its_item_and_pages_show_the_same(opened):
-    session = opened()
+def test_an_answer_names_its_item_and_when_all_is_answered_the_page_says_so(opened):
+    session = opened(labels=2)
 
     async def acts(user, pages):
         (page,) = pages
@@ -88,18 +87,8 @@ def test_an_answer_names_its_item_and_pages_show_the_same(opened):
         await page._act("point", 1, {"name": "point", "item": 1, "angle": 30.0})  # not of this form
         assert session.number == 1
         assert 'data-item="1"' in page._scene.content
-
-    shown(session, acts)
-
-
-def test_when_all_is_answered_the_page_says_so(opened):
-    session = opened(labels=2)
-
-    async def acts(user, pages):
-        for number in range(2):
-            await press(user, "0", lambda number=number: session.number == number + 1)
+        await press(user, "0", lambda: session.number == 2)
         await user.should_see("All labels are given")
-        (page,) = pages
         assert page._scene.content == ""
         assert not any(button.enabled for button in page._pressable)
 
@@ -142,28 +131,14 @@ def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
     assert controls.answer_of(DIRECTIONS, controls.UNSURE, None, {}) is None
 
 
-def test_practice_is_marked_and_can_be_skipped(opened, tmp_path):
-    session = opened(practice=3)
-
-    async def acts(user, pages):
-        await user.should_see("Practice 1 of 3, nothing is saved. Compare the action")
-        await press(user, "+1", lambda: session.number == -2)
-        await user.should_see("Practice 2 of 3, nothing is saved. Where you cannot tell, press ↓")
-        await press(user, "skip", lambda: session.number == 0)
-        await user.should_not_see("Practice")
-        await press(user, "+1", lambda: session.number == 1)
-
-    shown(session, acts)
-    assert label_files.read(tmp_path / "labels").people.item.tolist() == [0]
-
-
-def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_was_saved(opened, tmp_path):
+def test_every_page_ends_where_it_says_what_was_saved(opened, tmp_path):
     session, stopping = opened(), threading.Event()
     commands = Commands("cuelearner label mine", lambda labels: f"cuelearner train <{labels}>")
     pages = set()
-    last = server._Last(session, pages, stopping, commands)
+    last = server._Last(pages, stopping, commands)
+    last.session = session
     app = FastAPI()
-    last.routes(app)
+    last.route(app)
 
     async def seen(kind, address):
         async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://page") as client:
@@ -172,26 +147,19 @@ def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_w
     async def acts(user, its_pages):
         pages.update(its_pages)
         (page,) = its_pages
-        user.find(marker="finish").click()
-        await user.should_see("0 of 20 labels are given and saved")
         with pytest.raises(UserError, match="no answer to save yet"):
             await last.finish()
-        user.find(marker="go-on").click()
-        await asyncio.sleep(0.1)
         for number in range(2):
             await press(user, "+1", lambda number=number: session.number == number + 1)
         assert (await seen("GET", server.ADDRESS)).status_code == 404
-        user.find(marker="finish").click()
-        await user.should_see("2 of 20 labels are given and saved")
         with told_browser(user) as told_it:
             await page._end()
         assert told_it == [f'location.replace("{server.ADDRESS}")']
+        assert not stopping.is_set()  # until a browser has shown it
         text = (await seen("GET", server.ADDRESS)).text
         place = str(tmp_path / "labels" / label_files.PARQUET)
         for words in (f"2 of 20 labels are saved, in {place}", "cuelearner train &lt;2&gt;", "cuelearner label mine"):
             assert words in text
-        assert not stopping.is_set()  # until a browser has shown it
-        await seen("POST", server.SEEN)
         assert stopping.is_set()
 
     shown(session, acts, last.finish)
@@ -236,10 +204,9 @@ def test_arrows_point_where_actions_do(opened):
     assert keys["left"] > 0.3  # of an arrow that points down the left key moves the tip to the right of the screen
     assert keys["right"] < -0.3
     assert [re.search(rf'class="arrow {name}">.*?<text [^>]*>(.)', down)[1] for name in WAYS] == ["←", "→"]
-    session._pictures = session._pictures._replace(
-        trails=lambda env, state, actions: [f"<{a[0]:.2f}>" for a in actions]
-    )
-    trails = session._trails(item)
+    made = session.questions
+    made.pictures = made.pictures._replace(trails=lambda env, state, actions: [f"<{a[0]:.2f}>" for a in actions])
+    trails = made.draw(item._replace(trails=None)).trails
     assert [*trails] == ["asked", *WAYS]
     assert trails["left"] == f"<{turned_by(item.action, 20.0)[0]:.2f}>"
     shown = view.picture(item._replace(trails=trails), RELATIVE, 20.0)
@@ -279,8 +246,9 @@ def test_small_turns_are_drawn_larger_and_the_page_says_so(opened):
 
 def test_a_film_shows_what_the_action_leads_to(opened):
     session = opened()
-    best = np.asarray(session.env.best(session.item.guide.obs))
-    assert session.film(0, best).words == "True"
-    assert session.film(0, turned_by(best, 90.0)).words == "False"
-    film = json.loads(view.film(session.item, session.film(0, best)))
+    item, made = session.item, session.questions
+    best = np.asarray(made.env.best(item.guide.obs))
+    assert made.film(item, best).words == "True"
+    assert made.film(item, turned_by(best, 90.0)).words == "False"
+    film = json.loads(view.film(item, made.film(item, best)))
     assert (film["item"], film["frames"][-1]) == (0, {"dot": None})

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import recorded_situations as recorded
-from page_answers import labelled, pressed
+from page_answers import labelled
 
 pytest.importorskip("nicegui")
 from page_user import press, shown
@@ -17,7 +17,8 @@ from cuelearner_jax.cli.sources import recorded_or_task, with_cues
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.labelling import controls, pointing, view
-from cuelearner_jax.labelling.session import Item, Session
+from cuelearner_jax.labelling.questions import Item
+from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.spaces import UNSAID, Box, cues_from
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import fetch_layout
@@ -26,7 +27,7 @@ from cuelearner_jax.types import Sketch
 pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
 
 CUES = "left,right;up,down;open,close"
-SMALL = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20", "--no-practice")
+SMALL = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20")
 BOUNDS = ("--task.low", "-0.5", "0", "-1", "--task.high", "0.5", "0.4", "1")
 GOAL = np.array([0.25, 0.3, 0.0])
 PHOTO = Sketch((0, 0, 640, 480), "<image class='photo'/>", {}, {}, (320, 240), (0, 120), 0.0)
@@ -119,24 +120,12 @@ def test_the_action_and_its_correction_are_arrows_from_the_middle_and_the_correc
     assert drawn(space).count('class="arrow asked"') == 0  # the middle is nowhere to point to
 
 
-def test_a_key_of_a_cue_is_no_other_controls():
-    known = controls.controls(RELATIVE, box(CUES))
-    keys = [key for control in known.values() for key in control.keys]
-    assert len(keys) == len(set(keys))
-    assert (known["unsure"].shown, known["rest"].shown) == ("S", "space")
-    assert "press S: it costs nothing. F shows a film" in controls.hint(1, known)
-    assert known["pick-0-less"].keys == ("ArrowRight", "d", "D")
-    assert "film" not in controls.controls(RELATIVE, box(CUES), films=False)
-    assert "film-refined" not in controls.controls(RELATIVE, box(CUES), simulated=False)
-
-
 def test_one_press_about_one_cue_says_nothing_of_the_others():
     known = controls.controls(RELATIVE, box(CUES), one_cue=True)
     said = {name: controls.answer_of(box(CUES), one, None, {}) for name, one in known.items() if one.answer}
     assert said.keys() == {f"only-{cue}-{way}" for cue in range(3) for way in ("more", "less")} | {"rest"}
     np.testing.assert_array_equal(said["only-1-less"], [UNSAID, -1.0, UNSAID])
     np.testing.assert_array_equal(said["rest"], [0.0, 0.0, 0.0])
-    assert pressed(known, np.array([UNSAID, -1.0, UNSAID])) == ["only-1-less"]
 
 
 @pytest.mark.long
@@ -237,10 +226,7 @@ def test_what_does_not_fit_a_folder_is_told_in_one_line(folder, given, told):
         recorded_or_task(look_ahead([str(folder), *given]))
 
 
-def test_cues_and_one_cue_need_a_space_that_has_several(tmp_path):
+def test_a_task_with_cues_of_its_own_takes_no_others():
     task = recorded_or_task(look_ahead(["navigation"]))
     with pytest.raises(UserError, match="navigation has its own: leave it out"):
         with_cues(task, task.plain(), "left,right")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match="is empty"):
-        recorded_or_task(look_ahead([str(tmp_path / "empty")]))

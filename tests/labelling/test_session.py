@@ -18,7 +18,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.labelling.plan import Base
-from cuelearner_jax.labelling.programs import keys_of, programs
+from cuelearner_jax.labelling.programs import fit, keys_of
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Opaque, Uniform
 from cuelearner_jax.storage import label_files
@@ -72,7 +72,7 @@ def test_the_first_round_is_that_of_a_simulated_teacher(opened, tmp_path):
         np.testing.assert_allclose(getattr(file.labels, name), getattr(taught.labels, name)[:10], atol=1e-6)
     # The same labels and the same step of the same stream, though the fit after the first has another number there.
     told = guide.replace(labels=taught.labels)
-    refit = programs(guidance).fit(ENV, probes.SCALARS, told, keys.session, jnp.asarray(1))
+    refit = fit(guidance, ENV, probes.SCALARS, told, keys.session, jnp.asarray(1))
     chex.assert_trees_all_close(status.newest.model, refit.model, atol=1e-4)
     assert (status.newest.labels, status.newest.number, status.newest.quality.count) == (10, 1, 2)
 
@@ -191,28 +191,6 @@ def test_where_the_disk_takes_no_more_nothing_moves_on_and_nothing_is_saved_late
     assert session.status().trouble == ""
     rows = label_files.history(tmp_path / "labels" / JSONL)
     assert [(row["item"], row["answer"]) for row in rows][1:] == [(1, [1.0])]
-
-
-def test_practice_comes_first_is_not_saved_and_changes_nothing(opened, tmp_path):
-    plain = opened("plain")
-    session = opened(practice=3)
-    assert (session.number, session.practice) == (-3, 3)
-    assert session.answer(-3, np.ones(1))
-    assert session.answer(-2, None)
-    assert session.undo(-1)
-    seen = [session.item, plain.item]
-    assert seen[0].number == -2
-    assert np.abs(seen[0].action - seen[1].action).max() > 1e-3  # no question that counts is given away
-    session.skip_practice()
-    session.skip_practice()
-    assert session.number == 0
-    assert not session.undo(0)
-    assert (lines(tmp_path / "labels"), session.status().answered, session.status().per_minute) == (0, 0, None)
-    for mine, theirs in zip(give(session, 3), give(plain, 3), strict=True):
-        np.testing.assert_array_equal(mine.guide.obs, theirs.guide.obs)
-        np.testing.assert_array_equal(mine.action, theirs.action)
-    session.close()
-    assert opened(practice=3).number == 3  # who labels already needs none
 
 
 def test_a_session_is_finished_once_and_takes_nothing_afterwards(opened, tmp_path):

@@ -76,9 +76,7 @@ def test_figures_show_something_and_repeat_byte_for_byte(runs, tmp_path):
     for out in ("one", "two"):
         report(runs, tmp_path / out)
     names = {"curves.png", "curves.svg", "label_efficiency.png", "label_efficiency.svg"}
-    assert {path.name for path in (tmp_path / "one").iterdir()} == names | {
-        *("report.md", "report.html", "summary.csv", "curves.csv")
-    }
+    assert {path.name for path in (tmp_path / "one").iterdir()} == names | {*("report.md", "summary.csv", "curves.csv")}
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
         if path.suffix == ".svg":
@@ -92,28 +90,17 @@ def test_figures_show_something_and_repeat_byte_for_byte(runs, tmp_path):
     assert (np.abs(picture(tmp_path / "one" / "curves.png") - blue).max(axis=-1) < 0.02).sum() > 500
 
 
-def test_curve_data_has_a_row_for_each_variant_and_step(runs, tmp_path):
-    report(runs, tmp_path / "report")
-    with (tmp_path / "report" / "curves.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 3 * len(STEPS)
-
-
-def test_one_budget_needs_no_label_figure_and_stale_ones_go(runs, tmp_path):
+def test_nothing_is_overwritten_unasked_and_stale_figures_go(runs, tmp_path):
     out = tmp_path / "report"
     report(runs, out)
-    report([runs / "unguided", runs / "relative-500"], out, overwrite=True)
-    assert not (out / "label_efficiency.png").exists()
-    assert "label_efficiency" not in (out / "report.md").read_text()
-
-
-def test_refuses_to_overwrite_and_leaves_what_is_there(runs, tmp_path):
-    out = tmp_path / "report"
-    out.mkdir()
+    with (out / "curves.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 3 * len(STEPS)
     (out / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="exists already"):
         report(runs, out)
-    assert [path.name for path in out.iterdir()] == ["notes.txt"]
-    report(runs, out, overwrite=True)
+    report([runs / "unguided", runs / "relative-500"], out, overwrite=True)
+    assert not (out / "label_efficiency.png").exists()
+    assert "label_efficiency" not in (out / "report.md").read_text()
     assert (out / "notes.txt").read_text() == "mine"
 
 
@@ -177,52 +164,29 @@ def test_a_configuration_that_cannot_be_read_is_said_and_nothing_is_called_compl
     assert "nothing: all runs are complete" in missing("two")
 
 
-def test_seeds_and_budgets_of_the_plan_without_results_are_named(runs, tmp_path):
+def test_seeds_budgets_and_pieces_of_the_plan_without_results_are_named(runs, tmp_path):
     grid = {"guidance": ["none", "relative"], "seeds": list(range(10)), "labels": [100, 700]}
     planned(runs, total_steps=100, grid=grid)
+    for name, index in (("unguided", 3), ("relative-100", 5)):
+        shard = {"index": index, "count": 1000, "seeds": list(range(1000))}
+        planned(runs / name, total_steps=100, shard=shard)
     missing = report(runs, tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
     for kind in grid["guidance"]:
         assert f"no results of {kind} guidance with the seeds 8, 9" in missing
     assert "no results of relative guidance with the label budgets 700" in missing
     assert "none guidance with the label" not in missing
-
-
-def test_pieces_are_named_as_a_range(runs, tmp_path):
-    for name, index in (("unguided", 3), ("relative-100", 5)):
-        shard = {"index": index, "count": 1000, "seeds": list(range(1000))}
-        planned(runs / name, total_steps=100, shard=shard)
-    missing = report(runs, tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
     assert "shards not begun, of 1000: 1, 2, 4, 6, 7" in missing
 
 
-HOSTILE = "=cmd()|![x](http://a.b)<script>alert(1)</script>`\n| relative | 9,000 | 8 |\n\n# all is well $\\frac$"
-
-
 def test_names_are_only_names_in_markdown_csv_and_figures(tmp_path):
-    """A folder, a kind of guidance, a task, a command and a version that try to be tags, rows, links and formulas."""
-    folder = tmp_path / "runs" / "a|b<img src=x>`[c](d)\n- done"
-    constants: dict[str, Any] = {
-        "task": HOSTILE,
-        "command": HOSTILE,
-        "versions": HOSTILE,
-        "hardware": "@SUM(1)",
-        "commit": "`<b>`",
-    }
-    write(folder, HOSTILE, -0.5, 100, steps=STEPS[:-1], **constants)
-    write(tmp_path / "runs" / "plain", "_under", 0.5, 100, seeds=[0, 1], **constants)
-    text = report(tmp_path / "runs", tmp_path / "out", command=f"cuelearner report '{folder}'").read_text()
-    for active in ("<script", "<img", "<b>", "![x]", "[x](", "[c](", "\n- done", "\n# all", "\n| relative"):
-        assert active not in text, active
-    rows = [line for line in text.splitlines() if line.startswith("|")]
-    assert len(rows) == 2 + 2  # the header, the line below it, two variants
-    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {11}
-    assert "`" not in text.replace("\\`", "").split("configuration: ")[0]
-    for name in ("summary.csv", "curves.csv"):
-        with (tmp_path / "out" / name).open(newline="") as file:
-            found = list(csv.DictReader(file))
-        assert {row["guidance"] for row in found} == {"'" + HOSTILE.replace("\n", "\\n"), "_under"}
-        number = "final" if name == "summary.csv" else "iqm"
-        assert any(row[number].startswith("-0.") for row in found)  # numbers have no apostrophe
+    name = "=cmd()|<script>alert(1)</script>`\n| relative | 9,000 | 8 |"
+    write(tmp_path / "runs" / "a", name, -0.5, 100, steps=STEPS[:-1], task=name, command=name, versions=name)
+    text = report(tmp_path / "runs", tmp_path / "out", command="cuelearner report 'a`b'").read_text()
+    assert "\n| relative" not in text
+    (row,) = [line for line in text.splitlines() if line.startswith("| =cmd")]
+    assert len(re.findall(r"(?<!\\)\|", row)) == 11
+    assert "<script" not in row
+    assert list(summary(tmp_path / "out")) == [(f"'{name}", 100)]
     for path in (tmp_path / "out").glob("*.svg"):
         ElementTree.parse(path)
 
@@ -256,13 +220,8 @@ def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path)
         name: row for name, row in before["relative", 500].items() if name != "failed"
     }
     assert [after[key]["failed"] for key in before] == ["0", "0", "3"]
-    assert (after["scalar", 100]["seeds"], after["scalar", 100]["failed"], after["scalar", 100]["final"]) == (
-        "0",
-        "2",
-        "",
-    )
+    assert after.keys() == before.keys()
     assert "| relative | 500 | 8 of 11, 3 failed |" in text
-    assert "| scalar | 100 | 0 of 2, 2 failed | | | |" in text
     assert (
         "relative, 500 labels: seeds 8 (by step 20), 9 (by step 20), 10 (by step 20) failed, no longer finite: curve "
         "and means are over the other 8"

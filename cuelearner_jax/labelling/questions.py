@@ -1,0 +1,91 @@
+"""Make a session's questions: a situation, an action in it, and what the page draws of them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from cuelearner_jax import asking, user_code
+from cuelearner_jax.asking import GuideState
+from cuelearner_jax.environment import actions_of
+from cuelearner_jax.labelling import controls
+from cuelearner_jax.labelling.evidence import EvidenceLearner
+from cuelearner_jax.labelling.learner import Learner
+from cuelearner_jax.labelling.plan import Plan
+from cuelearner_jax.labelling.programs import advance, begin, keys_of
+from cuelearner_jax.policies import policy_name
+from cuelearner_jax.types import Reel, Sketch
+
+
+class Item(NamedTuple):
+    """A question: a situation and an action in it."""
+
+    number: int  # from 0
+    guide: GuideState  # the guide's state in that situation
+    action: np.ndarray  # (action,)
+    sketch: Sketch | None = None  # None: not needed yet
+    refined: np.ndarray | None = None  # the action refined by the newest model; None: no model yet
+    # drawings of the `controls.outcomes`, as `Pictures.trails`; None: not drawn yet
+    trails: dict[str, str] | None = None
+
+
+class Questions:
+    """Makes items, and holds the model that later items are asked by."""
+
+    def __init__(self, plan: Plan, env: Any) -> None:
+        """Begin to compile the model's fit."""
+        self.plan, self.env, self.pictures, self.space = plan, env, plan.task.pictures(), actions_of(env)
+        self.keys = keys_of(plan.seed)
+        slots = asking.label_slots(plan.labels, plan.config.sizes)
+        self.blank = asking.start(plan.guidance, self.env, slots, plan.labels, self.keys.model, self.keys.start)
+        kind = EvidenceLearner if plan.guidance.kind.by_evidence else Learner
+        self.learner = kind(plan, self.env, self.blank, self.keys.session)
+
+    def start(self, key: PRNGKeyArray) -> GuideState:
+        """Return the first situation of an episode."""
+        state, obs = begin(self.env, key)
+        return self.blank.replace(env=state, obs=obs)
+
+    def after(self, item: Item) -> GuideState:
+        """Return the situation that follows an item's action."""
+        key = asking.question_keys(self.keys.session, item.number).env
+        state, obs = advance(self.env, key, item.guide.env, jnp.asarray(item.action))
+        return item.guide.replace(env=state, obs=obs)
+
+    def ask(self, number: int, guide: GuideState) -> Item:
+        """Choose the action to ask about in a situation. Raises UserError for a policy without valid actions."""
+        if number < len(self.plan.again):
+            return Item(number, guide, self.plan.again[number])
+        action = self.learner.question(guide, asking.question_keys(self.keys.session, number))
+        user_code.check_actions(np.isfinite(action), policy_name(self.plan.base.policy))
+        return Item(number, guide, action)
+
+    def draw(self, item: Item) -> Item:
+        """Add what the page shows: the sketch, each answer's outcome, and the newest model's action."""
+        if item.sketch is None:
+            assert self.pictures.sketch is not None
+            item = item._replace(sketch=self.pictures.sketch(self.env, item.guide.env))
+        if item.trails is None:
+            outcomes, trails = self.outcomes(item), {}
+            if self.pictures.trails is not None:
+                actions = jnp.asarray(np.stack([*outcomes.values()]))
+                trails = dict(zip(outcomes, self.pictures.trails(self.env, item.guide.env, actions), strict=True))
+            item = item._replace(trails=trails)
+        return self.refine(item)
+
+    def refine(self, item: Item) -> Item:
+        """Add the newest model's action."""
+        newest = self.learner.newest
+        return item._replace(refined=self.learner.refined(item.guide.obs, item.action) if newest.number else None)
+
+    def outcomes(self, item: Item) -> dict[str, np.ndarray]:
+        """Return each answer's outcome for an item's action, see `controls.outcomes`."""
+        return controls.outcomes(self.plan.form, self.space, item.action, self.plan.config.scalars.eps_deg)
+
+    def film(self, item: Item, action: np.ndarray) -> Reel | None:
+        """Film the outcome of an action in an item's situation; None where the task has no films."""
+        reel = self.pictures.reel
+        return None if reel is None else reel(self.env, item.guide.env, jnp.asarray(action, jnp.float32))
