@@ -18,14 +18,16 @@ from brax.envs.wrappers import training
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.bridges.jax_environment import FixedSimulator, JaxEnvironment, layout_of, space_of
+from cuelearner_jax.bridges.jax_environment import from_simulator
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space
+from cuelearner_jax.spaces import DIRECTIONS, Box
 from cuelearner_jax.types import EnvState, Step
 
 RawKey = Any  # uint32 words, which is what brax passes: the wrappers read a batch's shape from them
 State = Any  # brax.envs.State, whose methods of flax a type checker does not know
+
+from_brax = from_simulator
 
 
 def supply_device_put_replicated() -> None:
@@ -62,6 +64,8 @@ class Episode(struct.PyTreeNode):
 class BraxView(envs.Env):
     """One of our environments as a brax environment, made by `to_brax`. Its parameters are compiled as constants."""
 
+    backend = "cuelearner"  # pyright: ignore[reportAssignmentType]
+
     def __init__(self, env: Environment):
         self.sys = env  # brax's domain randomization replaces the attribute of this name
 
@@ -75,11 +79,6 @@ class BraxView(envs.Env):
         """Number of entries of an action."""
         return actions_of(self.sys).size
 
-    @property
-    def backend(self) -> str:
-        """The name "cuelearner": the environment uses none of brax's backends."""
-        return "cuelearner"
-
     def reset(self, rng: RawKey) -> State:
         """Start an episode."""
         k_start, k_next = jax.random.split(_typed(rng))
@@ -87,15 +86,10 @@ class BraxView(envs.Env):
         zero = jnp.zeros(())
         episode: Any = Episode(state, obs, jnp.array(False))  # brax declares the state of its own physics here
         shapes = jax.eval_shape(lambda: _measures(self.sys.step(k_start, state, jnp.zeros(self.action_size))[1]))
-        return envs.State(
-            pipeline_state=episode,
-            obs=obs,
-            reward=zero,
-            done=zero,
-            metrics=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
-            # Not in `pipeline_state`: brax's automatic reset would bring the same random numbers back every episode.
-            info={"rng": jax.random.key_data(k_next), "truncation": zero},
-        )
+        metrics = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        # Not in `pipeline_state`: brax's automatic reset would bring the same random numbers back every episode.
+        info = {"rng": jax.random.key_data(k_next), "truncation": zero}
+        return envs.State(pipeline_state=episode, obs=obs, reward=zero, done=zero, metrics=metrics, info=info)
 
     def step(self, state: State, action: Float[Array, " n"]) -> State:
         """Execute the action that `action` stands for, see `to_brax`.
@@ -105,9 +99,12 @@ class BraxView(envs.Env):
         Returns:
             `obs` is our `Step.final_obs`, `done` is `terminated` and `info["truncation"]` is `truncated`, as 0 or 1.
         """
-        before = state.pipeline_state
+        before, space = state.pipeline_state, actions_of(self.sys)
+        if isinstance(space, Box):
+            low, high = jnp.array(space.low), jnp.array(space.high)
+            action = low + (high - low) * (action + 1) / 2
         key, k_next = jax.random.split(_typed(state.info["rng"]))
-        following, step = self.sys.step(key, before.env, _from_cube(actions_of(self.sys), action))
+        following, step = self.sys.step(key, before.env, space.retract(action))
         # With an action repeat brax goes on past the end: what came out of the episode must still be there afterwards.
         hold = partial(jax.tree.map, partial(jnp.where, before.ended))
         measures = _measures(step)
@@ -132,17 +129,13 @@ def to_brax(env: Environment) -> BraxView:
     """Return one of our environments as a `brax.envs.Env`, whose actions are in [-1, 1]^n.
 
     Of directions in the plane n is 2, and only the direction counts. Of a box n is its size: -1 is each entry's lower
-    bound, 1 its upper bound, and what lies beyond is brought back.
+    bound, 1 its upper bound, and what lies beyond is brought back. Raises UserError for other spaces of actions.
 
-    Episodes that our environment truncates arrive at brax's agents as truncated, under brax's own wrappers too. But
-    `AutoResetWrapper` begins every episode of a lane at the same cached first state, and brax's evaluator then reports
-    an infinite length for a truncated episode. `wrap_for_training` avoids both: `ppo.train(to_brax(env),
-    wrap_env_fn=wrap_for_training, ...)`.
+    Give brax's agents `wrap_env_fn=wrap_for_training`: their own `AutoResetWrapper` begins every episode of a lane at
+    the same cached first state, and reports an infinite length for a truncated episode.
 
     `metrics` are `Step.metrics` and, where an episode ends, `Step.outcome` (elsewhere 0), so that brax's sum over an
     episode is the outcome. A brax `randomization_fn` gets our environment and returns a batch of it with its axes.
-
-    Raises UserError for an environment with another space of actions.
     """
     space = actions_of(env)
     if space != DIRECTIONS and not isinstance(space, Box):
@@ -157,8 +150,7 @@ def to_brax(env: Environment) -> BraxView:
 def wrap_for_training(
     env: envs.Env, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable | None = None
 ) -> envs.Wrapper:
-    """Wrap an environment from `to_brax` so that every episode has a new random start; replaces
-    `brax.envs.training.wrap`.
+    """Wrap an environment from `to_brax` so that every episode has a new random start.
 
     Args:
         env: an environment from `to_brax`.
@@ -166,11 +158,9 @@ def wrap_for_training(
         action_repeat: how often each action is executed.
         randomization_fn: our environment -> a batch of it and the axes to map over.
     """
-    many = (
-        training.VmapWrapper(env)
-        if randomization_fn is None
-        else training.DomainRandomizationVmapWrapper(env, randomization_fn)
-    )
+    many = training.VmapWrapper(env)
+    if randomization_fn is not None:
+        many = training.DomainRandomizationVmapWrapper(env, randomization_fn)
     return FreshEpisodes(training.EpisodeWrapper(many, episode_length, action_repeat))
 
 
@@ -184,32 +174,19 @@ class FreshEpisodes(envs.Wrapper):
         episode = state.pipeline_state
         cut = (state.done > 0) & ~episode.ended  # cut by brax's step limit, which our environment does not know
         begun = (episode, episode.obs, state.info["rng"])
+
+        def restarted() -> Any:
+            fresh = self.env.reset(begun[2])
+            choose = lambda new, old: jnp.where(cut.reshape(-1, *(1,) * (new.ndim - 1)), new, old)  # noqa: E731
+            return jax.tree.map(choose, (fresh.pipeline_state, fresh.obs, fresh.info["rng"]), begun)
+
         # All environments are reset together, and only if one needs it: the predicate is one for the whole batch.
-        episode, first_obs, rng = jax.lax.cond(cut.any(), lambda: self._restarted(cut, begun), lambda: begun)
-        info = {**state.info, "rng": rng, "steps": state.info["episode_metrics"]["length"]}
+        episode, first_obs, rng = jax.lax.cond(cut.any(), restarted, lambda: begun)
         return state.replace(
             pipeline_state=episode.replace(ended=jnp.zeros_like(episode.ended)),
             obs=jnp.where(state.done[:, None] > 0, first_obs, state.obs),
-            info=info,
+            info={**state.info, "rng": rng, "steps": state.info["episode_metrics"]["length"]},
         )
-
-    def _restarted(self, cut: Bool[Array, " envs"], begun: tuple) -> tuple:
-        """Return new episodes where brax's limit cut the old ones."""
-        fresh = self.env.reset(begun[2])
-        started = (fresh.pipeline_state, fresh.obs, fresh.info["rng"])
-
-        def choose(new: Array, old: Array) -> Array:
-            return jnp.where(cut.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-
-        return jax.tree.map(choose, started, begun)
-
-
-def _from_cube(space: Space, action: Float[Array, " n"]) -> Float[Array, " action"]:
-    """Return the action that a vector in [-1, 1]^n of brax's agents stands for."""
-    if not isinstance(space, Box):
-        return space.retract(action)
-    low, high = jnp.array(space.low), jnp.array(space.high)
-    return space.retract(low + (high - low) * (action + 1) / 2)
 
 
 def _typed(rng: RawKey) -> PRNGKeyArray:
@@ -222,39 +199,3 @@ def _measures(step: Step) -> dict[str, Array]:
     ended = step.terminated | step.truncated
     outcome = {name: jnp.where(ended, value, 0.0) for name, value in step.outcome.items()}
     return {name: jnp.asarray(value, jnp.float32) for name, value in {**step.metrics, **outcome}.items()}
-
-
-def from_brax(
-    env: envs.Env,
-    to_action: Callable[[Float[Array, "2"]], Float[Array, " n"]] | None = None,
-    max_steps: int = 1000,
-    heuristic: Callable[[Float[Array, " obs"]], Float[Array, " action"]] | None = None,
-    *,
-    cues: Sequence[Cue] = (),
-) -> JaxEnvironment:
-    """Return a brax environment as one of ours, with its whole box [-1, 1]^n of actions.
-
-    `env` becomes a constant of what is compiled, `max_steps` is traced. Observations in a dictionary become one vector,
-    with a slice for each entry of the dictionary, in the order of their names.
-
-    Args:
-        env: bare, or in brax's `EpisodeWrapper`, whose truncations are then truncations here.
-        to_action: direction (2,) -> brax action (n,) in [-1, 1]^n. With it actions are directions in the plane.
-        max_steps: an episode is truncated after this many steps.
-        heuristic: observation -> the obvious action. A brax environment names none: without this the guidance
-            "heuristic" is refused there.
-        cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
-
-    Raises:
-        UserError: observations or actions do not fit, or `cues` are given beside `to_action`.
-    """
-    name = type(env.unwrapped).__name__
-    layout = layout_of(env, name)
-    return JaxEnvironment(
-        max_steps=jnp.array(max_steps, jnp.int32),
-        simulator=FixedSimulator(env),
-        observation=layout.observation,
-        actions=space_of(name, layout, to_action, cues),
-        to_action=to_action,
-        heuristic=heuristic,
-    )

@@ -24,8 +24,8 @@ BUILT_IN = {
     "gymnasium": "cuelearner_jax.tasks.gymnasium:GYMNASIUM",
     "logs": "cuelearner_jax.tasks.logs:LOGS",
     "navigation": "cuelearner_jax.tasks.navigation:NAVIGATION",
-    "brax": "cuelearner_jax.tasks.brax:BRAX",
-    "playground": "cuelearner_jax.tasks.playground:PLAYGROUND",
+    "brax": "cuelearner_jax.tasks.simulators:BRAX",
+    "playground": "cuelearner_jax.tasks.simulators:PLAYGROUND",
     "zoo": "cuelearner_jax.tasks.zoo:ZOO",
 }
 # Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task with the
@@ -33,8 +33,8 @@ BUILT_IN = {
 FAMILIES: dict[str, str] = {
     "gymnasium": "cuelearner_jax.tasks.gymnasium:task_of",
     "logs": "cuelearner_jax.tasks.logs:task_of",
-    "brax": "cuelearner_jax.tasks.brax:task_of",
-    "playground": "cuelearner_jax.tasks.playground:task_of",
+    "brax": "cuelearner_jax.tasks.simulators:brax_task",
+    "playground": "cuelearner_jax.tasks.simulators:playground_task",
     "zoo": "cuelearner_jax.tasks.zoo:task_of",
 }
 

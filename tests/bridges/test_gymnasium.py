@@ -49,6 +49,11 @@ def walk(world, actions, state=None):
     return [*states, state], steps
 
 
+def instances_of(world):
+    """The instances of this process."""
+    return pool_of(world.env.source).hosts[0].instances
+
+
 def rows(steps, name):
     return np.stack([getattr(step, name) for step in steps])
 
@@ -116,9 +121,9 @@ def test_it_holds_the_laws_of_environments():
 
 def test_a_state_that_was_left_is_taken_up_by_replaying_its_actions():
     here = world(Adder)
-    found = pool_of(here.env.source)
     actions = [[0.1], [0.2], [-0.3], [0.05]]
     states, steps = walk(here, actions)
+    found = instances_of(here)
     assert found.replays == 0
     for number in (1, 3, 0, 2):
         after, step = here.step(KEYS[number + 1], states[number], np.float32(actions[number]))
@@ -144,8 +149,7 @@ def test_what_is_resumed_in_another_process_is_bitwise_the_same():
 
 def test_lanes_that_share_a_state_each_get_an_instance():
     here = world(Adder)
-    env, found = here.env, pool_of(here.env.source)
-    state, _ = here.reset(KEYS[0])
+    env, (state, _) = here.env, here.reset(KEYS[0])
     lanes = jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), state)
 
     @jax.jit
@@ -158,12 +162,13 @@ def test_lanes_that_share_a_state_each_get_an_instance():
 
     totals = three(lanes).final_obs[-1, :, 0]
     np.testing.assert_allclose(totals, start_of(state.seed) + np.array([0.6, 0.6, 1.2, -3.0]), rtol=1e-6)
-    assert len(found.slots) == 4
+    found = instances_of(here)
+    assert len(found.running) == 4
     assert found.replays == 0
     # Two sets of lanes, one after the other: instances of both are kept, and replayed once.
     for _ in range(3):
         three(lanes)
-    assert len(found.slots) <= 8
+    assert len(found.running) <= 8
 
 
 def test_an_environment_that_does_not_repeat_itself_is_told():
