@@ -27,7 +27,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.reading import KIND
-from cuelearner_jax.policies import in_space
+from cuelearner_jax.policies import policy_of
 from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
 from cuelearner_jax.storage import label_files
@@ -111,7 +111,7 @@ def correct(
     world = world_of(found, before)
     own = as_policy(policy)
     # raises UserError where the policy returns something else than actions
-    CallablePolicy(in_space(own, found.space), actions=found.space)(found.rows.obs)
+    CallablePolicy(policy_of(own, found.space), actions=found.space)(found.rows.obs)
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
         world,
@@ -159,8 +159,8 @@ def agreement(
         scalars = getattr(own, "scalars", None) or plain_scalars(found.space)
         strength = float(scalars.eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base, "base")
-    base = None if base is None else in_space(base, found.space)
-    return study.agreement(in_space(own, found.space), found.rows, found.space, strength, base)
+    base = None if base is None else policy_of(base, found.space)
+    return study.agreement(policy_of(own, found.space), found.rows, found.space, strength, base)
 
 
 def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabels:

@@ -33,7 +33,7 @@ from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
-from cuelearner_jax.policies import Common, Guided, in_space
+from cuelearner_jax.policies import Common, Guided, policy_of
 from cuelearner_jax.spaces import DIRECTIONS, Space, says_something
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import GuidanceModel, Label, Teacher
@@ -187,7 +187,7 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     base = as_policy(policy)
     arguments.instance("model", model, FeedbackModel, "a model, as cl.ask and cl.fit_feedback give it")
     space = model.space
-    base = in_space(base, space)
+    base = policy_of(base, space)
     bound_deg = arguments.optional(arguments.amount, "bound_deg", bound_deg, space)
     labels = _checked_model(model).labels
     width, seen = labels.obs.shape[1], entries_of(policy)

@@ -18,7 +18,7 @@ from cuelearner_jax.api import arguments
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name
+from cuelearner_jax.policies import Policy, call_policy, policy_name, policy_of
 from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
@@ -49,7 +49,7 @@ class CallablePolicy:
 
     def __post_init__(self) -> None:
         """Make a policy of an object that acts. Raises UserError for any other."""
-        object.__setattr__(self, "policy", in_space(arguments.policy("policy", self.policy), self.actions))
+        object.__setattr__(self, "policy", policy_of(arguments.policy("policy", self.policy), self.actions))
 
     @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
@@ -103,7 +103,7 @@ def as_policy_in(given: Any, env: Any) -> Policy:
     policy = as_policy(given)
     if isinstance(given, CallablePolicy) and given.observation:
         check_layout("the policy", given.observation, given.actions, env)
-    policy = in_space(policy, actions_of(env))
+    policy = policy_of(policy, actions_of(env))
     user_code.acts_in("policy", policy, env)
     return policy
 

@@ -55,20 +55,19 @@ class Opaque(PolicyNode):
         """
         rows = np.random.default_rng(0).random((TRIED, size), np.float32)
         alone = np.concatenate([self._called(rows[place : place + 1]) for place in (0, 1, 0, 1)])
-        self._compare(alone[:2], alone[2:], REPEATED, "when it is asked again")
-        among = self._called(rows)
-        self._compare(among, self._called(rows), REPEATED, "when it is asked again")
-        self._compare(alone[:2], among[:2], BATCHED, f"in a batch of {TRIED}")
-
-    def _compare(self, actions: np.ndarray, others: np.ndarray, most: float, when: str) -> None:
-        """Raise UserError for actions (..., action) that differ by more than a share `most` of an entry's range."""
+        among, again = self._called(rows), self._called(rows)
         entries = np.subtract(self.actions.high, self.actions.low) if isinstance(self.actions, Box) else 1.0
-        apart = np.abs(np.asarray(self.actions.retract(actions)) - np.asarray(self.actions.retract(others)))
-        if (apart > most * entries).any():
-            raise UserError(
-                f"{policy_name(self)} does not repeat itself: the same observation gets another action {when}; give a "
-                "policy without memory and sampling, as model.predict(obs, deterministic=True)"
-            )
+        for actions, others, most, when in (
+            (alone[:2], alone[2:], REPEATED, "when it is asked again"),
+            (among, again, REPEATED, "when it is asked again"),
+            (alone[:2], among[:2], BATCHED, f"in a batch of {TRIED}"),
+        ):
+            apart = np.abs(np.asarray(self.actions.retract(actions)) - np.asarray(self.actions.retract(others)))
+            if (apart > most * entries).any():
+                raise UserError(
+                    f"{policy_name(self)} does not repeat itself: the same observation gets another action {when}; "
+                    "give a policy without memory and sampling, as model.predict(obs, deterministic=True)"
+                )
 
     def _called_back(self, obs: Any) -> np.ndarray:
         """Return the function's actions; NaN once it has failed, which `user_code` reports after the program."""
@@ -105,33 +104,32 @@ class Opaque(PolicyNode):
         Of a pair of actions and None (models of Stable-Baselines3), or a dictionary (of brax), the actions are taken.
         Whole numbers in a space of choices are numbers of choices.
         """
-        wanted = (rows, self.actions.size)
+        name, wanted = policy_name(self), (rows, self.actions.size)
         if isinstance(chosen, tuple) and len(chosen) == 2 and (chosen[1] is None or np.ndim(chosen[0]) == 2):
             if not isinstance(chosen[1], dict | None):
-                raise foreign.memory_error(policy_name(self))
+                raise foreign.memory_error(name)
             chosen = chosen[0]
         try:
             found = as_array(chosen)
         except Exception as error:  # PyTorch's own kinds too
             why = " ".join(str(error).split())[:200]
             raise UserError(
-                f"{policy_name(self)} returned {format_value(chosen)} ({why}): return an array of shape {wanted}"
+                f"{name} returned {format_value(chosen)} ({why}): return an array of shape {wanted}"
             ) from error
-        if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
-            raise UserError(f"{policy_name(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
-        if isinstance(self.actions, Choices) and found.shape == (rows,) and getattr(found.dtype, "kind", "") in "iu":
+        is_whole = jnp.issubdtype(found.dtype, jnp.integer)
+        if not is_whole and not jnp.issubdtype(found.dtype, jnp.floating):
+            raise UserError(f"{name} returned {found.dtype} numbers: return real ones, of shape {wanted}")
+        if isinstance(self.actions, Choices) and found.shape == (rows,) and is_whole:
             inside = (found >= 0) & (found < self.actions.size)
             if isinstance(inside, np.ndarray) and not inside.all():
                 raise UserError(
-                    f"{policy_name(self)} chose {found[~inside][0]}: give the number of a choice, 0 to "
-                    f"{self.actions.size - 1}, whatever number the environment starts from"
+                    f"{name} chose {found[~inside][0]}: give the number of a choice, 0 to {self.actions.size - 1}, "
+                    "whatever number the environment starts from"
                 )
             one_hot = as_array(found[:, None] == np.arange(self.actions.size)).astype(np.float32)
             return one_hot if isinstance(inside, np.ndarray) else jnp.where(inside[:, None], one_hot, jnp.nan)
         if found.shape != wanted:
-            raise UserError(
-                f"{policy_name(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
-            )
+            raise UserError(f"{name} returned actions of shape {found.shape} for {rows} observations: return {wanted}")
         with np.errstate(over="ignore"):
             return found.astype(np.float32)
 
@@ -162,56 +160,54 @@ def _called(code: Any) -> str:
     return getattr(code, "__qualname__", type(code).__qualname__).replace("<locals>.", "")
 
 
-def in_space(policy: Any, space: Space) -> Any:
-    """Return a policy whose bare function gets this space of actions, if it was given without one.
-
-    Raises UserError for a model of another library that is known to give other actions.
-    """
-    if not isinstance(policy, Opaque):
-        return policy
-    if isinstance(policy.function, foreign.Foreign):
-        policy.function.check(space)
-    return policy.replace(actions=space)
-
-
-def policy_of(given: Any) -> Any:
+def policy_of(given: Any, space: Space | None = None) -> Any:
     """Return anything that acts as a policy.
 
     Args:
         given: a policy; a class or function that gives one when it is called with nothing; a function of a batch of
             observations: one that `jax.jit` made is compiled with what calls it, any other gets NumPy arrays; or a
             policy of another library, see `foreign.function_of`.
+        space: the space of the actions of a function (None: not known yet).
 
     Raises:
-        UserError: the object is none of these, or a policy that is not a pytree.
+        UserError: the object is none of these, a policy that is not a pytree, or a model of another library that is
+            known to give other actions than those of the space.
     """
     function = foreign.function_of(given)
-    if function is None and not (hasattr(given, "act") and not isinstance(given, type)) and _required(given) == []:
+    if function is None and not _acts(given) and _required(given) == []:
         try:
             given = given()
         except (Exception, SystemExit) as error:
             raise user_code_error(f"policy {_called(given)}", error) from error
         function = foreign.function_of(given)
-    if function is not None:
-        return Opaque(function, on_host=True)
-    if hasattr(given, "act"):
-        if any(leaf is given for leaf in jax.tree.leaves(given)):
-            kind = type(given).__name__
+    policy = given if function is None else Opaque(function, on_host=True)
+    if _acts(policy):
+        if any(leaf is policy for leaf in jax.tree.leaves(policy)):
+            kind = type(policy).__name__
             raise UserError(
                 f"a {kind} has `act` but is not a pytree: make it a flax.struct.PyTreeNode, or give a function"
             )
-        return given
-    if callable(given) and not isinstance(given, type):
+    elif callable(given) and not isinstance(given, type):
         if len(more := _required(given) or ()) > 1:
             raise UserError(
                 f"policy {_called(given)} takes {', '.join(more)}: give a function of observations alone, for instance "
                 f"jax.jit(lambda obs: policy(obs, {', '.join(more[1:])})[0])"
             )
-        return Opaque(given, on_host=not isinstance(given, jax.stages.Wrapped))
-    raise UserError(
-        f"{format_value(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
-        "model of Stable-Baselines3 or a file in ONNX, or load one"
-    )
+        policy = Opaque(given, on_host=not isinstance(given, jax.stages.Wrapped))
+    else:
+        raise UserError(
+            f"{format_value(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
+            "model of Stable-Baselines3 or a file in ONNX, or load one"
+        )
+    if space is None or not isinstance(policy, Opaque):
+        return policy
+    if isinstance(policy.function, foreign.Foreign):
+        policy.function.check(space)
+    return policy.replace(actions=space)
+
+
+def _acts(given: Any) -> bool:
+    return hasattr(given, "act") and not isinstance(given, type)
 
 
 def _required(given: Any) -> list[str] | None:
@@ -220,6 +216,6 @@ def _required(given: Any) -> list[str] | None:
         parameters = inspect.signature(given).parameters.values()
     except (TypeError, ValueError):  # not callable, or compiled code
         return None
-    if any(one.kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD) for one in parameters):
+    if any(one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters):
         return None
     return [one.name for one in parameters if one.default is one.empty]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import in_space, policy_of
+from cuelearner_jax.policies import policy_of
 from cuelearner_jax.spaces import Box, Choices
 
 FIRST = np.eye(3, 2)  # a policy whose action is the first two entries of its observation
@@ -15,7 +15,7 @@ OBS = np.random.default_rng(0).uniform(-1, 1, (5, 3)).astype(np.float32)
 
 def acted(given, obs=OBS, space=SPACE):
     """What a policy does in a compiled program."""
-    policy = in_space(policy_of(given), space)
+    policy = policy_of(given, space)
     return np.asarray(jax.jit(lambda obs: policy.act(jax.random.key(0), None, obs))(obs))
 
 
@@ -24,7 +24,7 @@ def fault(given, obs=OBS, space=SPACE):
     from cuelearner_jax.api.policies import CallablePolicy
 
     with pytest.raises(UserError) as error:
-        CallablePolicy(in_space(policy_of(given), space), actions=space)(obs)
+        CallablePolicy(policy_of(given, space), actions=space)(obs)
     assert "\n" not in str(error.value)
     return str(error.value)
 
