@@ -154,7 +154,7 @@ def test_it_is_an_environment(folder):
     [
         ({"cues": "left,right;up,down"}, "2 pairs of words for 3 entries"),
         ({"cues": "left;right"}, "two words for each entry"),
-        ({"low": (0.0, 0.0, 0.0)}, "low is given alone"),
+        ({"low": (0.0, 0.0, 0.0)}, "given alone"),
         ({"low": (0.0,) * 3, "high": (0.1,) * 3}, "give bounds that hold the recorded actions"),
         ({"low": (0.0,) * 2, "high": (0.1,) * 2}, "3 cues for 2 entries"),
         ({"actions": "directions"}, "actions of 3 entries, directions have 2"),
