@@ -101,21 +101,11 @@ def test_the_taught_policy_does_what_its_teacher_holds_for_best():
     np.testing.assert_allclose(best_actions(EXPERT, STATES, OBS), BEST, atol=1e-6)
 
 
-def test_the_heuristic_is_the_environments():
-    np.testing.assert_allclose(act(Heuristic(ENV)), directions.rotate(OBS, -1.0), atol=1e-6)
-
-
 @pytest.mark.parametrize("base", [AGENT, Uniform(), Taught(EXPERT)], ids=["agent", "uniform", "taught"])
 def test_under_no_guidance_a_policy_is_itself(base):
     none = guidances.make("none", probes.SIZES, ENV)
     guided = Guided(base, none.init(KEY), ENV, probes.SCALARS, none)
     np.testing.assert_array_equal(act(guided), act(base))
-
-
-def test_under_the_heuristic_every_action_is_its():
-    heuristic = guidances.make("heuristic", probes.SIZES, ENV)
-    guided = Guided(AGENT, heuristic.init(KEY), ENV, probes.SCALARS, heuristic)
-    np.testing.assert_array_equal(act(guided), act(Heuristic(ENV)))
 
 
 def test_under_relative_guidance_every_action_is_refined_once_the_model_is_fitted():
@@ -137,12 +127,6 @@ def test_corrections_end_within_half_eps_of_the_teachers_best(base, eps_deg):
     error = np.rad2deg(np.abs(directions.difference(BEST, act(Corrected(base, EXPERT, scalars)))))
     assert error.max() <= eps_deg / 2 + 1e-2
     assert np.rad2deg(np.abs(directions.difference(BEST, act(base)))).max() > eps_deg
-
-
-def test_corrections_keep_to_the_bound():
-    scalars = dataclasses.replace(probes.SCALARS, tau_max_deg=30.0)
-    moved = directions.difference(act(Heuristic(ENV)), act(Corrected(Heuristic(ENV), EXPERT, scalars)))
-    np.testing.assert_allclose(np.rad2deg(moved), 30.0, atol=1e-2)  # 92 degrees short, so as far as allowed
 
 
 # Functions of one's own.
@@ -229,11 +213,6 @@ def stacked():
 def test_a_policy_that_does_not_repeat_itself_is_refused(function, why):
     with pytest.raises(UserError, match=why):
         act(Opaque(function, on_host=True))
-
-
-def test_rounding_in_another_batch_is_no_fault_and_extras_are_left_out():
-    function = lambda obs: (obs * (1 + 1e-3 * (len(obs) == 1)), {"log_prob": 0.0})  # noqa: E731
-    np.testing.assert_allclose(act(Opaque(function, on_host=True)), OBS, atol=1e-6)
 
 
 def test_a_function_of_more_than_observations_is_refused_with_the_call_that_would_do():

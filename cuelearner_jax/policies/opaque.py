@@ -55,19 +55,20 @@ class Opaque(PolicyNode):
         """
         rows = np.random.default_rng(0).random((TRIED, size), np.float32)
         alone = np.concatenate([self._called(rows[place : place + 1]) for place in (0, 1, 0, 1)])
-        among, again = self._called(rows), self._called(rows)
+        self._compare(alone[:2], alone[2:], REPEATED, "when it is asked again")
+        among = self._called(rows)
+        self._compare(among, self._called(rows), REPEATED, "when it is asked again")
+        self._compare(alone[:2], among[:2], BATCHED, f"in a batch of {TRIED}")
+
+    def _compare(self, actions: np.ndarray, others: np.ndarray, most: float, when: str) -> None:
+        """Raise UserError for actions (..., action) that differ by more than a share `most` of an entry's range."""
         entries = np.subtract(self.actions.high, self.actions.low) if isinstance(self.actions, Box) else 1.0
-        for actions, others, most, when in (
-            (alone[:2], alone[2:], REPEATED, "when it is asked again"),
-            (among, again, REPEATED, "when it is asked again"),
-            (alone[:2], among[:2], BATCHED, f"in a batch of {TRIED}"),
-        ):
-            apart = np.abs(np.asarray(self.actions.retract(actions)) - np.asarray(self.actions.retract(others)))
-            if (apart > most * entries).any():
-                raise UserError(
-                    f"{policy_name(self)} does not repeat itself: the same observation gets another action {when}; "
-                    "give a policy without memory and sampling, as model.predict(obs, deterministic=True)"
-                )
+        apart = np.abs(np.asarray(self.actions.retract(actions)) - np.asarray(self.actions.retract(others)))
+        if (apart > most * entries).any():
+            raise UserError(
+                f"{policy_name(self)} does not repeat itself: the same observation gets another action {when}; give a "
+                "policy without memory and sampling, as model.predict(obs, deterministic=True)"
+            )
 
     def _called_back(self, obs: Any) -> np.ndarray:
         """Return the function's actions; NaN once it has failed, which `user_code` reports after the program."""

@@ -10,14 +10,12 @@ import pytest
 from box_task import SMALL, Reach
 from brax import envs
 from brax.envs.wrappers import training
-from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as sac
 from flax import struct
 
-from cuelearner_envs.billiards import config as billiards
 from cuelearner_envs.navigation import config as navigation
 from cuelearner_jax.bridges import brax as brax_adapter
 from cuelearner_jax.bridges.brax import to_brax, wrap_for_training
@@ -90,12 +88,6 @@ def test_a_box_is_stretched_to_the_cube_of_brax():
         to_brax(Reach(Choices(3)))
 
 
-def test_a_typed_key_will_do():
-    env = to_brax(probes.Window())
-    given, words = env.reset(jax.random.key(0)), env.reset(RAW)
-    jax.tree.map(np.testing.assert_array_equal, given, words)
-
-
 @pytest.mark.parametrize("wrap", WRAPS)
 @pytest.mark.parametrize("truncates", [False, True])
 def test_ends_and_truncations_reach_the_wrappers(wrap, truncates):
@@ -111,27 +103,6 @@ def test_ends_and_truncations_reach_the_wrappers(wrap, truncates):
     )
     if wrap == "ours":
         assert column(states, lambda state: state.info["steps"]) == [1, 2] * 3
-
-
-@pytest.mark.parametrize("wrap", WRAPS)
-def test_an_episode_that_the_wrapper_cuts_is_truncated(wrap):
-    states = run(WRAPS[wrap](to_brax(probes.Chain(jnp.array(False))), episode_length=1), [(0.0, 1.0)] * 3)
-    assert column(states, done) == [1, 1, 1]
-    assert column(states, truncation) == [1, 1, 1]
-    assert column(states, lambda state: state.reward) == [0.5] * 3  # always from place 0
-    assert column(states, lambda state: state.obs[:, 0]) == [1, 1, 1]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("wrap", WRAPS)
-@pytest.mark.parametrize("truncates", [False, True])
-def test_an_end_amid_repeated_actions_is_not_lost(wrap, truncates):
-    # Three times the same action, of which the episode takes two; the third must not begin another one.
-    env = WRAPS[wrap](to_brax(probes.Chain(jnp.array(truncates))), episode_length=60, action_repeat=3)
-    states = run(env, [(0.6, 0.8)] * 2)
-    assert column(states, done) == [1, 1]
-    assert column(states, truncation) == [float(truncates)] * 2
-    np.testing.assert_allclose(column(states, lambda state: state.reward), [0.5 * 0.8 + 0.6] * 2, rtol=1e-6)
 
 
 class Countdown(WholeObservations, struct.PyTreeNode):
@@ -175,29 +146,6 @@ def test_the_sum_over_an_episode_is_its_outcome():
 
 @pytest.mark.long
 @pytest.mark.parametrize("wrap", WRAPS)
-def test_what_brax_learns_from_an_end(wrap):
-    """Targets of brax's own advantage estimator: nothing follows a termination, and a truncation teaches nothing."""
-    values = jnp.array([[3.0], [5.0], [3.0], [5.0]])
-    targets = {}
-    for truncates in (False, True):
-        states = run(WRAPS[wrap](to_brax(probes.Chain(jnp.array(truncates))), 50), [(0.0, 1.0), (1.0, 0.0)] * 2, 1)[1:]
-        truncations = jnp.stack([truncation(state) for state in states])
-        ends = jnp.stack([done(state) for state in states])
-        targets[truncates], _ = ppo_losses.compute_gae(
-            truncation=truncations,
-            termination=ends * (1 - truncations),  # as in compute_ppo_loss: (1 - discount) * (1 - truncation)
-            rewards=jnp.stack([state.reward for state in states]),
-            values=values,
-            bootstrap_value=jnp.array([100.0]),
-            lambda_=0.0,
-            discount=0.5,
-        )
-    np.testing.assert_allclose(targets[False][:, 0], [0.5 + 0.5 * 5, 1, 0.5 + 0.5 * 5, 1])
-    np.testing.assert_allclose(targets[True][:, 0], [0.5 + 0.5 * 5, 5, 0.5 + 0.5 * 5, 5])
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("wrap", WRAPS)
 def test_brax_may_randomize_our_parameters(wrap):
     offsets = jnp.array([0.0, 1.5])
 
@@ -227,12 +175,6 @@ def test_device_put_replicated_stacks_a_copy_for_each_device(monkeypatch):
     assert jax.device_put_replicated is supplied  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_a_jax_that_still_has_device_put_replicated_keeps_its_own(monkeypatch):
-    monkeypatch.setattr(jax, "device_put_replicated", "its own", raising=False)
-    brax_adapter.supply_device_put_replicated()
-    assert jax.device_put_replicated == "its own"  # pyright: ignore[reportAttributeAccessIssue]
-
-
 TINY = {"policy_hidden_layer_sizes": (16,), "value_hidden_layer_sizes": (16,)}
 
 
@@ -258,14 +200,6 @@ def assert_learned(before, after, metrics, losses):
         assert (old != new).any()
     for name in losses:
         assert np.isfinite(metrics[name]), name
-
-
-@pytest.mark.long
-def test_ppo_of_brax_learns_on_billiards():
-    env = to_brax(billiards.make_environment(billiards.BilliardsConfig(table="one_ball")))
-    before, after, step, metrics = train_ppo(env, None)  # with brax's own wrappers
-    assert step == 256
-    assert_learned(before, after, metrics, ["training/policy_loss", "training/v_loss", "training/entropy_loss"])
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ from brax.envs.wrappers import training
 
 from cuelearner_jax import loop
 from cuelearner_jax.bridges.brax import from_brax, to_brax
-from cuelearner_jax.environment import Environment, actions_of, offers, symmetries_of
+from cuelearner_jax.environment import Environment, actions_of, symmetries_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.program import make_program
@@ -73,14 +73,11 @@ def test_a_step_is_that_of_brax():
         np.testing.assert_array_equal(step.aftermath, step.final_obs)
 
 
-def test_time_runs_out_only_where_nothing_ended():
+def test_time_runs_out_by_ours_only_where_nothing_ended_or_by_brax():
     _, steps = walk(from_brax(Field(), max_steps=2), [(1.0, 0.0), (1.0, 0.0), (1.0, 0.0), (-1.0, 0.0)])
     assert [bool(step.terminated) for step in steps] == [False, True, False, False]
     assert [bool(step.truncated) for step in steps] == [False, False, False, True]
     assert np.abs(steps[3].obs - steps[3].final_obs).max() > 0
-
-
-def test_a_truncation_of_brax_is_one_of_ours():
     _, steps = walk(from_brax(training.EpisodeWrapper(Field(), 1, 1)), [(1.0, 0.0)] * 2)
     assert [bool(step.truncated) for step in steps] == [True, True]
     assert not any(step.terminated for step in steps)
@@ -144,12 +141,6 @@ def test_observations_in_a_dictionary_are_one_vector_with_named_slices():
         np.testing.assert_array_equal(one.aftermath, other.aftermath[[0, 0, 1]])
 
 
-def test_there_is_an_obvious_direction_where_one_is_given():
-    assert not offers(from_brax(Field()), "heuristic")
-    given = from_brax(Field(), heuristic=lambda obs: -obs)
-    np.testing.assert_array_equal(given.heuristic(jnp.array([0.0, 1.0])), [0, -1])
-
-
 @pytest.mark.parametrize(
     ("env", "to_action", "words"),
     [
@@ -178,13 +169,8 @@ BOOTSTRAPPING = probes.config(scalars={"discount": 0.9}, agent={"target_every": 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "make",
-    [Field, functools.partial(envs.get_environment, "inverted_pendulum", backend="positional")],
-    ids=["field", "pendulum"],
-)
-def test_our_loop_learns_on_an_environment_of_brax(make):
-    env = from_brax(make(), max_steps=5)
+def test_our_loop_learns_on_an_environment_of_brax():
+    env = from_brax(envs.get_environment("inverted_pendulum", backend="positional"), max_steps=5)
     program = make_program(BOOTSTRAPPING, guidances.make("none", probes.SIZES, env), env, 0)
     state = probes.start(program, [0], [0], env)
     fresh = probes.lane(state.agent.params, 0)

@@ -6,7 +6,6 @@ import shutil
 import numpy as np
 import probes
 import pytest
-from gymnasium_worlds import reach, toward
 from small_runs import next_command, stopping_at
 
 import cuelearner_jax as cl
@@ -101,30 +100,12 @@ def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
     assert main([*again, "--episodes", "4"]) == 0
 
 
-def test_python_and_the_command_line_agree(tmp_path):
-    file = tmp_path / "found.json"
-    command = ["evaluate", REACH, "--policy", "teacher", "--teacher", "gymnasium_worlds:toward", "--episodes", "4"]
-    assert main([*command, "--task.processes", "1", "--out", str(file)]) == 0
-    world = cl.from_gymnasium(reach, processes=1)
-    mine = cl.measure(toward, world, episodes=4).metrics
-    assert mine["success"] == [1.0]
-    (row,) = json.loads(file.read_text())["rows"]
-    for name, values in mine.items():
-        assert row[name] == pytest.approx(values.tolist(), rel=1e-5)
-
-
 def test_pictures_are_written(tmp_path):
     command = ["render", "gymnasium:gymnasium_worlds:limited", "--policy", "uniform", "--steps", "3"]
     assert main([*command, "--out", str(tmp_path / "film")]) == 0
     assert sorted(file.suffix for file in (tmp_path / "film").iterdir()) == [".gif", ".png"]
     assert main([*command, "--question", "--out", str(tmp_path / "asked")]) == 0
     assert len(list((tmp_path / "asked").iterdir())) == 1
-
-
-def test_a_limit_of_steps_that_is_given_is_not_announced(capsys):
-    command = ["evaluate", "gymnasium:gymnasium_worlds:Adder", "--policy", "uniform", "--episodes", "3"]
-    assert main([*command, "--task.max-steps", "6", "--task.processes", "1"]) == 0
-    assert "has no limit of steps" not in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,8 @@ import numpy as np
 import probes
 import pytest
 from box_task import EPS, SCALARS, SMALL, Reach
-from flax import struct
 
-import cuelearner_jax as cl
 from cuelearner_jax import asking
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.config import GuideSizes
-from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import (
@@ -32,7 +27,6 @@ from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.policies import Uniform
 from cuelearner_jax.spaces import UNSAID, Box, Cue, cues_from, from_json
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.testing import check_environment
 from cuelearner_jax.types import Label
 
 LARGE = Box((-1.0,) * 7, tuple(1.0 + 0.5 * entry for entry in range(7)))
@@ -92,12 +86,6 @@ def test_samples_and_the_even_spread_fill_the_box(box):
         np.testing.assert_allclose(shares.mean(0), 0.5, atol=0.06)  # of samples: standard deviation 0.013
         np.testing.assert_allclose(shares.std(0), 1 / np.sqrt(12), atol=0.03)
     np.testing.assert_allclose(box.spread(1)[0], (low + high) / 2, rtol=1e-6)
-
-
-@boxes
-def test_a_file_describes_a_box(box):
-    assert from_json(box.to_json()) == box
-    assert hash(from_json(box.to_json())) == hash(box)
 
 
 @pytest.mark.parametrize(
@@ -183,10 +171,6 @@ def test_a_perfect_model_ends_within_half_eps_along_every_entry(box):
     assert np.abs(box.log(first, near.actions)).max() <= 0.2 + 1e-5
 
 
-def test_a_probe_with_a_box_keeps_the_laws_of_environments():
-    check_environment(Reach())
-
-
 def test_relative_labels_lead_to_the_goal_of_a_box():
     sizes = dataclasses.replace(probes.SIZES, labels_per_round=100, fit_steps=600)
     env, scalars = Reach(), SCALARS
@@ -227,35 +211,6 @@ def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
         external_labels.check_file(spoilt, None, form, "labels.parquet")
 
 
-@pytest.mark.parametrize(
-    ("what", "planar"),
-    [
-        ("agent.coarse_directions", lambda: ddqn.Config(coarse_directions=36).make("raw", spaces_of(Reach()))),
-    ],
-)
-def test_what_knows_directions_alone_refuses_a_box(what, planar):
-    with pytest.raises(UserError, match=f"{what} works for directions .* not for actions of a box of 3 entries: [a-z]"):
-        planar()
-
-
-class Saying(struct.PyTreeNode):
-    """A teacher of one action."""
-
-    action: jax.Array
-
-    def best_action(self, state, obs):
-        return self.action
-
-
-def test_a_teacher_is_blamed_by_the_rules_of_their_space():
-    """A vector of zeros is no direction, and an action of this box."""
-    env = Reach()
-    guide = asking.start(registry.make("relative", probes.SIZES, env), env, 20, 20, KEY, KEY)
-    asking.blame(env, Saying(jnp.zeros(3)), guide)
-    with pytest.raises(UserError, match="teacher Saying gave actions that are not finite"):
-        asking.blame(env, Saying(jnp.array([0.0, jnp.nan, 0.0])), guide)
-
-
 @pytest.mark.parametrize("size", [9, 14, 28])
 def test_boxes_of_bimanual_arms_and_hands_need_no_cues_and_no_keys(size):
     plain = Box((-1.0,) * size, (1.0,) * size)
@@ -266,21 +221,3 @@ def test_boxes_of_bimanual_arms_and_hands_need_no_cues_and_no_keys(size):
         assert len(keys) == len(set(keys)) > 16
         assert from_json(box.to_json()) == box
         np.testing.assert_allclose(box.exp(*map(jnp.asarray, (box.low, np.ones(size)))), box.high)
-
-
-def test_a_policy_of_26_entries_is_corrected_by_labels_alone_and_its_folder_read(tmp_path):
-    random, size = np.random.default_rng(0), 26
-    best = random.uniform(-0.5, 0.5, (60, size))
-    actions = best + 0.2 + random.uniform(-0.2, 0.2, best.shape)
-    labels = cl.Labels(best, actions, np.sign(best - actions))
-    sizes = GuideSizes(frame="action", feedback_layers=(8,), fit_steps=20, fit_batch_size=8)
-    policy = cl.correct(shifted, labels, low=[-1] * size, high=[1] * size, guidance="relative", bound=0.25, sizes=sizes)
-    policy.save(tmp_path / "hand")
-    again = cl.load_policy(tmp_path / "hand", base=shifted)
-    assert again.actions == policy.actions
-    np.testing.assert_array_equal(again(best), policy(best))
-
-
-def shifted(obs):
-    """A policy that is wrong by a constant."""
-    return obs + 0.2

@@ -11,7 +11,6 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import logs, registry
-from cuelearner_jax.testing.environments import check_environment
 
 CUES = "left,right;up,down;open,close"
 BOUNDS = {"low": recorded.LOW, "high": recorded.HIGH}
@@ -145,10 +144,6 @@ def test_it_is_named_by_its_folder(folder):
         logs.LOGS.environment(logs.LOGS.plain())
 
 
-def test_it_is_an_environment(folder):
-    check_environment(logs.task_of(folder, CUES, **BOUNDS).environment(logs.task_of(folder, CUES, **BOUNDS).plain()))
-
-
 @pytest.mark.parametrize(
     ("given", "told"),
     [
@@ -166,11 +161,6 @@ def test_it_is_an_environment(folder):
 def test_what_does_not_fit_is_told(given, told, folder):
     with pytest.raises(UserError, match=told):
         logs.task_of(folder, **given, note=quiet)
-
-
-def test_an_entry_that_never_changes_needs_bounds():
-    with pytest.raises(UserError, match="fingers of the actions never changes"):
-        logs.bounds_of(np.array([[0.0, 1.0], [1.0, 1.0]], np.float32), None, None, ("x", "fingers"), quiet)
 
 
 def test_directions_and_choices_are_recorded_too(tmp_path):
@@ -218,10 +208,3 @@ def test_a_clip_is_a_film_of_its_situation(tmp_path):
     for row in (0, 1):
         assert drawn.sketch(env, at(row)).box[2:] == (48, 32)
         assert len(drawn.reel(env, at(row), jnp.zeros(3)).pictures) == 3
-
-
-def test_no_pictures_where_they_are_wanted_are_told(tmp_path):
-    recorded.write(tmp_path / "situations", pictures=False)
-    task = logs.task_of(tmp_path / "situations", CUES, **BOUNDS)
-    with pytest.raises(UserError, match="has no picture of row"):
-        task.pictures().sketch(task.environment(task.plain()), at(0))
