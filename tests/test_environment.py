@@ -9,7 +9,6 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.bridges.brax import from_brax, to_brax
 from cuelearner_jax.environment import (
     UNKNOWN_UNIT,
     Features,
@@ -32,7 +31,6 @@ PROBES = {
     "window": probes.Window(),
     "mirrored window": probes.Window(mirrors=True),
     "chain": probes.Chain(),
-    "chain through brax": from_brax(to_brax(probes.Chain())),
 }
 SHAPES = {
     **{
@@ -115,7 +113,7 @@ def test_shapes_in_place_of_arrays_offer_the_same():
 
 
 def test_environments_without_a_mirror_have_the_identity_alone():
-    assert [symmetries_of(env) for env in PROBES.values()] == [1, 4, 1, 1]
+    assert [symmetries_of(env) for env in PROBES.values()] == [1, 4, 1]
 
 
 def test_actions_are_directions_where_nothing_else_is_said():

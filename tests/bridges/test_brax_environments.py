@@ -1,7 +1,5 @@
 """brax's environments as ours, and in our loop."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +9,13 @@ from brax import envs
 from brax.envs.wrappers import training
 
 from cuelearner_jax import loop
-from cuelearner_jax.bridges.brax import from_brax, to_brax
+from cuelearner_jax.bridges import brax as brax_adapter
+from cuelearner_jax.bridges.brax import from_brax
 from cuelearner_jax.environment import Environment, actions_of, symmetries_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import DIRECTIONS, Box, Cue
-from cuelearner_jax.spaces.directions import evenly_spaced
 
 
 class Field(envs.Env):
@@ -81,16 +79,6 @@ def test_time_runs_out_by_ours_only_where_nothing_ended_or_by_brax():
     _, steps = walk(from_brax(training.EpisodeWrapper(Field(), 1, 1)), [(1.0, 0.0)] * 2)
     assert [bool(step.truncated) for step in steps] == [True, True]
     assert not any(step.terminated for step in steps)
-
-
-@pytest.mark.parametrize("truncates", [False, True])
-def test_there_and_back(truncates):
-    chain = probes.Chain(jnp.array(truncates))
-    actions = np.asarray(evenly_spaced(6))
-    (start, expected), (same, steps) = walk(chain, actions), walk(from_brax(to_brax(chain)), actions)
-    np.testing.assert_array_equal(same, start)
-    for one, other in zip(steps, expected, strict=True):
-        jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), one, other)
 
 
 def test_a_step_leaves_the_state_that_it_was_given():
@@ -160,6 +148,19 @@ def test_what_does_not_fit_is_refused_in_one_line(env, to_action, words):
     assert "\n" not in str(refused.value)
     with pytest.raises(UserError, match="cues are of the box, to_action of directions: give one of the two"):
         from_brax(Field(), lambda direction: direction, cues=from_brax(Field()).actions.cues)
+
+
+def test_device_put_replicated_stacks_a_copy_for_each_device(monkeypatch):
+    monkeypatch.delattr(jax, "device_put_replicated", raising=False)
+    brax_adapter.supply_device_put_replicated()
+    supplied = jax.device_put_replicated  # pyright: ignore[reportAttributeAccessIssue]
+    devices = jax.local_devices()[:1]
+    copies = supplied({"a": jnp.arange(3.0), "b": 2}, devices)
+    np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
+    assert copies["b"].shape == (1,)
+    np.testing.assert_array_equal(jax.pmap(lambda a: a + 1, devices=devices)(copies["a"]), [[1, 2, 3]])
+    brax_adapter.supply_device_put_replicated()
+    assert jax.device_put_replicated is supplied  # pyright: ignore[reportAttributeAccessIssue]
 
 
 # Our loop on brax's.
