@@ -19,10 +19,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space, box
+from cuelearner_jax.spaces import Box, Cue, Space, box
 from cuelearner_jax.types import Step
 
-ToAction = Callable[[Float[Array, "2"]], Float[Array, " n"]]
 Heuristic = Callable[[Float[Array, " obs"]], Float[Array, " action"]]
 
 
@@ -45,8 +44,6 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     simulator: Callable[[], Any] = struct.field(pytree_node=False)
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
-    # action of ours -> the simulator's (n,); None: as it is
-    to_action: ToAction | None = struct.field(pytree_node=False, default=None)
     heuristic: Heuristic | None = struct.field(pytree_node=False, default=None)
 
     def reset(self, key: PRNGKeyArray) -> tuple[Running, Float[Array, " obs"]]:
@@ -57,23 +54,15 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     def step(self, key: PRNGKeyArray, state: Running, action: Float[Array, " action"]) -> tuple[Running, Step]:
         """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
         before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into their input dictionaries
-        given = action if self.to_action is None else self.to_action(action)
-        after = Running(_as_arrays(self.simulator().step(before, given)), state.steps + 1)
+        after = Running(_as_arrays(self.simulator().step(before, action)), state.steps + 1)
         stopped = jnp.asarray(after.state.info.get("truncation", 0)) > 0
         terminated = (after.state.done > 0) & ~stopped
         truncated = (stopped | (after.steps >= self.max_steps)) & ~terminated
         fresh, fresh_obs = self.reset(key)
         final_obs, ended = flat(after.state.obs), terminated | truncated
-        step = Step(
-            obs=jnp.where(ended, fresh_obs, final_obs),
-            final_obs=final_obs,
-            aftermath=final_obs,
-            reward=after.state.reward.astype(jnp.float32),
-            terminated=terminated,
-            truncated=truncated,
-            metrics={name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()},
-            outcome={},
-        )
+        obs, reward = jnp.where(ended, fresh_obs, final_obs), after.state.reward.astype(jnp.float32)
+        metrics = {name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()}
+        step = Step(obs, final_obs, final_obs, reward, terminated, truncated, metrics, outcome={})
         return jax.tree.map(partial(jnp.where, ended), fresh, after), step
 
 
@@ -148,12 +137,7 @@ def _entries_of(simulator: Any, size: int) -> tuple[str, ...]:
 
 
 def from_simulator(
-    env: Any,
-    to_action: ToAction | None = None,
-    max_steps: int = 1000,
-    heuristic: Heuristic | None = None,
-    *,
-    cues: Sequence[Cue] = (),
+    env: Any, max_steps: int = 1000, heuristic: Heuristic | None = None, *, cues: Sequence[Cue] = ()
 ) -> JaxEnvironment:
     """Return an environment of brax or MuJoCo Playground as one of ours, with its whole box [-1, 1]^n of actions.
 
@@ -162,24 +146,16 @@ def from_simulator(
 
     Args:
         env: bare, or in brax's `EpisodeWrapper`, whose truncations are then truncations here.
-        to_action: direction (2,) -> the simulator's action (n,). With it actions are directions in the plane.
         max_steps: an episode is truncated after this many steps.
         heuristic: observation -> the obvious action. Without this the guidance "heuristic" is refused.
         cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
 
     Raises:
-        UserError: observations or actions do not fit, or `cues` are given beside `to_action`.
+        UserError: observations or actions do not fit.
     """
     name = type(env.unwrapped).__name__
-    layout, space = layout_of(env, name), DIRECTIONS
-    if to_action is None:
-        space = layout.box(cues)
-    elif cues:
-        raise UserError(f"{name}: cues are of the box, to_action of directions: give one of the two")
-    elif (given := jax.eval_shape(to_action, jnp.zeros(2)).shape) != (len(layout.entries),):
-        raise UserError(f"{name}: to_action returns shape {given}, but an action has shape {(len(layout.entries),)}")
-    steps = jnp.array(max_steps, jnp.int32)
-    return JaxEnvironment(steps, FixedSimulator(env), layout.observation, space, to_action, heuristic)
+    layout, steps = layout_of(env, name), jnp.array(max_steps, jnp.int32)
+    return JaxEnvironment(steps, FixedSimulator(env), layout.observation, layout.box(cues), heuristic)
 
 
 def _as_arrays(state: Any) -> Any:

@@ -11,11 +11,11 @@ from brax.envs.wrappers import training
 from cuelearner_jax import loop
 from cuelearner_jax.bridges import brax as brax_adapter
 from cuelearner_jax.bridges.brax import from_brax
-from cuelearner_jax.environment import Environment, actions_of, symmetries_of
+from cuelearner_jax.environment import Environment, symmetries_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.program import make_program
-from cuelearner_jax.spaces import DIRECTIONS, Box, Cue
+from cuelearner_jax.spaces import Box, Cue
 
 
 class Field(envs.Env):
@@ -93,19 +93,15 @@ def test_actions_of_another_size():
     np.testing.assert_allclose(steps[0].final_obs, start + np.array([-0.3, 0.0]), atol=1e-7)
     start, steps = walk(from_brax(Field(3)), [(-0.6, 0.8, 0.5)])
     np.testing.assert_allclose(steps[0].final_obs, start + np.array([-0.3, 0.4]), atol=1e-7)
-    three = from_brax(Field(3), to_action=lambda direction: jnp.append(-direction, 0.0))
-    start, steps = walk(three, [(-0.6, 0.8)])
-    np.testing.assert_allclose(steps[0].final_obs, start + np.array([0.3, -0.4]), atol=1e-7)
 
 
-def test_actions_are_the_whole_box_or_directions_where_the_caller_says_what_they_mean():
+def test_actions_are_the_whole_box_with_names_of_the_model_or_cues_of_the_caller():
     box = from_brax(Field(3)).actions
     assert (box.low, box.high) == ((-1.0,) * 3, (1.0,) * 3)
     assert [cue.name for cue in box.cues] == ["entry 1", "entry 2", "entry 3"]
     assert {cue.words for cue in box.cues} == {("more", "less")}
     own = (Cue("east", ("right", "left"), ("d", "a"), "shares"), Cue("north", ("up", "down"), ("w", "s"), "shares"))
     assert from_brax(Field(), cues=own).actions == Box((-1.0, -1.0), (1.0, 1.0), own)
-    assert actions_of(from_brax(Field(), lambda direction: direction)) == DIRECTIONS
     named = from_brax(envs.get_environment("halfcheetah")).actions  # by its model
     assert [cue.name for cue in named.cues] == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
 
@@ -130,24 +126,16 @@ def test_observations_in_a_dictionary_are_one_vector_with_named_slices():
 
 
 @pytest.mark.parametrize(
-    ("env", "to_action", "words"),
+    ("env", "words"),
     [
-        (Field(3), lambda direction: direction, r"Field: to_action returns shape \(2,\), but .* \(3,\)"),
-        (
-            envs.get_environment("fast", obs_mode="dict_pixels"),
-            None,
-            r"Fast: .* 'pixels/view_0' is an image \(4, 4, 3\)",
-        ),
-        (training.VmapWrapper(Field(), 2), None, r"Field: it is a batch of shape \(2,\): give a single"),
-        (training.AutoResetWrapper(Field()), None, "Field: AutoResetWrapper hides"),
+        (envs.get_environment("fast", obs_mode="dict_pixels"), r"Fast: .* 'pixels/view_0' is an image \(4, 4, 3\)"),
+        (training.VmapWrapper(Field(), 2), r"Field: it is a batch of shape \(2,\): give a single"),
+        (training.AutoResetWrapper(Field()), "Field: AutoResetWrapper hides"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(env, to_action, words):
-    with pytest.raises(UserError, match=words) as refused:
-        from_brax(env, to_action)
-    assert "\n" not in str(refused.value)
-    with pytest.raises(UserError, match="cues are of the box, to_action of directions: give one of the two"):
-        from_brax(Field(), lambda direction: direction, cues=from_brax(Field()).actions.cues)
+def test_what_does_not_fit_is_refused_in_one_line(env, words):
+    with pytest.raises(UserError, match=words):
+        from_brax(env)
 
 
 def test_device_put_replicated_stacks_a_copy_for_each_device(monkeypatch):
