@@ -101,11 +101,12 @@ def test_the_taught_policy_does_what_its_teacher_holds_for_best():
     np.testing.assert_allclose(best_actions(EXPERT, STATES, OBS), BEST, atol=1e-6)
 
 
-@pytest.mark.parametrize("base", [AGENT, Uniform(), Taught(EXPERT)], ids=["agent", "uniform", "taught"])
-def test_under_no_guidance_a_policy_is_itself(base):
-    none = guidances.make("none", probes.SIZES, ENV)
-    guided = Guided(base, none.init(KEY), ENV, probes.SCALARS, none)
-    np.testing.assert_array_equal(act(guided), act(base))
+def test_under_no_guidance_a_policy_is_itself_and_under_the_heuristic_every_action_is_the_heuristics():
+    for name, own in (("none", AGENT), ("heuristic", Heuristic(ENV))):
+        guidance = guidances.make(name, probes.SIZES, ENV)
+        guided = Guided(AGENT, guidance.init(KEY), ENV, probes.SCALARS, guidance)
+        np.testing.assert_array_equal(act(guided), act(own))
+    np.testing.assert_allclose(act(Heuristic(ENV)), directions.rotate(OBS, -1.0), atol=1e-6)
 
 
 def test_under_relative_guidance_every_action_is_refined_once_the_model_is_fitted():
@@ -120,8 +121,7 @@ def test_under_relative_guidance_every_action_is_refined_once_the_model_is_fitte
     assert np.abs(act(guided) - np.asarray(refined.actions)).max(-1).min() > 0
 
 
-@pytest.mark.parametrize("base", [AGENT, Uniform(), Heuristic(ENV)], ids=["agent", "uniform", "heuristic"])
-@pytest.mark.parametrize("eps_deg", [5.0, 20.0])
+@pytest.mark.parametrize(("base", "eps_deg"), [(AGENT, 5.0), (Uniform(), 20.0)], ids=["agent", "uniform"])
 def test_corrections_end_within_half_eps_of_the_teachers_best(base, eps_deg):
     scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg)
     error = np.rad2deg(np.abs(directions.difference(BEST, act(Corrected(base, EXPERT, scalars)))))
@@ -170,8 +170,6 @@ def test_a_function_rolls_out_the_same_in_jax_and_on_the_host():
     ("function", "shape"),
     [
         (lambda obs: obs[..., :1], "(40, 1)"),
-        (lambda obs: obs[:3], "(3, 2)"),
-        (lambda obs: obs[:, 0], "(40,)"),
         (lambda obs: obs[None], "(1, 40, 2)"),
     ],
 )
@@ -201,10 +199,6 @@ def stacked():
     ("function", "why"),
     [
         (lambda obs: obs + np.random.normal(size=obs.shape), "another action when it is asked again"),
-        (
-            lambda obs: np.eye(2)[(np.random.random(len(obs)) < 0.5).astype(int)],
-            "another action when it is asked again",
-        ),
         (stacked(), "another action when it is asked again"),
         (lambda obs: obs - 0.1 * obs.mean(0), "another action in a batch of 32"),
         (lambda obs: (obs, obs), "gives a state beside its actions"),
@@ -263,8 +257,6 @@ def agents():
 BLOCKS = {
     "agent": agents,
     "guided agent": lambda: guided(agents()).replace(bound=jnp.array(0.2)),
-    "guided uniform": lambda: guided(Uniform()),
-    "guided heuristic": lambda: guided(Heuristic(ENV)),
     "corrected agent": lambda: Corrected(agents(), EXPERT, dataclasses.replace(probes.SCALARS, tau_max_deg=60.0)),
 }
 

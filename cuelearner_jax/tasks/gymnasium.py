@@ -26,7 +26,6 @@ from cuelearner_jax.bridges.gymnasium.layout import Actions
 from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, checked_quantities
 from cuelearner_jax.errors import UserError, format_value, user_code_error
-from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
 from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
 from cuelearner_jax.tasks import fetch_layout
@@ -181,7 +180,7 @@ def task_of(name: str) -> Task:
     Call this only with names from a caller or the command line, never from a file. Raises UserError if the environment
     is not available.
     """
-    if REFERENCE.fullmatch(name):
+    if plugins.REFERENCE.fullmatch(name):
         return task_from(plugins.load(name, object, "an environment"), called=name)
     module, _, own = name.rpartition(":")
     if module:  # Gymnasium's own way to name an id that a package registers

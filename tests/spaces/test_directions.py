@@ -40,7 +40,7 @@ def test_difference_undoes_rotate():
     np.testing.assert_allclose(directions.difference(base, directions.rotate(base, jnp.array(turn))), turn, atol=2e-6)
 
 
-@pytest.mark.parametrize("length", [2e-38, 1e-30, 1.0, 1e30, 3e38])
+@pytest.mark.parametrize("length", [2e-38, 1.0, 3e38])
 def test_retract_takes_any_length(length):
     np.testing.assert_allclose(directions.retract(jnp.array([0.0, -length])), [0.0, -1.0], atol=1e-6)
 

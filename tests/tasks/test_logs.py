@@ -148,10 +148,8 @@ def test_it_is_named_by_its_folder(folder):
     ("given", "told"),
     [
         ({"cues": "left,right;up,down"}, "2 pairs of words for 3 entries"),
-        ({"cues": "left;right"}, "two words for each entry"),
         ({"low": (0.0, 0.0, 0.0)}, "given alone"),
         ({"low": (0.0,) * 3, "high": (0.1,) * 3}, "give bounds that hold the recorded actions"),
-        ({"low": (0.0,) * 2, "high": (0.1,) * 2}, "3 cues for 2 entries"),
         ({"actions": "directions"}, "actions of 3 entries, directions have 2"),
         ({"actions": "choices"}, "give another kind of actions"),
         ({"actions": "directions", "low": (0.0,), "high": (1.0,)}, "leave them out"),
