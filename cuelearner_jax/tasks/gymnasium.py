@@ -112,13 +112,7 @@ class GymnasiumConfig:
 def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig, split: str) -> GymnasiumTask:
     """Return the environment of a configuration; Gymnasium is loaded only when it is reset.
 
-    Args:
-        factory: makes the environment; None: Gymnasium's registry.
-        config: the configuration.
-        split: has no effect, since episodes differ only in their keys.
-
-    Raises:
-        UserError: an invalid value.
+    `factory` makes it (None: Gymnasium's registry). Raises UserError for an invalid value.
     """
     if not config.environment:
         raise UserError(f"task.environment is empty: name the task {FAMILY}:ENVIRONMENT, as {FAMILY}:FetchReach-v4")
@@ -128,14 +122,12 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
     observation = config.observation
     size = sum(quantity.size for quantity in observation)
     try:
-        is_named = isinstance(json.loads(config.arguments), dict)
-    except ValueError:
-        is_named = False
-    if not is_named:
+        dict(**json.loads(config.arguments))
+    except (ValueError, TypeError):
+        given = format_value(config.arguments)
         raise UserError(
-            f"task.arguments is {format_value(config.arguments)}: give arguments by name as JSON, such as "
-            "'{\"size\": 3}'"
-        )
+            f"task.arguments is {given}: give arguments by name as JSON, such as '{{\"size\": 3}}'"
+        ) from None
     refusal = ""
     if factory is None and ":" in config.environment:  # the configuration is a file's
         refusal = (
@@ -175,10 +167,7 @@ GYMNASIUM = Task(
 def task_of(name: str) -> Task:
     """Return the task of an environment: an id of Gymnasium's registry, module:id, or package.module:NAME.
 
-    The module is imported.
-
-    Call this only with names from a caller or the command line, never from a file. Raises UserError if the environment
-    is not available.
+    The module is imported, so never give a name from a file. Raises UserError if the environment is not available.
     """
     if plugins.REFERENCE.fullmatch(name):
         return task_from(plugins.load(name, object, "an environment"), called=name)

@@ -114,10 +114,7 @@ def actions_of(whose: str, space: Any) -> Actions:
         if least == most:
             raise UserError(f"{whose}: entry {number} of its actions can only be {least:g}: wrap it to leave it out")
         if not max(-least, most) < LARGEST:
-            raise UserError(
-                f"{whose}: entry {number} of its actions has no bounds: wrap it, for instance in "
-                "gymnasium.wrappers.RescaleAction"
-            )
+            raise UserError(f"{whose}: entry {number} of its actions has no bounds: wrap it, as in RescaleAction")
     return Actions(tuple(low.tolist()), tuple(high.tolist()))
 
 

@@ -74,16 +74,15 @@ class Source:
 def _takes(factory: Callable[..., Any], name: str) -> bool:
     """Return whether a function or class accepts an argument of that name."""
     try:
-        parameters = inspect.signature(factory).parameters
+        parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
         return False
-    return name in parameters or any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+    return any(one.name == name or one.kind is one.VAR_KEYWORD for one in parameters)
 
 
 def cores() -> int:
     """Return the number of processors that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_installed() -> None:
