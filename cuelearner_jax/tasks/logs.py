@@ -263,7 +263,7 @@ def bounds_of(
     if low is not None and high is not None:
         return low, high
     if low is not None or high is not None:
-        raise UserError("one of low and high is given alone: give both, one number per entry")
+        raise UserError(f"{'low' if high is None else 'high'} is given alone: give both low and high")
     least, most = actions.min(0).tolist(), actions.max(0).tolist()
     names = entries or [f"entry {number}" for number in range(1, len(least) + 1)]
     if still := [name for name, a, b in zip(names, least, most, strict=True) if not b > a]:
