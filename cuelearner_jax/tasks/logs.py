@@ -174,7 +174,6 @@ def task_of(
     low: Sequence[float] | None = None,
     high: Sequence[float] | None = None,
     actions: str = "box",
-    order: str = "shuffled",
     note: Callable[[str], None] = console.print,
 ) -> Task:
     """Return a folder of situations as a task.
@@ -184,7 +183,6 @@ def task_of(
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         low, high: bounds of the actions, one per entry (default: the recorded actions' range, reported by `note`).
         actions: kind of action space, "box", "directions" or "choices".
-        order: order of the situations, "shuffled" or "recorded".
         note: called with one line about each value that had to be chosen.
 
     Raises:
@@ -192,9 +190,8 @@ def task_of(
     """
     found = _read(Path(folder))
     centre, spread = scales_of(found.observations)
-    for name, value, kind in (("actions", actions, Actions), ("order", order, Order)):
-        if value not in get_args(kind):
-            raise UserError(f"{name} is {value!r}{suggestion(value, get_args(kind))}")
+    if actions not in get_args(Actions):
+        raise UserError(f"actions is {actions!r}{suggestion(actions, get_args(Actions))}")
     size, names = found.actions.shape[1], ()
     bounds: Any = (0.0,) * size, (1.0,) * size
     if actions == "box":
@@ -207,7 +204,6 @@ def task_of(
         path=str(Path(folder)),
         digest=found.digest,
         rows=len(found.observations),
-        order=cast(Order, order),
         names=tuple(quantity.name for quantity in found.slices),
         entries=tuple(quantity.size for quantity in found.slices),
         actions=cast(Actions, actions),

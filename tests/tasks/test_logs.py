@@ -46,8 +46,8 @@ def walked(env, steps):
 @pytest.mark.parametrize("order", ["recorded", "shuffled"])
 def test_a_walk_meets_every_situation_once(order, folder):
     observations, _ = recorded.arrays()
-    task = logs.task_of(folder, CUES, **BOUNDS, order=order)
-    env = task.environment(task.plain())
+    task = logs.task_of(folder, CUES, **BOUNDS)
+    env = task.environment(task.configure(order=order))
     rows, seen = walked(env, 12)
     assert sorted(rows) == list(range(12))
     places = np.asarray(env.places)
