@@ -10,20 +10,16 @@ import probes
 import pytest
 from box_task import EPS, SCALARS, SMALL, Reach
 
-from cuelearner_jax import asking
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import (
-    DEMONSTRATION,
     RELATIVE,
     demonstrate,
     human_answer,
     relative_feedback,
     scalar_answer,
 )
-from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import refine
-from cuelearner_jax.policies import Uniform
 from cuelearner_jax.spaces import UNSAID, Box, Cue, cues_from, from_json
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Label
@@ -170,43 +166,20 @@ def test_a_perfect_model_ends_within_half_eps_along_every_entry(box):
     assert np.abs(box.log(first, near.actions)).max() <= 0.2 + 1e-5
 
 
-def test_relative_labels_lead_to_the_goal_of_a_box():
-    sizes = dataclasses.replace(probes.SIZES, labels_per_round=100, fit_steps=600)
-    env, scalars = Reach(), SCALARS
-    guidance = registry.make("relative", sizes, env)
-    guide = asking.start(guidance, env, 400, 400, jax.random.key(1), jax.random.key(2))
-    label_round = probes.label_rounds(guidance, sizes)
-    for _ in range(4):
-        guide = label_round(env, probes.Expert(env), scalars, Uniform(SMALL), guide, KEY)
-    assert guide.labels.answer.shape == (400, 3)
-    contexts = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    obs = jnp.repeat(contexts, 16, 0)
-    first, goals = SMALL.sample(KEY, (64,)), jax.vmap(env.best)(obs)
-    acted = jax.jit(guidance.act)(guide.model, env, obs, first, jnp.ones(64, bool), scalars)
-    away = np.asarray(SMALL.distance(acted.actions, goals))
-    assert np.mean(np.asarray(SMALL.distance(first, goals)) <= 0.1) < 0.1
-    assert np.mean(away <= 0.1) > 0.9
-
-
-@pytest.mark.parametrize("form", [RELATIVE, DEMONSTRATION], ids=lambda form: form.name)
-def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
-    action, other = pairs(SMALL, 12)
-    kinds = {
-        "relative": np.array(list(itertools.islice(itertools.product((-1, 0, 1, UNSAID), repeat=3), 12)), np.float32),
-        "demonstration": np.asarray(other),
-    }
-    labels = Label(np.zeros((1, 12, 2), np.float32), action[None], kinds[form.name][None], np.ones((1, 12), bool))
-    eps = EPS if form.by_eps else None
-    path = tmp_path / "labels.parquet"
-    label_files.write(path, {"name": "reach"}, form.name, SMALL, eps, np.array([4]), labels, form.meaning(SMALL))
+def test_a_label_file_holds_answers_about_a_box(tmp_path):
+    action, _ = pairs(SMALL, 12)
+    given = np.array(list(itertools.islice(itertools.product((-1, 0, 1, UNSAID), repeat=3), 12)), np.float32)
+    labels = Label(np.zeros((1, 12, 2), np.float32), action[None], given[None], np.ones((1, 12), bool))
+    path, meaning = tmp_path / "labels.parquet", RELATIVE.meaning(SMALL)
+    label_files.write(path, {"name": "reach"}, "relative", SMALL, EPS, np.array([4]), labels, meaning)
     file = label_files.read(path)
-    assert (file.space, file.answers, file.eps) == (SMALL, form.name, eps)
+    assert (file.space, file.answers, file.eps) == (SMALL, "relative", EPS)
     np.testing.assert_array_equal(file.labels.action, action)
-    np.testing.assert_array_equal(file.labels.answer, kinds[form.name])
-    external_labels.check_file(file, None, form, "labels.parquet")
+    np.testing.assert_array_equal(file.labels.answer, given)
+    external_labels.check_file(file, None, RELATIVE, "labels.parquet")
     spoilt = file._replace(labels=file.labels.replace(action=file.labels.action + np.float32([5, 0, 0])))
     with pytest.raises(UserError, match="vectors between the bounds"):
-        external_labels.check_file(spoilt, None, form, "labels.parquet")
+        external_labels.check_file(spoilt, None, RELATIVE, "labels.parquet")
 
 
 @pytest.mark.parametrize("size", [9, 28])
