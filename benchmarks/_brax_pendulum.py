@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from brax import envs
 from brax.envs.wrappers import training
-from pendulum import STRONGEST, Pendulum, seen
+from pendulum import STEPS, STRONGEST, Pendulum, seen
 
 ENDLESS = Pendulum(2**30)  # brax's wrapper ends the episodes
 
@@ -33,5 +33,7 @@ class FreshEpisodes(envs.Wrapper):  # brax's `AutoResetWrapper` begins every epi
         return after.replace(pipeline_state=swing, obs=jax.vmap(seen)(swing), info={**after.info, "rng": rngs})
 
 
-def wrap(env: envs.Env, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> envs.Wrapper:
+def wrap(
+    env: envs.Env, episode_length: int = STEPS, action_repeat: int = 1, randomization_fn: Any = None
+) -> envs.Wrapper:
     return FreshEpisodes(training.EpisodeWrapper(training.VmapWrapper(env), episode_length, action_repeat))
