@@ -33,7 +33,5 @@ class FreshEpisodes(envs.Wrapper):  # brax's `AutoResetWrapper` begins every epi
         return after.replace(pipeline_state=swing, obs=jax.vmap(seen)(swing), info={**after.info, "rng": rngs})
 
 
-def wrap(
-    env: envs.Env, episode_length: int = STEPS, action_repeat: int = 1, randomization_fn: Any = None
-) -> envs.Wrapper:
+def wrap(env: envs.Env, episode_length: int = STEPS, action_repeat: int = 1, randomization_fn: Any = None) -> Any:
     return FreshEpisodes(training.EpisodeWrapper(training.VmapWrapper(env), episode_length, action_repeat))
