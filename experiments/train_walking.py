@@ -305,7 +305,7 @@ def anymal() -> Walker:
     return Walker(
         environment=Locomotion(),
         policy=policy.from_brax,
-        measure=tracking.measure_training,
+        measure=lambda policy, key, robots: tracking.measure(policy, "mjx", tracking.TRIALS["clean"], key, robots),
         examine=tracking.examine,
         save=policy.save,
         load=policy.load,

@@ -26,13 +26,7 @@ def check_number(
 ) -> None:
     """Raise UserError unless a field holds a number that stays one in single precision, and lies within bounds.
 
-    Args:
-        name: of the field.
-        value: what it holds.
-        least, most: bounds; both are allowed.
-        positive: must it be above 0?
-        whole: must it be a whole number?
-        unit: for the message, in words.
+    `least` and `most` are allowed; a `positive` number is above 0. `unit` is for the message, in words.
     """
     kind = (int, np.integer) if whole else (int, float, np.integer, np.floating)
     if isinstance(value, kind) and not isinstance(value, bool) and least <= value <= most:

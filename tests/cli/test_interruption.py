@@ -54,18 +54,6 @@ def test_ctrl_c_and_sigterm_save_and_resume_goes_on_as_if_never_stopped(tmp_path
     assert rows(folder) == uninterrupted
 
 
-@pytest.mark.long
-def test_kill_loses_one_stretch_at_most_and_resume_goes_on(tmp_path, uninterrupted):
-    folder = tmp_path / "run"
-    process = start_and_wait_for(folder, 300)
-    process.kill()
-    process.communicate(timeout=60)
-    assert main([*COMMAND, "--out", str(folder), "--resume"]) == 0
-    assert rows(folder) == uninterrupted
-    saved = sorted(int(path.name) for path in (folder / "none" / "checkpoints").iterdir() if path.name.isdigit())
-    assert saved[-1] == STEPS
-
-
 @pytest.mark.parametrize(
     ("seconds", "number"), [(0.3, signal.SIGTERM), pytest.param(6.0, signal.SIGINT, marks=pytest.mark.long)]
 )

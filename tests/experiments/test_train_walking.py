@@ -132,8 +132,8 @@ def test_its_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, argument
 
 
 def test_a_policy_is_measured_trial_by_trial(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(tracking, "TRIALS", {"clean": tracking.CLEAN})
-    monkeypatch.setattr(tracking, "SECONDS", 4.0)
+    monkeypatch.setattr(tracking, "TRIALS", {"clean": tracking.TRIALS["clean"]})
+    monkeypatch.setattr(tracking, "STEPS", 200)
     monkeypatch.setattr(tracking, "ENGINES", ("mujoco",))  # MJX compiles for long
     out = tmp_path / "figures.json"
     assert train_walking.main(["evaluate", str(policy.SHIPPED), "--robots", "3", "--out", str(out)]) == 0

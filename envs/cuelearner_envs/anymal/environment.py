@@ -91,13 +91,7 @@ class LeggedNavigation(Navigation, kw_only=True):
         return self.walking(observe(body.qpos, body.qvel, last_action, told)), told
 
     def command(self, body: Body, told: Float[Array, "3"], heading: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Return the command (as `LeggedWalker.told`) that follows `told` on the way toward a heading.
-
-        Args:
-            body: the robot now.
-            told: the command before.
-            heading: where to walk and to look, a unit vector in the world's frame.
-        """
+        """Return the command that follows `told` on the way toward a heading, a unit vector in the world's frame."""
         yaw = robot.planar_pose(body.qpos)[2]
         off = difference(from_angle(yaw), heading)
         turning = jnp.clip(off / TURNING_TIME, -self.robot.turn_rate, self.robot.turn_rate)
@@ -155,22 +149,8 @@ class LeggedNavigation(Navigation, kw_only=True):
 def make_environment(
     config: NavigationConfig, split: str = "training", walking: WalkingPolicy | None = None
 ) -> LeggedNavigation:
-    """The environment of a configuration with the quadruped for a robot.
-
-    It walks by a policy (default: the shipped one).
-    """
+    """Return the environment of a configuration with the quadruped, walking by a policy (default: the shipped one)."""
     plain = make_navigation(config, split)
     noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
-    return LeggedNavigation(
-        worlds=plain.worlds,
-        robot=plain.robot,
-        lidar=plain.lidar.replace(noise=noise),
-        max_steps=plain.max_steps,
-        period=plain.period,
-        goal_radius=plain.goal_radius,
-        goal_rotation=plain.goal_rotation,
-        mirrors=plain.mirrors,
-        sides=plain.sides,
-        look_ahead=plain.look_ahead,
-        walking=walking_policy.load() if walking is None else walking,
-    )
+    walking = walking_policy.load() if walking is None else walking
+    return LeggedNavigation(**{**vars(plain), "lidar": plain.lidar.replace(noise=noise)}, walking=walking)

@@ -5,9 +5,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import mujoco
@@ -16,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.physics import LEAST_UPRIGHT, LOWEST_KNEE, LOWEST_TRUNK
+from cuelearner_envs.judging import in_threads
 
 TIMESTEP = 0.002  # [s]
 
@@ -68,8 +67,7 @@ class Judge:
         """Apply one control step (0.02 s), with an action in [-1, 1], to each robot not fallen or retired."""
         targets = robot.HOME + robot.ACTION_SCALE * np.asarray(actions, float)
         up = np.flatnonzero(~(self.down | self.retired))
-        with ThreadPoolExecutor(os.cpu_count()) as pool:  # MuJoCo releases Python's lock
-            list(pool.map(partial(self._control, targets), up, chunksize=max(1, len(up) // 8)))
+        in_threads(partial(self._control, targets), up)
 
     def _control(self, targets: Float[np.ndarray, "robots 12"], number: int | np.integer) -> None:
         model, data = self.models[number], self.data[number]

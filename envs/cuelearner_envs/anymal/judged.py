@@ -9,8 +9,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, PRNGKeyArray
+from jaxtyping import Array, Key
 
+from cuelearner_envs import judging
 from cuelearner_envs.anymal.environment import LeggedNavigation, LeggedWalker
 from cuelearner_envs.anymal.judge import Judge
 from cuelearner_envs.anymal.model import planar_pose
@@ -71,21 +72,16 @@ class Course:
             self.judge.place(number, pose)
 
     @property
-    def outcomes(self) -> list[str]:
-        """Names of an episode's outcomes."""
-        first = jax.tree.map(lambda leaf: leaf[0], self.state)
-        return list(jax.eval_shape(self.env.ends, first)[0])
-
-    @property
     def poses(self) -> np.ndarray:
         """x, y, yaw [m, rad] of each robot (robots, 3)."""
         return np.asarray(_poses(self.state.body.qpos))
 
-    def step(self, actions: jax.Array, each: Callable[[np.ndarray], None] | None = None) -> tuple[Any, Any, Any]:
-        """Take one navigation step with each robot; `each` is called with the configurations after every control step.
+    def step(
+        self, actions: jax.Array, each: Callable[[np.ndarray], None] | None = None
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Take one navigation step with each robot; return outcomes and whether the episodes ended, each (robots,).
 
-        Returns:
-            outcome, terminated, truncated, as `Navigation.ends` does, each (robots,).
+        `each` is called with the configurations after every control step.
         """
         headings = rotate(actions, jnp.asarray(self.poses[:, 2]))
         body, last, told = self.state.body, self.state.last_action, self.state.told
@@ -97,38 +93,11 @@ class Course:
                 each(self.judge.qpos)
         fallen = jnp.asarray(self.judge.fallen)
         self.state, self.obs, ends = _after(self.env, self.state, body, last, told, actions, fallen)
-        return jax.device_get(ends)
+        outcome, terminated, truncated = jax.device_get(ends)
+        self.judge.retired |= terminated | truncated
+        return outcome, terminated | truncated
 
 
-def rollout(
-    policy: Policy,
-    env: LeggedNavigation,
-    key: PRNGKeyArray,
-    num_envs: int,
-    steps: int,
-    tell: Callable[[int, int], None] = lambda done, count: None,
-) -> dict[str, np.ndarray]:
-    """`cuelearner_jax.evaluate.rollout` of first episodes alone, the same ones, in C MuJoCo.
-
-    `tell` is told how many steps of how many each robot has made.
-
-    Returns:
-        Outcomes of each episode (num_envs,), nan where it has not ended within `steps` shared by all, and "finished".
-    """
-    k_reset, k_run = jax.random.split(key)
-    course = Course(env, jax.random.split(k_reset, num_envs))
-    choose = jax.jit(policy.act)
-    running = np.ones(num_envs, bool)
-    found = {name: np.full(num_envs, np.nan) for name in course.outcomes}
-    for index in range(steps // num_envs):
-        tell(index, steps // num_envs)
-        k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))
-        outcome, terminated, truncated = course.step(choose(k_act, course.state, course.obs))
-        ended = running & (terminated | truncated)
-        for name, values in found.items():
-            values[ended] = outcome[name][ended]
-        running &= ~ended
-        course.judge.retired |= ended
-        if not running.any():
-            break
-    return {**found, "finished": 1.0 - running}
+def rollout(policy: Policy, env: LeggedNavigation, *how: Any) -> dict[str, np.ndarray]:
+    """Roll out first episodes in C MuJoCo; see `judging.rollout`."""
+    return judging.rollout(partial(Course, env), policy, *how)

@@ -80,14 +80,9 @@ def push_randomly(key: PRNGKeyArray, body: Body, trial: Trial) -> Body:
 def reward(
     before: Walk, after: Body, felt: Felt, action: Float[Array, "12"], landed: Float[Array, "4"]
 ) -> dict[str, Any]:
-    """Return the terms of the reward, already weighted; their sum counts where it is positive.
+    """Return the terms of the reward of a step, already weighted; their sum counts where it is positive.
 
-    Args:
-        before: the robot before the step, with the command.
-        after: its body afterwards.
-        felt: what the step told.
-        action: that led there.
-        landed: how long each foot that has just landed had been in the air [s], 0 for the others.
+    `landed`: how long each foot that has just landed had been in the air [s], 0 for the others.
     """
     command = before.command
     velocity = robot.planar_velocity(after.qpos, after.qvel)

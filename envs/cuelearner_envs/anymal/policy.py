@@ -113,8 +113,6 @@ def load(folder: Path = SHIPPED) -> WalkingPolicy:
         count = sum(name.startswith("kernel_") for name in arrays)
         layers = tuple((arrays[f"kernel_{number}"], arrays[f"bias_{number}"]) for number in range(count))
         mean, std = arrays["mean"], arrays["std"]
-    except PermissionError as error:
-        raise UserError(f"{file} cannot be read ({error.strerror}): check its permissions") from error
     except Exception as error:  # NumPy's and zipfile's readers raise many exception types for damaged bytes
         raise UserError(f"{file} is damaged: restore it, or train the policy anew") from error
     widths = [OBS, *(bias.size for _, bias in layers)]

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.anymal.judged import Course
-from cuelearner_envs.anymal.scene import AZIMUTH, Picture, Studio, above, beside, furnish, unobstructed
+from cuelearner_envs.anymal.scene import AZIMUTH, Picture, Studio, above, furnish, unobstructed
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import ENDS
 from cuelearner_envs.navigation.world import World
@@ -58,11 +58,9 @@ def record(
         ends, met, world = jax.device_get(see(env, state))
         configurations: list[np.ndarray] = []
         action = choose(jax.random.fold_in(key, number), course.state, course.obs)
-        outcome, terminated, truncated = course.step(
-            action, each=lambda qpos, kept=configurations: kept.append(qpos[0])
-        )
+        outcome, ended = course.step(action, each=lambda qpos, kept=configurations: kept.append(qpos[0]))
         named = [name for name in ENDS if outcome.get(name, np.zeros(1))[0]]
-        rewards.append(10.0 * float(outcome["success"][0]) - 10.0 * float(terminated[0] and "success" not in named))
+        rewards.append(10.0 if "success" in named else 0.0 if named in ([], ["timeout"]) else -10.0)
         frames.append(
             LeggedFrame(
                 world=world,
@@ -75,7 +73,7 @@ def record(
                 episode=episode,
             )
         )
-        if terminated[0] or truncated[0]:
+        if ended[0]:
             course = None
     return frames, rewards
 
@@ -95,14 +93,6 @@ def animate(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None
     pictures.check_film(file, fps)
     specimen = next(_pictures(frames[:1], fps))
     pictures.write_film(file, fps, partial(_pictures, frames), pictures.palette_of(specimen, COLOURS))
-
-
-def portrait(file: str | os.PathLike[str]) -> None:
-    """The model alone, standing."""
-    with Studio(robot.load(), *STILL) as studio:
-        qpos = np.array([0, 0, robot.STANDING_HEIGHT, 1, 0, 0, 0, *robot.HOME])
-        studio.pose(qpos)
-        imageio.imwrite(Path(file), studio.picture(beside(qpos, distance=2.0)))
 
 
 def _perceived(env: LeggedNavigation, state: Any) -> tuple[jax.Array, jax.Array, World]:

@@ -18,13 +18,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.navigation.world import FAR_AWAY, World
+from cuelearner_envs.navigation.world import World, tallness, used
 from cuelearner_jax.errors import UserError
 
 Picture = UInt8[np.ndarray, "height width 3"]
 LOW, TALL, GOAL = (0.79, 0.8, 0.82, 1), (0.36, 0.39, 0.42, 1), (0.0, 0.62, 0.45, 0.55)
 BEAM, HIT = (0.34, 0.71, 0.91, 0.16), (0.8, 0.47, 0.65, 1)
-LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
 AZIMUTH, SIDES_APART = 130, 30  # side from which the robot is seen, and spacing of the other sides tried [deg]
 BEAMS_APART = 3  # every so many-th beam is drawn
 NO_OPENGL = (
@@ -37,12 +36,12 @@ def furnish(world: World, goal: Float[np.ndarray, "2"], goal_radius: float) -> m
     """Return the robot's model with a world's solids and the goal, for drawing only."""
     spec = mujoco.MjSpec.from_file(str(robot.FILE))
     look: dict[str, Any] = {"contype": 0, "conaffinity": 0}
-    for (x, y, yaw, length, width), height in _used(world.boxes, world.box_heights):
+    for (x, y, yaw, length, width), height in used(world.boxes, world.box_heights):
         turn = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
         size, place = [length, width, height / 2], [x, y, height / 2]
         kind = mujoco.mjtGeom.mjGEOM_BOX
         spec.worldbody.add_geom(type=kind, pos=place, quat=turn, size=size, rgba=_shade(height), **look)
-    for (x, y, radius), height in _used(world.circles, world.circle_heights):
+    for (x, y, radius), height in used(world.circles, world.circle_heights):
         size, place = [radius, height / 2, 0], [x, y, height / 2]
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER
         spec.worldbody.add_geom(type=kind, pos=place, size=size, rgba=_shade(height), **look)
@@ -158,13 +157,7 @@ def _gl_context() -> Any:
     return importlib.import_module(f"mujoco.{name}").GLContext
 
 
-def _used(rows: Any, heights: Any) -> list[tuple[list[float], float]]:
-    """Return the solids in use; unused ones lie far away to fill the arrays."""
-    pairs = zip(np.asarray(rows, float).tolist(), np.asarray(heights, float).tolist(), strict=True)
-    return [(row, height) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
-
-
 def _shade(height: float) -> list[float]:
     """Return a grey level, darker for taller solids."""
-    share = np.clip((height - LOWEST) / (TALLEST - LOWEST), 0, 1)
+    share = tallness(height)
     return [float((1 - share) * low + share * tall) for low, tall in zip(LOW, TALL, strict=True)]

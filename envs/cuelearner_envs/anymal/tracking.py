@@ -22,18 +22,23 @@ from cuelearner_envs.anymal.physics import Body, Ground, control, standing
 from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe
 
 HELD, SETTLING = 200, 100  # control steps for which a command is held, and how many of them are not yet settled
-SECONDS = 20.0  # a robot walks for
+STEPS = 1000  # of control that a robot walks: 20 s
 
-CLEAN = Trial()
-DISTURBED = Trial(noise=1.0, push=0.5)
-VARIED = Trial(friction=(0.5, 1.25), payload=6.0)
 ENGINES = ("mjx", "mujoco")
-TRIALS = {"clean": CLEAN, "disturbed": DISTURBED, "varied": VARIED}
+TRIALS = {
+    "clean": Trial(),
+    "disturbed": Trial(noise=1.0, push=0.5),
+    "varied": Trial(friction=(0.5, 1.25), payload=6.0),
+}
 
 
-def steps_of(seconds: float) -> int:
-    """Steps of control, whole commands of them."""
-    return max(1, round(seconds / robot.CONTROL_PERIOD / HELD)) * HELD
+def _chosen(
+    policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, index: Array, qpos: Array, qvel: Array, last: Array
+) -> tuple[Array, Array, PRNGKeyArray]:
+    """Return a robot's action and command in a step, and the key of its pushes."""
+    command = random_command(jax.random.fold_in(key, index // HELD), trial)
+    k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
+    return policy(add_noise(k_noise, observe(qpos, qvel, last, command), trial.noise)), command, k_push
 
 
 @partial(jax.jit, static_argnames=("robots", "steps"))
@@ -46,10 +51,7 @@ def walk(
 
     def one(ground: Ground, key: PRNGKeyArray, state: tuple, index: jax.Array) -> tuple[tuple, tuple]:
         body, last_action, down = state
-        command = random_command(jax.random.fold_in(key, index // HELD), trial)
-        k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
-        obs = add_noise(k_noise, observe(body.qpos, body.qvel, last_action, command), trial.noise)
-        action = policy(obs)
+        action, command, k_push = _chosen(policy, trial, key, index, body.qpos, body.qvel, last_action)
         after, felt = control(push_randomly(k_push, body, trial), action, ground)
         down = down | felt.fallen
         body = jax.tree.map(partial(jnp.where, down), body, after)  # a fallen robot stays where it is
@@ -80,9 +82,7 @@ def walk_in_mujoco(
         """Actions, commands and pushes of a step."""
 
         def one(key: PRNGKeyArray, qpos: jax.Array, qvel: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
-            command = random_command(jax.random.fold_in(key, index // HELD), trial)
-            k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
-            action = policy(add_noise(k_noise, observe(qpos, qvel, last, command), trial.noise))
+            action, command, k_push = _chosen(policy, trial, key, index, qpos, qvel, last)
             after = push_randomly(k_push, Body(qpos, qvel, qvel), trial).qvel
             return action, command, after[:2] - qvel[:2]
 
@@ -130,11 +130,6 @@ def figures(
     }
 
 
-def measure_training(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> dict[str, float]:
-    """Figures of undisturbed walking in MJX."""
-    return measure(policy, "mjx", CLEAN, key, robots)
-
-
 def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> Iterator[tuple[str, dict[str, float]]]:
     """Figures of every trial of `TRIALS` in both engines, one after the other as they are measured."""
     for engine in ENGINES:
@@ -145,4 +140,4 @@ def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> Iterator[t
 def measure(policy: WalkingPolicy, engine: str, trial: Trial, key: PRNGKeyArray, robots: int) -> dict[str, float]:
     """Figures of 20 s of random commands in `mjx` or `mujoco`."""
     play = {"mjx": walk, "mujoco": walk_in_mujoco}[engine]
-    return figures(*jax.device_get(play(policy, trial, key, robots=robots, steps=steps_of(SECONDS))))
+    return figures(*jax.device_get(play(policy, trial, key, robots=robots, steps=STEPS)))

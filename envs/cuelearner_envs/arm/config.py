@@ -44,26 +44,21 @@ class ArmConfig:
 
     def __post_init__(self) -> None:
         """Raise UserError with one line for the first value that cannot work."""
-        check(self)
+        check_word("skill", self.skill, get_args(Skill))
+        check_word("reward", self.reward, REWARDS)
+        check_word("preferred_side", self.preferred_side, SIDES)
+        if self.preferred_side != "none" and not self.has_post:
+            raise UserError(f"task.preferred_side is {self.preferred_side}: that needs --task.skill push and its post")
+        check_number("max_steps", self.max_steps, 1, MOST_STEPS, whole=True)
+        check_number("within", self.within, positive=True, unit="metres")
+        check_number("camera_turn_deg", self.camera_turn_deg, -180, 180, unit="degrees")
+        check_vector("camera_offset", self.camera_offset, 3, -1, 1, "metres")
+        check_number("friction", self.friction, 0.01, 10)
 
     @property
     def has_post(self) -> bool:
         """Whether a post stands on the table."""
         return self.skill == "push" and self.obstacle
-
-
-def check(config: ArmConfig) -> None:
-    """Raise UserError with one line for the first value that cannot work."""
-    check_word("skill", config.skill, get_args(Skill))
-    check_word("reward", config.reward, REWARDS)
-    check_word("preferred_side", config.preferred_side, SIDES)
-    if config.preferred_side != "none" and not config.has_post:
-        raise UserError(f"task.preferred_side is {config.preferred_side}: that needs --task.skill push and its post")
-    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
-    check_number("within", config.within, positive=True, unit="metres")
-    check_number("camera_turn_deg", config.camera_turn_deg, -180, 180, unit="degrees")
-    check_vector("camera_offset", config.camera_offset, 3, -1, 1, "metres")
-    check_number("friction", config.friction, 0.01, 10)
 
 
 def make_environment(config: ArmConfig, observation: Sequence[Quantity]) -> Arm:

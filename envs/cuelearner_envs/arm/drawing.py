@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
+from scipy.spatial.transform import Rotation
 
 from cuelearner_envs.arm import model as arm
 
@@ -149,7 +150,7 @@ def _solids(scene: Scene) -> Iterator[tuple[Faces, tuple[int, int, int]]]:
         yield _column(), POST
     if scene.cube is not None:
         cube = np.asarray(scene.cube, float)
-        yield _box(cube[:3], (arm.CUBE,) * 3, _matrix(cube[3:])), CUBE
+        yield _box(cube[:3], (arm.CUBE,) * 3, Rotation.from_quat(np.roll(cube[3:], -1)).as_matrix()), CUBE
 
 
 def _box(middle: np.ndarray, half: Sequence[float], turn: np.ndarray | None = None) -> Faces:
@@ -173,17 +174,6 @@ def _column(sides: int = 14) -> Faces:
     low, high = (np.stack([x, y, np.full(sides, z)], -1) for z in (arm.TABLE, arm.TABLE + arm.POST_HEIGHT))
     walls = [np.stack([low[k], low[k - sides + 1], high[k - sides + 1], high[k]]) for k in range(sides)]
     return [*walls, high]
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _draw_goal(brush: ImageDraw.ImageDraw, goal: np.ndarray) -> None:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from cuelearner_envs.anymal.model import rotation
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
 from cuelearner_envs.arm.physics import Body, Ground
@@ -158,7 +159,7 @@ class Arm(WholeObservations, struct.PyTreeNode):
             return jnp.concatenate([place, goal, place, jnp.zeros(2), velocity, jnp.zeros(2)])
         body = state.body
         cube = camera.seen(self.cube(state))
-        turn = physics.rotation(body.qpos[physics.CUBE][3:])
+        turn = rotation(body.qpos[physics.CUBE][3:])
         moving = body.qvel[physics.CUBE_VELOCITY] * arm.CONTROL_PERIOD - velocity
         turning = jnp.sum(turn * body.qvel[physics.CUBE_TURNING][None], -1) * arm.CONTROL_PERIOD
         fingers = body.qpos[physics.FINGERS], body.qvel[physics.FINGERS] * arm.CONTROL_PERIOD

@@ -101,14 +101,5 @@ def make_environment(config: ArmConfig, plays: Environment) -> FetchArm:
             "--robot fetch"
         )
     plain = make_arm(config, plays.observation)
-    return FetchArm(
-        camera=plain.camera,
-        ground=Ground(friction=plain.ground.friction, post=jnp.zeros(())),
-        grasps=plain.grasps,
-        within=plain.within,
-        max_steps=plain.max_steps,
-        skill=plain.skill,
-        reward=plain.reward,
-        observation=plain.observation,
-        plays=plays,
-    )
+    ground = Ground(friction=plain.ground.friction, post=jnp.zeros(()))
+    return FetchArm(**{**vars(plain), "ground": ground}, plays=plays)

@@ -5,17 +5,16 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Key, PRNGKeyArray
+from jaxtyping import Array, Key
 
+from cuelearner_envs import judging
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm.environment import Arm
 from cuelearner_envs.arm.physics import Body
@@ -50,8 +49,7 @@ class Judge:
             self.data[number].ctrl[:] = targets[number]
             mujoco.mj_step(self.model, self.data[number], nstep=self.steps)
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:  # MuJoCo releases Python's lock
-            list(pool.map(one, range(len(self.data)), chunksize=max(1, len(self.data) // 8)))
+        judging.in_threads(one, range(len(self.data)))
         return self.body
 
     @property
@@ -77,36 +75,21 @@ def _after(env: Arm, states: Any, body: Body) -> Any:
     return after, jax.vmap(env.observe)(after), jax.vmap(env.ends)(after)
 
 
-def rollout(
-    policy: Policy,
-    env: Arm,
-    key: PRNGKeyArray,
-    num_envs: int,
-    steps: int,
-    tell: Callable[[int, int], None] = lambda done, count: None,
-) -> dict[str, np.ndarray]:
-    """Roll out first episodes alone, those of `cuelearner_jax.evaluate.rollout`, in C MuJoCo.
+class GripperCourse:
+    """Grippers in C MuJoCo, each in an episode of an environment."""
 
-    `tell` is told how many steps of how many each gripper has made.
+    def __init__(self, env: Arm, keys: Key[Array, " grippers"]) -> None:
+        self.env, self.judge = env, Judge(env, len(keys))
+        self.state, self.obs = _begin(env, keys)
+        self.judge.place(self.state.body)
 
-    Returns:
-        Outcomes of each episode (num_envs,), nan where it has not ended within `steps` shared by all, and "finished".
-    """
-    k_reset, k_run = jax.random.split(key)
-    states, obs = _begin(env, jax.random.split(k_reset, num_envs))
-    judge, choose = Judge(env, num_envs), jax.jit(policy.act)
-    judge.place(states.body)
-    running, found = np.ones(num_envs, bool), {}
-    for index in range(steps // num_envs):
-        tell(index, steps // num_envs)
-        k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))
-        body = judge.control(np.asarray(_targets(env, states, choose(k_act, states, obs))))
-        states, obs, (outcome, truncated) = _after(env, states, body)
-        ended = running & np.asarray(truncated)
-        for name, values in outcome.items():
-            kept = found.setdefault(name, np.full(num_envs, np.nan))
-            kept[ended] = np.asarray(values)[ended]
-        running &= ~ended
-        if not running.any():
-            break
-    return {**found, "finished": 1.0 - running}
+    def step(self, actions: Array) -> tuple[dict[str, Array], np.ndarray]:
+        """Take a step with each gripper; return outcomes and whether time is up, each (grippers,)."""
+        body = self.judge.control(np.asarray(_targets(self.env, self.state, actions)))
+        self.state, self.obs, (outcome, truncated) = _after(self.env, self.state, body)
+        return outcome, np.asarray(truncated)
+
+
+def rollout(policy: Policy, env: Arm, *how: Any) -> dict[str, np.ndarray]:
+    """Roll out first episodes in C MuJoCo; see `judging.rollout`."""
+    return judging.rollout(partial(GripperCourse, env), policy, *how)

@@ -131,18 +131,6 @@ def control(body: Body, targets: Command, ground: Ground) -> Body:
     return jax.lax.scan(one, body, length=arm.SUBSTEPS)[0]
 
 
-def rotation(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """Return the matrix that turns the cube's frame into the world's."""
-    w, x, y, z = quaternion
-    return jnp.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def euler(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Return the angles about x, y and z of a rotation, as Fetch's observations have them [rad]."""
     flat = jnp.hypot(matrix[2, 2], matrix[1, 2])

@@ -15,6 +15,7 @@ from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
 from cuelearner_envs.arm.drawing import Picture, Scene, draw, points
 from cuelearner_envs.arm.environment import Arm, Situation
+from cuelearner_envs.playing import played
 from cuelearner_jax import pictures
 from cuelearner_jax.types import Policy, Reel, Sketch
 
@@ -36,21 +37,7 @@ def scene_of(env: Arm, state: Situation, action: Any = None) -> Scene:
 def record(env: Arm, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Picture], list[float]]:
     """Return a picture and the reward of each of so many steps; a new episode follows the end of one."""
 
-    @jax.jit
-    def play(env: Arm, key: PRNGKeyArray) -> Any:
-        k_reset, k_play = jax.random.split(key)
-
-        def advance(carry: Any, number: Array) -> Any:
-            state, obs = carry
-            k_act, k_step = jax.random.split(jax.random.fold_in(k_play, number))
-            states = jax.tree.map(lambda leaf: leaf[None], state)
-            action = policy.act(k_act, states, obs[None])[0]
-            following, step = env.step(k_step, state, action)
-            return (following, step.obs), (state, step.reward)
-
-        return jax.lax.scan(advance, env.reset(k_reset), jnp.arange(steps))[1]
-
-    states, rewards = jax.device_get(play(env, key))
+    states, rewards = played(env, policy, key, steps, lambda env, state, action, step: (state, step.reward))
     each = (jax.tree.map(lambda leaf, number=number: leaf[number], states) for number in range(steps))
     return [draw(scene_of(env, state)) for state in each], [float(reward) for reward in rewards]
 

@@ -41,11 +41,8 @@ CARRIED = 0.35  # the largest entry of an action that carries a slippery cube
 def past(obs: Observations, side: Amount = 0.0, friction: Amount = 1.0, post: Amount = 1.0) -> Float[Array, "n 4"]:
     """Push the cube past the post to the goal, on the shorter side or on a given one.
 
-    Args:
-        obs: observations.
-        side: +1 left, -1 right, as the robot sees the post; 0: the shorter.
-        friction: of the cube, as far as it is known; with a slippery one care is taken.
-        post: 1 where it stands; 0: the cube is pushed straight.
+    `side`: +1 left, -1 right, as the robot sees the post; 0: the shorter. `friction`: of the cube, as far as it is
+    known. `post`: 1 where it stands; 0: the cube is pushed straight.
     """
     obs = jnp.asarray(obs)
     cube, goal = obs[:, OBJECT], obs[:, GOAL]

@@ -42,18 +42,13 @@ class BilliardsConfig:
 
     def __post_init__(self) -> None:
         """Raise UserError with one line for the first value that cannot work."""
-        check(self)
-
-
-def check(config: BilliardsConfig) -> None:
-    """Raise UserError with one line for the first value that cannot work."""
-    check_word("table", config.table, SHOTS)
-    check_number("action_turn_deg", config.action_turn_deg, -360, 360, unit="degrees")
-    check_vector("observation_bias", config.observation_bias, 2, -1, 1, "metres")
-    check_vector("acceleration", config.acceleration, 2, -9.81, 9.81, "m/s^2")
-    check_number("aim_error_deg", config.aim_error_deg, 0, 360, unit="degrees")
-    check_number("habit", config.habit, 0, 1)
-    check_number("search_directions", config.search_directions, 1, MOST_DIRECTIONS, whole=True)
+        check_word("table", self.table, SHOTS)
+        check_number("action_turn_deg", self.action_turn_deg, -360, 360, unit="degrees")
+        check_vector("observation_bias", self.observation_bias, 2, -1, 1, "metres")
+        check_vector("acceleration", self.acceleration, 2, -9.81, 9.81, "m/s^2")
+        check_number("aim_error_deg", self.aim_error_deg, 0, 360, unit="degrees")
+        check_number("habit", self.habit, 0, 1)
+        check_number("search_directions", self.search_directions, 1, MOST_DIRECTIONS, whole=True)
 
 
 def make_environment(config: BilliardsConfig) -> Billiards:

@@ -12,15 +12,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, UInt8
-from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 
+from cuelearner_envs import canvas
 from cuelearner_envs.billiards.physics import Trajectory, positions_at
 from cuelearner_envs.billiards.table import Table, corner_gap, cushions, pockets
 from cuelearner_jax import pictures
@@ -44,39 +43,29 @@ def draw_table(
     angle: float | None = None,
     path: Trajectory | None = None,
 ) -> None:
-    """Draw a table and its balls, filling the axes.
+    """Draw a table and its balls, filling the axes; pocketed balls lie in the tray below the table.
 
-    Args:
-        axes: matplotlib axes; their limits and aspect are set and their frame is hidden.
-        table: one table (no batch).
-        positions: places of the balls [m], ball 0 is the cue ball.
-        pocketed: balls that are off the table: they lie in the tray below it.
-        angle: direction of a proposed shot, drawn as an arrow from the cue ball [rad, counterclockwise from +x].
-        path: a shot from `trace`, drawn as one line for each ball that it moves.
+    A proposed shot's `angle` is drawn as an arrow from the cue ball [rad]; of a `path` each ball's line.
     """
     _draw_room(axes, table)
     if path is not None:
         _draw_tracks(axes, table, path)
     _Balls(axes, table).place(np.asarray(positions), np.asarray(pocketed))
     if angle is not None:
-        _arrow(axes, table).set_positions(*_arrow_ends(table, np.asarray(positions)[0], angle))
+        _arrow(axes).set_positions(*_arrow_ends(table, np.asarray(positions)[0], angle))
 
 
 def still(table: Table, path: Trajectory, file: str | os.PathLike[str], dpi: int = 160) -> None:
     """Write a picture of one shot: pale balls where it began, the way of each, solid balls where they came to rest.
 
-    Args:
-        table: one table (no batch).
-        path: the shot, from `trace`.
-        file: a name that ends in .png, .svg or .pdf.
-        dpi: dots per inch of a .png; the picture is 8 inches wide.
+    The file's name ends in .png, .svg or .pdf; the picture is 8 inches wide.
     """
     figure, axes = _figure(table, dpi)
     draw_table(axes, table, path.positions[-1], path.pocketed[-1], path=path)
     start = np.asarray(path.positions[0])
     _Balls(axes, table, ghosts=True).place(start, np.asarray(path.pocketed[0]))
-    _arrow(axes, table).set_positions(*_arrow_ends(table, start[0], _angle(path)))
-    _save(figure, file, dpi)
+    _arrow(axes).set_positions(*_arrow_ends(table, start[0], _angle(path)))
+    canvas.save(figure, file, dpi)
 
 
 def question(
@@ -87,46 +76,24 @@ def question(
     file: str | os.PathLike[str],
     dpi: int = 160,
 ) -> None:
-    """Write a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it.
-
-    Args:
-        table: one table (no batch).
-        positions: places of the balls [m], ball 0 is the cue ball.
-        pocketed: balls that are off the table.
-        action: direction of the shot.
-        file: a name that ends in .png, .svg or .pdf.
-        dpi: dots per inch of a .png; the picture is 8 inches wide.
-    """
+    """Write a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it."""
     figure, axes = _figure(table, dpi)
     x, y = np.asarray(action, dtype=float)
     draw_table(axes, table, positions, pocketed, angle=math.atan2(y, x))
-    _save(figure, file, dpi)
+    canvas.save(figure, file, dpi)
 
 
 def animate(
     table: Table, shots: Sequence[Trajectory], file: str | os.PathLike[str], fps: float = 30.0, speed: float = 1.0
 ) -> None:
-    """Write an animation of shots, one after the other; before each, an arrow shows its direction.
+    """Write an animation (.gif or .mp4) of shots; before each, an arrow shows its direction.
 
-    Args:
-        table: one table (no batch).
-        shots: shots from `trace`, in the order in which they were played.
-        file: a name that ends in .gif or .mp4.
-        fps: frames a second; a GIF counts in hundredths of a second and takes the nearest rate it can have.
-        speed: seconds of the game in a second of the film.
-
-    Raises:
-        ValueError: if the name of the file ends otherwise, there are no shots, or a rate is not positive.
+    `speed`: seconds of the game in a second of the film.
     """
     pictures.check_film(file, fps)
-    if not shots or speed <= 0:
-        raise ValueError("an animation needs at least one shot and a positive speed")
     # The first picture shows every ball and the arrow.
     palette = pictures.palette_of(next(_frames(table, shots, fps, speed)), 255)
     pictures.write_film(file, fps, lambda rate: _frames(table, shots, rate, speed), palette)
-
-
-# --- the parts of a drawing ------------------------------------------------------------------------------------------
 
 
 def rail_width(table: Table) -> float:
@@ -148,12 +115,6 @@ def _figure(table: Table, dpi: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(dots / dpi, 2 * round(dots * (top - bottom) / (right - left) / 2) / dpi), dpi=dpi)
     FigureCanvasAgg(figure)
     return figure, figure.add_axes((0, 0, 1, 1))
-
-
-def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
-    """Write a picture with no date: the same drawing, the same bytes."""
-    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
-        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
 
 
 def _draw_room(axes: Axes, table: Table) -> None:
@@ -224,11 +185,10 @@ class _Balls:
             disc.set_visible(not (self.ghosts and pocketed[ball]))
             number.set_position(tuple(centre))
 
-    def draw(self, renderer: Any) -> None:
-        """Draw them alone, over what is there."""
-        for disc, number in zip(self.discs, self.numbers, strict=True):
-            disc.draw(renderer)
-            number.draw(renderer)
+    @property
+    def artists(self) -> list[Any]:
+        """Each ball's disc and number."""
+        return [one for pair in zip(self.discs, self.numbers, strict=True) for one in pair]
 
 
 def ball_colour(ball: int) -> str:
@@ -241,12 +201,8 @@ def _angle(path: Trajectory) -> float:
     return math.atan2(y, x)
 
 
-def _arrow(axes: Axes, table: Table, animated: bool = False) -> FancyArrowPatch:
-    arrow = FancyArrowPatch((0, 0), (1, 1), arrowstyle="-|>", mutation_scale=14, shrinkA=0, shrinkB=0, color=ARROW)
-    edge = patheffects.withStroke(linewidth=4, foreground="#00000066")
-    arrow.set(linewidth=2.2, zorder=7, path_effects=[edge], animated=animated)
-    axes.add_patch(arrow)
-    return arrow
+def _arrow(axes: Axes, animated: bool = False) -> FancyArrowPatch:
+    return canvas.arrow(axes, ARROW, 14, canvas.edged(4, "#00000066"), animated)
 
 
 def _arrow_ends(table: Table, cue: np.ndarray, angle: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -267,11 +223,8 @@ def _draw_tracks(axes: Axes, table: Table, path: Trajectory) -> None:
             before, _ = _positions_at(table, path, jnp.asarray([times[alive] - 1e-4]))
             points = np.concatenate([points, np.asarray(before)[:, ball]])
         if alive and np.abs(np.diff(points, axis=0)).sum() > 1e-3:
-            edge = [patheffects.withStroke(linewidth=2.6, foreground="#00000055")]
+            edge = canvas.edged(2.6, "#00000055")
             axes.plot(*points.T, color=ball_colour(ball), linewidth=1.4, zorder=4, path_effects=edge)
-
-
-# --- films -----------------------------------------------------------------------------------------------------------
 
 
 def _frames(
@@ -279,27 +232,19 @@ def _frames(
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Pictures of the shots at a fixed rate. The table is drawn once; each frame draws only what moves over it."""
     figure, axes = _figure(table, dpi=100)
-    canvas: Any = figure.canvas
     _draw_room(axes, table)
-    balls, arrow = _Balls(axes, table, animated=True), _arrow(axes, table, animated=True)
+    balls, arrow = _Balls(axes, table, animated=True), _arrow(axes, animated=True)
     _, right, _, _ = _limits(table)
     style = {"ha": "right", "va": "center", "fontsize": 9, "color": "#6f675c"}
     caption = axes.text(right - 0.012, _tray(table)[0, 1], "", animated=True, **style)
-    canvas.draw()
-    empty = canvas.copy_from_bbox(figure.bbox)
-
+    over = canvas.Backdrop(figure)
     for number, path in enumerate(shots, start=1):
         caption.set_text(f"shot {number} of {len(shots)}")
         arrow.set_positions(*_arrow_ends(table, np.asarray(path.positions[0, 0]), _angle(path)))
         positions, pocketed, held = _film(table, path, fps, speed)
         for frame in range(len(positions)):
-            canvas.restore_region(empty)
             balls.place(positions[frame], pocketed[frame])
-            balls.draw(canvas.renderer)
-            if frame < held:
-                arrow.draw(canvas.renderer)
-            caption.draw(canvas.renderer)
-            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            yield over.picture(*balls.artists, *([arrow] if frame < held else []), caption)
 
 
 def _film(

@@ -69,9 +69,6 @@ class Contact(NamedTuple):
     falls: Bool[Array, ""]  # a drops into a pocket
 
 
-# ---------------------------------------------------------------------------------------------------------------- time
-
-
 def drag(table: Table) -> Float[Array, ""]:
     """Rate of exponential decay of all velocities [1/s]."""
     return -jnp.log(table.speed_kept)
@@ -96,9 +93,6 @@ def slice_length(table: Table) -> Float[Array, ""]:
     """Time between kicks: a parabola of this length rises by `BEND` over its chord [s]. Of no meaning without tilt."""
     strength = jnp.hypot(table.acceleration[0], table.acceleration[1])
     return jnp.where(strength > 0.0, jnp.sqrt(8.0 * BEND / jnp.where(strength > 0.0, strength, 1.0)), 1.0)
-
-
-# -------------------------------------------------------------------------------------------------------- what is next
 
 
 def next_contact(table: Table, motion: Motion) -> Contact:
@@ -143,9 +137,6 @@ def of(value: Float[Array, "balls"], ball: Bool[Array, "balls"]) -> Float[Array,
     return jnp.sum(jnp.where(ball, value, 0.0))
 
 
-# ------------------------------------------------------------------------------------------------------------- the step
-
-
 def impact(table: Table, motion: Motion, contact: Contact, unseen: Scalar) -> Motion:
     """Apply the impulses of a contact that is now, between balls a and b or between a and a cushion."""
     a, b, paired = contact.a, contact.b, jnp.any(contact.b)
@@ -159,30 +150,15 @@ def impact(table: Table, motion: Motion, contact: Contact, unseen: Scalar) -> Mo
     # A kick that is due acts on both balls of a pair alike, so only a cushion feels it.
     late_x = jnp.where(paired, 0.0, table.acceleration[0] * unseen)
     late_y = jnp.where(paired, 0.0, table.acceleration[1] * unseen)
-    restitution, friction, roll = _surfaces(table, paired)
-    jn = normal_impulse(-(vx * nx + vy * ny), -(late_x * nx + late_y * ny), restitution, discs)
+    jn = normal_impulse(-(vx * nx + vy * ny), -(late_x * nx + late_y * ny), table.restitution, discs)
     slip = (vy + late_y) * nx - (vx + late_x) * ny - of(motion.rim, a) - of(motion.rim, b)
-    jt = tangential_impulse(slip, jn, friction, discs)
+    jt = tangential_impulse(slip, jn, table.friction, discs)
 
     sign = a.astype(vx.dtype) - b.astype(vx.dtype)
-    if table.cloth is not None:  # the impulse acts on the velocity; what rolls on adds its share of the one before
-        sign = sign * (1.0 - roll)
     return motion._replace(
         ux=motion.ux + sign * (jn * nx - jt * ny),
         uy=motion.uy + sign * (jn * ny + jt * nx),
         rim=motion.rim + jnp.where(a | b, RIM_PER_IMPULSE * jt, 0.0),
-    )
-
-
-def _surfaces(table: Table, paired: Bool[Array, ""]) -> tuple[Scalar, Scalar, Scalar]:
-    """Return restitution, friction and the share that rolls on, of an impact between two balls or with a cushion."""
-    if table.cloth is None:
-        return table.restitution, table.friction, 0.0
-    cloth = table.cloth
-    return (
-        jnp.where(paired, table.restitution, cloth.rebound),
-        jnp.where(paired, cloth.throw, table.friction),
-        jnp.where(paired, cloth.roll, 0.0),
     )
 
 
@@ -255,9 +231,6 @@ def strike(
     )
 
 
-# ------------------------------------------------------------------------------------------------------------ interface
-
-
 def simulate(
     table: Table,
     positions: Float[ArrayLike, "balls 2"],
@@ -293,26 +266,13 @@ def simulate_many(
 ) -> Shot:
     """`vmap(simulate)` in blocks: working memory stays in cache, and a long shot holds up only its block.
 
-    Every field of the result leads with (shots,). Any field of the table may lead with (shots,) too; others are shared.
+    Every field of the result leads with (shots,).
     """
     shots, block = len(angles), min(block, len(angles))
-    fields, tree = jax.tree.flatten(table.replace(acceleration=jnp.asarray(table.acceleration)))
-    ranks = jax.tree.leaves(tree.unflatten([0] * len(fields)).replace(acceleration=1))
-    own = [jnp.ndim(field) > rank for field, rank in zip(fields, ranks, strict=True)]
-
-    def blocks(leaf: Array) -> Array:  # the last block is filled up with copies of the last shot
-        filled = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -shots % block, axis=0)])
-        return filled.reshape(-1, block, *leaf.shape[1:])
-
-    def play(batch: tuple[list[Array], Array, Array, Array]) -> Shot:
-        changed, *scene = batch
-        values, each = iter(changed), [0 if is_own else None for is_own in own]
-        mixed = tree.unflatten([next(values) if is_own else field for field, is_own in zip(fields, own, strict=True)])
-        return jax.vmap(simulate, in_axes=(tree.unflatten(each), 0, 0, 0))(mixed, *scene)
-
-    batch = [field for field, is_own in zip(fields, own, strict=True) if is_own], positions, pocketed, angles
-    result = jax.lax.map(play, jax.tree.map(lambda leaf: blocks(jnp.asarray(leaf)), batch))
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:shots], result)
+    rows = np.minimum(np.arange(-(-shots // block) * block), shots - 1)  # the last block is filled up
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], (positions, pocketed, angles))
+    result = jax.lax.map(lambda one: simulate(table, *one), scene, batch_size=block)
+    return jax.tree.map(lambda leaf: leaf[:shots], result)
 
 
 def trace(

@@ -12,11 +12,7 @@ from cuelearner_jax.types import Policy
 
 
 def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tuple[list[Trajectory], list[float]]:
-    """Paths and rewards of `shots` shots of a policy; a new rack follows the end of an episode.
-
-    Args:
-        policy: who acts.
-    """
+    """Paths and rewards of `shots` shots of a policy; a new rack follows the end of an episode."""
 
     @jax.jit
     def play(key: PRNGKeyArray, state: Balls, obs: jax.Array) -> tuple[Balls, jax.Array, jax.Array, Trajectory]:

@@ -12,14 +12,6 @@ Scalar = float | Float[Array, ""]
 CORNER_GAP = 1.4142  # a cushion ends this many hole widths before a corner: the hole then measures two of them across
 
 
-class Cloth(struct.PyTreeNode):
-    """How balls meet where they roll on cloth: what our plain discs, which slide, have not."""
-
-    throw: Scalar = 0.25  # Coulomb coefficient between balls, in the place of the table's
-    roll: Scalar = 0.0  # share of its velocity that a ball keeps through an impact with another; 2/7: a rolling sphere
-    rebound: Scalar = 1.0  # restitution of the cushions, in the place of the table's
-
-
 class Table(struct.PyTreeNode):
     """Parameters of one table. Every field but the last three is traced: a changed value needs no new compile.
 
@@ -39,7 +31,6 @@ class Table(struct.PyTreeNode):
     acceleration: tuple[float, float] | Float[Array, "2"] = (0.0, 0.0)  # of every ball, as on a tilted table [m/s^2]
     cushion_radius: Scalar = 0.004  # cushions are rounded this far round the table's edge [m]
     pocket_margin: Scalar = 0.001  # a ball whose centre is this far outside is pocketed [m]
-    cloth: Cloth | None = None  # None: nothing of it is compiled
     balls: int = struct.field(pytree_node=False, default=4)  # with the cue ball
     side_pockets: bool = struct.field(pytree_node=False, default=False)  # in the middle of both long sides
     max_events: int = struct.field(pytree_node=False, default=256)  # bound on a shot's impacts, pocketings and kicks

@@ -21,6 +21,7 @@ from cuelearner_jax.spaces.directions import (
     to_angle,
 )
 
+Scalar = Float[Array, ""] | float
 PROPOSALS = 1200  # directions in which a network's values are taken
 APART = 3  # of them, at least, between two that are looked at closely
 REACH = math.radians(1.5)  # how far on either side shots are tried [rad]: a tilt of 0.005 m/s^2 bends a shot by less
@@ -47,12 +48,7 @@ class SearchTeacher(struct.PyTreeNode):
         return best_direction(self.rewards(state), self.aim_error, self.habit)
 
     def nearest_good(
-        self,
-        state: Balls,
-        obs: Float[Array, " obs"],
-        action: Float[Array, "2"],
-        spread: Float[Array, ""] | float,
-        share: Float[Array, ""] | float,
+        self, state: Balls, obs: Float[Array, " obs"], action: Float[Array, "2"], spread: Scalar, share: Scalar
     ) -> Float[Array, "2"]:
         """The nearest direction that it holds for good (`cuelearner_jax.types.ValuesDirections`)."""
         return nearest_direction(self.rewards(state), spread, share, action)
@@ -74,12 +70,7 @@ class Transferred(struct.PyTreeNode):
         return self._here(self.teacher.best_action(state, self.own.observe(state)))
 
     def nearest_good(
-        self,
-        state: Balls,
-        obs: Float[Array, " obs"],
-        action: Float[Array, "2"],
-        spread: Float[Array, ""] | float,
-        share: Float[Array, ""] | float,
+        self, state: Balls, obs: Float[Array, " obs"], action: Float[Array, "2"], spread: Scalar, share: Scalar
     ) -> Float[Array, "2"]:
         """The nearest direction of a shot that the teacher holds for good."""
         struck = rotate(action, self.env.action_turn - self.own.action_turn)
@@ -111,12 +102,7 @@ class LocalSearchTeacher(struct.PyTreeNode):
         return best_direction(self.rewards(state, proposed, proposed[0]), self.aim_error, self.habit)
 
     def nearest_good(
-        self,
-        state: Balls,
-        obs: Float[Array, " obs"],
-        action: Float[Array, "2"],
-        spread: Float[Array, ""] | float,
-        share: Float[Array, ""] | float,
+        self, state: Balls, obs: Float[Array, " obs"], action: Float[Array, "2"], spread: Scalar, share: Scalar
     ) -> Float[Array, "2"]:
         """The nearest direction that it holds for good (`cuelearner_jax.types.ValuesDirections`).
 
@@ -170,12 +156,7 @@ class NearbyTeacher(struct.PyTreeNode):
         return rotate(centre, turns[jnp.argmin(jnp.where(best, jnp.abs(turns), jnp.inf))])
 
     def nearest_good(
-        self,
-        state: Balls,
-        obs: Float[Array, " obs"],
-        action: Float[Array, "2"],
-        spread: Float[Array, ""] | float,
-        share: Float[Array, ""] | float,
+        self, state: Balls, obs: Float[Array, " obs"], action: Float[Array, "2"], spread: Scalar, share: Scalar
     ) -> Float[Array, "2"]:
         """The nearest good direction near the action itself (`cuelearner_jax.types.ValuesDirections`)."""
         turns, expected = self.turns(), self.expected(state, action, spread)

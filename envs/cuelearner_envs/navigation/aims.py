@@ -33,9 +33,7 @@ UNSEEN = -1.0  # nearness in directions that the lidar does not cover
 def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
     """The ways of a situation; see `Navigation.aims`.
 
-    Args:
-        obs: the observation.
-        ahead: tell also, as the last three features, where two legs lead (`look_ahead.look_ahead`).
+    With `ahead` the last three features tell where two legs lead (`look_ahead.look_ahead`).
     """
     goal, away = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2] * FARTHEST
     ways = rotate(jnp.broadcast_to(goal, (WAYS, 2)), jnp.arange(WAYS) * (2 * jnp.pi / WAYS))

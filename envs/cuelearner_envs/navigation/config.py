@@ -58,24 +58,19 @@ class NavigationConfig:
 
     def __post_init__(self) -> None:
         """Raise UserError with one line for the first value that cannot work."""
-        check(self)
-
-
-def check(config: NavigationConfig) -> None:
-    """Raise UserError with one line for the first value that cannot work."""
-    check_word("style", config.style, STYLES)
-    check_word("preferred_side", config.preferred_side, SIDES)
-    if config.preferred_side != "none" and config.style != "corridor":
-        raise UserError(f"task.preferred_side is {config.preferred_side}: that needs --task.style corridor")
-    check_number("worlds", config.worlds, 1, MOST_WORLDS, whole=True)
-    check_number("world_seed", config.world_seed, 0, MOST_SEED, whole=True)
-    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
-    check_number("goal_radius", config.goal_radius, positive=True, unit="metres")
-    check_number("max_range", config.max_range, positive=True, unit="metres")
-    check_number("lidar_rotation_deg", config.lidar_rotation_deg, unit="degrees")
-    check_number("goal_rotation_deg", config.goal_rotation_deg, unit="degrees")
-    check_number("lidar_noise", config.lidar_noise, 0, unit="metres")
-    check_number("lidar_dropout", config.lidar_dropout, 0, 1, unit="a probability")
+        check_word("style", self.style, STYLES)
+        check_word("preferred_side", self.preferred_side, SIDES)
+        if self.preferred_side != "none" and self.style != "corridor":
+            raise UserError(f"task.preferred_side is {self.preferred_side}: that needs --task.style corridor")
+        check_number("worlds", self.worlds, 1, MOST_WORLDS, whole=True)
+        check_number("world_seed", self.world_seed, 0, MOST_SEED, whole=True)
+        check_number("max_steps", self.max_steps, 1, MOST_STEPS, whole=True)
+        check_number("goal_radius", self.goal_radius, positive=True, unit="metres")
+        check_number("max_range", self.max_range, positive=True, unit="metres")
+        check_number("lidar_rotation_deg", self.lidar_rotation_deg, unit="degrees")
+        check_number("goal_rotation_deg", self.goal_rotation_deg, unit="degrees")
+        check_number("lidar_noise", self.lidar_noise, 0, unit="metres")
+        check_number("lidar_dropout", self.lidar_dropout, 0, 1, unit="a probability")
 
 
 def make_environment(config: NavigationConfig, split: str = "training") -> Navigation:

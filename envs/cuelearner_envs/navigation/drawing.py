@@ -11,10 +11,8 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
@@ -22,10 +20,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
 
+from cuelearner_envs import canvas
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import Frame
-from cuelearner_envs.navigation.robot import Robot
-from cuelearner_envs.navigation.world import FAR_AWAY, World
+from cuelearner_envs.navigation.robot import Robot, hull
+from cuelearner_envs.navigation.world import World, tallness, used
 from cuelearner_jax import pictures
 
 # Okabe and Ito's palette, as in the figures of results: told apart with any colour vision.
@@ -40,7 +39,6 @@ WORDS = {
 }
 CHOSEN, ASKED = "direction chosen", "direction in question"  # what an arrow means
 FLOOR, LOW, TALL = "#fbfaf7", "#c9ccd1", "#5d636b"
-LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
 WIDTH_INCHES, STRIP_INCHES, MARGIN = 7.0, 0.4, 0.35  # the strip below the floor is for words; margin in [m]
 ARROW_REACH = (0.55, 1.6)  # beginning and end of an arrow, from the middle of the body [m]
 GHOSTS_APART = 1.4  # between the bodies of a still [m]
@@ -48,18 +46,13 @@ HOLD_AFTER = 1.2  # at the end of an animated episode [s]
 
 
 def draw_world(axes: Axes, world: World) -> None:
-    """Draw the floor and the solids of a world from above, the taller the darker, filling the axes.
-
-    Args:
-        axes: matplotlib axes; their limits and aspect are set and their frame is hidden.
-        world: one world (no batch).
-    """
+    """Draw the floor and the solids of a world from above, the taller the darker, filling the axes."""
     half = np.asarray(world.extent, float) / 2
     axes.set(xlim=(-half[0] - MARGIN, half[0] + MARGIN), ylim=(-half[1] - MARGIN, half[1] + MARGIN), aspect="equal")
     axes.axis("off")
     axes.add_patch(Rectangle((-half[0], -half[1]), *(2 * half), facecolor=FLOOR, edgecolor="none", zorder=0))
-    solids = [(height, _box(row)) for row, height in _used(world.boxes, world.box_heights)]
-    solids += [(height, Circle((row[0], row[1]), row[2])) for row, height in _used(world.circles, world.circle_heights)]
+    solids = [(height, _box(row)) for row, height in used(world.boxes, world.box_heights)]
+    solids += [(height, Circle((row[0], row[1]), row[2])) for row, height in used(world.circles, world.circle_heights)]
     for height, patch in sorted(solids, key=lambda solid: solid[0]):  # from above, the tall covers the low
         patch.set(facecolor=shade(height), edgecolor="none", zorder=1)
         axes.add_patch(patch)
@@ -68,17 +61,8 @@ def draw_world(axes: Axes, world: World) -> None:
 def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], dpi: int = 160) -> None:
     """Write a picture of the first episode: its way, and halfway what the lidar saw and what was chosen.
 
-    Args:
-        robot: gives the outline of the body.
-        frames: from `recording.record`; those after the first episode are left out.
-        file: a name that ends in .png, .svg or .pdf.
-        dpi: dots per inch of a .png; the picture is 7 inches wide.
-
-    Raises:
-        ValueError: if there are no frames.
+    The file's name ends in .png, .svg or .pdf; the picture is 7 inches wide.
     """
-    if not frames:
-        raise ValueError("a picture needs at least one frame")
     episode = [frame for frame in frames if frame.episode == frames[0].episode]
     first, middle, last = episode[0], episode[len(episode) // 2], episode[-1]
     figure, axes, strip = _figure(np.asarray(first.world.extent), dpi)
@@ -94,19 +78,12 @@ def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], d
     _arrow(axes).set_positions(*_arrow_ends(middle))
     words = WORDS.get(last.outcome, "still walking after")
     length = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=-1).sum()
-    _caption(strip).set(text=f"{words} {last.seconds:.1f} s, {length:.1f} m", color=_outcome_colour(last))
-    _save(figure, file, dpi)
+    _caption(strip).set(text=f"{words} {last.seconds:.1f} s, {length:.1f} m", color=OUTCOMES.get(last.outcome, INK))
+    canvas.save(figure, file, dpi)
 
 
 def question(robot: Robot, frame: Frame, file: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Write a picture of one situation and of the direction in question as an arrow, for somebody to judge it.
-
-    Args:
-        robot: gives the outline of the body.
-        frame: from `recording.situation`.
-        file: a name that ends in .png, .svg or .pdf.
-        dpi: dots per inch of a .png; the picture is 7 inches wide.
-    """
+    """Write a picture of one situation and of the direction in question as an arrow, for somebody to judge it."""
     figure, axes, strip = _figure(np.asarray(frame.world.extent), dpi)
     draw_world(axes, frame.world)
     _draw_goal(axes, frame)
@@ -116,81 +93,29 @@ def question(robot: Robot, frame: Frame, file: str | os.PathLike[str], dpi: int 
     _arrow(axes).set_positions(*_arrow_ends(frame))
     away = float(np.linalg.norm(np.asarray(frame.goal) - frame.pose[:2]))
     _caption(strip).set(text=f"{away:.1f} m from the goal", color=INK)
-    _save(figure, file, dpi)
+    canvas.save(figure, file, dpi)
 
 
 def animate(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], fps: float = 10.0) -> None:
-    """Write an animation of all episodes, one picture a step; the end of an episode stands for a moment.
+    """Write an animation (.gif or .mp4) of all episodes, one picture a step; the end of an episode stands for a moment.
 
-    Args:
-        robot: gives the outline of the body.
-        frames: from `recording.record`.
-        file: a name that ends in .gif or .mp4.
-        fps: steps in a second of the film (with steps of 0.2 s, 10 shows twice the speed of life); a GIF counts in
-            hundredths of a second and takes the nearest rate it can have.
-
-    Raises:
-        ValueError: if the name of the file ends otherwise, there are no frames, or the rate is not positive.
+    With steps of 0.2 s, 10 pictures a second show twice the speed of life.
     """
     pictures.check_film(file, fps)
-    if not frames:
-        raise ValueError("an animation needs at least one frame")
     exactly = (BODY, GOAL, CRASH, ARROW, HITS, FLOOR, "#ffffff")
     palette = pictures.palette_of(_specimen(robot, frames), 88, exactly)
     pictures.write_film(file, fps, lambda rate: _pictures(robot, frames, round(HOLD_AFTER * rate)), palette)
 
 
-def overview(
-    worlds: Sequence[World],
-    file: str | os.PathLike[str],
-    titles: Sequence[str] | None = None,
-    columns: int = 3,
-    routes: int = 4,
-) -> None:
-    """Write worlds side by side from above, some routes of each as straight lines from start to goal.
-
-    Args:
-        worlds: worlds (no batch), drawn from the left to the right and from the top to the bottom.
-        file: a name that ends in .png, .svg or .pdf.
-        titles: one for each world, written above it.
-        columns: worlds in a row.
-        routes: how many of a world's routes are drawn, the first ones.
-    """
-    if not worlds:
-        raise ValueError("an overview needs at least one world")
-    columns = min(columns, len(worlds))
-    rows = [worlds[start : start + columns] for start in range(0, len(worlds), columns)]
-    sides = [np.stack([np.asarray(world.extent) for world in row]) + 2 * MARGIN for row in rows]
-    panel = (WIDTH_INCHES + 1.0) / columns  # [inch]
-    title = 0.3 if titles else 0.0  # [inch]
-    heights = [panel * float((side[:, 1] / side[:, 0]).max()) + title for side in sides]
-    figure = Figure(figsize=(panel * columns, sum(heights)))
-    FigureCanvasAgg(figure)
-    for number, world in enumerate(worlds):
-        row, column = divmod(number, columns)
-        bottom, height = sum(heights[row + 1 :]), heights[row] - title
-        axes = figure.add_axes((column / columns, bottom / sum(heights), 1 / columns, height / sum(heights)))
-        draw_world(axes, world)
-        for start, goal in zip(np.asarray(world.starts)[:routes], np.asarray(world.goals)[:routes], strict=True):
-            axes.plot(*np.stack([start, goal]).T, color=BODY, linewidth=0.8, alpha=0.7, zorder=2)
-            axes.plot(*start, marker="o", markersize=3, color=START, zorder=3)
-            axes.plot(*goal, marker="*", markersize=7, color=GOAL, markeredgewidth=0, zorder=3)
-        if titles:
-            axes.set_title(titles[number], fontsize=10, pad=3)
-    _save(figure, file, 160)
-
-
 def shade(height: float) -> str:
     """Colour of a solid of some height [m], a hexadecimal code."""
-    share = np.clip((height - LOWEST) / (TALLEST - LOWEST), 0.0, 1.0)
-    return to_hex((1 - share) * np.array(to_rgb(LOW)) + share * np.array(to_rgb(TALL)))
+    share = tallness(height)
+    return to_hex((1 - share) * np.array(to_rgb(LOW)) + share * np.array(to_rgb(TALL)))  # pyright: ignore[reportArgumentType]
 
 
 def outline(robot: Robot, pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "points 2"]:
-    """The rounded outline of the body at a pose [m]: what its three discs span."""
-    bend = np.linspace(-math.pi / 2, math.pi / 2, 13)
-    front = np.stack([np.cos(bend), np.sin(bend)], axis=-1) * float(robot.disc_radius) + [float(robot.disc_offset), 0.0]
-    return _to_world(pose, np.concatenate([front, -front]))
+    """Return the outline of the body at a pose [m]."""
+    return _to_world(pose, hull(robot)[0])
 
 
 def hits(frame: Frame) -> Float[np.ndarray, "271 2"]:
@@ -200,20 +125,11 @@ def hits(frame: Frame) -> Float[np.ndarray, "271 2"]:
     return _to_world(frame.pose, np.asarray(frame.ranges)[:, None] * beams)
 
 
-# --- the parts of a drawing ------------------------------------------------------------------------------------------
-
-
 def _to_world(pose: np.ndarray, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
     """Points in the frame of the body as points of the world [m]."""
     x, y, yaw = np.asarray(pose, float)
     cos, sin = math.cos(yaw), math.sin(yaw)
     return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
-
-
-def _used(rows: Any, heights: Any) -> list[tuple[np.ndarray, float]]:
-    """Solids with their heights, without those that only fill the arrays."""
-    pairs = zip(np.asarray(rows, float), np.asarray(heights, float), strict=True)
-    return [(row, float(height)) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
 
 
 def _box(row: Float[np.ndarray, "5"]) -> Polygon:
@@ -234,12 +150,6 @@ def _figure(extent: Float[np.ndarray, "2"], dpi: float) -> tuple[Figure, Axes, A
     strip.set(xlim=(-length / 2, length / 2), ylim=(0, 1))
     strip.axis("off")
     return figure, axes, strip
-
-
-def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
-    """Write a picture with no date: the same drawing, the same bytes."""
-    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
-        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
 
 
 def _draw_goal(axes: Axes, frame: Frame) -> None:
@@ -282,10 +192,6 @@ def _caption(strip: Axes, animated: bool = False) -> Any:
     return strip.text(left, 0.5, "", va="center_baseline", fontsize=9, animated=animated)
 
 
-def _outcome_colour(frame: Frame) -> str:
-    return OUTCOMES.get(frame.outcome, INK)
-
-
 class _Body:
     """The artists of the robot, which can be moved: its outline, and a chevron that points ahead."""
 
@@ -294,22 +200,15 @@ class _Body:
     ) -> None:
         self.robot = robot
         look: dict[str, Any] = {"animated": animated, "alpha": alpha, "closed": True, "zorder": 6 if alpha == 1 else 5}
-        self.hull = Polygon(np.zeros((3, 2)), facecolor=colour, edgecolor="white", linewidth=0.8, **look)
-        self.head = Polygon(np.zeros((3, 2)), facecolor="white", edgecolor="none", **look)
-        axes.add_patch(self.hull)
-        axes.add_patch(self.head)
+        body = Polygon(np.zeros((3, 2)), facecolor=colour, edgecolor="white", linewidth=0.8, **look)
+        self.artists = (body, Polygon(np.zeros((3, 2)), facecolor="white", edgecolor="none", **look))
+        for artist in self.artists:
+            axes.add_patch(artist)
 
     def place(self, pose: Float[np.ndarray, "3"]) -> None:
         """Move it to a pose [m, rad]."""
-        radius, tip = float(self.robot.disc_radius), float(self.robot.disc_offset) + 0.6 * float(self.robot.disc_radius)
-        chevron = np.array([[tip, 0.0], [tip - 1.1 * radius, 0.6 * radius], [tip - 1.1 * radius, -0.6 * radius]])
-        self.hull.set_xy(outline(self.robot, pose))
-        self.head.set_xy(_to_world(pose, chevron))
-
-    def draw(self, renderer: Any) -> None:
-        """Draw it alone, over what is there."""
-        self.hull.draw(renderer)
-        self.head.draw(renderer)
+        for artist, points in zip(self.artists, hull(self.robot), strict=True):
+            artist.set_xy(_to_world(pose, points))
 
 
 class _Lidar:
@@ -319,8 +218,9 @@ class _Lidar:
         self.free = Polygon(np.zeros((3, 2)), facecolor=BEAMS, alpha=0.22, edgecolor="none", zorder=2)
         axes.add_patch(self.free)
         (self.dots,) = axes.plot([], [], linestyle="none", marker="o", markersize=1.8, color=HITS, zorder=4)
-        self.free.set_animated(animated)
-        self.dots.set_animated(animated)
+        self.artists = (self.free, self.dots)
+        for artist in self.artists:
+            artist.set_animated(animated)
 
     def place(self, frame: Frame) -> None:
         """Move it to what a frame saw."""
@@ -329,18 +229,9 @@ class _Lidar:
         self.free.set_xy(np.concatenate([[frame.pose[:2]], ends]))
         self.dots.set_data(*ends[met].T)
 
-    def draw(self, renderer: Any) -> None:
-        """Draw it alone, over what is there."""
-        self.free.draw(renderer)
-        self.dots.draw(renderer)
-
 
 def _arrow(axes: Axes, animated: bool = False) -> FancyArrowPatch:
-    arrow = FancyArrowPatch((0, 0), (1, 1), arrowstyle="-|>", mutation_scale=13, shrinkA=0, shrinkB=0, color=ARROW)
-    edge = patheffects.withStroke(linewidth=3.6, foreground="#000000aa")
-    arrow.set(linewidth=2.2, zorder=7, path_effects=[edge], animated=animated)
-    axes.add_patch(arrow)
-    return arrow
+    return canvas.arrow(axes, ARROW, 13, canvas.edged(3.6, "#000000aa"), animated)
 
 
 def _arrow_ends(frame: Frame) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -364,9 +255,6 @@ def _spread(way: Float[np.ndarray, "poses 3"], middle: Float[np.ndarray, "3"]) -
     return chosen
 
 
-# --- films -----------------------------------------------------------------------------------------------------------
-
-
 class _Stage:
     """One episode's figure. Constant parts are drawn once; each picture draws only what moves."""
 
@@ -378,31 +266,26 @@ class _Stage:
         self.body, self.crashed = (_Body(axes, robot, colour=colour, animated=True) for colour in (BODY, CRASH))
         (self.trail,) = axes.plot([], [], color=BODY, linewidth=1.6, zorder=4, animated=True)
         self.caption = _caption(strip, animated=True)
-        self.canvas: Any = self.figure.canvas
-        self.canvas.draw()
-        self.empty = self.canvas.copy_from_bbox(self.figure.bbox)
+        self.over = canvas.Backdrop(self.figure)
 
     def step(self, frame: Frame, way: Float[np.ndarray, "poses 3"], words: str) -> UInt8[np.ndarray, "height width 3"]:
         """Draw what the robot sees and chooses before a step, and the path so far."""
         self.lidar.place(frame)
         self.body.place(frame.pose)
         self.arrow.set_positions(*_arrow_ends(frame))
-        return self._picture(way, words, INK, self.lidar, self.trail, self.body, self.arrow)
+        return self._picture(way, words, INK, *self.lidar.artists, self.trail, *self.body.artists, self.arrow)
 
     def end(self, last: Frame, way: Float[np.ndarray, "poses 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """Draw where an episode ended, and how."""
         body = self.crashed if last.outcome in ("collision", "fall") else self.body
         body.place(last.next_pose)
         words = f"{WORDS[last.outcome]} {last.seconds:.1f} s"
-        return self._picture(way, words, _outcome_colour(last), self.trail, body)
+        return self._picture(way, words, OUTCOMES.get(last.outcome, INK), self.trail, *body.artists)
 
     def _picture(self, way: np.ndarray, words: str, colour: str, *artists: Any) -> UInt8[np.ndarray, "height width 3"]:
         self.trail.set_data(*way[:, :2].T)
         self.caption.set(text=words, color=colour)
-        self.canvas.restore_region(self.empty)
-        for artist in (*artists, self.caption):
-            artist.draw(self.canvas.renderer)
-        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+        return self.over.picture(*artists, self.caption)
 
 
 def _extent(frames: Sequence[Frame]) -> Float[np.ndarray, "2"]:

@@ -182,12 +182,7 @@ class Navigation(Described, struct.PyTreeNode):
         return self.lidar.read(self.world(state.world), state.pose)
 
     def observe(self, state: AnyWalker) -> Float[Array, " obs"]:
-        """Return the robot's observation; every entry is of the order of 1.
-
-        - 271 entries: how near the lidar's beams end, from right behind to left behind, exp(-distance / 1 m) of
-        - 2: direction to the goal in the body's frame; 1: distance to the goal over 15 m
-        - 6: the last three actions, the latest first
-        """
+        """Return the robot's observation, see `observation`; every entry is of the order of 1."""
         offset = rotate(state.goal - state.pose[:2], self.goal_rotation - state.pose[2])
         distance = jnp.linalg.norm(offset)
         return jnp.concatenate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,22 +33,9 @@ def clutter(key: PRNGKeyArray) -> Layout:
     k_count, k_place, k_turn, k_size, k_round, k_radius, k_tall = jax.random.split(key, 7)
     k_boxes, k_circles = jax.random.split(k_count)
     used = jnp.arange(16) < jax.random.randint(k_boxes, (), 8, 17)
-    boxes = jnp.concatenate(
-        [
-            jax.random.uniform(k_place, (16, 2), minval=-9.5, maxval=9.5),
-            jax.random.uniform(k_turn, (16, 1), maxval=math.pi),
-            jax.random.uniform(k_size, (16, 2), minval=0.2, maxval=0.9),
-        ],
-        axis=-1,
-    )
+    boxes = _drawn(16, (k_place, 2, -9.5, 9.5), (k_turn, 1, 0.0, math.pi), (k_size, 2, 0.2, 0.9))
     drawn = jnp.arange(12) < jax.random.randint(k_circles, (), 6, 13)
-    circles = jnp.concatenate(
-        [
-            jax.random.uniform(k_round, (12, 2), minval=-9.5, maxval=9.5),
-            jax.random.uniform(k_radius, (12, 1), minval=0.15, maxval=0.6),
-        ],
-        axis=-1,
-    )
+    circles = _drawn(12, (k_round, 2, -9.5, 9.5), (k_radius, 1, 0.15, 0.6))
     return _layout(k_tall, extent, _only(used, boxes), _only(drawn, circles))
 
 
@@ -73,23 +60,11 @@ def rooms(key: PRNGKeyArray) -> Layout:
     stretches = jnp.concatenate([along_x, along_y])
     walls = jax.vmap(_wall_with_door)(jax.random.split(k_doors, stretches.shape[0]), stretches).reshape(-1, 5)
     k_place, k_turn, k_length, k_width = jax.random.split(k_thin, 4)
-    thin = jnp.concatenate(
-        [
-            jax.random.uniform(k_place, (6, 2), minval=-extent / 2 + 0.8, maxval=extent / 2 - 0.8),
-            jax.random.uniform(k_turn, (6, 1), maxval=math.pi),
-            jax.random.uniform(k_length, (6, 1), minval=0.3, maxval=0.8),
-            jax.random.uniform(k_width, (6, 1), minval=0.02, maxval=0.05),
-        ],
-        axis=-1,
-    )
+    inside = -extent / 2 + 0.8, extent / 2 - 0.8
+    shape = (k_turn, 1, 0.0, math.pi), (k_length, 1, 0.3, 0.8), (k_width, 1, 0.02, 0.05)
+    thin = _drawn(6, (k_place, 2, *inside), *shape)
     k_where, k_radius = jax.random.split(k_poles)
-    poles = jnp.concatenate(
-        [
-            jax.random.uniform(k_where, (8, 2), minval=-extent / 2 + 0.8, maxval=extent / 2 - 0.8),
-            jax.random.uniform(k_radius, (8, 1), minval=0.05, maxval=0.12),
-        ],
-        axis=-1,
-    )
+    poles = _drawn(8, (k_where, 2, *inside), (k_radius, 1, 0.05, 0.12))
     return _layout(k_tall, extent, jnp.concatenate([walls, thin]), poles)
 
 
@@ -127,6 +102,12 @@ def _wall_with_door(key: PRNGKeyArray, ends: Float[Array, "4"]) -> Float[Array, 
     shape = jnp.stack([pieces / 2, jnp.full(2, thickness)], -1)
     walls = jnp.concatenate([centres, jnp.full((2, 1), yaw), shape], axis=-1)
     return _only(pieces > 0.2, walls)
+
+
+def _drawn(count: int, *columns: tuple[PRNGKeyArray, int, Any, Any]) -> Float[Array, "count width"]:
+    """Rows of uniform numbers: of each group of columns the key, their number, and both bounds."""
+    groups = [jax.random.uniform(key, (count, width), minval=low, maxval=high) for key, width, low, high in columns]
+    return jnp.concatenate(groups, axis=-1)
 
 
 def _only(used: Bool[Array, " rows"], rows: Float[Array, "rows width"]) -> Float[Array, "rows width"]:

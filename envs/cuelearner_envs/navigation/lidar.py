@@ -63,12 +63,7 @@ def scan(world: World, pose: Float[ArrayLike, "3"], max_range: Scalar = MAX_RANG
     """Distance along each beam to the first surface [m], from -135 deg to +135 deg, counterclockwise.
 
     The sensor sits at the robot's centre, below the top of every solid. From inside a solid a beam reads the way out,
-    as MuJoCo's rays do.
-
-    Args:
-        world: one world.
-        pose: x, y, yaw [m, rad].
-        max_range: what a beam reads that meets nothing nearer [m].
+    as MuJoCo's rays do. A beam that meets nothing nearer reads `max_range`.
     """
     world, pose = jax.tree.map(jnp.asarray, world), jnp.asarray(pose)
     beams = rotate(from_angle(jnp.asarray(BEAM_ANGLES)), pose[2])
@@ -82,13 +77,8 @@ def scan_tilted(
     """`scan` of a sensor that is tilted: beams meet the floor, and pass over solids that are too low.
 
     A beam that has entered a solid above its top is taken to pass over it, and one that begins above a solid's top or
-    leaves it upward likewise: tilts of walking are small.
-
-    Args:
-        world: one world.
-        origin: where the sensor is; the last entry is its height above the floor [m].
-        turn: the matrix that turns the sensor's frame into the world's.
-        max_range: what a beam reads that meets nothing nearer [m].
+    leaves it upward likewise: tilts of walking are small. `origin` is the sensor's place, with its height above the
+    floor [m]; `turn` turns its frame into the world's.
     """
     ahead = from_angle(jnp.asarray(BEAM_ANGLES))
     # Sums, not a matrix product: an accelerator rounds the factors of those.

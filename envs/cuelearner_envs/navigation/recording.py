@@ -11,7 +11,8 @@ from jaxtyping import ArrayLike, Float, PRNGKeyArray
 
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.world import World
-from cuelearner_jax.types import Policy
+from cuelearner_envs.playing import played
+from cuelearner_jax.types import Policy, Step
 
 ENDS = ("success", "collision", "fall", "timeout")
 
@@ -62,32 +63,16 @@ def _seen(env: Navigation, state: Any) -> dict[str, Any]:
 
 
 def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
-    """Frames and rewards of `steps` steps of a policy; a new episode follows the end of one.
+    """Frames and rewards of `steps` steps of a policy; a new episode follows the end of one."""
 
-    Args:
-        policy: who acts.
-    """
+    def see(env: Navigation, state: Any, action: jax.Array, step: Step) -> tuple[jax.Array, ...]:
+        moved = env.moved(state, action)
+        ends = jnp.stack([step.outcome.get(name, jnp.zeros(())) for name in ENDS])  # only legged robots fall
+        seen = (state.world, state.goal, state.pose, env.ranges(state))
+        return (*seen, action, moved.pose, moved.steps * jnp.asarray(env.period), ends, step.reward)
 
-    @jax.jit
-    def play(env: Navigation, key: PRNGKeyArray) -> Any:
-        k_reset, k_play = jax.random.split(key)
-
-        def advance(carry: Any, number: jax.Array) -> Any:
-            state, obs = carry
-            k_act, k_step = jax.random.split(jax.random.fold_in(k_play, number))
-            states = jax.tree.map(lambda leaf: leaf[None], state)
-            action = policy.act(k_act, states, obs[None])[0]
-            moved = env.moved(state, action)
-            following, step = env.step(k_step, state, action)
-            seconds = moved.steps * jnp.asarray(env.period)
-            ends = jnp.stack([step.outcome.get(name, jnp.zeros(())) for name in ENDS])  # only legged robots fall
-            seen = (state.world, state.goal, state.pose, env.ranges(state))
-            seen += (action, moved.pose, seconds, ends, step.reward)
-            return (following, step.obs), seen
-
-        return jax.lax.scan(advance, env.reset(k_reset), jnp.arange(steps))[1]
-
-    which, goals, poses, ranges, actions, next_poses, seconds, ends, rewards = jax.device_get(play(env, key))
+    found = played(env, policy, key, steps, see)
+    which, goals, poses, ranges, actions, next_poses, seconds, ends, rewards = found
     worlds = jax.device_get(env.world(which))
     finished = np.cumsum(ends.any(-1))
     frames = [

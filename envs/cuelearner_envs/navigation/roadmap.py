@@ -133,6 +133,13 @@ def _candidates(
     return jnp.concatenate(kinds), jnp.concatenate(ranks)
 
 
+def _toward_goal(
+    roadmap: RoadMap, world: World, robot: Robot, to_goal: Float[Array, " nodes"], state: AnyWalker
+) -> Float[Array, "2"]:
+    place, _ = way(roadmap, world, robot, to_goal, state.pose[:2], state.goal)
+    return rotate(retract(place - state.pose[:2]), -state.pose[2])
+
+
 class RoadMapTeacher(struct.PyTreeNode):
     """Knows every world of an environment (`cuelearner_jax.types.Teacher`)."""
 
@@ -144,9 +151,7 @@ class RoadMapTeacher(struct.PyTreeNode):
         """The direction of the shortest way to the goal, in the body's frame. Looks at the true state."""
         world = self.env.world(state.world)
         roadmap = jax.tree.map(lambda leaf: leaf[state.world], self.maps)
-        to_goal = self.to_goals[state.world, state.route]
-        place, _ = way(roadmap, world, self.env.robot, to_goal, state.pose[:2], state.goal)
-        return rotate(retract(place - state.pose[:2]), -state.pose[2])
+        return _toward_goal(roadmap, world, self.env.robot, self.to_goals[state.world, state.route], state)
 
 
 class BriefTeacher(struct.PyTreeNode):
@@ -159,9 +164,7 @@ class BriefTeacher(struct.PyTreeNode):
         """The direction of the shortest way to the goal, in the body's frame. Looks at the true state."""
         world, robot = self.env.world(state.world), self.env.robot
         roadmap = build(self.keys[state.world], world, robot)
-        to_goal = distances(roadmap, world, robot, state.goal)
-        place, _ = way(roadmap, world, robot, to_goal, state.pose[:2], state.goal)
-        return rotate(retract(place - state.pose[:2]), -state.pose[2])
+        return _toward_goal(roadmap, world, robot, distances(roadmap, world, robot, state.goal), state)
 
 
 class SidedTeacher(struct.PyTreeNode):

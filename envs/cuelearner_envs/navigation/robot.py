@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
@@ -32,6 +33,16 @@ class Robot(struct.PyTreeNode):
     def reach(self) -> Scalar:
         """Distance from the centre to the body's farthest point [m]: clear of this, it may turn as it likes."""
         return self.disc_radius + self.disc_offset
+
+
+def hull(robot: Robot) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "3 2"]]:
+    """Return the outline of the body, which its three discs span, and a chevron that points ahead [m]."""
+    radius, offset = float(robot.disc_radius), float(robot.disc_offset)
+    bend = np.linspace(-np.pi / 2, np.pi / 2, 13)
+    front = np.stack([np.cos(bend), np.sin(bend)], axis=-1) * radius + [offset, 0.0]
+    tip = offset + 0.6 * radius
+    back = tip - 1.1 * radius
+    return np.concatenate([front, -front]), np.array([[tip, 0.0], [back, 0.6 * radius], [back, -0.6 * radius]])
 
 
 class Motion(struct.PyTreeNode):

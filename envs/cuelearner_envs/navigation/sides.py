@@ -31,12 +31,8 @@ def count_passed(
 ) -> Float[Array, "2"]:
     """Return how many obstacles a straight step passes, on the left and on the right.
 
-    One is passed by a step that crosses the line through its middle across the corridor, forward; which side that is
-    says where on this line.
-
-    Args:
-        ahead: +1 or -1, see `heading`.
-        before, after: where the step begins and ends [m].
+    One is passed by a step that crosses the line through its middle across the corridor, forward (`ahead`, see
+    `heading`); which side that is says where on this line.
     """
     middles, there = obstacles(world)
     x, step = middles[:, 0], after - before

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 from cuelearner_envs import svg
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
-from cuelearner_envs.navigation.robot import Robot
-from cuelearner_envs.navigation.world import FAR_AWAY
+from cuelearner_envs.navigation.robot import Robot, hull
+from cuelearner_envs.navigation.world import used
 from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Reel, Sketch
 
@@ -33,10 +33,8 @@ def sketch(env: Navigation, state: Any) -> Sketch:
     """Return the robot's surroundings as a sketch, from above."""
     world, goal, pose, ranges = jax.device_get(_seen(env, state))
     parts = [svg.rectangle(-AROUND, -AROUND, 2 * AROUND, 2 * AROUND, "fill:var(--floor)")]
-    boxes = zip(world.boxes, world.box_heights.tolist(), strict=True)
-    discs = zip(world.circles, world.circle_heights.tolist(), strict=True)
-    solids = [(height, _box(row, height, pose)) for row, height in boxes]
-    solids += [(height, _disc(row, height, pose)) for row, height in discs]
+    solids = [(height, _box(row, height, pose)) for row, height in used(world.boxes, world.box_heights)]
+    solids += [(height, _disc(row, height, pose)) for row, height in used(world.circles, world.circle_heights)]
     parts += [shape for _, shape in sorted(solids)]  # from above, the tall covers the low
     ends = _up(ranges[:, None] * np.stack([np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES)], axis=-1))
     parts.append(svg.polygon([(0.0, 0.0), *ends], "fill:var(--free);fill-opacity:0.25"))
@@ -114,8 +112,6 @@ def _fill(height: float) -> str:
 
 
 def _box(row: np.ndarray, height: float, pose: np.ndarray) -> str:
-    if abs(row[0]) > FAR_AWAY / 2:
-        return ""
     x, y, yaw, length, width = (float(value) for value in row)
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length, width]
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -124,8 +120,6 @@ def _box(row: np.ndarray, height: float, pose: np.ndarray) -> str:
 
 
 def _disc(row: np.ndarray, height: float, pose: np.ndarray) -> str:
-    if abs(row[0]) > FAR_AWAY / 2:
-        return ""
     at = _placed(row[None, :2], pose)
     return svg.circle(tuple(at[0]), float(row[2]), _fill(height)) if _shown(at, float(row[2])) else ""
 
@@ -148,10 +142,5 @@ def _goal(at: np.ndarray, radius: float, away: float) -> str:
 
 
 def _robot(robot: Robot) -> str:
-    radius, offset = float(robot.disc_radius), float(robot.disc_offset)
-    bend = np.linspace(-math.pi / 2, math.pi / 2, 13)
-    front = np.stack([np.cos(bend), np.sin(bend)], axis=-1) * radius + [offset, 0.0]
-    hull = svg.polygon(np.concatenate([front, -front]), "fill:var(--body);stroke:#222222;stroke-width:0.04")
-    tip = offset + 0.6 * radius
-    back = tip - 1.1 * radius
-    return hull + svg.polygon([(tip, 0.0), (back, 0.6 * radius), (back, -0.6 * radius)], "fill:#222222")
+    body, chevron = hull(robot)
+    return svg.polygon(body, "fill:var(--body);stroke:#222222;stroke-width:0.04") + svg.polygon(chevron, "fill:#222222")

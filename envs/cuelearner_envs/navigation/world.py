@@ -5,10 +5,12 @@ Metres and radians; x to the right, y up, z from the floor; the origin is the wo
 
 from __future__ import annotations
 
+import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 FAR_AWAY = 1000.0  # where unused rows lie [m]: a solid there is out of reach of everything
+LOWEST, TALLEST = 0.6, 1.5  # heights of the solids drawn lightest and darkest [m]
 
 
 class World(struct.PyTreeNode):
@@ -24,3 +26,14 @@ class World(struct.PyTreeNode):
     extent: Float[Array, "2"]  # length along x and y between the outer walls [m]
     starts: Float[Array, "routes 2"]  # where episodes may begin [m]; from each the robot can reach the goal of its row
     goals: Float[Array, "routes 2"]  # [m], 5 to 15 m from the start as the crow flies
+
+
+def used(rows: ArrayLike, heights: ArrayLike) -> list[tuple[np.ndarray, float]]:
+    """Return boxes or circles with their heights, without those that only fill the arrays."""
+    pairs = zip(np.asarray(rows, float), np.asarray(heights, float).tolist(), strict=True)
+    return [(row, height) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
+
+
+def tallness(height: float) -> float:
+    """Return 0 for the lowest solids up to 1 for the tallest, by which drawings shade them."""
+    return float(np.clip((height - LOWEST) / (TALLEST - LOWEST), 0.0, 1.0))

@@ -9,10 +9,9 @@ import numpy as np
 
 from cuelearner_envs.billiards.config import BilliardsConfig
 from cuelearner_envs.billiards.config import make_environment as make_billiards
-from cuelearner_envs.billiards.foreign import ForeignBilliards
-from cuelearner_envs.billiards.processes import Played
+from cuelearner_envs.billiards.foreign import ForeignBilliards, Played
 from cuelearner_envs.billiards.table import CORNER_GAP, Table
-from cuelearner_envs.pooltool.outline import Outline
+from cuelearner_envs.pooltool import Outline
 from cuelearner_jax.errors import UserError
 
 # With it a free ball comes to rest after 1.3 m, as on our table, where it leaves with 0.5 m/s [m/s].
@@ -20,7 +19,7 @@ STRIKE_SPEED = 0.7
 
 
 class Pooltool(NamedTuple):
-    """Pooltool's physics on a table (`cuelearner_envs.billiards.processes.Engine`)."""
+    """Pooltool's physics on a table (`cuelearner_envs.billiards.foreign.Engine`)."""
 
     outline: Outline
 
@@ -41,14 +40,7 @@ def make_environment(config: BilliardsConfig) -> ForeignBilliards:
     plain = make_billiards(config)
     if any(config.acceleration):
         raise UserError("pooltool's table is level: leave out --task.acceleration")
-    return ForeignBilliards(
-        table=plain.table,
-        action_turn=plain.action_turn,
-        observation_bias=plain.observation_bias,
-        max_shots=plain.max_shots,
-        mirrors=plain.mirrors,
-        engine=Pooltool(outline_of(getattr(Table, config.table)())),
-    )
+    return ForeignBilliards(**vars(plain), engine=Pooltool(outline_of(getattr(Table, config.table)())))
 
 
 def outline_of(table: Table) -> Outline:

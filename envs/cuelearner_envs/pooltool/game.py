@@ -29,8 +29,8 @@ from pooltool.physics.resolve.resolver import Resolver, ResolverConfig
 from pooltool.physics.resolve.stick_ball import StickBallModel
 from pooltool.physics.resolve.transition import BallTransitionModel
 
-from cuelearner_envs.billiards.processes import Played
-from cuelearner_envs.pooltool.outline import Outline
+from cuelearner_envs.billiards.foreign import Played
+from cuelearner_envs.pooltool import Outline
 
 CUSHION_HEIGHT = 0.64  # of a ball's diameter: pooltool's own
 RESTING, SLIDING, POCKETED = 0, 2, 4  # pooltool's names for how a ball moves

@@ -244,9 +244,7 @@ def answer(
 
     Args:
         key: of the teacher's faults.
-        world: the world that the teacher knows.
-        state: the situation.
-        action: the action in question.
+        world, state, action: the situation, and the action in question.
         eps: strength of an answer, in shares of the range or rad: differences below eps / 2 are answered by 0.
         wrong: share of answers with the wrong sign.
         one_cue: whether one cue alone is answered, the one that differs most.
@@ -263,12 +261,7 @@ def rollout(
 ) -> tuple[Float[Array, "steps obs"], State, Float[Array, ""], Bool[Array, ""]]:
     """Play an episode; return the observations and states acted in, the return and the success.
 
-    Args:
-        key: of the episode.
-        world: the world.
-        act: from an observation (obs,) to an action; with `knows`, from a `State`, as a teacher acts.
-        steps: of the episode.
-        knows: whether `act` takes states.
+    `act` takes an observation (obs,); with `knows`, a `State`, as a teacher does.
     """
 
     def one(state: State, _: None) -> tuple[State, tuple]:

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from cuelearner_envs.anymal import judged
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.anymal.environment import SENSOR_NOISE, make_environment
+from cuelearner_envs.anymal.environment import make_environment
 from cuelearner_envs.navigation.config import NavigationConfig
-from cuelearner_envs.navigation.config import make_environment as make_simple
 from cuelearner_envs.navigation.lidar import scan, scan_tilted
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.spaces import directions
@@ -51,12 +50,6 @@ def walked(env):
     return [state, following, later, last], [first, second, third]
 
 
-def test_agents_see_the_same_as_on_the_simple_robot(env):
-    assert env.obs_size == make_simple(CONFIG).obs_size
-    _, obs = begin(env, jax.random.split(jax.random.key(0), WALKERS))
-    assert obs.shape == (WALKERS, env.obs_size)
-
-
 @pytest.mark.long
 def test_every_end_has_its_name(walked):
     _, (first, _, _) = walked
@@ -72,36 +65,6 @@ def test_every_end_has_its_name(walked):
 
 
 @pytest.mark.long
-def test_time_runs_out_without_a_termination(walked):
-    _, (_, _, third) = walked
-    assert bool(third.truncated[0])
-    assert not bool(third.terminated[0])
-    assert float(third.outcome["duration"][0]) == pytest.approx(0.6)
-
-
-@pytest.mark.long
-def test_told_straight_ahead_it_walks_straight_ahead(walked):
-    (before, _, after, _), _ = walked
-    start, end = before.body.qpos[0], after.body.qpos[0]
-    ahead = directions.from_angle(robot.planar_pose(start)[2])
-    way = float(jnp.sum((end[:2] - start[:2]) * ahead))
-    aside = float(jnp.abs(jnp.sum((end[:2] - start[:2]) * directions.rotate(ahead, math.pi / 2))))
-    assert 0.15 < way < 0.42  # 0.4 s at up to 1 m/s, from rest
-    assert aside < 0.1
-
-
-@pytest.mark.long
-def test_after_an_end_an_episode_begins_anew_standing_on_a_route(env, walked):
-    (_, following, _, _), _ = walked
-    for number in (1, 2, 3):
-        start = env.worlds.starts[following.world[number], following.route[number]]
-        np.testing.assert_allclose(following.body.qpos[number, :2], start)
-        assert int(following.steps[number]) == 0
-        assert not bool(following.fallen[number])
-    assert int(following.steps[0]) == 1
-
-
-@pytest.mark.long
 def test_replay_recalls_what_was_seen(env, walked):
     states, steps = walked
     state = jax.tree.map(lambda leaf: leaf[0], states[1])
@@ -110,14 +73,6 @@ def test_replay_recalls_what_was_seen(env, walked):
     np.testing.assert_allclose(jax.jit(env.recall)(memory), seen, atol=1e-6)
     after = jax.jit(env.recall_next)(memory, jnp.array([1.0, 0.0]), steps[1].aftermath[0])
     np.testing.assert_allclose(after, steps[1].final_obs[0], atol=1e-6)
-
-
-@pytest.mark.long
-def test_all_that_is_carried_is_small(walked):
-    (state, *_), _ = walked
-    body = sum(leaf.size for leaf in jax.tree.leaves(state.body)) // WALKERS
-    assert body == 19 + 18 + 18
-    assert sum(leaf.size for leaf in jax.tree.leaves(state)) // WALKERS < 90
 
 
 @pytest.mark.long
@@ -132,19 +87,6 @@ def test_commands_lead_where_the_direction_points(env, walked):
         for _ in range(10):  # the steps of control of 0.2 s, in which the bounds allow 1.6 m/s and 4 rad/s
             told = env.command(body, told, heading)
         np.testing.assert_allclose(told, wanted, atol=1e-4)
-
-
-@pytest.mark.long
-def test_commands_change_no_faster_than_legs_can_follow(env, walked):
-    body = jax.tree.map(lambda leaf: leaf[0], walked[0][0].body)
-    yaw = robot.planar_pose(body.qpos)[2]
-    forward, back = jnp.array([1.0, 0.0, 1.5]), directions.from_angle(yaw + math.pi - 0.01)
-    np.testing.assert_allclose(env.command(body, forward, -back), forward.at[2].set(1.5 - 0.4), atol=0.02)
-    np.testing.assert_allclose(env.command(body, -forward, back), [-1.0, 0.0, -1.5 + 0.4], atol=0.02)
-    np.testing.assert_allclose(env.command(body, forward, back)[0], 1.0 - 8.0 * 0.02, atol=1e-3)
-
-
-# ----------------------------------------------------------------------------------------------------------- the sensor
 
 
 def tilted(yaw=0.0, pitch=0.0, roll=0.0):
@@ -197,15 +139,6 @@ def test_a_tilted_sensor_reads_what_mujocos_rays_do(env):
             theirs = np.minimum(np.minimum(np.where(found < 0, np.inf, found), down), 10.0)
             equal.append(np.abs(ours - theirs) < 2e-3)
     assert np.mean(equal) > 0.997  # the rest: beams at an edge, and ones that come down onto a top
-
-
-def test_the_sensor_has_noise_of_its_own(env):
-    assert float(env.lidar.noise) == pytest.approx(SENSOR_NOISE)
-    more = make_environment(NavigationConfig(worlds=8, lidar_noise=0.1))
-    assert float(more.lidar.noise) == pytest.approx(math.hypot(0.1, SENSOR_NOISE))
-
-
-# -------------------------------------------------------------------------------------------------------- in C MuJoCo
 
 
 def test_in_c_mujoco_walking_toward_the_goal_reaches_it_or_meets_something():

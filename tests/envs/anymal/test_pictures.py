@@ -39,8 +39,3 @@ def test_it_is_seen_from_the_usual_side_where_nothing_stands_there():
 def test_the_camera_moves_to_the_nearest_side_that_is_free(distance):
     turned = looked_at((*toward(AZIMUTH, distance), 0.4)).azimuth - AZIMUTH
     assert abs(turned) == SIDES_APART
-
-
-def test_where_no_side_is_free_it_stays():
-    ring = [(*toward(azimuth, 2.2), 0.6) for azimuth in range(0, 360, SIDES_APART)]
-    assert looked_at(*ring).azimuth == AZIMUTH

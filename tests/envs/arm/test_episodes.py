@@ -9,7 +9,6 @@ import pytest
 
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
-from cuelearner_envs.arm.config import ArmConfig, make_environment
 from cuelearner_envs.arm.environment import Arm
 from cuelearner_envs.arm.judged import Judge, rollout
 from cuelearner_envs.arm.physics import Ground
@@ -74,13 +73,6 @@ def picked():
     return run(post=0.0, grasps=1.0)
 
 
-def test_the_fields_of_a_pick_are_those_of_its_configuration():
-    made = make_environment(ArmConfig("pick"), ())
-    assert (float(made.grasps), float(made.ground.post)) == (1.0, 0.0)
-    made = make_environment(ArmConfig("push"), ())
-    assert (float(made.grasps), float(made.ground.post)) == (0.0, 1.0)
-
-
 def test_scripts_succeed(pushed, picked):
     assert pushed[0]["success"].mean() >= 0.95
     assert picked[0]["success"].mean() >= 0.95
@@ -127,13 +119,6 @@ def test_nothing_goes_through_anything(pushed, picked):
     low = pushed[1].body.qpos[..., 2] < arm.TABLE + arm.POST_HEIGHT + arm.TIP - 0.01
     gripper = np.linalg.norm(pushed[1].body.qpos[..., :2] - np.array(arm.POST_PLACE), axis=-1)
     assert gripper[low].min() > arm.POST_RADIUS + arm.FINGER_RADIUS
-
-
-def test_a_slippery_cube_slides_farther(pushed):
-    slid = run(friction=0.05)
-    speed = lambda walk: np.abs(np.diff(walk[1].body.qpos[..., physics.CUBE][..., :2], axis=0)).max()  # noqa: E731
-    assert speed(slid) < 0.1
-    assert slid[0]["success"].mean() < pushed[0]["success"].mean()
 
 
 def test_observations_are_laid_out_as_fetchs(picked):
@@ -189,9 +174,3 @@ def test_c_mujoco_judges_the_scripts_alike():
     assert found["finished"].all()
     assert found["success"].mean() >= 0.95
     assert found["distance"].shape == (EPISODES,)
-
-
-@pytest.mark.long
-def test_scripts_succeed_in_nearly_all_of_many_episodes():
-    for changes in ({}, {"post": 0.0}, {"post": 0.0, "grasps": 1.0}):
-        assert run(episodes=500, seed=1, **changes)[0]["success"].mean() >= 0.98

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 import cuelearner_jax as cl
-from cuelearner_envs.arm import scripts
 from cuelearner_envs.arm.config import ArmConfig
 from cuelearner_envs.arm.environment import Camera
-from cuelearner_envs.arm.fetch import FetchArm
 from cuelearner_envs.arm.teacher import ScriptTeacher
 from cuelearner_jax.environment import WholeObservations
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import policy_of
 from cuelearner_jax.tasks import arm
 
 CAMERA = {"camera_turn_deg": 90.0, "camera_offset": (0.0, 0.02, 0.0)}
@@ -131,25 +128,3 @@ def test_what_fetch_cannot_be_is_refused_in_one_line(monkeypatch):
     monkeypatch.setattr(arm, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"is not installed: pip install 'cuelearner-jax\[gymnasium\]'"):
         cl.make("arm", robot="fetch").env  # noqa: B018
-
-
-def test_policies_of_the_gripper_act_in_fetch(monkeypatch):
-    monkeypatch.setattr(arm, "find_spec", lambda name: object())
-    for skill in arm.FETCH:
-        ours, theirs = (cl.make("arm", robot=name, skill=skill) for name in ("gripper", "fetch"))
-        assert ours.observation == theirs.observation
-        assert ours.actions == theirs.actions
-        assert isinstance(theirs.env, FetchArm)
-
-
-@pytest.mark.long
-def test_a_policy_is_adapted_in_fetch_by_labels():
-    pytest.importorskip("gymnasium_robotics")
-    world = cl.make("arm", robot="fetch", scenario="turned_camera", skill="reach")
-    script = policy_of(jax.jit(scripts.reach))
-    before = cl.measure(script, world, episodes=20).metrics["success"]
-    found = cl.adapt(script, world, cl.teacher_of(world), labels=100)
-    (turn,) = [one for one in found.estimates if "turn" in one.name and one.changed]
-    assert turn.mean == pytest.approx(10.0, abs=0.3)
-    assert float(np.mean(before)) <= 0.1
-    assert float(np.mean(cl.measure(found.policy, world, episodes=20).metrics["success"])) >= 0.95

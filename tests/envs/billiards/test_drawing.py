@@ -1,7 +1,6 @@
 """Billiards drawings, looked at pixel by pixel: balls are where they should be, films last as long as the shots."""
 
 import math
-from typing import Any
 from xml.etree import ElementTree
 
 import imageio.v2 as imageio
@@ -63,29 +62,6 @@ def test_balls_lie_where_they_are_and_a_pocketed_one_not_on_the_cloth():
     assert rows.min() > edge  # all of the ball is below the table
 
 
-def test_numbers_name_the_targets_only():
-    axes, _, _ = drawn(lambda axes: drawing.draw_table(axes, Table.easy(), np.zeros((4, 2)), np.zeros(4, bool)))
-    texts = [text.get_text() for text in axes.texts if text.get_text() != "pocketed"]
-    assert texts == ["", "1", "2", "3"]
-
-
-@pytest.mark.parametrize("angle", [0.0, 1.0, -2.5])
-def test_arrow_points_from_the_cue_ball_along_the_angle(angle):
-    positions = np.array([[-0.1, 0.02], [0.3, 0.1]])
-    _, _, pixel = drawn(lambda axes: drawing.draw_table(axes, TABLE, positions, np.array([False, False]), angle=angle))
-    along = positions[0] + 0.05 * np.array([math.cos(angle), math.sin(angle)])
-    assert is_colour(pixel(*along), drawing.ARROW, 0.1)
-
-
-def test_tracks_end_at_rest_or_where_the_ball_falls(shot):
-    axes, _, _ = drawn(lambda axes: drawing.draw_table(axes, TABLE, shot.positions[-1], shot.pocketed[-1], path=shot))
-    cue, target = (np.asarray(line.get_xydata()) for line in axes.lines)
-    np.testing.assert_allclose(cue[0], [0.1, -0.1], atol=1e-6)
-    np.testing.assert_allclose(cue[-1], shot.positions[-1, 0], atol=1e-6)
-    np.testing.assert_allclose(target[0], [0.3, 0.1], atol=1e-6)
-    np.testing.assert_allclose(target[-1], [0.4, 0.2], atol=3e-3)
-
-
 @pytest.mark.parametrize("angle", [1.0, -2.5])
 def test_a_question_shows_the_balls_and_the_shot_as_an_arrow(tmp_path, angle):
     positions, ahead = np.array([[-0.1, 0.02], [0.3, 0.1]]), np.array([math.cos(angle), math.sin(angle)])
@@ -141,26 +117,3 @@ def test_gif_has_the_frames_of_the_shot_and_lasts_as_long(shot, tmp_path):
     assert share(pictures[0][int(below) :], drawing.TARGETS[0]) == 0
     assert share(pictures[-1][int(below) :], drawing.TARGETS[0]) > 1e-3
     assert share(pictures[-1][: int(below)], drawing.TARGETS[0]) == 0
-
-
-@pytest.mark.long
-@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # by the reader of this test
-def test_mp4_has_even_sides_and_every_frame_of_both_shots(shot, tmp_path):
-    drawing.animate(TABLE, [shot, shot], tmp_path / "shots.mp4", fps=25, speed=3.0)
-    movie: Any = imageio.get_reader(tmp_path / "shots.mp4")
-    with movie as reader:
-        size, frames = reader.get_meta_data()["size"], sum(1 for _ in reader.iter_data())
-    held = round(drawing.HOLD_BEFORE * 25) + round(drawing.HOLD_AFTER * 25)
-    assert frames == 2 * (held + math.ceil(float(shot.times[-1]) / 3 * 25) + 1)
-    assert size[0] == 800
-    assert size[1] % 2 == 0
-
-
-def test_animate_says_what_it_cannot_do(shot, tmp_path):
-    with pytest.raises(ValueError, match=r"\.gif or \.mp4"):
-        drawing.animate(TABLE, [shot], tmp_path / "shot.avi")
-    with pytest.raises(ValueError, match="at least one shot"):
-        drawing.animate(TABLE, [], tmp_path / "shot.gif")
-    with pytest.raises(ValueError, match="positive"):
-        drawing.animate(TABLE, [shot], tmp_path / "shot.gif", speed=0.0)
-    assert list(tmp_path.iterdir()) == []

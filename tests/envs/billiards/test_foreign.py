@@ -8,8 +8,7 @@ import numpy as np
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Balls
-from cuelearner_envs.billiards.foreign import ForeignBilliards
-from cuelearner_envs.billiards.processes import Played
+from cuelearner_envs.billiards.foreign import ForeignBilliards, Played
 from cuelearner_envs.billiards.table import parking
 
 OWN = make_environment(BilliardsConfig("regulation"))
@@ -50,9 +49,3 @@ def test_a_step_is_scored_by_the_rules_of_the_task():
     right, left = jnp.array([1.0, 0.0]), jnp.array([-1.0, 0.0])
     earned = jax.jit(lambda action: env_of(Still()).step(jax.random.key(0), state, action)[1].reward)
     assert [float(earned(action)) for action in (right, left)] == [1.0, 0.0]
-
-
-def test_worlds_of_equal_engines_are_one_world_to_compiled_programs():
-    same, other = (jax.tree.structure(env_of(Still(moved))) for moved in (0.01, 0.02))
-    assert jax.tree.structure(env_of(Still())) == same
-    assert same != other

@@ -3,19 +3,15 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from billiards_scenes import BATCH, EASY, KEY, SCENE, balls, observe, observe_many, random_states, step_many, toward
+from billiards_scenes import BATCH, EASY, KEY, SCENE, balls, observe, observe_many, random_states, step_many
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_jax.spaces import directions
 
 MIRRORED = make_environment(BilliardsConfig("easy", mirrors=True))
 mirror = jax.jit(MIRRORED.mirror)
 mirror_many = jax.jit(jax.vmap(MIRRORED.mirror, (None, 0, 0)))
 features = jax.jit(EASY.features)
 heuristic = jax.jit(EASY.heuristic)
-
-
-# ------------------------------------------------------------------------------------------------------------- mirrors
 
 
 def test_mirrored_shots_have_mirrored_results():
@@ -36,19 +32,6 @@ def test_mirrored_shots_have_mirrored_results():
         back, vector = mirror_many(jnp.array(which), mirrored_obs, mirrored_strikes)
         np.testing.assert_allclose(back, obs, atol=1e-7)
         np.testing.assert_array_equal(vector, strikes)
-
-
-def test_the_identity_comes_first_and_symmetries_are_an_option():
-    obs = observe(EASY, balls(SCENE.positions, (False, True, False, False)))
-    same, vector = mirror(jnp.array(0), obs, jnp.array([0.6, 0.8]))
-    np.testing.assert_array_equal(same, obs)
-    np.testing.assert_array_equal(vector, np.array([0.6, 0.8], np.float32))
-    images = {tuple(np.asarray(mirror(jnp.array(n), obs, jnp.array([0.6, 0.8]))[0]).tolist()) for n in range(4)}
-    assert len(images) == MIRRORED.symmetries == 4
-    assert EASY.symmetries == 1
-
-
-# ---------------------------------------------------------------------------------------------- heuristic and features
 
 
 def test_the_heuristic_points_at_the_closest_ball_that_is_left():
@@ -77,22 +60,3 @@ def test_features_give_the_balls_along_and_across_the_strike():
     np.testing.assert_allclose(places, [[0, 0, 0], [0.25, 0.375, 1.0], [0.75, 0.125, 1.0]], atol=1e-6)
     aside = [0.0, -0.5, np.arctan(-0.2 / 0.04)]  # the first is pocketed, the second straight ahead
     np.testing.assert_allclose(offsets, [[0, 0, 0], [0.25, 0.0, 0.0], aside], atol=1e-6)
-
-
-def test_features_of_many_directions_are_those_of_each():
-    chosen = directions.evenly_spaced(6).reshape(3, 2, 2)
-    obs = observe(EASY, PLAYED)
-    many = features(obs, chosen)
-    assert many.own.shape == (2 + 3 * 3,)
-    assert many.turned.shape == (3, 2, 6 + 3 * 3)
-    for place in np.ndindex(3, 2):
-        np.testing.assert_allclose(many.turned[place], features(obs, chosen[place]).turned, atol=1e-6)
-
-
-def test_a_mirror_reverses_what_lies_across_and_keeps_what_lies_along():
-    obs, strike = observe(EASY, PLAYED), toward(25.0)
-    _, places, _, offsets = parts(obs, strike)
-    for which, flipped, order in ((1, [-1, 1], [0, 1, 2]), (2, [1, -1], [0, 2, 1])):  # upside down: from the top again
-        _, image_places, _, image_offsets = parts(*mirror(jnp.array(which), obs, strike))
-        np.testing.assert_allclose(image_offsets, offsets[order] * np.array([1, -1, -1]), atol=1e-6)
-        np.testing.assert_allclose(image_places, places[order] * np.array([*flipped, 1]), atol=1e-6)

@@ -54,12 +54,6 @@ def test_trails_tell_what_becomes_of_the_balls_after_each_action():
     assert 3 <= len(miss) <= 8  # straight lines and their corners
 
 
-def test_a_foul_is_a_cross():
-    (drawn,) = trails(ENV, balls([[-0.3, 0.1], [0.3, 0.1]]), jnp.array([[-1.0, 1.0]]) / math.sqrt(2.0))
-    shapes = [*ElementTree.fromstring(f"<g>{drawn}</g>")]
-    assert [one.tag for one in shapes] == ["polyline"] * 3
-
-
 def test_a_film_ends_as_the_shot_does():
     along = jnp.array([math.cos(math.pi / 4), math.sin(math.pi / 4)])
     state = balls([[0.1, -0.1], [0.3, 0.1]])

@@ -1,15 +1,12 @@
 """Navigation pictures, looked at pixel by pixel, and the records behind them: what is drawn is what happened."""
 
-import itertools
 import math
 from typing import Any
-from xml.etree import ElementTree
 
 import imageio.v2 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
@@ -19,7 +16,7 @@ from rooms import room
 
 from cuelearner_envs.navigation import drawing, scan
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_envs.navigation.recording import ENDS, record, situation
+from cuelearner_envs.navigation.recording import record, situation
 from cuelearner_envs.navigation.robot import Robot, discs
 from cuelearner_jax.policies import Heuristic
 
@@ -55,30 +52,6 @@ def looker(image, strip):
     return pixel
 
 
-# --- records ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [name for name in ENDS if name != "fall"])  # the simple robot does not fall
-def test_frames_follow_each_other_and_end_as_the_rewards_say(records, name):
-    frames, rewards = records[name]
-    assert len(frames) == len(rewards) == STEPS
-    assert {frame.outcome for frame in frames} == {"", name}
-    assert frames[0].episode == 0
-    for frame, following in itertools.pairwise(frames):
-        same = following.episode == frame.episode
-        assert same == (frame.outcome == "")
-        if same:
-            np.testing.assert_array_equal(following.pose, frame.next_pose)
-            assert following.seconds == pytest.approx(frame.seconds + 0.2, abs=1e-4)
-        else:
-            assert following.episode == frame.episode + 1
-            assert following.seconds == pytest.approx(0.2)
-            np.testing.assert_array_equal(following.pose[:2], frame.world.starts[0])
-    paid = {"": 0.0, "success": 10.0, "collision": -10.0, "timeout": 0.0}
-    assert rewards == [paid[frame.outcome] for frame in frames]
-
-
 def test_an_episode_ends_where_it_ends_not_where_the_next_begins(records):
     last = next(frame for frame in records["success"][0] if frame.outcome)
     assert np.linalg.norm(last.next_pose[:2] - last.goal) < last.goal_radius == 0.5
@@ -95,23 +68,6 @@ def test_a_frame_holds_what_was_seen_and_chosen_at_its_pose(records):
         np.testing.assert_allclose(frame.action, [math.cos(ahead), math.sin(ahead)], atol=1e-5)
         assert isinstance(frame.world.boxes, np.ndarray)
         assert frame.world.boxes.shape == (6, 5)
-
-
-def test_the_policy_is_traced_once_and_decides():
-    env = ENVIRONMENTS["timeout"]
-
-    traces = []
-
-    def backwards(key, states, obs):
-        traces.append((states.pose.shape, obs.shape))
-        return -jax.vmap(env.heuristic)(obs)
-
-    frames, _ = record(env, probes.Acting(backwards), jax.random.key(0), 5)
-    assert traces == [((1, 3), (1, env.obs_size))]
-    assert frames[4].next_pose[0] < frames[0].pose[0] - 0.5
-
-
-# --- parts -----------------------------------------------------------------------------------------------------------
 
 
 def test_solids_are_where_the_world_has_them_in_the_shade_of_their_height():
@@ -147,23 +103,6 @@ def test_the_outline_spans_the_discs_of_the_body(pose):
     np.testing.assert_allclose(apart, robot.disc_radius, atol=1e-5)  # on the outer two discs, all of it
     ends = np.ptp(points @ [math.cos(pose[2]), math.sin(pose[2])])
     assert ends == pytest.approx(0.93)
-
-
-def test_beams_end_on_surfaces(records):
-    frame = records["collision"][0][0]._replace(pose=np.array([1.0, 0.5, 0.4], np.float32))
-    frame = frame._replace(ranges=np.asarray(scan(frame.world, frame.pose)))
-    x, y = drawing.hits(frame).T
-    at_column = np.abs(np.hypot(x - 2.0, y + 2.0) - 0.5) < 1e-3
-    at_wall = np.minimum(np.abs(np.abs(x) - 6.0), np.abs(np.abs(y) - 4.0)) < 1e-3
-    cos, sin = math.cos(math.pi / 6), math.sin(math.pi / 6)
-    own = np.stack([cos * x + sin * (y - 2), cos * (y - 2) - sin * x])
-    at_box = np.abs((np.abs(own) - [[0.9], [0.4]]).max(axis=0)) < 1e-3
-    assert at_column.sum() > 10
-    assert at_box.sum() > 10
-    assert (at_column | at_wall | at_box).all()
-
-
-# --- stills ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["success", "collision"])
@@ -212,33 +151,6 @@ def test_a_question_shows_the_first_situation_and_the_direction_in_question(reco
     assert green - red > 0.08
 
 
-def test_still_leaves_out_later_episodes_and_repeats(records, tmp_path):
-    frames, _ = records["success"]
-    first = [frame for frame in frames if frame.episode == 0]
-    assert len(first) < len(frames)
-    for suffix in ("png", "svg"):
-        files = [tmp_path / f"{name}.{suffix}" for name in ("all", "first")]
-        for file, chosen in zip(files, (frames, first), strict=True):
-            drawing.still(Robot(), chosen, file)
-        assert files[0].read_bytes() == files[1].read_bytes()
-    assert ElementTree.parse(tmp_path / "all.svg").getroot().tag.endswith("svg")
-
-
-def test_overview_has_a_panel_of_each_world(tmp_path):
-    worlds = [room([[-3.0, 0.0]], [[3.0, -1.0]]) for _ in range(5)]
-    drawing.overview(worlds, tmp_path / "worlds.png", [f"world {number}" for number in range(5)])
-    image = imageio.imread(tmp_path / "worlds.png")[..., :3] / 255
-    assert image.shape[1] == 1280
-    goals = is_colour(image, drawing.GOAL, 0.1)
-    rows = [slice(0, image.shape[0] // 2), slice(image.shape[0] // 2, None)]
-    thirds = [slice(part * 1280 // 3, (part + 1) * 1280 // 3) for part in range(3)]
-    found = [bool(goals[row, third].any()) for row in rows for third in thirds]
-    assert found == [True] * 5 + [False]
-
-
-# --- films -----------------------------------------------------------------------------------------------------------
-
-
 def test_gif_shows_each_step_and_then_the_end(records, tmp_path):
     frames, _ = records["collision"]
     frames = [frame for frame in frames if frame.episode < 2]
@@ -259,37 +171,3 @@ def test_gif_shows_each_step_and_then_the_end(records, tmp_path):
     assert shown[end] == 0
     assert min(shown[:end]) > 1e-4
     assert pictures[-1][-1, -1].tolist() == [1, 1, 1]  # white stays white on a page
-
-
-@pytest.mark.long
-def test_gif_of_many_steps_is_small(records, tmp_path):
-    drawing.animate(Robot(), records["timeout"][0], tmp_path / "film.gif")
-    assert (tmp_path / "film.gif").stat().st_size < 20_000 * STEPS
-
-
-@pytest.mark.long
-@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # by the reader of this test
-def test_mp4_has_even_sides_and_every_picture(records, tmp_path):
-    frames = records["timeout"][0][:10]  # an end after seven steps, then an episode without one
-    drawing.animate(Robot(), frames, tmp_path / "film.mp4", fps=20)
-    movie: Any = imageio.get_reader(tmp_path / "film.mp4")
-    with movie as reader:
-        size, count = reader.get_meta_data()["size"], sum(1 for _ in reader.iter_data())
-    assert count == 10 + round(drawing.HOLD_AFTER * 20)
-    assert size[0] == 700
-    assert size[1] % 2 == 0
-
-
-def test_drawing_says_what_it_cannot_do(records, tmp_path):
-    frames, _ = records["success"]
-    with pytest.raises(ValueError, match=r"\.gif or \.mp4"):
-        drawing.animate(Robot(), frames, tmp_path / "film.avi")
-    with pytest.raises(ValueError, match="at least one frame"):
-        drawing.animate(Robot(), [], tmp_path / "film.gif")
-    with pytest.raises(ValueError, match="positive fps"):
-        drawing.animate(Robot(), frames, tmp_path / "film.gif", fps=0.0)
-    with pytest.raises(ValueError, match="at least one frame"):
-        drawing.still(Robot(), [], tmp_path / "still.png")
-    with pytest.raises(ValueError, match="at least one world"):
-        drawing.overview([], tmp_path / "worlds.png")
-    assert list(tmp_path.iterdir()) == []

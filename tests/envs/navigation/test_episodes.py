@@ -1,7 +1,7 @@
 """Navigation over whole episodes: how they end and begin, what replay makes of them, and their mirror images."""
 
 import math
-from functools import cache, partial
+from functools import cache
 
 import chex
 import jax
@@ -11,9 +11,7 @@ import pytest
 
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import Lidar
-from cuelearner_envs.navigation.robot import collides
 from cuelearner_envs.navigation.worlds import generate_many
-from cuelearner_jax.agents.replay import Memory, buffer_for, stored_step
 from cuelearner_jax.spaces import directions
 
 KEY = jax.random.key(0)
@@ -43,9 +41,6 @@ def worlds():
     )
 
 
-# --- episodes --------------------------------------------------------------------------------------------------------
-
-
 def assert_begun(env, states):
     """All at rest at the start of a route of their world, at its goal's route."""
     states = jax.device_get(states)
@@ -66,23 +61,6 @@ def test_episodes_begin_at_rest_at_the_start_of_every_route_turned_any_way():
     quarters = np.histogram(np.asarray(states.pose[:, 2]), 4, (-math.pi, math.pi))[0]
     assert quarters.sum() == 600
     assert quarters.min() > 110  # 150 each, standard deviation 10.6
-
-
-def test_starts_and_goals_are_free_whichever_way_the_body_is_turned_and_5_to_15_m_apart():
-    touches = jax.jit(jax.vmap(jax.vmap(jax.vmap(collides, (None, None, 0)), (None, None, 0)), (None, 0, 0)))
-    for places in (worlds().worlds.starts, worlds().worlds.goals):
-        yaws = jnp.linspace(0, math.pi, 9)
-        poses = jnp.concatenate(
-            [
-                jnp.broadcast_to(places[:, :, None], (3, 16, 9, 2)),
-                jnp.broadcast_to(yaws[:, None], (3, 16, 9, 1)),
-            ],
-            -1,
-        )
-        assert not touches(worlds().robot, worlds().worlds, poses).any()
-    apart = np.linalg.norm(worlds().worlds.goals - worlds().worlds.starts, axis=-1)
-    assert apart.min() >= 5
-    assert apart.max() <= 15
 
 
 @jax.jit
@@ -135,9 +113,6 @@ def test_each_step_has_one_end_at_most_and_pays_accordingly(plays):
     np.testing.assert_array_equal(result.truncated, ends[2] > 0)
 
 
-# --- replay ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_remembered_steps_rebuild_what_was_seen_before_and_after(plays, kind):
     env, played_steps = plays[kind]
@@ -149,69 +124,6 @@ def test_remembered_steps_rebuild_what_was_seen_before_and_after(plays, kind):
     assert ended.sum() > 20
     assert np.abs(recalled - result.obs)[ended].max(-1).min() > 1e-3  # what a reset shows is something else
     np.testing.assert_array_equal(recalled[:, PREVIOUS], result.final_obs[:, PREVIOUS])
-
-
-def test_a_faulty_reading_is_made_again_and_not_drawn_again(plays):
-    """Beside the test above: the faults are there, and they differ from place to place."""
-    faulty, played_steps = plays["faulty"]
-    states = flat(played_steps[0])
-    turned = faulty.replace(lidar=FAULTLESS.replace(rotation=FAULTS.rotation))
-    sensed, true = np.asarray(ranges(faulty, states)), np.asarray(ranges(turned, states))
-    lost = (sensed == 10) & (true < 9.5)
-    assert lost[true < 9.5].mean() == pytest.approx(0.1, abs=0.005)
-    seen = ~lost & (true > 0.3) & (true < 9.5)
-    assert np.std((sensed - true)[seen]) == pytest.approx(0.05, rel=0.02)
-    assert np.mean((sensed - true)[seen]) == pytest.approx(0, abs=0.001)
-    errors = (sensed - true)[:400]
-    alike = np.mean(np.abs(errors[:-1] - errors[1:]) < 1e-4, axis=-1)
-    assert alike.max() < 0.3
-    np.testing.assert_array_equal(ranges(faulty, states), sensed)
-
-
-def test_a_stored_transition_takes_80_bytes():
-    for env in (worlds(), worlds().replace(lidar=FAULTS, mirrors=True)):
-        rows = buffer_for(env, bootstraps=True).empty(10)
-        assert rows.nbytes / 10 <= 80
-
-
-@jax.jit
-def through(env, memory, action, result):
-    """The last 320 of 960 steps as a ring buffer of that many rows gives them back, oldest first."""
-    buffer, stored = buffer_for(env, bootstraps=True), partial(stored_step, bootstraps=True)
-
-    def add(rows, item):
-        number, *parts = item
-        return buffer.add(rows, number * 16, jax.vmap(stored)(*parts)), None
-
-    rows, _ = jax.lax.scan(add, buffer.empty(320), (jnp.arange(60), memory, action, result))
-    memory = Memory(env, buffer, rows, jnp.int32(960), 16, bootstraps=True)
-    return memory.one_step(buffer.read(rows, jnp.arange(320)))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_ring_buffer_gives_back_the_transitions_that_were_made(plays, kind):
-    env, (_, obs, memory, action, result, _) = plays[kind]
-    found = through(env, memory, action, result)
-    obs, action, result = flat(jax.tree.map(lambda leaf: leaf[40:], (obs, action, result)))  # what fits in, in order
-    np.testing.assert_allclose(found.obs, obs, atol=2e-6)
-    np.testing.assert_allclose(found.next_obs, result.final_obs, atol=2e-6)
-    np.testing.assert_array_equal(found.action, action)
-    np.testing.assert_array_equal(found.reward, result.reward)
-    np.testing.assert_array_equal(found.discount, np.where(result.terminated, 0, 1))
-    assert result.truncated.any()
-    assert result.terminated.any()
-
-
-def test_the_number_of_a_world_survives_being_stored(plays):
-    env, (states, obs, *_) = plays["plain"]
-    state = jax.tree.map(lambda leaf: leaf[0, 0], states)
-    for number in (0, 1023, 2**20 + 1):
-        memory = env.remember(state.replace(world=jnp.int32(number)), obs[0, 0])
-        assert memory.dtype == jnp.float32
-        assert int(memory[11]) == number
-
-
-# --- mirrors ---------------------------------------------------------------------------------------------------------
 
 
 SIGNS = jnp.array([1.0, -1.0, -1.0, 1.0, 1.0])  # of x, y, yaw and two lengths when left and right are exchanged
@@ -255,17 +167,6 @@ def assert_mostly_close(found, expected):
     apart = np.abs(np.asarray(found) - np.asarray(expected))
     np.testing.assert_allclose(np.sort(apart, axis=-1)[:, :-2], 0, atol=1e-4)
     assert (apart > 1e-4).mean() < 1e-3
-
-
-# --- changes ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_robot_walks_as_before_with_a_faulty_sensor(plays):
-    states, _, _, action, plain, _ = jax.tree.map(lambda leaf: leaf[:200], flat(plays["plain"][1]))
-    _, faulty = step_many(plays["faulty"][0], states, action)
-    np.testing.assert_allclose(faulty.aftermath, plain.aftermath, atol=1e-5)
-    np.testing.assert_array_equal(faulty.reward, plain.reward)
-    assert np.abs(faulty.final_obs - plain.final_obs).max(-1).min() > 1e-3
 
 
 def test_changed_worlds_compile_nothing_new():

@@ -14,16 +14,13 @@ from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.lidar import BEAMS, scan
 from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
 from cuelearner_envs.navigation.worlds import FARTHEST
-from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.config import GuideSizes, to_json
-from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.spaces.directions import from_angle
-from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 
 PLAINLY = 45  # features of a way without look-ahead
@@ -68,12 +65,6 @@ def test_in_an_empty_hall_every_way_leads_on_to_the_goal():
     np.testing.assert_allclose([leg[36], detour[36]], [LEAST, 2 * LEAST], atol=1e-3)
 
 
-def test_a_goal_nearer_than_every_station_is_no_reason_to_go_past_it():
-    left, detour, leg = ahead(seen(jnp.full(BEAMS, 10.0), (0.0, 1.0)))
-    np.testing.assert_allclose([left[0], detour[0]], 0.0, atol=1e-3)
-    np.testing.assert_allclose(leg[0], 1.0, atol=1e-3)
-
-
 # 3 m ahead a wall with a doorway from y = 1.5 to 3.5; the goal lies 6 m straight ahead.
 DOORWAY = [[3.0, -4.25, 0, 0.1, 5.75], [3.0, 8.75, 0, 0.1, 5.25]]
 
@@ -110,13 +101,6 @@ def test_an_l_shaped_passage_is_walked_in_two_legs():
     assert left[0] > 2.0  # straight at the goal: the passage's wall
 
 
-def test_where_the_first_leg_is_blocked_nothing_follows():
-    """A wall touches the disc: whatever lies behind it cannot be had that way."""
-    left, detour, leg = ahead(among([[RADIUS + 0.15, 0, 0, 0.1, 3.0]], (6.0, 0.0)))
-    np.testing.assert_allclose([left[0], detour[0], leg[0]], [6.0, 3.0 * SCALE, 0.0], atol=1e-3)
-    assert left[18] < 0.1  # along the wall and round its end, 3 m away
-
-
 def test_what_is_seen_of_a_wall_stops_a_second_leg_and_what_is_not_seen_does_not():
     """Behind a screen the free-space assumption holds: the hidden wall counts only for who sees it."""
     goal, screen, hidden = (6.5, 0.0), [3.0, 0.0, 0, 0.1, 1.0], [5.0, 0.0, 0, 0.1, 1.6]
@@ -139,13 +123,6 @@ def test_a_turned_scene_has_the_same_features(beams):
     assert np.ptp(here, 1).min() > 0.5  # of several metres, not all alike
 
 
-def test_a_mirrored_scene_has_mirrored_features():
-    rng = np.random.default_rng(1)
-    ranges = rng.uniform(1.0, 7.0, BEAMS)
-    one, other = ahead(seen(ranges, (4.0, 2.0))), ahead(seen(ranges[::-1].copy(), (4.0, -2.0)))
-    np.testing.assert_allclose(one, np.roll(other[:, ::-1], 1, axis=1), atol=2e-3)
-
-
 def test_unless_it_is_asked_for_aims_are_what_they_were():
     rng = np.random.default_rng(2)
     obs = seen(rng.uniform(0.5, 9.0, BEAMS), (3.0, 1.0))
@@ -160,14 +137,6 @@ def world(**changes):
     return NavigationConfig(worlds=1, **changes)
 
 
-def test_the_option_widens_aims_and_leaves_observations_alone():
-    task = registry.find("navigation")
-    plain, more = (spaces_of(shape_of(task, world(look_ahead=on))) for on in (False, True))
-    assert (plain.aims, more.aims) == (PLAINLY, PLAINLY + 3)
-    assert plain._replace(aims=None) == more._replace(aims=None)
-    assert not NavigationConfig().look_ahead
-
-
 def kept(guidance, look_ahead):
     """A policy folder, as it is known without its arrays."""
     own = {"sizes": to_json(GuideSizes()), "options": {"aim_layers": (8,), "aim_doubt": 2.0}}
@@ -175,14 +144,6 @@ def kept(guidance, look_ahead):
     adapted = AdaptedLanes(Path(), {"policy": layer}, Lanes(*(np.zeros(1),) * 4), np.ones(1, bool), None, None)
     config = RunConfig(world(look_ahead=look_ahead))
     return PolicySource(registry.find("navigation"), config, None, Path(), adapted=adapted)
-
-
-def test_weights_of_ways_are_kept_with_their_width():
-    source = kept("intent", True)
-    assert source.adapted is not None
-    shapes = serialization.shapes_of(source.adapted.values["policy"], shape_of(source.task, source.config.task))
-    kernels = [leaf.shape for leaf in jax.tree.leaves(shapes["model"]) if leaf.shape[-1:] == (8,) and leaf.ndim > 1]
-    assert kernels == [(PLAINLY + 3, 8)]
 
 
 @pytest.mark.parametrize("policy", ["adapted", "base"])
@@ -193,10 +154,3 @@ def test_who_weighs_ways_is_refused_where_they_tell_something_else(policy):
         with pytest.raises(UserError, match=f"uses aims of {PLAINLY + 3 * before} features"):
             source.check(policy, world(look_ahead=not before))
     kept("relative", False).check(policy, world(look_ahead=True))  # who asks nothing of ways does not mind
-
-
-def test_agents_do_not_mind_what_ways_tell():
-    folder = Path(__file__).parents[3] / "docs" / "data" / "navigation_agent"
-    source = PolicySource.of_run(folder, registry.find)
-    for policy in ("agent", "corrected"):
-        source.check(policy, world(look_ahead=True))

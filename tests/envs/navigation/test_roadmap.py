@@ -14,7 +14,6 @@ from probes import long_but
 from cuelearner_envs.navigation.environment import Navigation, Walker
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
 from cuelearner_envs.navigation.roadmap import (
-    BLOCKED,
     LINE_MARGIN,
     NODE_MARGIN,
     RoadMapTeacher,
@@ -24,13 +23,7 @@ from cuelearner_envs.navigation.roadmap import (
 )
 from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import evaluate
-from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.feedback.answers import human_answer, relative_answer
-from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Taught
-from cuelearner_jax.spaces import DIRECTIONS
-from cuelearner_jax.spaces.directions import difference, from_angle
-from cuelearner_jax.types import Label
 
 REACH = 0.465  # from the middle of the body to its farthest point [m]
 NEEDED = REACH + LINE_MARGIN
@@ -38,9 +31,6 @@ ROUNDING = 2e-5  # of the map's float32 against float64 here [m]
 STYLES = ("clutter", "rooms", "corridor")
 ASKED = 40  # places in each world that the teacher is asked about
 ROUTES = (0, 5, 11)  # of each world
-
-
-# --- geometry in float64, by other means than the map's --------------------------------------------------------------
 
 
 def to_segments(points, starts, ends):
@@ -87,9 +77,6 @@ def clear_of(world, points):
     sides = np.roll(corners, -1, axis=1) - corners
     inside = (cross(sides, points[:, None, None] - corners) > 0).all(-1).any(-1)
     return np.where(inside, 0, room(world, points, points))
-
-
-# --- worlds and their maps -------------------------------------------------------------------------------------------
 
 
 def gate(side):
@@ -227,33 +214,6 @@ def test_a_way_is_the_straight_line_where_the_goal_is_in_view_and_else_leads_ove
     assert np.sum(kinds, axis=0).min() >= 10
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("index", long_but((0, 2), WORLDS))
-def test_a_way_gets_shorter_by_what_is_walked_along_it(teacher, index):
-    world = one(teacher.env.worlds, index)
-    for route in ROUTES[:2]:
-        places = free_places(world, 100 + index)
-        following, lengths = map(np.asarray, ways(teacher, index, route, places))
-        part = (0.7 * places + 0.3 * following).astype(np.float32)
-        _, later = map(np.asarray, ways(teacher, index, route, part))
-        known = lengths < BLOCKED
-        assert known.mean() > 0.9
-        walked = np.linalg.norm(part - places, axis=-1)
-        assert (later <= lengths - walked + 2e-3)[known].all()  # shorter still where a better node comes in view
-
-
-def test_every_route_has_a_way(teacher):
-    for index in WORLDS:
-        world = one(teacher.env.worlds, index)
-        for route in range(16):
-            _, length = ways(teacher, index, route, jnp.tile(world.starts[route], (ASKED, 1)))
-            straight = np.linalg.norm(world.goals[route] - world.starts[route])
-            assert straight - 1e-4 <= length[0] < BLOCKED
-
-
-# --- the teacher -----------------------------------------------------------------------------------------------------
-
-
 best = jax.jit(lambda teacher, states: jax.vmap(lambda state: teacher.best_action(state, jnp.zeros(280)))(states))
 observe = jax.jit(lambda env, states: jax.vmap(env.observe)(states))
 
@@ -307,66 +267,6 @@ def test_whoever_follows_the_teacher_arrives(teacher):
     assert found["duration"] < 20
 
 
-# --- what the teacher says -------------------------------------------------------------------------------------------
-
-
-SCALARS = Scalars(eps_deg=20.0)
-told, asked = jax.jit(human_answer, static_argnums=1), jax.jit(relative_answer)
-
-
-def answer(teacher, index, pose, goal, action_deg, scalars=SCALARS):
-    """h and the angle by which the label turns the action [deg]."""
-    world = one(teacher.env.worlds, index)
-    state = walkers(world, index, goal, np.array([pose[:2]], np.float32), [math.radians(pose[2])])
-    action = from_angle(jnp.deg2rad(jnp.float32(action_deg)))
-    key, wanted, obs = jax.random.key(0), best(teacher, state)[0], observe(teacher.env, state)[0]
-    h, _ = told(key, DIRECTIONS, action, wanted, scalars)
-    relative = guidances.make("relative", Sizes(feedback_layers=(8,)), teacher.env)
-    where = jax.tree.map(lambda leaf: leaf[0], state)
-    said, answered = asked(key, teacher.env, teacher, where, obs, action, scalars)
-    assert bool(answered)
-    assert said.tolist() == h.tolist()
-    target = relative.target(Label(obs, action, said, answered), scalars)
-    return int(h[0]), round(math.degrees(float(difference(action, action + target))), 3)
-
-
-@pytest.mark.parametrize(
-    ("pose", "action_deg", "h"),
-    [
-        # The goal (4, 3) stands in view, to the left of a body that faces along x: 90 degrees.
-        ((4.0, -3.0, 0.0), 0.0, 1),
-        ((4.0, -3.0, 0.0), 79.0, 1),
-        ((4.0, -3.0, 0.0), 81.0, 0),
-        ((4.0, -3.0, 0.0), 99.0, 0),
-        ((4.0, -3.0, 0.0), 101.0, -1),
-        ((4.0, -3.0, 0.0), 180.0, -1),
-        ((4.0, -3.0, 0.0), -89.0, 1),
-        ((4.0, -3.0, 0.0), -91.0, -1),
-        # The body turned: ahead, behind and to the right.
-        ((4.0, -3.0, 90.0), 0.0, 0),
-        ((4.0, -3.0, 90.0), 20.0, -1),
-        ((4.0, -3.0, -90.0), 170.5, 0),
-        ((4.0, -3.0, -90.0), -160.0, -1),
-        ((4.0, -3.0, -90.0), 160.0, 1),
-        ((4.0, -3.0, 180.0), -90.0, 0),
-        ((4.0, -3.0, 180.0), 0.0, -1),
-    ],
-)
-def test_a_goal_in_view_is_left_or_right_of_the_action_or_right_there(teacher, pose, action_deg, h):
-    for index in GATES:
-        assert answer(teacher, index, pose, 1, action_deg) == (h, pytest.approx(20 * h, abs=0.01))
-
-
-@pytest.mark.parametrize("yaw", [0.0, 120.0, -75.0])
-def test_straight_at_a_goal_behind_a_wall_the_answer_is_the_side_of_the_gap(teacher, yaw):
-    for index, side in GATES.items():
-        # Straight toward the goal, and at the gap's middle (0, 4), 45 degrees aside, from which the wall's end differs.
-        assert answer(teacher, index, (-4.0, 0.0, yaw), 0, -yaw) == (side, pytest.approx(20 * side, abs=0.01))
-        beyond = -yaw + side * 80.0
-        assert answer(teacher, index, (-4.0, 0.0, yaw), 0, beyond) == (-side, pytest.approx(-20 * side, abs=0.01))
-        assert answer(teacher, index, (-4.0, 0.0, yaw), 0, -yaw + side * 43.0)[0] == 0
-
-
 def test_the_way_through_the_gap_is_as_long_as_it_has_to_be(teacher):
     # The shortest that keeps a line's distance: tangents of sqrt(3.9^2 + 3^2 - 0.545^2) m to an arc round either corner
     # of the wall's end, 0.2 m between the arcs, which together turn by twice 43.93 degrees.
@@ -376,11 +276,3 @@ def test_the_way_through_the_gap_is_as_long_as_it_has_to_be(teacher):
         following, length = ways(teacher, index, 0, places)
         assert shortest - 1e-3 < float(length[0]) < 1.1 * shortest
         assert 3.0 < side * float(following[0, 1]) < 5.0
-
-
-def test_faults_turn_answers_round_or_keep_them_back(teacher):
-    wrong = Scalars(eps_deg=20.0, mistake_probability=1.0)
-    assert answer(teacher, 6, (4.0, -3.0, 0.0), 1, 0.0, wrong) == (-1, pytest.approx(-20.0, abs=0.01))
-    biased = Scalars(eps_deg=20.0, teacher_bias_deg=40.0)
-    assert answer(teacher, 6, (4.0, -3.0, 0.0), 1, 90.0, biased)[0] == 1
-    assert answer(teacher, 6, (4.0, -3.0, 0.0), 1, 130.0, biased)[0] == 0

@@ -11,12 +11,11 @@ from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.geometry import line_clearance
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
-from cuelearner_envs.navigation.roadmap import RoadMapTeacher, SidedTeacher, make_sided_teacher
-from cuelearner_envs.navigation.sides import closed, count_passed, heading
+from cuelearner_envs.navigation.roadmap import make_sided_teacher
+from cuelearner_envs.navigation.sides import closed, count_passed
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
-from cuelearner_jax.tasks.navigation import make_teacher
 
 # A corridor of 20 m by 4.6 m with a box in the middle, a circle at x = 5 and the walls of all worlds.
 BOX, CIRCLE, SIZE = [0, 0.1, 0.3, 0.4, 0.3], [5.0, 0.0, 0.4], (20.0, 4.6)
@@ -43,11 +42,6 @@ STEPS = [  # ahead, before, after, (passed on the left, on the right)
 def test_an_obstacle_is_passed_where_the_line_through_its_middle_is_crossed_forward(ahead, before, after, counted):
     found = passes(WORLD, jnp.float32(ahead), jnp.array(before), jnp.array(after))
     np.testing.assert_array_equal(found, counted)
-
-
-def test_ways_have_a_direction():
-    assert heading(jnp.array([1.0, 0.0]), jnp.array([3.0, 9.0])) == 1
-    assert heading(jnp.array([1.0, 0.0]), jnp.array([-3.0, 9.0])) == -1
 
 
 def test_a_closed_side_lets_nothing_through_and_the_other_stays_open():
@@ -85,20 +79,6 @@ def test_they_are_counted_for_a_quadruped_too():
         assert [name for name, value in sides.items() if value] == ["passed_right"]
 
 
-@pytest.mark.long
-def test_the_sides_of_an_episode_are_its_outcome():
-    state, _ = TWO.reset(jax.random.key(0))
-    for counts, names in [
-        ((0, 0), []),
-        ((2, 0), ["passed_left"]),
-        ((0, 1), ["passed_right"]),
-        ((1, 1), ["passed_both"]),
-    ]:
-        outcome = TWO.ends(state.replace(passed=jnp.array(counts, jnp.float32)))[0]
-        assert [name for name, value in outcome.items() if name.startswith("passed") and value == 1] == names
-    assert "passed_left" not in TWO.replace(sides=False).ends(state)[0]
-
-
 walked = jax.jit(lambda teacher, env: rollout(Taught(teacher), env, episodes("tuning"), 20, 20 * 120))
 
 
@@ -108,17 +88,6 @@ def test_a_teacher_passes_where_it_is_wanted(wish, side):
     found = walked(make_sided_teacher(TWO, jnp.float32(side)), TWO)
     assert found["success"] == 1
     assert found[f"passed_{wish}"] == 1
-
-
-def test_a_wish_chooses_the_teacher_and_corridors_count_sides():
-    def made(**changes):
-        config = NavigationConfig(worlds=4, **changes)
-        env = jax.eval_shape(lambda: make_environment(config))
-        return env.sides, type(jax.eval_shape(lambda env: make_teacher(config, env), env))
-
-    assert made(style="corridor", preferred_side="left") == (True, SidedTeacher)
-    assert made(style="corridor") == (True, RoadMapTeacher)
-    assert made() == (False, RoadMapTeacher)
 
 
 @pytest.mark.parametrize(

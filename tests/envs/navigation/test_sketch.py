@@ -11,7 +11,7 @@ import pytest
 from rooms import room
 
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_envs.navigation.sketch import ASIDE, STEPS, reel, sketch
+from cuelearner_envs.navigation.sketch import STEPS, reel, sketch
 
 ENV = Navigation(jax.tree.map(lambda leaf: leaf[None], room([[-4.0, 0.0]], [[4.0, 0.0]])))
 
@@ -57,14 +57,6 @@ def test_a_goal_far_away_is_told_at_the_edge():
     head = re.search(r"translate\(([-\d.]+) ([-\d.]+)\)", found.still)
     assert (abs(float(head[1])) < 1e-3, float(head[2])) == (True, 3.5)
     assert "goal 10 m" in found.still
-
-
-def test_a_page_wider_than_the_sketch_shows_what_lies_there():
-    far = sketch(ENV, standing(-3.0, 0.0, math.pi / 2, [5.0, 0.0]))  # the goal and a wall lie 8 m and more to the right
-    marks = [float(one.get("cx")) for one in shapes(far, "goal") if one.get("cx")]
-    assert marks == pytest.approx([8.0, 8.0], abs=1e-3)
-    walls = [one.get("points").split() for one in shapes(far, "solid") if one.get("points")]
-    assert any(min(float(corner.split(",")[0]) for corner in wall) > ASIDE for wall in walls)
 
 
 def test_a_film_walks_where_the_direction_leads():

@@ -78,7 +78,7 @@ def test_answers_say_where_the_right_action_lies_and_teachers_err_as_they_are_to
     np.testing.assert_array_equal(answer(one_cue=True), [UNSAID, -1, UNSAID])
 
 
-@pytest.mark.parametrize("cues", [1, 2])
+@pytest.mark.parametrize("cues", [1, 3])
 def test_a_world_keeps_the_laws_of_an_environment(cues):
     _, worlds, _ = situations(cues)
     env = ZooEnvironment.of(jax.tree.map(lambda leaf: leaf[4], worlds))
