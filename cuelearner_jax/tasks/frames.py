@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
+from cuelearner_envs.playing import played
 from cuelearner_jax import pictures, user_code
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Running, model_of
 from cuelearner_jax.errors import UserError
@@ -59,20 +60,8 @@ def pictures_of(
         pictures.still([frames[0], frames[-1]], file)
 
     def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
-        @jax.jit
-        def play(env: Any, key: PRNGKeyArray) -> Any:
-            k_reset, k_play = jax.random.split(key)
-
-            def advance(carry: Any, number: Array) -> Any:
-                state, obs = carry
-                k_act, k_step = jax.random.split(jax.random.fold_in(k_play, number))
-                action = policy.act(k_act, jax.tree.map(lambda leaf: leaf[None], state), obs[None])[0]
-                after, step = env.step(k_step, state, action)
-                return (after, step.obs), (seen(state), action, step.reward)
-
-            return jax.lax.scan(advance, env.reset(k_reset), jax.numpy.arange(steps))[1]
-
-        states, actions, rewards = jax.device_get(play(env, key))
+        see = lambda env, state, action, step: (seen(state), action, step.reward)  # noqa: E731
+        states, actions, rewards = played(env, policy, key, steps, see)
         user_code.tell()
         return film(env, states, actions), rewards.tolist()
 
