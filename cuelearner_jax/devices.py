@@ -111,11 +111,8 @@ def lane_mesh(devices: Sequence[Any] | None = None) -> Mesh:
 def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...], gives: Any) -> Callable[..., Any]:
     """Return `function` mapped over each device's lanes, in one program without communication between devices.
 
-    Args:
-        mesh: a mesh from `lane_mesh`.
-        function: takes a block of lanes (leading axis) and the arrays that they share.
-        takes: `SHARED` or `BY_LANE` for each argument.
-        gives: `SHARED` or `BY_LANE` for each result.
+    `function` takes a block of lanes (leading axis) and the arrays that they share. `takes` and `gives` are `SHARED` or
+    `BY_LANE` for each argument and result.
     """
 
     def whole(*arguments: Any) -> Any:
@@ -123,20 +120,26 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
         specs = [spec for tree, spec in zip(arguments, takes, strict=True) for _ in jax.tree.leaves(tree)]
         # Empty arrays (the labels of lanes without any) stay outside: XLA of JAX 0.11 crashes on one that enters.
         full = [leaf.size > 0 for leaf in leaves]
-        entering, outside = compress(leaves, full), [not there for there in full]
 
         def share(*entered: jax.Array) -> Any:
-            inside, empty = iter(entered), map(made, compress(leaves, outside), compress(specs, outside))
-            return function(*jax.tree.unflatten(structure, [next(inside if there else empty) for there in full]))
+            entering = iter(entered)
+            return function(
+                *jax.tree.unflatten(
+                    structure,
+                    [
+                        next(entering) if there else empty(leaf, spec)
+                        for leaf, spec, there in zip(leaves, specs, full, strict=True)
+                    ],
+                )
+            )
 
-        def made(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+        def empty(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
             rows = leaf.shape[0] // (mesh.size if spec == BY_LANE else 1)
             return jnp.zeros((rows, *leaf.shape[1:]), leaf.dtype)
 
-        mapped = jax.shard_map(
-            share, mesh=mesh, in_specs=tuple(compress(specs, full)), out_specs=gives, check_vma=False
-        )
-        return mapped(*entering)
+        taken = tuple(compress(specs, full))
+        mapped = jax.shard_map(share, mesh=mesh, in_specs=taken, out_specs=gives, check_vma=False)
+        return mapped(*compress(leaves, full))
 
     return whole
 
@@ -145,13 +148,8 @@ def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return `function` for every lane of a block: by `jax.vmap` on an accelerator, one by one on a CPU.
 
     A batched matrix product sums in another order than a single one. On a CPU, therefore, lanes are computed one by
-    one: no bit of a lane's result depends on the number of lanes, and a core is not slower.
-
-    Args:
-        function: takes one lane's trees of arrays.
-
-    Returns:
-        The function of blocks: every leaf with a leading axis of lanes.
+    one: no bit of a lane's result depends on the number of lanes, and a core is not slower. `function` takes one lane's
+    trees of arrays; every leaf of a block has a leading axis of lanes.
     """
 
     def mapped(*blocks: Any) -> Any:
@@ -167,11 +165,7 @@ def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
 def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Callable[[Any], tuple[Any, Any, Any]]:
     """Like `each_lane`, updating the block in place.
 
-    Args:
-        function: lane -> (updated lane, results common to all lanes, results of each lane).
-
-    Returns:
-        A function: block -> (updated block, results common to all lanes, results of each lane).
+    `function`: lane -> (updated lane, results common to all lanes, results of each lane).
     """
 
     def mapped(block: Any) -> tuple[Any, Any, Any]:

@@ -1,7 +1,17 @@
 """The environment protocol, its optional members, and the symmetries of its data.
 
 An environment is a pytree: its parameters are traced, so a changed world needs no new compile. What every environment
-has is in `Environment`, what it may have in `OptionalMembers`; no module asks for the name of a task.
+has is in `Environment`. It may also have these members; no module asks for the name of a task.
+
+| member                 | meaning                                                                                  |
+|------------------------|------------------------------------------------------------------------------------------|
+| actions                | the action space, where it is not directions in the plane; ask by `actions_of`           |
+| view()                 | the environment without the parts that no policy uses; ask by `view_of`                  |
+| heuristic(obs)         | the task's obvious action (action,), without learning                                    |
+| symmetries             | number of exact symmetries for data augmentation; ask by `symmetries_of`                 |
+| mirror(which, obs, v)  | images of an observation and an action-like vector under symmetry `which`; 0: itself     |
+| features(obs, actions) | `Features`: a network's inputs for one observation and each of the actions               |
+| aims(obs)              | `Aims`: one for each thing that an action may be about, in a fixed order                 |
 """
 
 from __future__ import annotations
@@ -14,7 +24,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Space
@@ -118,54 +128,15 @@ class Environment(View, Protocol):
 
 
 class Aims(NamedTuple):
-    """Actions that a teacher may mean in a situation, as many in each; see `OptionalMembers.aims`."""
+    """Actions that a teacher may mean in a situation (one a ball and a pocket, say), as many in each.
+
+    Their order carries no information: one network with the same weights is applied to each aim.
+    """
 
     actions: Float[Array, "aims action"]
     features: Float[Array, "aims features"]  # features that tell good aims from bad ones, of the order of one
     possible: Bool[Array, " aims"]  # False: not an aim in this situation
     open: Bool[Array, " aims"] | None = None  # False: may be meant, but must not be followed; None: all may be followed
-
-
-class OptionalMembers(Protocol):
-    """Optional members of an environment; ask by `offers`, `view_of`, `symmetries_of` and `actions_of`."""
-
-    @property
-    def actions(self) -> Space:
-        """The action space, where it is not directions in the plane."""
-        ...
-
-    def view(self) -> View:
-        """Return the environment without the parts that no policy uses."""
-        ...
-
-    def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """Return the task's obvious action, without learning."""
-        ...
-
-    @property
-    def symmetries(self) -> int:
-        """Number of exact symmetries for data augmentation (1: only the identity)."""
-        ...
-
-    def mirror(
-        self, which: Int[Array, ""], obs: Float[Array, " obs"], vector: Float[Array, " action"]
-    ) -> tuple[Float[Array, " obs"], Float[Array, " action"]]:
-        """Return the image of an observation and of an action-like vector under symmetry `which`.
-
-        0 is the identity.
-        """
-        ...
-
-    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
-        """Return a network's inputs for one observation and each of the actions."""
-        ...
-
-    def aims(self, obs: Float[Array, " obs"]) -> Aims:
-        """Return one aim for each thing that an action may be about (a ball and a pocket, say), in a fixed order.
-
-        The order carries no information: one network with the same weights is applied to each aim.
-        """
-        ...
 
 
 class Described:

@@ -9,7 +9,7 @@ from typing import Any
 # Refusals of the file system that no check beforehand can rule out.
 FILE_SYSTEM = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),
-    *(errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.EBUSY),
+    *(errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.EBUSY, errno.ENOTEMPTY, errno.EEXIST),
 )
 MOST_LISTED = 20  # numbers that a message names
 
@@ -25,12 +25,11 @@ def one_line(text: str) -> str:
 class UserError(Exception):
     """Bad input. The message is one clear line that says what is wrong and what to do.
 
-    The command line prints the message alone, without a traceback, and exits with status 2. Whatever a path or a name
-    in the message holds, there are no line breaks and no escape sequences in it.
+    The command line prints the message alone, without a traceback, and exits with status 2.
     """
 
     def __init__(self, message: object = "") -> None:
-        """Store the message, on one line."""
+        """Store the message on one line, without escape sequences that a path or a name in it may hold."""
         super().__init__(one_line(" ".join(str(message).splitlines())))
 
 
@@ -59,25 +58,20 @@ def mentions(error: BaseException | None, numbers: Collection[int | None], *word
     return False
 
 
-def no_space(error: BaseException) -> bool:
-    """Return whether an exception, or one of its causes, says that the disk is full."""
-    words = ("No space left on device", "Disk quota exceeded", "File too large")
-    return mentions(error, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), *words)
-
-
 def machine_message(error: BaseException, resumes: bool) -> str | None:
     """Return one line about an exception that the file system or a lack of memory caused; None for any other.
 
     `resumes`: whether the command can resume from what it saved.
     """
-    if no_space(error):
+    words = ("No space left on device", "Disk quota exceeded", "File too large")
+    if mentions(error, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), *words):
         again = "go on with the same command and --resume" if resumes else "give the same command again"
         return f"the disk is full: free some, then {again}"
     if isinstance(error, OSError) and error.filename is not None and error.errno in FILE_SYSTEM:
         return f"{error.filename}: {error.strerror}; what was saved before is safe"
     if mentions(error, (errno.ENOMEM,), "RESOURCE_EXHAUSTED", "Out of memory") or isinstance(error, MemoryError):
-        words = (str(error).splitlines() or [""])[0][:200]
-        return f"not enough memory ({words}): lower the sizes that were given, or the number of seeds at once"
+        why = (str(error).splitlines() or [""])[0][:200]
+        return f"not enough memory ({why}): lower the sizes that were given, or the number of seeds at once"
     return None
 
 
@@ -89,26 +83,12 @@ def format_value(value: Any) -> str:
         return f"an array of shape {shape}"
     if not isinstance(value, str | bytes | int | float | complex | list | tuple | dict | set | None):
         return f"a {type(value).__name__}"
-    short = reprlib.Repr()
-    short.maxstring = short.maxother = 60
-    try:
-        text = short.repr(value)
-    except Exception:  # values that have no short text: a failing `repr` of an entry, an integer of thousands of digits
-        return f"a {type(value).__name__}"
-    return text if text.isprintable() and len(text) <= 120 else f"a {type(value).__name__}"
+    return one_line(reprlib.repr(value))
 
 
 def user_code_error(named: str, error: BaseException) -> UserCodeError:
-    """Return the error for an exception of the user's own code: the code's name and the exception.
-
-    Args:
-        named: name of the code, for instance "policy my_policy".
-        error: the exception that the code raised.
-    """
-    try:
-        words = " ".join(str(error).split())[:200]
-    except Exception:  # the exception's own text fails
-        words = ""
+    """Return the error for an exception of the user's own code; `named`: the code, as "policy my_policy"."""
+    words = " ".join(str(error).split())[:200]
     return UserCodeError(f"{named} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
 
 

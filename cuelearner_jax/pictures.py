@@ -31,11 +31,8 @@ def sketch(image: Source, words: str = "") -> Sketch:
     """Return a picture as the sketch of a situation; its frame counts in pixels.
 
     Args:
-        image: RGB uint8 (height, width, 3), or the bytes of a PNG or JPEG file.
+        image: RGB uint8 (height, width, 3), or the bytes of a PNG or JPEG file; else UserError.
         words: about the situation, in a few words.
-
-    Raises:
-        UserError: the image is neither.
     """
     uri, (width, height) = _uri(image, LARGEST)
     still = f'<image class="photo" href="{uri}" width="{width}" height="{height}"/>'
@@ -47,31 +44,20 @@ def clip(frames: Sequence[Source], period: float, words: str = "") -> Reel:
     """Return a short film of pictures that replaces a sketch's picture while it plays.
 
     Args:
-        frames: pictures as `sketch` takes them, all of one size.
+        frames: pictures as `sketch` takes them, all of one size; else UserError.
         period: between two of them [s].
         words: words for the film's end.
-
-    Raises:
-        UserError: there is no frame, one is no picture, their sizes differ, or the period is not positive.
     """
-    if not period > 0 or not len(frames):
-        raise UserError(f"a clip of {len(frames)} frames every {period:g} s: give at least one, and a positive period")
-    found = [_uri(frame, LARGEST // 2) for frame in frames]
+    found = [_uri(frame, LARGEST // 2) for frame in _some(frames)]
     if len({size for _, size in found}) > 1:
         raise UserError(f"the frames of a clip differ in size ({found[0][1]} and others): give frames of one size")
     return Reel(period, [], words, [uri for uri, _ in found])
 
 
 def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
-    """Write up to six frames of a film, the first and the last among them, as one PNG.
-
-    Raises UserError if there is no frame, or one is no picture.
-    """
-    if not len(frames):
-        raise UserError("there is no frame to draw: give at least one")
-    chosen = [
-        pixels(frames[number]) for number in np.unique(np.linspace(0, len(frames) - 1, SHEET).round().astype(int))
-    ]
+    """Write up to six frames of a film, the first and the last among them, as one PNG."""
+    places = np.unique(np.linspace(0, len(_some(frames)) - 1, SHEET).round().astype(int))
+    chosen = [pixels(frames[number]) for number in places]
     height, width = chosen[0].shape[:2]
     columns = min(3, len(chosen))
     sheet = Image.new("RGB", (columns * width, -(-len(chosen) // columns) * height), "white")
@@ -81,12 +67,7 @@ def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
 
 
 def animate(frames: Sequence[Source], file: str | os.PathLike[str], fps: float = 25.0) -> None:
-    """Write all frames as a film; its name ends in .gif or .mp4.
-
-    Raises UserError if there is no frame, one is no picture, or the name ends otherwise.
-    """
-    if not len(frames):
-        raise UserError("there is no frame to draw: give at least one")
+    """Write all frames as a film; raises UserError unless its name ends in .gif or .mp4."""
     try:
         check_film(file, fps)
     except ValueError as error:
@@ -97,31 +78,34 @@ def animate(frames: Sequence[Source], file: str | os.PathLike[str], fps: float =
             frame = pixels(frames[min(int(number * fps / rate), len(frames) - 1)])
             yield frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2]  # even sides, as codecs need
 
-    specimen = np.concatenate([pixels(frames[number]) for number in (0, len(frames) // 2, -1)])
+    specimen = np.concatenate([pixels(_some(frames)[number]) for number in (0, len(frames) // 2, -1)])
     write_film(file, fps, even, palette_of(specimen, 256))
+
+
+def _some(frames: Sequence[Source]) -> Sequence[Source]:
+    if not len(frames):
+        raise UserError("there is no frame to draw: give at least one")
+    return frames
 
 
 def pixels(image: Source) -> Picture:
     """Return a picture as RGB uint8 (height, width, 3). Raises UserError for anything else."""
-    return image if isinstance(image, np.ndarray) and _checked(image) else np.asarray(_opened(image)[0].convert("RGB"))
-
-
-def _checked(image: np.ndarray) -> bool:
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise UserError(f"a picture is {image.dtype} {image.shape}: give uint8 (height, width, 3), red, green and blue")
-    return True
+    return np.asarray(_opened(image)[0].convert("RGB"))
 
 
 def _opened(image: Any) -> tuple[Image.Image, str]:
-    """Return the image of a file's bytes, rotated as its EXIF tag says, and its format."""
+    """Return the image, rotated as its EXIF tag says, and the format of the file's bytes; empty: of other bytes."""
+    if isinstance(image, np.ndarray):
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+            wanted = "give uint8 (height, width, 3), red, green and blue"
+            raise UserError(f"a picture is {image.dtype} {image.shape}: {wanted}")
+        return Image.fromarray(image), ""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            found = Image.open(io.BytesIO(image), formats=tuple(SHOWN))
-            kind = found.format or ""
-            if found.getexif().get(TURNED, 1) != 1:
-                found, kind = ImageOps.exif_transpose(found), ""  # rotated, so the stored bytes are not reused
-            found.load()
+        found = Image.open(io.BytesIO(image), formats=tuple(SHOWN))
+        kind = found.format or ""
+        if found.getexif().get(TURNED, 1) != 1:
+            found, kind = ImageOps.exif_transpose(found), ""  # rotated, so the stored bytes are not reused
+        found.load()
     except Exception as error:  # Pillow raises many kinds for damaged files
         raise UserError(f"a picture cannot be read ({error}): give the bytes of a PNG or JPEG file") from error
     return found, kind
@@ -129,11 +113,7 @@ def _opened(image: Any) -> tuple[Image.Image, str]:
 
 def _uri(image: Source, largest: int) -> tuple[str, tuple[int, int]]:
     """Return a picture as a data URI with its longer side at most `largest`, and its width and height [pixels]."""
-    if isinstance(image, np.ndarray):
-        _checked(image)
-        found, kind = Image.fromarray(image), ""
-    else:
-        found, kind = _opened(image)
+    found, kind = _opened(image)
     data = image if isinstance(image, bytes) else b""
     if kind not in SHOWN or max(found.size) > largest:
         found = found.convert("RGB")
@@ -150,13 +130,10 @@ def write_film(
     """Write a film of pictures that are made one by one: GIF with one exact palette, or MP4.
 
     Args:
-        file: a name that ends in .gif or .mp4.
+        file: a name that ends in .gif or .mp4; else ValueError.
         fps: pictures a second; a GIF counts in hundredths of a second and takes the nearest rate it can have.
         pictures: makes them for the rate that it gets.
         palette: a GIF's colours, see `palette_of`.
-
-    Raises:
-        ValueError: if the name ends otherwise or the rate is not positive.
     """
     check_film(file, fps)
     if Path(file).suffix.lower() == ".gif":
@@ -168,10 +145,8 @@ def write_film(
 
 def check_film(file: str | os.PathLike[str], fps: float) -> None:
     """Raise ValueError if such a film cannot be written."""
-    if Path(file).suffix.lower() not in KINDS:
-        raise ValueError(f"cannot animate to {file}: give a name that ends in .gif or .mp4")
-    if fps <= 0:
-        raise ValueError(f"cannot animate at {fps} pictures a second: give a positive fps")
+    if Path(file).suffix.lower() not in KINDS or fps <= 0:
+        raise ValueError(f"cannot animate to {file} at {fps:g}: give a name in .gif or .mp4, and a positive fps")
 
 
 def palette_of(specimen: Picture, colours: int, exactly: Sequence[str] = ()) -> list[int]:

@@ -6,10 +6,9 @@ import importlib
 import os
 import re
 import sys
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from cuelearner_jax.errors import UserError, suggestion
+from cuelearner_jax.errors import UserCodeError, UserError, suggestion
 
 REFERENCE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 
@@ -27,9 +26,6 @@ def load(reference: str, kind: type[T], called: str) -> T:
     Raises:
         UserError: no such module or name, the module does not import, or the object is something else.
     """
-    if ".py:" in reference:
-        file, _, name = reference.rpartition(".py:")
-        raise UserError(f"{reference} is a file: give {Path(file).name}:{name} (module:NAME), in the file's folder")
     if not REFERENCE.fullmatch(reference):
         raise UserError(f"{reference!r} does not name {called}: give package.module:NAME, for instance my_code:MINE")
     module_name, _, name = reference.partition(":")
@@ -44,16 +40,15 @@ def load(reference: str, kind: type[T], called: str) -> T:
             raise UserError(
                 f"no module {missing!r} for {reference}: run in the folder that holds it, or install it"
             ) from error
-        told = (str(error).strip().splitlines() or [""])[0][:200]
-        raise UserError(f"{module_name} fails to import ({type(error).__name__}: {told}): mend it first") from error
+        why = (str(error).strip().splitlines() or [""])[0][:200]
+        raise UserCodeError(f"{module_name} fails to import ({type(error).__name__}: {why}): mend it first") from error
     if not hasattr(module, name):
         there = [other for other, value in vars(module).items() if isinstance(value, kind)]
         raise UserError(f"{module_name} has no {name!r}{suggestion(name, there) if there else f', nor {called}'}")
     found = getattr(module, name)
     if not isinstance(found, kind):
-        raise UserError(
-            f"{reference} is of type {type(found).__name__}: {called} is a {kind.__module__}.{kind.__name__}"
-        )
+        wanted = f"{called} is a {kind.__module__}.{kind.__name__}"
+        raise UserError(f"{reference} is of type {type(found).__name__}: {wanted}")
     return found
 
 

@@ -1,8 +1,8 @@
-"""Handle Ctrl-C and schedulers' signals: finish and save work that can be saved, else end at once with one line.
+"""Ctrl-C and schedulers' signals: finish and save work that can be saved, else end at once with one line.
 
-In a command's own process a thread listens for signals, also while compiled code keeps Python waiting, and ends the
-process without Python's shutdown, in which threads that still compute would crash. Elsewhere (notebooks, tests)
-Python's own handlers run, between two calls of compiled code.
+In a command's own process a thread hears signals, also while compiled code keeps Python waiting, and ends the process
+without Python's shutdown, in which threads that still compute would crash. Elsewhere (notebooks, tests) Python's own
+handlers run, between two calls of compiled code. Files are written whole, so that no moment is a bad one to end.
 """
 
 from __future__ import annotations
@@ -12,16 +12,12 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
+from typing import Any
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a scheduler, a terminal that was closed
 SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # clears a progress bar's line and shows its cursor
-
-_listening = threading.Event()  # set in a process of the command's own
-_leaving = threading.Lock()
-_saves = threading.RLock()
 
 
 class Interrupted(Exception):
@@ -30,28 +26,15 @@ class Interrupted(Exception):
     status = 130  # exit status of the command: 128 plus the signal's number
 
 
-class Stopping(threading.Event):
-    """An event that the first signal sets. It keeps the signal's number."""
+class _Work(threading.Event):
+    """Work that the first signal asks to stop; it keeps the signal's number."""
 
     number: int = signal.SIGINT
+    name: str = ""
 
 
-class _LateSignal:
-    """A second Ctrl-C in a process without a listening thread, while a result is being saved."""
-
-    saving = 0
-    pressed = False
-
-
-class _Heard:
-    """A handler of signals, called by the listening thread or by Python."""
-
-    def __init__(self, act: Callable[[int], None]) -> None:
-        self.act = act
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        if not _listening.is_set():
-            self.act(number)
+_works: list[_Work] = []  # what can be finished and saved, the innermost last
+_listening = threading.Event()  # set in a process of the command's own
 
 
 @contextmanager
@@ -63,42 +46,22 @@ def interruptible(what: str = "this stretch of steps") -> Iterator[threading.Eve
     Args:
         what: the work that is finished first, in words.
     """
-    stopping = Stopping()
-
-    def act(number: int) -> None:
-        if not stopping.is_set():
-            stopping.number = number
-            stopping.set()
-            _say(f"stopping after {what} (Ctrl-C again: at once)")
-        elif number == signal.SIGINT:  # schedulers repeat their signal, and kill in the end
-            _stop_at_once(number)
-
+    work = _Work()
+    work.name = what
     if threading.current_thread() is not threading.main_thread():
-        yield stopping
+        yield work
         return
-    before = _installed(_Heard(act), also=signal.SIGINT)
+    before = {} if _listening.is_set() else _install(_hear, ignored=(signal.SIGTERM, signal.SIGHUP))
+    _works.append(work)
     try:
-        yield stopping
+        yield work
     except Interrupted as end:
-        end.status = 128 + stopping.number
+        end.status = 128 + work.number
         raise
     finally:
+        _works.remove(work)
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def saving() -> Iterator[None]:
-    """Run the body to its end, however often Ctrl-C is pressed."""
-    with _saves:
-        _LateSignal.saving += 1
-        try:
-            yield
-        finally:
-            _LateSignal.saving -= 1
-    if _LateSignal.pressed and not _LateSignal.saving:
-        _LateSignal.pressed = False
-        raise KeyboardInterrupt
 
 
 def listen() -> None:
@@ -108,52 +71,38 @@ def listen() -> None:
     """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    _installed(_Heard(_stop_at_once))
+    heard = _install(lambda number, frame: None, ignored=NUMBERS)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     _listening.set()
-    threading.Thread(target=_listen, args=(reading,), name="signals", daemon=True).start()
+
+    def hear() -> None:
+        while number := os.read(reading, 1)[0]:
+            if number in heard:
+                _hear(number, None)
+
+    threading.Thread(target=hear, name="signals", daemon=True).start()
 
 
-def _listen(reading: int) -> None:
-    while heard := os.read(reading, 1):
-        handler = signal.getsignal(heard[0])
-        if isinstance(handler, _Heard):
-            handler.act(heard[0])
-
-
-def _installed(handler: _Heard, also: int | None = None) -> dict[int, Callable | int]:
-    """Handle `also` and the signals that this process was not started to ignore. Return the former handlers."""
-    before: dict[int, Callable | int] = {}
-    for number in NUMBERS:
-        was = signal.getsignal(number)
-        if was != signal.SIG_IGN or number == also:
-            before[number] = signal.SIG_DFL if was is None else was
-            signal.signal(number, handler)
+def _install(handler: Any, ignored: tuple[int, ...]) -> dict[int, Any]:
+    """Handle the signals, without those of `ignored` that this process ignores; return the former handlers."""
+    before: dict[int, Any] = {number: signal.getsignal(number) or signal.SIG_DFL for number in NUMBERS}
+    before = {number: was for number, was in before.items() if was != signal.SIG_IGN or number not in ignored}
+    for number in before:
+        signal.signal(number, handler)
     return before
 
 
-def _stop_at_once(number: int) -> None:
-    if _listening.is_set():
-        if not _saves.acquire(blocking=False):
-            _say("saving first")
-            _saves.acquire()
-        _leave(number)
-    elif _LateSignal.saving:
-        _LateSignal.pressed = True
-        _say("saving first")
-    else:
-        raise KeyboardInterrupt
-
-
-def _leave(number: int) -> None:
-    if not _leaving.acquire(blocking=False):
-        return
-    with contextlib.suppress(OSError):  # bypasses Python's streams, whose locks another thread may hold
-        shown = SHOW_CURSOR if os.isatty(2) else b""
-        os.write(2, shown + b"stopped at once; what was saved before is safe\n")
-    os._exit(128 + number)
-
-
-def _say(text: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # the reader may be gone
-        print(text, file=sys.stderr, flush=True)
+def _hear(number: int, frame: Any) -> None:
+    work = _works[-1] if _works else None
+    if work is not None and not work.is_set():
+        work.number = number
+        work.set()
+        with contextlib.suppress(OSError, ValueError):  # the reader may be gone
+            print(f"stopping after {work.name} (Ctrl-C again: at once)", file=sys.stderr, flush=True)
+    elif work is None or number == signal.SIGINT:  # schedulers repeat their signal, and kill in the end
+        if not _listening.is_set():
+            raise KeyboardInterrupt
+        with contextlib.suppress(OSError):  # bypasses Python's streams, whose locks another thread may hold
+            shown = SHOW_CURSOR if os.isatty(2) else b""
+            os.write(2, shown + b"stopped at once; what was saved before is safe\n")
+        os._exit(128 + number)

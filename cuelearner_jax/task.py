@@ -142,14 +142,10 @@ class Task:
 
     def __post_init__(self) -> None:
         """Raise ValueError for the first part that cannot work."""
-        if not self.name.isidentifier():
-            raise ValueError(f"task {self.name!r}: the name must be an identifier, as in Python")
-        if not (isinstance(self.config, type) and dataclasses.is_dataclass(self.config)):
-            raise ValueError(f"task {self.name}: config must be a dataclass, not {self.config!r}")
         fields = {entry.name for entry in dataclasses.fields(self.config)}
-        if "name" in fields:
-            raise ValueError(f"task {self.name}: a field of {self.config.__name__} may not be called 'name'")
         names = [body.name for body in self.bodies]
+        if not self.name.isidentifier() or "name" in fields:
+            raise ValueError(f"task {self.name!r}: its name must be an identifier, and no field of its configuration")
         if not names or len(set(names)) < len(names):
             raise ValueError(f"task {self.name}: it needs at least one body, each of another name, not {names}")
         if unknown := sorted(set(self.labels_hold) - fields):
@@ -158,24 +154,14 @@ class Task:
             if not isinstance(preset.config.task, self.config):
                 kind = type(preset.config.task).__name__
                 raise ValueError(f"task {self.name}: preset {name!r} configures {kind}, not {self.config.__name__}")
-        for name in self.scenarios:
-            self._check_scenario(name)
-
-    def _check_scenario(self, name: str) -> None:
-        scenario, called = self.scenarios[name], f"task {self.name}: scenario {name!r}"
-        changed = ("changes", self.config, scenario.changes)
-        for verb, group, given in (
-            changed,
-            ("suggests", GuideSizes, scenario.sizes),
-            ("suggests", Scalars, scenario.scalars),
-        ):
-            if unknown := sorted(set(given) - {entry.name for entry in dataclasses.fields(group)}):
-                raise ValueError(f"{called} {verb} {unknown[0]!r}, no field of {group.__name__}")
-        try:
-            for base in [preset.config.task for preset in self.presets.values()] or [self.plain()]:
-                scenario.apply(base)
-        except Exception as error:
-            raise ValueError(f"{called} makes no configuration ({error})") from error
+        for name, scenario in self.scenarios.items():
+            try:
+                dataclasses.replace(GuideSizes(), **scenario.sizes)
+                dataclasses.replace(Scalars(), **scenario.scalars)
+                for base in [preset.config.task for preset in self.presets.values()] or [self.plain()]:
+                    scenario.apply(base)
+            except Exception as error:
+                raise ValueError(f"task {self.name}: scenario {name!r} makes no configuration ({error})") from error
 
     def plain(self) -> Any:
         """Return the default configuration."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Collection
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +28,6 @@ from cuelearner_jax.types import Params
 
 ABOUT = "teacher.json"
 TRAIN = "python experiments/train_teacher.py"  # folder of the repository, for messages
-
-
-@dataclass(frozen=True)
-class Shape:
-    """The sizes of a teacher's network."""
-
-    layers: tuple[int, ...]
-    directions: int
 
 
 def init_params(layers: tuple[int, ...], env: Any, key: PRNGKeyArray) -> Params:
@@ -106,41 +97,32 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
 
 def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     """Return a teacher that `save` wrote. Raises UserError if there is none, or its observations differ."""
-    about = _about(folder)
-    try:
-        shape = from_json(Shape, {name: about["config"][name] for name in ("layers", "directions")})
-    except (ValueError, KeyError, TypeError) as error:
-        raise formats.damaged("teacher", folder / ABOUT) from error
-    template = jax.eval_shape(lambda key: init_params(shape.layers, env, key), jax.random.key(0))
+    sizes = _about(folder)["config"]
+    layers = tuple(sizes["layers"])
+    template = jax.eval_shape(lambda key: init_params(layers, env, key), jax.random.key(0))
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:
         params = saved.restore({"params": halves})["params"]
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), params)
     aim = jnp.asarray(aim_error, jnp.float32), jnp.asarray(habit, jnp.float32)
-    return LearnedTeacher(env, params, *aim, shape.layers, shape.directions)
+    return LearnedTeacher(env, params, *aim, layers, sizes["directions"])
 
 
 def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> Any:
     """Return the configuration of the world that a teacher learned in.
+
+    Raises UserError for no teacher, one of another task, or one that does not know a change of this world.
 
     Args:
         folder: folder of the teacher.
         task: name of the task in which it is to be asked.
         config: the configuration in which it is to be asked.
         apart: fields in which the two may differ, because they change nothing or the task handles them.
-
-    Raises:
-        UserError: no teacher there, one of another task, or one that does not know a change of this world.
     """
-    told = _about(folder).get("task")
-    if not isinstance(told, dict) or "name" not in told:
-        raise formats.damaged("teacher", folder / ABOUT)
-    if told["name"] != task:
-        raise UserError(f"the teacher in {folder} is one of {told['name']}, not of {task}: give another folder")
-    try:
-        own = from_json(type(config), {name: value for name, value in told.items() if name != "name"})
-    except (ValueError, TypeError) as error:
-        raise formats.damaged("teacher", folder / ABOUT) from error
+    world = dict(_about(folder)["task"])
+    if (name := world.pop("name")) != task:
+        raise UserError(f"the teacher in {folder} is one of {name}, not of {task}: give another folder")
+    own = from_json(type(config), world)
     before, now = ({name: one for name, one in to_json(world).items() if name not in apart} for world in (own, config))
     for field, value in before.items():
         if value != now[field]:
@@ -174,5 +156,5 @@ def _about(folder: Path) -> dict[str, Any]:
 
 def _typed(fields: dict[str, Any]) -> str:
     """Return fields of a task's configuration as command-line arguments."""
-    told = {name: value if isinstance(value, list) else [value] for name, value in fields.items()}
-    return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in told.items())
+    values = {name: value if isinstance(value, list) else [value] for name, value in fields.items()}
+    return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in values.items())

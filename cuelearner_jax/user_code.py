@@ -1,30 +1,24 @@
 """Errors of the user's own policies, teachers and environments: exceptions, and invalid actions.
 
-A function that is called back on the host leaves its exception here and returns NaN, because exceptions that leave a
-compiled program are long and unclear. Code that reads a program's results on the host asks here first.
+An exception of the user's code keeps its own traceback. A function that is called back on the host leaves its exception
+here and returns NaN, because exceptions that leave a compiled program are long and unclear. Code that reads a program's
+results on the host asks here first.
 """
 
 from __future__ import annotations
 
 import functools
-import sysconfig
 from collections.abc import Callable
-from pathlib import Path
-from types import FrameType, TracebackType
 from typing import Any, ParamSpec, TypeVar
 
 import jax
 import numpy as np
 
 from cuelearner_jax.devices import fixed_numerics
-from cuelearner_jax.errors import NotFinite, UserError, no_space, user_code_error
+from cuelearner_jax.errors import UserCodeError, UserError
 
 P = ParamSpec("P")
 T = TypeVar("T")
-
-_PACKAGE = Path(__file__).parent
-_OURS = (_PACKAGE, *(_PACKAGE.parent / place / "cuelearner_envs" for place in ("", "envs")))
-_LIBRARIES = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))
 
 _left: list[BaseException] = []  # errors left by functions on the host, which other threads call
 
@@ -48,10 +42,7 @@ def tell() -> None:
 
 
 def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a public function that computes with fixed numerics, and reports faults of the user's code in one line.
-
-    The UserError has the original as `__cause__`.
-    """
+    """Return a public function that computes with fixed numerics, and raises what functions on the host left."""
 
     @functools.wraps(function)
     def wrapped(*arguments: P.args, **named: P.kwargs) -> T:
@@ -60,42 +51,13 @@ def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
                 found = function(*arguments, **named)
             tell()
             return found
-        except (Exception, SystemExit) as error:
+        except Exception:
             tell()
-            raise_in_one_line(error)
             raise
         finally:
             _left.clear()
 
     return wrapped
-
-
-def raise_in_one_line(error: BaseException) -> None:
-    """Raise a UserError from an exception of the user's own code; do nothing for any other exception.
-
-    A full disk is not a fault of the code that met it.
-    """
-    if isinstance(error, UserError | NotFinite) or no_space(error):
-        return
-    if (step := user_traceback(error)) is not None:
-        code = step.tb_frame.f_code
-        name = getattr(code, "co_qualname", code.co_name).replace("<locals>.", "")
-        raise user_code_error(name, error) from error.with_traceback(step)
-
-
-def user_traceback(error: BaseException) -> TracebackType | None:
-    """Return an exception's traceback from the first function of the user's code on; None: there is none."""
-    step = error.__traceback__
-    while step is not None and not _is_users(step.tb_frame):
-        step = step.tb_next
-    return step
-
-
-def _is_users(frame: FrameType) -> bool:
-    file = frame.f_code.co_filename
-    if file.startswith("<frozen") or not frame.f_globals.get("__name__", ""):
-        return False
-    return not any(Path(file).is_relative_to(place) for place in (*_OURS, *_LIBRARIES))
 
 
 def acts_in(name: str, policy: Any, env: Any) -> None:
@@ -119,9 +81,9 @@ def _tried(name: str, verb: str, env: Any, function: Any) -> None:
             raise
         raise type(error)(f"{name}: {error}") from error.__cause__
     except Exception as error:
-        raise_in_one_line(error)
-        raise UserError(
-            f"{name} cannot {verb} in this world, whose observations have {obs.shape[-1]} entries: give one made for it"
+        raise UserCodeError(
+            f"{name} cannot {verb} in this world, whose observations have {obs.shape[-1]} entries: "
+            f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         ) from error
 
 

@@ -39,7 +39,6 @@ from cuelearner_jax.tasks import registry
 
 SCHEMA = tables.Schema(
     stem="adaptation",
-    mark="base",
     required=("task", "world", "method", "variant", "base", "labels", "steps"),
     strings=("task", "world", "method", "variant", "split", "commit", "versions", "hardware", "command"),
     integers=("base", "label_seed", "labels", "steps"),

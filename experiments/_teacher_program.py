@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.agents.networks import all_finite
-from cuelearner_jax.config import LARGEST, MOST_LAYERS
+from cuelearner_jax.config import LARGEST
 from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import directions as geometry
@@ -73,8 +73,8 @@ def check_config(config: TeacherConfig) -> None:
         raise UserError(
             f"teacher.tries is {config.tries}: give at least 4 (the best, a promising one, two uniform ones)"
         )
-    if not 1 <= len(config.layers) <= MOST_LAYERS or min(config.layers) < 1 or max(config.layers) > LARGEST:
-        raise UserError(f"teacher.layers: give at least one layer of positive width, at most {MOST_LAYERS}")
+    if not config.layers or min(config.layers) < 1 or max(config.layers) > LARGEST:
+        raise UserError("teacher.layers: give at least one layer of positive width")
     if not 0 < config.learning_rate < math.inf:
         raise UserError(f"teacher.learning_rate is {config.learning_rate}: give a positive, finite number")
     if not 0 <= config.explore_probability <= 1:

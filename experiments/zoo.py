@@ -92,8 +92,13 @@ def acts_of(world: Any, fit: Fit, corrects: jax.Array) -> Any:
     return lambda obs: jnp.where(corrects, own(obs), zoo.policy(robot, obs))
 
 
-def batch(world: Any, state: Asked, key: jax.Array, number: jax.Array, wrong: jax.Array, one_cue: jax.Array) -> Asked:
-    """Ask a batch of questions where the policy corrected so far goes, predict the answers and read them."""
+def ask(
+    world: Any, state: Asked, key: jax.Array, number: jax.Array, wrong: jax.Array, one_cue: jax.Array
+) -> tuple[Labels, jax.Array]:
+    """Ask a batch of questions where the policy corrected so far goes, and predict the answers.
+
+    Returns all labels so far, and the evidence.
+    """
     robot, reader = world.robot, reader_of(world.robot)
     k_play, k_where, k_action, k_answer = jax.random.split(key, 4)
     count, begun = len(state.labels.valid) // BATCHES, number > 0
@@ -111,10 +116,15 @@ def batch(world: Any, state: Asked, key: jax.Array, number: jax.Array, wrong: ja
     ratio = reader.predict(state.fit, new)[2].sum() - reader.predict(state.nothing, new)[2].sum()
     at = number * count + jnp.arange(count)
     labels = Labels(*(leaf.at[at].set(part) for leaf, part in zip(state.labels, new, strict=True)))
-    fits = reader.read(labels, state.plain, state.smooth)
+    return labels, state.evidence + jnp.where(begun, ratio, 0.0)
+
+
+def read(world: Any, labels: Labels, evidence: jax.Array, plain: Hypothesis, smooth: Hypothesis) -> Asked:
+    """Read all labels so far; start from the hypotheses of the fit before."""
+    fits = reader_of(world.robot).read(labels, plain, smooth)
     best, nothing = fitting.pick(fits, fitting.best_of(fits)), fitting.pick(fits, 0)
-    evidence = state.evidence + jnp.where(begun, ratio, 0.0)
-    return Asked(labels, *fitting.again(fits), best, nothing, evidence)
+    plain, smooth = fitting.again(fits)
+    return Asked(labels, plain, smooth, best, nothing, evidence)
 
 
 def begun(world: Any, labels: int) -> Asked:
@@ -175,8 +185,8 @@ def _begun(worlds: Any, labels: int) -> Asked:
 
 
 @jax.jit
-def _batch(worlds: Any, state: Asked, keys: Any, number: Any, wrong: Any, one_cue: Any) -> Asked:
-    one = lambda world, state, key, wrong, one_cue: batch(world, state, key, number, wrong, one_cue)  # noqa: E731
+def _ask(worlds: Any, state: Asked, keys: Any, number: Any, wrong: Any, one_cue: Any) -> tuple[Labels, jax.Array]:
+    one = lambda world, state, key, wrong, one_cue: ask(world, state, key, number, wrong, one_cue)  # noqa: E731
     return each_lane(one)(worlds, state, keys, wrong, one_cue)
 
 
@@ -206,7 +216,9 @@ def measure(robots: Any, cells: list[Cell], labels: int) -> list[dict[str, Any]]
     state = _begun(worlds, labels)
     for number in range(BATCHES):
         each = jax.vmap(lambda key, number=number: jax.random.fold_in(key, number))(keys)
-        state = _batch(worlds, state, each, jnp.array(number), wrong, one_cue)
+        labelled = _ask(worlds, state, each, jnp.array(number), wrong, one_cue)
+        # not one program: the parts that a fit repeats are compiled once
+        state = each_lane(read)(worlds, *labelled, state.plain, state.smooth)
     values = jax.tree.map(np.asarray, _played(worlds, state))
     evidence = np.asarray(state.evidence)
     judged = [

@@ -52,7 +52,7 @@ def checked(function: Any = None, **_: Any) -> Any:
             made.append(_with_checks(function))
         return made[0](*arguments, **keywords)
 
-    return _as_of_a_library(checking)
+    return checking
 
 
 def _with_checks(function: Any) -> Callable:
@@ -60,16 +60,8 @@ def _with_checks(function: Any) -> Callable:
     function.__annotations__ = _known_hints(function)
     checks = beartype(function, conf=_conf)
     function.__annotations__ = declared
-    if checks is not function:  # which is returned where nothing is annotated
-        _as_of_a_library(checks)
     named = any(_named.search(str(annotation)) for annotation in declared.values())
     return _with_dimensions(checks, typechecker=None) if named else checks
-
-
-def _as_of_a_library(wrapper: Any) -> Callable:
-    """Return the wrapper, with frames of jaxtyping's file: the package takes unknown ones for the user's code."""
-    wrapper.__code__ = wrapper.__code__.replace(co_filename=jaxtyping.__file__)
-    return wrapper
 
 
 def _known_hints(function: Any) -> dict[str, Any]:

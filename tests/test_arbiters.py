@@ -240,14 +240,3 @@ def test_random_steps_are_no_arms(program):
         faded = faded * FADE**4 + row.sum()
     assert float(state.arbiter.sums.gain[0].sum()) == pytest.approx(faded, rel=1e-4)
     assert 0 < float(metrics["guided_share"][0]) < 0.5
-
-
-@pytest.mark.long
-def test_lanes_beside_each_other_are_lanes_alone(program):
-    env = probes.Window()
-    _, beside, _ = run(program, env, [3, 4], 2)
-    _, alone, _ = run(program, env, [4], 2)
-    for mine, yours in zip(
-        jax.tree.leaves(probes.lane(beside, 1)), jax.tree.leaves(probes.lane(alone, 0)), strict=True
-    ):
-        np.testing.assert_array_equal(mine, yours)

@@ -13,7 +13,7 @@ import pytest
 from cuelearner_jax import asking
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import Heuristic, Taught, Teaching, Uniform
+from cuelearner_jax.policies import Heuristic, Taught, Uniform
 from cuelearner_jax.spaces import directions
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
@@ -101,16 +101,6 @@ def test_questions_are_about_what_the_base_policy_does():
     np.testing.assert_allclose(uniform.action[:ROUND], drawn, atol=1e-6)
 
 
-def test_an_unguided_question_is_the_base_policys_own_action():
-    none = guidances.make("none", probes.SIZES, ENV)
-    guide = begun(guidance=none)
-    keys = asking.question_keys(LANE_KEY, 0)
-    action = asking.question(asks(probes.SCALARS, Heuristic(ENV), guidance=none), guide, keys)[0]
-    np.testing.assert_array_equal(action, ENV.heuristic(guide.obs))
-    with pytest.raises(ValueError, match="'none' asks nothing"):
-        asking.ask(asks(probes.SCALARS, Uniform(), guidance=none), EXPERT, guide, LANE_KEY, jnp.asarray(0))
-
-
 def test_after_a_question_comes_what_its_action_leads_to():
     env = probes.Chain(jnp.array(False))
     guide = begun(env=env)
@@ -125,17 +115,6 @@ def test_after_a_question_comes_what_its_action_leads_to():
     moved = asking.proceed(ENV, begun().replace(env=ENV.reset(jax.random.key(4))[0]), action, keys)
     np.testing.assert_array_equal(moved.env, state)
     np.testing.assert_array_equal(moved.obs, step.obs)
-
-
-def test_questions_may_lie_steps_apart():
-    """The chain's two places follow each other, so that every second step is at the first."""
-    env, sizes = probes.Chain(jnp.array(False)), dataclasses.replace(probes.SIZES, question_every=2)
-    bundle = guidances.make("relative", sizes, env)
-    base = Heuristic(env)
-    ask = probes.label_rounds(bundle, sizes)
-    found = ask(env, Teaching(base), probes.SCALARS, base, begun(env=env, guidance=bundle), LANE_KEY)
-    np.testing.assert_array_equal(found.labels.obs[:ROUND], np.tile(env.observe(0), (ROUND, 1)))
-    assert int(found.asked) == ROUND
 
 
 def test_an_answer_stands_in_its_row_and_changes_nothing_else():
@@ -173,18 +152,6 @@ def test_questions_without_an_answer_do_not_count():
     assert bool(fit(ENV, probes.SCALARS, once, LANE_KEY, jnp.asarray(0)).model.fitted)
 
 
-def test_answers_that_do_not_count_teach_nothing():
-    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND + 2), LANE_KEY)
-    position = ROUND + 1
-    one, other = (record(guide, position, jnp.array([1.0, 0.0]), jnp.array([h]), False) for h in (1.0, -1.0))
-    fits = [fit(ENV, probes.SCALARS, told, LANE_KEY, jnp.asarray(1)).model for told in (one, other)]
-    chex.assert_trees_all_equal(*fits)
-    counted = record(guide, position, jnp.array([1.0, 0.0]), jnp.array([1.0]), True)
-    assert counted.labels.valid[position]
-    learned = fit(ENV, probes.SCALARS, counted, LANE_KEY, jnp.asarray(1)).model
-    assert not np.array_equal(jax.tree.leaves(learned.params)[1], jax.tree.leaves(fits[0].params)[1])
-
-
 def test_each_question_and_each_fit_has_random_numbers_of_its_own():
     drawn = [asking.question_keys(LANE_KEY, position) for position in range(3)]
     words = {tuple(np.asarray(jax.random.key_data(key)).tolist()) for keys in drawn for key in keys}
@@ -217,32 +184,3 @@ def test_shuffled_answers_are_those_given_each_with_another_label():
     np.testing.assert_array_equal(found[~valid], answer[~valid])
     other = asking.fitted_labels(jax.random.key(12), labels, scalars)
     assert (np.asarray(other.answer) != found).any()
-
-
-@pytest.mark.parametrize("told", [False, True], ids=["asked", "given"])
-def test_models_are_fitted_to_shuffled_answers_and_labels_keep_their_own(told, monkeypatch):
-    fitted = []
-
-    def fit(self, key, env, labels, former, scalars):
-        jax.debug.callback(lambda *rows: fitted.append(rows), labels.answer, labels.valid)
-        return former
-
-    monkeypatch.setattr(type(RELATIVE), "fit", fit)
-    scalars, start = dataclasses.replace(probes.SCALARS, answer="shuffled"), begun(budget=20)
-    asked = probes.label_rounds(RELATIVE, probes.SIZES)
-    guide, best = start, start
-    for _ in range(20 // ROUND):
-        guide = asked(ENV, EXPERT, scalars, Heuristic(ENV), guide, LANE_KEY)
-        best = asked(ENV, EXPERT, probes.SCALARS, Heuristic(ENV), best, LANE_KEY)
-    chex.assert_trees_all_equal(guide.labels, best.labels)  # what is kept, and what files hold
-    labels = guide.labels.replace(answer=jnp.arange(20.0)[:, None])
-    if told:
-        fitted.clear()
-        taken = asking.take_labels(RELATIVE, ENV, scalars, labels, start, LANE_KEY)
-        chex.assert_trees_all_equal(taken.labels, labels)
-    jax.effects_barrier()
-    answers, valid = map(np.asarray, fitted[-1])
-    kept = np.asarray(labels.answer if told else guide.labels.answer)
-    assert valid.sum() == 20
-    np.testing.assert_array_equal(np.sort(answers, 0), np.sort(kept, 0))
-    assert not told or (answers != kept).all()

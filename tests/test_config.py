@@ -19,62 +19,28 @@ from cuelearner_jax.run_config import RunConfig
 @pytest.mark.parametrize(
     ("group", "values", "message"),
     [
-        ("agent", {"directions": 0}, "agent.directions is 0"),
-        ("agent", {"target_directions": -1}, "agent.target_directions is -1"),
-        ("sizes", {"num_envs": 0}, "sizes.num_envs is 0"),
-        ("agent", {"batch_size": 0}, "agent.batch_size is 0"),
-        ("agent", {"replay_capacity": 0}, "agent.replay_capacity is 0"),
-        ("sizes", {"labels_per_round": 0}, "sizes.labels_per_round is 0"),
-        ("sizes", {"fit_steps": 0}, "sizes.fit_steps is 0"),
-        ("sizes", {"fit_batch_size": 0}, "sizes.fit_batch_size is 0"),
-        ("sizes", {"validate_every": 0}, "sizes.validate_every is 0"),
-        ("sizes", {"lanes_per_block": -1}, "sizes.lanes_per_block is -1"),
-        ("agent", {"q_layers": ()}, "at least one layer"),
-        ("sizes", {"feedback_layers": ()}, "at least one layer"),
-        ("agent", {"q_layers": (32, 0)}, "positive width"),
+        ("sizes", {"num_envs": 0}, "sizes.num_envs is 0: give a positive number"),
+        ("sizes", {"lanes_per_block": -1}, "sizes.lanes_per_block is -1: give a number that is not negative"),
+        ("agent", {"q_layers": ()}, "agent.q_layers is empty: give at least one layer"),
+        ("agent", {"q_layers": (32, 0)}, "agent.q_layers is (32, 0): give a positive number"),
+        ("agent", {"q_layers": 32}, "agent.q_layers is 32: give a value of type"),
         ("agent", {"replay_capacity": 4001}, "agent.replay_capacity is 4001: give a multiple of sizes.num_envs"),
+        ("agent", {"learning_rate": math.nan}, "agent.learning_rate is nan: give a finite number"),
         ("sizes", {"fit_steps": 210}, "sizes.fit_steps is 210: give a multiple of sizes.validate_every"),
-        ("agent", {"learning_rate": -0.1}, "agent.learning_rate is -0.1"),
-        ("scalars", {"max_grad_norm": -1.0}, "scalars.max_grad_norm is -1.0"),
-        ("scalars", {"k_max": -1}, "scalars.k_max is -1"),
-        ("scalars", {"tau_deg": -1.0}, "scalars.tau_deg is -1.0"),
-        ("scalars", {"eps_deg": 0.0}, "scalars.eps_deg is 0"),
-        ("scalars", {"eps_deg": 181.0}, "scalars.eps_deg is 181.0"),
+        ("scalars", {"eps_deg": 181.0}, "scalars.eps_deg is 181.0: give a number above 0 and up to 180"),
         ("scalars", {"discount": 1.0}, "scalars.discount is 1.0"),
-        ("scalars", {"discount": -0.5}, "scalars.discount is -0.5"),
-        ("scalars", {"mistake_probability": -0.1}, "scalars.mistake_probability is -0.1"),
-        ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
-        ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),
         ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': give best or nearest or shuffled"),
         ("scalars", {"nearest_share": 1.1}, "scalars.nearest_share is 1.1: give a number from 0 to 1"),
-        ("scalars", {"nearest_aim_deg": -1.0}, "scalars.nearest_aim_deg is -1.0: give a number that is not negative"),
-        ("scalars", {"scalar_within_deg": math.nan}, "scalars.scalar_within_deg is nan"),
-        ("agent", {"polyak": 1.5}, "agent.polyak is 1.5: give a number from 0 to 1"),
-        ("agent", {"learning_rate": math.nan}, "agent.learning_rate is nan: give a finite number"),
         ("scalars", {"teacher_bias_deg": -math.inf}, "scalars.teacher_bias_deg is -inf: give a finite number"),
-        ("scalars", {"max_grad_norm": 0.0}, "scalars.max_grad_norm is 0.0: give a positive number"),
-        ("schedule", {"total_steps": 0}, "schedule.total_steps is 0"),
-        ("schedule", {"eval_every": 0}, "schedule.eval_every is 0"),
-        ("schedule", {"eval_steps": 0}, "schedule.eval_steps is 0"),
-        ("schedule", {"eval_envs": 0}, "schedule.eval_envs is 0"),
-        ("schedule", {"checkpoint_every": 0}, "schedule.checkpoint_every is 0"),
-        ("agent", {"target_every": 0}, "agent.target_every is 0"),
+        ("schedule", {"total_steps": 2**31}, "schedule.total_steps is 2147483648: give at most 2147483647"),
         ("schedule", {"eval_every": 18}, "schedule.eval_every is 18: give a multiple of sizes.num_envs"),
         ("schedule", {"total_steps": 50}, "schedule.total_steps is 50: give a multiple of schedule.eval_every"),
         ("schedule", {"checkpoint_every": 24}, "schedule.checkpoint_every is 24: give a multiple"),
         ("schedule", {"eval_steps": 25}, "schedule.eval_steps is 25: give a multiple of schedule.eval_envs"),
-        ("sizes", {"ensemble": 0}, "sizes.ensemble is 0"),
-        ("sizes", {"candidates": 0}, "sizes.candidates is 0"),
-        ("sizes", {"ask_all": True}, "sizes.ask_all asks about every candidate: give sizes.candidates above 1 too"),
-        (
-            "sizes",
-            {"ask_all": True, "candidates": 4},
-            "sizes.labels_per_round is 10: give a multiple of sizes.candidates",
-        ),
-        ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
-        ("sizes", {"candidates": 8}, "give a sizes.ensemble above 1 too, or sizes.ask_all"),
-        ("schedule", {"guide_eval_every": -10}, "schedule.guide_eval_every is -10"),
         ("schedule", {"guide_eval_every": 15}, "schedule.guide_eval_every is 15: give a multiple of sizes.labels"),
+        ("sizes", {"ask_all": True}, "sizes.ask_all asks about every candidate: give sizes.candidates above 1 too"),
+        ("sizes", {"ask_all": True, "candidates": 4}, "sizes.labels_per_round is 10: give a multiple of sizes.candi"),
+        ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
     ],
 )
 def test_values_that_cannot_work_are_refused(group, values, message):
@@ -115,11 +81,6 @@ def test_defaults_and_probes_can_work():
     run_config.check(RunConfig(probes.WindowConfig()))
     run_config.check(probes.CONFIG)
     run_config.check(probes.config(scalars={"teacher_bias_deg": -3.0, "eps_deg": 180.0, "k_max": 0}))
-
-
-def test_bootstraps_with_a_discount():
-    assert not probes.config(scalars={"discount": 0.0}).bootstraps
-    assert probes.config(scalars={"discount": 0.1}).bootstraps
 
 
 def test_scalars_and_schedule_are_trees_of_their_numbers_and_sizes_are_not():
@@ -163,23 +124,13 @@ def test_the_digest_depends_on_values_and_not_on_order():
     assert len(config.digest(values)) == 12
 
 
-@pytest.mark.parametrize("group", [probes.SIZES, probes.SCALARS, probes.SCHEDULE])
-def test_the_digest_depends_on_every_field(group):
-    values = config.to_json(group)
-    changed = {name: config.digest(values | {name: [value, "another"]}) for name, value in values.items()}
-    assert len(set(changed.values()) | {config.digest(values)}) == len(values) + 1
-
-
 @pytest.mark.parametrize("group", [probes.SIZES, probes.SCALARS, probes.SCHEDULE, probes.WindowConfig(3.5)])
 def test_json_comes_back_as_it_was(group):
     text = json.dumps(config.to_json(group))
     assert config.from_json(type(group), json.loads(text)) == group
 
 
-def test_an_unknown_field_is_named():
-    with pytest.raises(UserError, match=r"unknown field 'learning_rat' for Scalars"):
+def test_an_unknown_field_is_named_and_a_missing_one_has_its_default():
+    with pytest.raises(UserError, match=r"learning_rat is 0\.1 in a file of another version"):
         config.from_json(Scalars, {"learning_rat": 0.1})
-
-
-def test_fields_that_a_file_lacks_get_their_defaults():
     assert config.from_json(Scalars, {"eps_deg": 7.0}) == Scalars(eps_deg=7.0)

@@ -9,9 +9,7 @@ import probes
 import pytest
 
 from cuelearner_jax import evaluate
-from cuelearner_jax.config import Schedule
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent, Uniform
 
 LONGEST = 4
@@ -101,17 +99,6 @@ class Portions:
     agents: int
     actions: int = 8192
     states: int = 16
-
-
-def test_an_evaluation_that_cuts_episodes_short_is_refused_before_a_training():
-    task = dataclasses.replace(probes.make_task(), longest=lambda config: LONGEST)
-    config = probes.config(schedule={"eval_envs": 10, "eval_steps": 10 * LONGEST})
-    task.check_evaluations(config)
-    short = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, eval_steps=30))
-    with pytest.raises(UserError, match="30 for 10 environments, 3 each, but an episode lasts up to 4: give --sched"):
-        task.check_evaluations(short)
-    probes.make_task().check_evaluations(short)  # where steps count
-    assert Schedule().eval_steps >= Schedule().eval_envs
 
 
 @pytest.mark.parametrize("shape", [(7,), (2, 3, 50), (0, 4)])

@@ -16,6 +16,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import asked_from
 from cuelearner_jax.runs.program import make_program
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import difference, rotate
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
@@ -54,9 +55,9 @@ def test_a_relative_answer_moves_the_executed_action_by_eps():
 
 
 def test_a_demonstration_is_executed():
-    obs, action, reward = steps_of(labelled("demonstration")[3], 1)
-    np.testing.assert_allclose(action, ENV.best(jnp.asarray(obs)), atol=1e-6)
-    np.testing.assert_array_equal(reward, np.ones(20))
+    form, eps = guidances.make("demonstration", CONFIG.sizes, ENV).form, np.deg2rad(probes.SCALARS.eps_deg)
+    asked, shown = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
+    np.testing.assert_allclose(form.correct(DIRECTIONS, asked, shown, eps), shown, atol=1e-6)
 
 
 def test_an_unanswered_question_executes_the_asked_action():

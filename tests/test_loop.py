@@ -11,7 +11,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import asking, evaluate, loop
+from cuelearner_jax import evaluate, loop
 from cuelearner_jax.agents.networks import as_function, q_network
 from cuelearner_jax.agents.replay import Transition, apply_symmetries
 from cuelearner_jax.arbiters import Episodes
@@ -168,27 +168,10 @@ def test_first_uniform_then_guided_then_greedy():
     assert np.abs(turned - greedy).max(-1).min() > 1e-3  # so the three can be told apart
 
 
-def test_guided_with_probability_zero_is_greedy_after_the_random_steps():
-    met, params = acted("heuristic", probability=0.0)
+@pytest.mark.parametrize(("kind", "probability"), [("heuristic", 0.0), ("none", 1.0), ("relative", 1.0)])
+def test_actions_that_nothing_guides_are_greedy_after_the_random_steps(kind, probability):
+    met, params = acted(kind, probability)  # the guide of relative labels is not fitted
     np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
-
-
-def test_none_is_greedy_whatever_the_probability():
-    met, params = acted("none", probability=1.0)
-    np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
-
-
-def test_guidance_that_is_not_fitted_leaves_the_greedy_actions():
-    met, params = acted("relative", probability=1.0)
-    np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
-
-
-def test_about_half_of_the_episodes_are_guided():
-    met, params = acted("heuristic", stretches=30, guidance_until=10**6)
-    guided = np.abs(met["action"] - np.asarray(ENV.heuristic(met["obs"]))).max(-1) < 1e-5
-    greedy = (met["action"] == probes.greedy_actions(q, params, met["obs"])).all(-1)
-    assert (guided ^ greedy)[8:].all()
-    assert guided[8:].mean() == pytest.approx(0.5, abs=0.06)  # standard deviation 0.0125
 
 
 def test_an_episode_is_guided_as_a_whole():
@@ -232,8 +215,14 @@ def labelled(program, seeds, budgets, rounds=LARGEST // 10, scalars=probes.SCALA
     return clock, state
 
 
-def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would():
-    clock, state = labelled(probes.window_program("relative"), SEEDS, BUDGETS)
+@pytest.fixture(scope="module")
+def taught():
+    """Four lanes after all their labels."""
+    return labelled(probes.window_program("relative"), SEEDS, BUDGETS)
+
+
+def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would(taught):
+    clock, state = taught
     assert int(clock.round) == 6
     labels = jax.tree.map(np.asarray, state.guide.labels)
     assert labels.obs.shape == (4, LARGEST, 2)
@@ -253,11 +242,7 @@ def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would():
         )
         assert set(h) == {-1, 0, 1}
     assert state.guide.model.fitted.all()
-
-
-def test_the_first_labels_of_a_larger_budget_are_those_of_a_smaller():
-    _, state = labelled(probes.window_program("relative"), SEEDS, BUDGETS)
-    for small, large in ((0, 2), (1, 3)):
+    for small, large in ((0, 2), (1, 3)):  # the first labels of a larger budget are those of a smaller
         for name in PARTS:
             rows = np.asarray(getattr(state.guide.labels, name))
             np.testing.assert_allclose(rows[small, :15], rows[large, :15], atol=1e-6)
@@ -275,19 +260,10 @@ def test_questions_before_the_first_fit_are_uniform_and_later_ones_refined():
     assert np.abs(directions.difference(ENV.best(uniform.obs), uniform.action))[:, 30:].mean() > 1.2
 
 
-def test_silent_teachers_use_up_the_budget():
-    silent = dataclasses.replace(probes.SCALARS, silence_probability=1.0)
-    _, state = labelled(probes.window_program("relative"), SEEDS, BUDGETS, scalars=silent)
-    assert not state.guide.labels.valid.any()
-    assert not state.guide.model.fitted.any()
-
-
-def test_a_lane_whose_budget_is_spent_stays_as_it_is():
-    program = probes.window_program("relative")
-    _, two = labelled(program, SEEDS, BUDGETS, 2)
-    _, three = labelled(program, SEEDS, BUDGETS)
-    assert_equal(probes.lane(two, 0), probes.lane(three, 0))
-    assert not np.array_equal(two.guide.labels.obs[2], three.guide.labels.obs[2])
+def test_a_lane_whose_budget_is_spent_stays_as_it_is(taught):
+    _, two = labelled(probes.window_program("relative"), SEEDS, BUDGETS, 2)
+    assert_equal(probes.lane(two, 0), probes.lane(taught[1], 0))
+    assert not np.array_equal(two.guide.labels.obs[2], taught[1].guide.labels.obs[2])
 
 
 def assert_equal(one, other):
@@ -295,13 +271,8 @@ def assert_equal(one, other):
         np.testing.assert_array_equal(mine, yours)
 
 
-def assert_close(one, other, rtol=1e-4, atol=1e-5):
-    for mine, yours in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(mine, yours, rtol=rtol, atol=atol)
-
-
-def test_refined_uniform_actions_win_far_more_often_than_chance():
-    _, state = labelled(probes.window_program("relative"), SEEDS, BUDGETS)
+def test_refined_uniform_actions_win_far_more_often_than_chance(taught):
+    _, state = taught
     guidance = guidances.make("relative", probes.SIZES, ENV)
 
     def reward(model):
@@ -315,22 +286,6 @@ def test_refined_uniform_actions_win_far_more_often_than_chance():
     assert guided[2:].min() > 0.5
     assert guided[2:].mean() > 0.75
     assert (guided[2:] > guided[:2]).all()  # sixty labels against fifteen
-
-
-def test_labels_given_elsewhere_replace_those_asked_for_and_the_earlier_model_is_forgotten():
-    program = probes.window_program("relative")
-    _, asked = labelled(program, SEEDS, BUDGETS)
-    labels = jax.tree.map(jnp.copy, asked.guide.labels)
-    fresh = program.take_labels(ENV, probes.SCALARS, labels, probes.start(program, SEEDS, BUDGETS))
-    again = program.take_labels(ENV, probes.SCALARS, labels, asked)
-    assert_equal(fresh.guide.model, again.guide.model)
-    assert fresh.guide.model.fitted.all()
-    assert_equal(fresh.guide.labels, labels)
-    other = labels.replace(answer=-labels.answer)
-    assert not np.array_equal(
-        jax.tree.leaves(program.take_labels(ENV, probes.SCALARS, other, again).guide.model)[0],
-        jax.tree.leaves(fresh.guide.model)[0],
-    )
 
 
 # Lanes.
@@ -359,16 +314,6 @@ def test_every_seed_differs(grid):
         assert not np.array_equal(state.guide.labels.action[one], state.guide.labels.action[other])
 
 
-def test_many_seeds_differ_pairwise():
-    program = probes.window_program("relative")
-    states = [probes.start(program, seeds, [LARGEST] * 4) for seeds in ([0, 1, 2, 3], [4, 5, 6, 7])]
-    state = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
-    weights = np.asarray(jax.tree.leaves(state.agent.params)[1]).reshape(8, -1)
-    for one, other in itertools.combinations(range(8), 2):
-        assert np.abs(weights[one] - weights[other]).max() > 0.01
-        assert not np.array_equal(jax.random.key_data(state.key)[one], jax.random.key_data(state.key)[other])
-
-
 def test_lanes_of_one_seed_start_alike_and_differ_by_their_budget(grid):
     state, _ = grid
     fresh = probes.start(probes.window_program("relative"), SEEDS, BUDGETS)
@@ -393,32 +338,6 @@ def test_a_lane_alone_is_the_lane_beside_others(grid):
     alone, measured = trained(program, SEEDS[3:], BUDGETS[3:])
     assert_equal(probes.lane(state, 3), probes.lane(alone, 0))  # to the last bit
     assert_equal(probes.lane(metrics, 3), probes.lane(measured, 0))
-
-
-@pytest.mark.long
-def test_the_smaller_budget_is_the_sweep_of_that_budget_alone(grid):
-    state, _ = grid
-    guide = guidances.make("relative", probes.SIZES, ENV)
-    small, _ = trained(make_program(probes.CONFIG, guide, ENV, 15), [2], [15])
-    assert small.guide.labels.obs.shape[1] == 20
-    assert_same_lane(state, 1, small)
-
-
-def assert_same_lane(state, lane, alone):
-    """Up to the order of summation in float32."""
-    together, single = probes.lane(state, lane), probes.lane(alone, 0)
-    budget = int(single.guide.budget)
-    met, met_alone = probes.stored(state, lane, 48), probes.stored(alone, 0, 48)
-    np.testing.assert_array_equal(met["obs"], met_alone["obs"])
-    np.testing.assert_array_equal(met["reward"], met_alone["reward"])
-    np.testing.assert_allclose(met["action"], met_alone["action"], atol=1e-4)
-    for name in (*PARTS, "valid"):
-        rows, rows_alone = (getattr(one.guide.labels, name)[:budget] for one in (together, single))
-        np.testing.assert_allclose(rows, rows_alone, atol=1e-4)
-    assert_close(together.agent.params, single.agent.params, atol=1e-4)
-    assert_close(together.guide.model, single.guide.model, atol=1e-3)
-    for part in (lambda one: one.key, lambda one: one.arbiter, lambda one: one.guide.obs):
-        assert_equal(part(together), part(single))
 
 
 # Lanes that are no longer finite.
@@ -465,17 +384,6 @@ def test_a_fit_that_diverges_fails_the_lane_and_leaves_its_guide():
     _, state = program.label_round(ENV, EXPERT, probes.SCALARS, clock, state)  # once failed, always
     assert state.failed.all()
     assert_equal(jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), state.guide), guide)
-
-
-def test_one_stretch_of_steps_is_two_of_half_the_length():
-    program = probes.window_program("none")
-    results = []
-    for iterations in ((STRETCH,), (STRETCH // 2, STRETCH // 2)):
-        clock, state = loop.start_clock(), probes.start(program, [0], [0])
-        for count in iterations:
-            clock, state, _ = program.train(ENV, probes.SETTINGS, clock, state, count)
-        results.append(jax.tree.map(np.asarray, (clock, state.replace(key=jax.random.key_data(state.key)))))
-    assert_equal(*results)
 
 
 # Environments that are no program of JAX.
@@ -567,7 +475,3 @@ def test_transitions_are_mirrored_as_a_whole():
     np.testing.assert_array_equal(without.obs, image.obs)
     same = apply_symmetries(jax.random.key(0), ENV, batch)
     assert all(one is other for one, other in zip(jax.tree.leaves(same), jax.tree.leaves(batch), strict=True))
-
-
-def test_label_slots_are_whole_rounds():
-    assert [asking.label_slots(budget, probes.SIZES) for budget in (1, 10, 11, 100)] == [10, 10, 20, 100]

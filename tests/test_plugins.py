@@ -41,16 +41,9 @@ def test_an_object_of_a_package_is_found(folder):
     refused("house_of_mine.cellar:PINE", "no module 'house_of_mine.cellar'")
 
 
-REFERENCES = ["", "module", "module:", ":NAME", "a b:NAME", "my-module:NAME", ".module:NAME", "a..b:NAME", "a:B.c"]
-
-
-@pytest.mark.parametrize("reference", [*REFERENCES, "9a:B", "a:b:C"])
+@pytest.mark.parametrize("reference", ["module", ":NAME", "my-module:NAME", "a..b:NAME", "a:B.c", "./sub/mine.py:OAK"])
 def test_what_is_no_reference_is_told_its_form(folder, reference):
     refused(reference, "does not name a table: give package.module:NAME")
-
-
-def test_a_file_is_named_as_its_module():
-    refused("./sub/mine.py:OAK", r"give mine:OAK \(module:NAME\)")
 
 
 def test_a_missing_module_is_to_be_installed_or_run_beside(folder):
@@ -61,21 +54,13 @@ def test_a_missing_module_is_to_be_installed_or_run_beside(folder):
     refused("nowhere_to_be_found.shop:OAK", "no module 'nowhere_to_be_found'")
 
 
-def test_a_module_that_needs_a_missing_one_says_which(folder):
-    (folder / "needy_module.py").write_text("import nowhere_to_be_found\n")
-    refused(
-        "needy_module:OAK", "needy_module fails to import .ModuleNotFoundError: .*nowhere_to_be_found.*: mend it first"
-    )
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("1 / 0\n", "ZeroDivisionError: division by zero"),
-        ("OAK = (\n", "SyntaxError"),
         ("raise ValueError('first\\nsecond')\n", "ValueError: first"),
-        ("raise ValueError\n", "ValueError: "),
         ("raise SystemExit(3)\n", "SystemExit: 3"),
+        ("import nowhere_to_be_found\n", "ModuleNotFoundError: .*nowhere_to_be_found"),
     ],
 )
 def test_a_module_that_fails_is_told_in_one_line(folder, text, message):

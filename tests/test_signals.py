@@ -1,4 +1,4 @@
-"""Ctrl-C and its like: heard at once in a process of the command's own, between two calls elsewhere; saves whole."""
+"""Ctrl-C and its like: heard at once in a process of the command's own, between two calls elsewhere."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from cuelearner_jax.signals import Interrupted, interruptible, saving
+from cuelearner_jax.signals import Interrupted, interruptible
 
 # A call that keeps Python waiting for minutes, as compiled code does.
 BUSY = "import hashlib; print('ready', flush=True); hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"
@@ -66,42 +66,15 @@ def test_the_first_signal_is_told_at_once_and_a_second_ctrl_c_ends_compiled_code
     assert process.returncode == 130
 
 
-def test_a_second_ctrl_c_waits_for_a_save(started):
-    script = """
-import time
-with signals.interruptible(), signals.saving():
-    print("ready", flush=True)
-    time.sleep(1.5)
-    print("saved", flush=True)
-time.sleep(60)
-"""
-    process = started(LISTEN + script)
-    process.send_signal(signal.SIGINT)
-    assert process.stderr is not None
-    process.stderr.readline()
-    process.send_signal(signal.SIGINT)
-    out, told = process.communicate(timeout=20)
-    assert out == "saved\n"
-    assert told.startswith("saving first\nstopped at once")
-    assert process.returncode == 130
-
-
-def test_elsewhere_a_second_ctrl_c_raises_once_the_save_is_whole(capsys):
+def test_elsewhere_a_second_ctrl_c_raises(capsys):
     before = signal.getsignal(signal.SIGTERM)
-    whole = False
     with pytest.raises(KeyboardInterrupt), interruptible("this game") as stopping:  # noqa: PT012
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGTERM)
         assert stopping.is_set()
-        with saving():
-            os.kill(os.getpid(), signal.SIGINT)
-            whole = True
-    assert whole
-    assert capsys.readouterr().err == "stopping after this game (Ctrl-C again: at once)\nsaving first\n"
+        os.kill(os.getpid(), signal.SIGINT)
+    assert capsys.readouterr().err == "stopping after this game (Ctrl-C again: at once)\n"
     assert signal.getsignal(signal.SIGTERM) == before
-    with pytest.raises(KeyboardInterrupt), interruptible():  # noqa: PT012
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
 
 
 def test_an_interruption_has_the_status_of_its_signal():

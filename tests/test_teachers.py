@@ -1,7 +1,5 @@
 """A teacher's folder: what is kept of its network, and what is refused."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,6 @@ import pytest
 from cuelearner_jax import teachers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import directions
-from cuelearner_jax.storage import formats
 from cuelearner_jax.teachers import LearnedTeacher, init_params
 
 ENV = probes.Window(mirrors=True)
@@ -51,16 +48,5 @@ def test_a_folder_without_a_teacher_is_refused(tmp_path):
 def test_a_teacher_of_another_task_is_refused(made, tmp_path):
     teachers.save(tmp_path, made, ABOUT)
     probes.edit_json(tmp_path / "teacher.json", lambda about: about["config"].update(layers=[32]))
-    with pytest.raises(UserError, match="another version of the program"):
-        teachers.load(tmp_path, ENV, 0.0, 0.0)
-
-
-@pytest.mark.parametrize("text", ["{", "[]", json.dumps({"format": 3}), {"config": 3}])
-def test_a_damaged_description_is_refused(made, tmp_path, text):
-    teachers.save(tmp_path, made, ABOUT)
-    if isinstance(text, str):
-        (tmp_path / "teacher.json").write_text(text)
-    else:  # whole, but no teacher
-        formats.write("teacher", tmp_path / "teacher.json", text)
-    with pytest.raises(UserError, match="damaged"):
+    with pytest.raises(UserError, match="another configuration or version of the program"):
         teachers.load(tmp_path, ENV, 0.0, 0.0)

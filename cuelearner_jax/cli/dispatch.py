@@ -50,10 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()  # flush here, where a missing reader is handled
     except UserError as error:
         _print(f"error: {error}")
-        if isinstance(error, UserCodeError) and (cause := error.__cause__) is not None:
-            from cuelearner_jax.user_code import user_traceback
-
-            traceback.print_exception(cause.with_traceback(user_traceback(cause) or cause.__traceback__))
+        if isinstance(error, UserCodeError):
+            traceback.print_exception(error.__cause__)
         return 2
     except (Interrupted, NotFinite) as error:
         _print(str(error))

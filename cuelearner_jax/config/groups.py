@@ -13,7 +13,8 @@ from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 
-from cuelearner_jax.config.parts import POSITIVE, SHARE, Bounds, Layers, register
+from cuelearner_jax.config.parts import POSITIVE, SHARE, Bounds, Layers, check_multiple, check_part, register
+from cuelearner_jax.errors import UserError
 
 Frame = Literal["raw", "action"]
 
@@ -27,7 +28,7 @@ class GuideSizes:
     then predicts a turn from there)."""
     feedback_layers: Layers = (400, 400, 300, 300)
     """Hidden layers of the guidance model."""
-    labels_per_round: Annotated[int, POSITIVE] = 10
+    labels_per_round: Annotated[int, Bounds(1, 1 << 30)] = 10
     """New labels after which the guidance model is fitted again from scratch."""
     fit_steps: Annotated[int, POSITIVE] = 2000
     """Adam steps of one fit (a fixed number, so that all seeds take equally long)."""
@@ -148,3 +149,21 @@ class Schedule:
 
 for _group in (GuideScalars, TeacherFaults, Scalars, Schedule):
     register(_group, int)
+
+
+def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
+    """Raise UserError with one line for the first value of the guide's configuration that cannot work."""
+    check_part(sizes, "sizes")
+    check_part(scalars, "scalars")
+    check_multiple(sizes.fit_steps, sizes.validate_every, "sizes.fit_steps", "sizes.validate_every")
+    if sizes.ask_all and sizes.candidates == 1:
+        raise UserError(
+            "sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave out sizes.ask_all"
+        )
+    if sizes.ask_all:
+        check_multiple(sizes.labels_per_round, sizes.candidates, "sizes.labels_per_round", "sizes.candidates")
+    elif sizes.candidates > 1 and sizes.ensemble == 1:
+        raise UserError(
+            f"sizes.candidates is {sizes.candidates}: questions are chosen by the disagreement of members, so give a "
+            "sizes.ensemble above 1 too, or sizes.ask_all"
+        )

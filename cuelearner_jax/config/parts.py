@@ -24,7 +24,6 @@ from cuelearner_jax.errors import UserError, format_value, suggestion
 
 LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
 LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
-MOST_LAYERS = 64  # most layers, since each is compiled by itself
 TRACED = "traced"  # annotates a whole number that does not shape the program
 
 PartT = TypeVar("PartT")
@@ -80,13 +79,12 @@ def static(options: PartT) -> PartT:
 def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
     """Return checked values for a configuration's fields: NumPy's numbers as Python's, lists as tuples.
 
+    Raises UserError for no such field, or a value of another type than its field's.
+
     Args:
         group: a configuration, or its class.
         prefix: name of the group in messages.
         changes: the values by field (default: those that the configuration holds).
-
-    Raises:
-        UserError: no such field, or a value of another type than its field's.
     """
     fields = [field.name for field in dataclasses.fields(group) if field.init]
     kinds = get_type_hints(group if isinstance(group, type) else type(group))
@@ -124,20 +122,18 @@ def check_part(group: Any, prefix: str) -> None:
     for field in dataclasses.fields(group):
         value, name = getattr(group, field.name), f"{prefix}.{field.name}"
         bounds = next((extra for extra in get_args(hints[field.name]) if isinstance(extra, Bounds)), None)
-        _check_range(value, name)
-        if bounds is None:
-            continue
-        if isinstance(value, tuple):
-            if not 1 <= len(value) <= MOST_LAYERS or not all(number in bounds for number in value):
-                raise UserError(f"{name}: give at least one layer of positive width, at most {MOST_LAYERS}")
-        elif value not in bounds:
-            raise UserError(f"{name} is {value}: give {bounds}")
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not abs(number) <= LARGEST_FLOAT:
+                raise UserError(f"{name} is {number}: give a finite number (in single precision)")
+            if isinstance(number, int) and abs(number) > LARGEST:
+                raise UserError(f"{name} is {number}: give at most {LARGEST}, which is counted in 32 bits")
+            if bounds is not None and number not in bounds:
+                raise UserError(f"{name} is {value}: give {bounds}")
+        if bounds is not None and value == ():
+            raise UserError(f"{name} is empty: give at least one layer")
 
 
-def _check_range(value: Any, name: str) -> None:
-    """Raise UserError for numbers outside 32 bits."""
-    for number in value if isinstance(value, tuple) else (value,):
-        if isinstance(number, int) and abs(number) > LARGEST:
-            raise UserError(f"{name} is {number}: give at most {LARGEST}, which is counted in 32 bits")
-        if isinstance(number, float) and not abs(number) <= LARGEST_FLOAT:
-            raise UserError(f"{name} is {number}: give a finite number (in single precision)")
+def check_multiple(value: int, unit: int, name: str, unit_name: str) -> None:
+    """Raise UserError unless a value is a multiple of `unit`."""
+    if value % unit:
+        raise UserError(f"{name} is {value}: give a multiple of {unit_name} ({unit})")

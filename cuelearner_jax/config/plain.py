@@ -8,29 +8,21 @@ import json
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import jax
 import numpy as np
+from jax.core import Tracer
 
 from cuelearner_jax.errors import UserError
 
-NUMBERS = "biufU"  # kinds of NumPy's values that Python has too
-
 
 def plain(given: Any) -> Any:
-    """Return numbers and words of NumPy and JAX as Python's, and lists and arrays of one axis as tuples.
-
-    Any other value is returned unchanged.
-    """
+    """Return numbers of NumPy and JAX as Python's, lists and arrays as tuples, and any other value unchanged."""
     if isinstance(given, list | tuple):
         return tuple(map(plain, given))
-    kind = getattr(given, "dtype", None)
-    if not isinstance(kind, np.dtype) or kind.kind not in NUMBERS or getattr(given, "ndim", 2) > 1:
-        return given
-    try:
-        found = np.asarray(given)
-    except (TypeError, ValueError, RuntimeError):  # traced, or deleted
-        return given
-    listed = (found.astype(float) if kind.kind == "f" else found).tolist()
-    return tuple(listed) if found.ndim else listed
+    if isinstance(given, np.ndarray | np.generic | jax.Array) and not isinstance(given, Tracer):
+        found = given.tolist()
+        return tuple(found) if isinstance(found, list) else found
+    return given
 
 
 def to_json(config: Any) -> dict[str, Any]:
@@ -43,16 +35,10 @@ def from_json(kind: type, values: dict[str, Any]) -> Any:
 
     Raises UserError for an unknown field, or a value of another type than its field's.
     """
-    known = {field.name for field in dataclasses.fields(kind)}
-    unknown = sorted(set(values) - known)
-    if unknown:
-        raise UserError(
-            f"unknown field {unknown[0]!r} for {kind.__name__}: the file was written by another version of cuelearner"
-        )
+    types, known = get_type_hints(kind), {field.name for field in dataclasses.fields(kind)}
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    types = get_type_hints(kind)
     for name, value in values.items():
-        if not fits(value, types[name]):
+        if name not in known or not fits(value, types[name]):
             raise UserError(f"{name} is {value!r} in a file of another version of cuelearner or of the task")
     return kind(**values)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -41,24 +42,12 @@ class Opaque(PolicyNode):
         if self.on_host:
             # Tried while tracing, so that a fault is reported before anything is compiled.
             with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
-                self._try(obs.shape[-1])
+                _try(self, obs.shape[-1])
             shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
             chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
         else:
             chosen = self._checked(self.function(obs), obs.shape[0], jnp.asarray)
-        return self.actions.retract(self.actions.only_actions(chosen))
-
-    def _try(self, size: int) -> None:
-        """Raise UserError for a function that does not repeat its actions, or whose actions depend on the batch.
-
-        Two observations are asked about in turn, each alone, and then among others: `TRIED` in all.
-        """
-        rows = np.random.default_rng(0).random((TRIED, size), np.float32)
-        alone = np.concatenate([self._called(rows[place : place + 1]) for place in (0, 1, 0, 1)])
-        self._compare(alone[:2], alone[2:], REPEATED, "when it is asked again")
-        among = self._called(rows)
-        self._compare(among, self._called(rows), REPEATED, "when it is asked again")
-        self._compare(alone[:2], among[:2], BATCHED, f"in a batch of {TRIED}")
+        return _valid(self.actions, chosen)
 
     def _compare(self, actions: np.ndarray, others: np.ndarray, most: float, when: str) -> None:
         """Raise UserError for actions (..., action) that differ by more than a share `most` of an entry's range."""
@@ -137,6 +126,25 @@ class Opaque(PolicyNode):
     def describe(self) -> dict[str, Any]:
         """Return the description of code, with the function's name."""
         return {"policy": "code", "named": _called(self.function)}
+
+
+@lru_cache(maxsize=64)  # once for each function
+def _try(policy: Opaque, size: int) -> None:
+    """Raise UserError for a function that does not repeat its actions, or whose actions depend on the batch.
+
+    Two observations are asked about in turn, each alone, and then among others: `TRIED` in all.
+    """
+    rows = np.random.default_rng(0).random((TRIED, size), np.float32)
+    alone = np.concatenate([policy._called(rows[place : place + 1]) for place in (0, 1, 0, 1)])
+    policy._compare(alone[:2], alone[2:], REPEATED, "when it is asked again")
+    among = policy._called(rows)
+    policy._compare(among, policy._called(rows), REPEATED, "when it is asked again")
+    policy._compare(alone[:2], among[:2], BATCHED, f"in a batch of {TRIED}")
+
+
+@partial(jax.jit, static_argnums=0)
+def _valid(actions: Space, chosen: Array) -> Array:
+    return actions.retract(actions.only_actions(chosen))
 
 
 def call_policy(

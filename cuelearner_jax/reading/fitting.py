@@ -63,6 +63,7 @@ class Fit(struct.PyTreeNode):
     score: Float[Array, ""]  # sum over answers of log p(answer | all others) [nats]
 
 
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def unfitted(space: Space, family: Family, obs_size: int) -> tuple[Hypothesis, Hypothesis]:
     """Return the hypotheses before any answer, stacked: those without the process, and those with it."""
     kinds = jnp.array(linear.groups(space, family, obs_size))
@@ -115,12 +116,8 @@ class Reader:
         frame, steady = self._frame(labels)
         labels = labels._replace(valid=labels.valid & steady)
         first = self._fit(frame, labels, plain)
-        best = jnp.argmax(jnp.nan_to_num(first.score, nan=-jnp.inf))
-        two = jnp.stack([jnp.zeros_like(best), best])
-        start = jax.tree.map(lambda leaf: leaf[two], first.hypothesis)
-        start = Hypothesis(Parts(start.parts.weights, True), start.change, smooth.hyper)
-        second = self._fit(frame, labels, start)
-        return jax.tree.map(lambda one, other: jnp.concatenate([one, other]), _with_process(first), second)
+        second = self._fit(frame, labels, _first_and_best(first, smooth))
+        return _together(first, second)
 
     def _ask(self, obs: Float[Array, "*k n obs"]) -> Float[Array, "*k n action"]:
         return self.acts(obs.reshape(-1, obs.shape[-1])).reshape(*obs.shape[:-1], -1)
@@ -145,10 +142,7 @@ class Reader:
             rows = self._data(frame, labels, hypothesis.change) if number else rows
             found, hypothesis = _update(rows, frame, hypothesis, found, self.priors)
         rows = self._data(frame, labels, hypothesis.change)
-        score = _score(rows, frame, hypothesis, found, self.priors)
-        count = len(score)
-        frames = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), frame)
-        return Fit(hypothesis, found, rows, frames, found.bound, score)
+        return _scored(rows, frame, hypothesis, found, self.priors)
 
     def _data(self, frame: Frame, labels: Labels, change: Change) -> Data:
         """Return the linear models at stacked estimates."""
@@ -181,12 +175,14 @@ class Reader:
         return SCALE * self.eps * jnp.sqrt(self.predict(fitted, labels)[1])
 
 
+@partial(jax.jit, static_argnames="priors")
 def correction(fitted: Fit, eps: Any, priors: Priors = PRIORS) -> Correction:
     """Return what is needed to act by a fit."""
     change, frame = fitted.hypothesis.change, fitted.frame
     return correction_of(fitted.posterior, change, frame, fitted.data.inputs, eps, priors)
 
 
+@jax.jit
 def again(fitted: Fit) -> tuple[Hypothesis, Hypothesis]:
     """Return where the next `Reader.read` starts: the hypotheses of this one."""
     count = len(HYPOTHESES)
@@ -200,6 +196,7 @@ def again(fitted: Fit) -> tuple[Hypothesis, Hypothesis]:
     return Hypothesis(Parts(plain.parts.weights, False), plain.change, hyper), smooth
 
 
+@jax.jit
 def best_of(fitted: Fit) -> Array:
     """Return the number of the hypothesis that predicts best; 0, nothing, where the others are not `WORTH` better."""
     score = jnp.nan_to_num(fitted.score, nan=-jnp.inf)
@@ -207,6 +204,7 @@ def best_of(fitted: Fit) -> Array:
     return jnp.where(score[best] < score[0] + WORTH, 0, best)
 
 
+@jax.jit
 def pick(fitted: Fit, number: Any) -> Fit:
     """Return one of stacked fits."""
     return jax.tree.map(lambda leaf: leaf[number], fitted)
@@ -279,8 +277,8 @@ def _unread(rows: Data, hyper: Hyper) -> Posterior:
 
 
 @partial(jax.jit, static_argnames="priors")
-def _score(rows: Data, frame: Frame, hypothesis: Hypothesis, found: Posterior, priors: Priors) -> Float[Array, " k"]:
-    """Return the sum of log p(answer | all others) of each hypothesis, by the cavity of each answer's site."""
+def _scored(rows: Data, frame: Frame, hypothesis: Hypothesis, found: Posterior, priors: Priors) -> Fit:
+    """Return fits with the sum of log p(answer | all others) of each, by the cavity of each answer's site."""
 
     def one(rows: Data, hypothesis: Hypothesis, found: Posterior) -> Array:
         _, variance = posterior.predict(found, rows, hypothesis.parts, rows.features, rows.inputs, priors)
@@ -293,12 +291,25 @@ def _score(rows: Data, frame: Frame, hypothesis: Hypothesis, found: Posterior, p
         cavity = variance / jnp.maximum(1 - variance * found.precision, 0.05)
         return predictive_log_likelihood(mean - cavity * slope, cavity, rows.answers, habits).sum()
 
-    return each_lane(one)(rows, hypothesis, found)
+    score = each_lane(one)(rows, hypothesis, found)
+    frames = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(score), *leaf.shape)), frame)
+    return Fit(hypothesis, found, rows, frames, found.bound, score)
 
 
-def _with_process(fitted: Fit) -> Fit:
-    """Return fits without the process as fits with one of no amplitude."""
+@jax.jit
+def _first_and_best(first: Fit, smooth: Hypothesis) -> Hypothesis:
+    """Return where fits with the process start: the first hypothesis, and the one that predicts best."""
+    best = jnp.argmax(jnp.nan_to_num(first.score, nan=-jnp.inf))
+    two = jnp.stack([jnp.zeros_like(best), best])
+    start = jax.tree.map(lambda leaf: leaf[two], first.hypothesis)
+    return Hypothesis(Parts(start.parts.weights, True), start.change, smooth.hyper)
+
+
+@jax.jit
+def _together(first: Fit, second: Fit) -> Fit:
+    """Return all fits, stacked; those without the process have one of no amplitude."""
     never = lambda hyper: hyper.replace(amplitudes=jnp.full_like(hyper.amplitudes, _NEVER))  # noqa: E731
-    hypothesis, found = fitted.hypothesis, fitted.posterior
+    hypothesis, found = first.hypothesis, first.posterior
     hypothesis = hypothesis.replace(parts=Parts(hypothesis.parts.weights, True), hyper=never(hypothesis.hyper))
-    return fitted.replace(hypothesis=hypothesis, posterior=found.replace(hyper=never(found.hyper)))
+    first = first.replace(hypothesis=hypothesis, posterior=found.replace(hyper=never(found.hyper)))
+    return jax.tree.map(lambda one, other: jnp.concatenate([one, other]), first, second)

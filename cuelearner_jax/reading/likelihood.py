@@ -28,6 +28,7 @@ from cuelearner_jax.spaces import UNSAID
 
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
+FAR = 30.0  # widths beyond which an end counts as infinite: the normal distribution has nothing there in float32
 
 
 class Answers(struct.PyTreeNode):
@@ -63,18 +64,20 @@ def intervals(
 
 def log_likelihood(change: Float[Array, "n cues"], answers: Answers, habits: Habits) -> Float[Array, "n cues"]:
     """Return log p(answer | change) of each cue, 0 where nothing was said."""
-    between = _mass(change, answers, habits.tau, habits.width)
-    log_p = jnp.log((1 - habits.lapse) * between + habits.lapse / 3)
+    upper, lower = (ndtr(end) for end in _ends(change, answers, habits))
+    log_p = jnp.log((1 - habits.lapse) * (upper - lower) + habits.lapse / 3)
     return jnp.where(answers.valid, log_p, 0.0)
 
 
-def _mass(change: Array, answers: Answers, tau: Array, width: Array) -> Array:
-    def below(end: Array) -> Array:
-        finite = jnp.isfinite(end)
-        inside = ndtr((jnp.where(finite, end, 0.0) * tau - change) / width)
-        return jnp.where(finite, inside, end > 0)
+def _ends(change: Array, answers: Answers, habits: Habits) -> tuple[Array, Array]:
+    """Return both ends of the interval, seen from a change, in widths; an infinite end is `FAR` away."""
 
-    return below(answers.upper) - below(answers.lower)
+    def away(end: Array) -> Array:
+        finite = jnp.isfinite(end)
+        inside = (jnp.where(finite, end, 0.0) * habits.tau - change) / habits.width
+        return jnp.where(finite, inside, jnp.where(end > 0, FAR, -FAR))
+
+    return away(answers.upper), away(answers.lower)
 
 
 def expected_log_likelihood(
@@ -99,7 +102,14 @@ def curvature(
 ) -> tuple[Float[Array, "n cues"], Float[Array, "n cues"]]:
     """Return first and second derivative of `expected_log_likelihood` by the mean."""
 
-    def slope(mean: Array) -> Array:
-        return jax.grad(lambda m: expected_log_likelihood(m, variance, answers, habits).sum())(mean)
+    nodes, shares = jnp.asarray(_NODES, jnp.float32), jnp.asarray(_WEIGHTS, jnp.float32)
 
-    return jax.jvp(slope, (mean,), (jnp.ones_like(mean),))
+    def at(node: Array) -> tuple[Array, Array]:
+        upper, lower = _ends(mean + node * jnp.sqrt(variance), answers, habits)
+        high, low = (jnp.exp(-0.5 * end**2) / (2 * jnp.pi) ** 0.5 for end in (upper, lower))
+        p = ndtr(upper) - ndtr(lower) + habits.lapse / (3 * (1 - habits.lapse))
+        first = (low - high) / (p * habits.width)
+        return first, (lower * low - upper * high) / (p * habits.width**2) - first**2
+
+    first, second = (jnp.tensordot(shares, each, 1) for each in jax.vmap(at)(nodes))
+    return jnp.where(answers.valid, first, 0.0), jnp.where(answers.valid, second, 0.0)

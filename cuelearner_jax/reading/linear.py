@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
@@ -24,7 +25,7 @@ from cuelearner_jax.spaces import Space
 
 SCALE = 3.0  # unit of changes of an action, in eps: the size of a usual correction
 STEP = 0.35  # of the central differences of an entry, in its standard deviations
-MIXED = 8  # largest number of entries that may mix
+MIXED = 8  # largest number of entries that may mix, of the observation and of the action
 PARTS = ("seen", "mixed", "shift", "gain")  # groups of weights: of what is seen, and of the action
 JUMP = 4.0  # change of an action, in `SCALE` eps, from which a bend is a jump
 LARGEST = 5.0  # standard deviations at which inputs of the process are cut
@@ -73,7 +74,14 @@ def no_change(space: Space, family: Family, obs_size: int) -> Change:
 def groups(space: Space, family: Family, obs_size: int) -> tuple[int, ...]:
     """Return the number in `PARTS` of each weight, in the order of `weights_of`."""
     mixed = 0 if family else min(MIXED, obs_size) ** 2
-    return (0,) * unknowns(family, obs_size) + (1,) * mixed + ((2,) + (3,) * space.size) * len(space.cues)
+    own = tuple(3 if term else 2 for term in terms(len(space.cues), 1 + space.size)[1].tolist())
+    return (0,) * unknowns(family, obs_size) + (1,) * mixed + own
+
+
+def terms(cues: int, basis: int) -> Int[np.ndarray, "2 own"]:
+    """Return cue and term of each weight of the action. Of more than `MIXED` entries, each has a shift and a gain."""
+    cue, term = np.indices((cues, basis))
+    return np.stack(np.nonzero((basis <= 1 + MIXED) | (term == 0) | (term == 1 + cue)))
 
 
 def undone(family: Family, change: Change, obs: Float[Array, "n obs"]) -> Float[Array, "n obs"]:
@@ -208,7 +216,8 @@ def features(
     n, cues, _ = slope.shape
     z = ((obs - frame.mean[None]) / frame.deviation[None])[:, frame.mixed]
     mixed = (-slope[:, :, frame.mixed, None] * z[:, None, None, :]).reshape(n, cues, len(frame.mixed) ** 2)
-    own = jnp.einsum("cd,nb->ncdb", jnp.eye(cues), basis(space, base)).reshape(n, cues, -1)
+    cue, term = terms(cues, 1 + space.size)
+    own = jnp.eye(cues)[:, cue][None] * basis(space, base)[:, None, term]
     return jnp.concatenate([slope, mixed, own], 2)
 
 
@@ -222,12 +231,12 @@ def inputs(
 
 def weights_of(frame: Frame, change: Change) -> Float[Array, " p"]:
     """Return an estimate as weights of `features`."""
-    step = jnp.where(frame.step > 0, frame.step, 1.0)
+    step, own = jnp.where(frame.step > 0, frame.step, 1.0), change.action[tuple(terms(*change.action.shape))]
     if not len(frame.mixed):
-        return jnp.concatenate([change.theta / step, change.action.ravel()])
+        return jnp.concatenate([change.theta / step, own])
     theta = change.theta - change.mix @ (frame.mean - change.centre)
     mix = (change.mix * frame.deviation[None] / step[:, None])[frame.mixed][:, frame.mixed]
-    return jnp.concatenate([theta / step, mix.ravel(), change.action.ravel()])
+    return jnp.concatenate([theta / step, mix.ravel(), own])
 
 
 def change_of(frame: Frame, weights: Float[Array, " p"], like: Change) -> Change:
@@ -238,4 +247,5 @@ def change_of(frame: Frame, weights: Float[Array, " p"], like: Change) -> Change
     if mixed:
         part = mix.reshape(mixed, mixed) * frame.step[frame.mixed][:, None] / frame.deviation[frame.mixed][None]
         whole = whole.at[frame.mixed[:, None], frame.mixed[None]].set(part)
-    return Change(theta * frame.step, whole, frame.mean, action.reshape(like.action.shape))
+    action = jnp.zeros_like(like.action).at[tuple(terms(*like.action.shape))].set(action)
+    return Change(theta * frame.step, whole, frame.mean, action)

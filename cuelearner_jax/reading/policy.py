@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -33,10 +35,9 @@ class Read(PolicyNode):
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the base's actions, corrected."""
         first = self.base.act(key, states, obs)
-        before = linear.undone(self.family, self.correction.change, obs)
+        before = _undone(self.family, self.correction, obs)
         action = self.base.act(key, states, before)
-        found = corrected(self.space, self.family, self.correction, obs, before, first, action)
-        return self.space.clip(found, first, self.bound)
+        return _bounded(self.space, self.family, self.correction, self.bound, obs, before, first, action)
 
     @property
     def sees(self) -> bool:
@@ -64,6 +65,20 @@ class Read(PolicyNode):
             "mixed": int(own.frame.mixed.shape[-1]),
             "base": describe(self.base),
         }
+
+
+# Compiled apart from the base, which may be plain Python.
+@partial(jax.jit, static_argnums=0)
+def _undone(family: Family, correction: Correction, obs: Array) -> Array:
+    return linear.undone(family, correction.change, obs)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _bounded(
+    space: Space, family: Family, correction: Correction, bound: Array, obs: Array, *rest: Array
+) -> Float[Array, "n action"]:
+    """Return corrected actions, within a bound of the base's; `rest`: what `corrected` takes after `obs`."""
+    return space.clip(corrected(space, family, correction, obs, *rest), rest[1], bound)
 
 
 def unread(

@@ -82,8 +82,7 @@ def describe_fit(
     names = _names(family, seen, observation)
     step = np.asarray(fitted.frame.step, np.float64)
     estimates = _seen(weights[:seen], root[:seen], effect[:, :seen], names, family, step)
-    cues, basis = fitted.hypothesis.change.action.shape
-    own = slice(len(weights) - cues * basis, None)
+    own = slice(len(weights) - linear.terms(*fitted.hypothesis.change.action.shape).shape[1], None)
     estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
     hyper = fitted.posterior.hyper
     priors = posterior.PRIORS
@@ -146,12 +145,11 @@ def _of_action(
     mean: Float[Floats, " w"], root: Float[Floats, "w p"], effect: Float[Floats, "n w"], space: Space, eps: float
 ) -> list[Estimate]:
     """Return changes of the action: the shift of each cue, and of a box the share of each entry in it."""
-    estimates, basis = [], 1 + space.size
-    typical = np.sqrt((effect**2).mean(0))
-    for place, (value, row) in enumerate(zip(mean, root, strict=True)):
-        cue, term = divmod(place, basis)
+    estimates, typical = [], np.sqrt((effect**2).mean(0))
+    numbers = linear.terms(len(space.cues), 1 + space.size).T
+    for (cue, term), value, row, size in zip(numbers, mean, root, typical, strict=True):
         deviation = float(np.linalg.norm(row))
-        if not _matters(value, deviation, float(typical[place])):
+        if not _matters(value, deviation, float(size)):
             continue
         name, unit = f"action: {space.cues[cue].name}", space.unit
         factor, start = float(space.to_unit(SCALE * eps, np)), 0.0

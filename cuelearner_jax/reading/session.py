@@ -101,8 +101,7 @@ class Reading:
             base, spread = self._acts(rows), jnp.full((count, len(self.space.cues)), FIRST * self.eps)
         else:
             base, spread = self._reader.act(self.fit, rows), self._reader.spread(self.fit, rows)
-        away = jnp.maximum(spread, self.eps / 2) * jax.random.normal(k_action, spread.shape)
-        return index, np.asarray(self.space.exp(base, away))
+        return index, np.asarray(_near(self.space, k_action, base, jnp.maximum(spread, self.eps / 2)))
 
     def learn(
         self,
@@ -190,6 +189,12 @@ def is_python(policy: Any) -> bool:
     while (base := getattr(policy, "base", None)) is not None:
         policy = base
     return bool(getattr(policy, "on_host", False))
+
+
+@partial(jax.jit, static_argnums=0)
+def _near(space: Space, key: Any, actions: Array, spread: Array) -> Array:
+    """Return actions at random around others; `spread` is along each cue."""
+    return space.exp(actions, spread * jax.random.normal(key, spread.shape))
 
 
 @jax.jit

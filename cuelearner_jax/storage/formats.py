@@ -21,7 +21,7 @@ from typing import Any
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.storage.whole import replacing, unreadable
+from cuelearner_jax.storage.whole import replacing
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
 FORMATS = {"config": 1, "labels": 1, "teacher": 1, "policy": 1}
@@ -44,14 +44,11 @@ def damaged(kind: str, path: Path, reason: object = "") -> UserError:
 def read(kind: str, path: Path) -> Values:
     """Read a JSON file in the current format of its kind; return its values without the digest.
 
-    Raises:
-        UserError: the file cannot be read, is damaged, was changed since it was written, or has another format.
+    Raises UserError if the file is damaged, was changed since it was written, or has another format.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise unreadable(path, error) from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise damaged(kind, path) from error
     check(kind, values, path)
     if values.pop(DIGEST, None) != configuration.digest(values):

@@ -45,7 +45,6 @@ ROW = ("obs", "action", "answer")  # columns that hold lists
 PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of a person's rows
 SCHEMA = tables.Schema(
     stem="labels",
-    mark="action",
     required=("seed", "obs", "action"),
     strings=("said", "who", "when"),
     integers=("seed", "item"),
@@ -59,7 +58,7 @@ CONVENTIONS = {
     "answer": "what the teacher said of the action, in the form that `answers` names",
     "eps": "strength of an answer in the unit of the space's cues, null where the form has none",
 }
-TOLD = ("format", "answers", "eps", "task", "space", "session")  # must be equal for labels to share a file
+SHARED = ("format", "answers", "eps", "task", "space", "session")  # must be equal for labels to share a file
 
 
 class People(NamedTuple):
@@ -92,11 +91,7 @@ class LabelFile(NamedTuple):
 
 
 class LabelWriter(tables.TableWriter):
-    """Appends rows to `labels.jsonl` in a folder; each row is on disk when the call returns.
-
-    Opening an existing file continues it: a torn last line, left by a crash, is dropped first, and a finished file
-    (Parquet) becomes JSONL again.
-    """
+    """Appends rows to `labels.jsonl` in a folder, as `TableWriter` does; an existing file is continued."""
 
     def __init__(
         self,
@@ -107,7 +102,7 @@ class LabelWriter(tables.TableWriter):
         eps: float | None,
         meaning: str = "",
         session: dict[str, Any] | None = None,
-        **told: Any,
+        **more: Any,
     ) -> None:
         """Open the file, creating it and the folder where needed.
 
@@ -115,34 +110,25 @@ class LabelWriter(tables.TableWriter):
             folder: the file's folder.
             task, answers, space, eps, session: see `LabelFile`.
             meaning: meaning of an answer's numbers, written into the file.
-            told: further entries of a new file's head, such as the versions that wrote it.
+            more: further entries of a new file's head, such as the versions that wrote it.
 
         Raises:
             UserError: the folder holds labels of another kind, or unreadable ones; nothing has been changed.
         """
         about = _about(task, answers, space, eps, meaning, session)
         there = found_in(folder)
+        before = None if there is None else _table_and_head(there)[1]
+        if before is not None:
+            old, new = ({name: head.get(name) for name in SHARED} for head in (before, about))
+            if (differing := next(differences(old, new), None)) is not None:
+                raise UserError(f"{there} holds labels of another {differing}: give the same, or another --out")
         self._widths: dict[str, int] = {}
-        if there is not None:
-            table, before = _told(there)
-            if before is not None:
-                _check_same(there, before, about)
-            for name in set(ROW) & set(table.column_names):
-                answered = [values for values in table[name].to_pylist() if values is not None]
-                self._widths |= {name: len(answered[-1])} if answered else {}
-        super().__init__(folder, SCHEMA, about={**about, **told})
+        super().__init__(folder, SCHEMA, about={**about, **more})
 
     def append(
         self, *, seed: int, obs: np.ndarray, action: np.ndarray, answer: np.ndarray | None, **person: Any
     ) -> None:
-        """Append one row.
-
-        Args:
-            seed: seed that the label belongs to.
-            obs: the task's observation in the question, (obs,).
-            action: the action asked about, (action,).
-            answer: what the teacher said, (width,); None: nothing was said, or the answer is taken back.
-            person: the columns `PEOPLE`, for a person's label.
+        """Append one row, with columns of the names at the top of this module.
 
         Raises:
             ValueError: a number is not finite, or a width differs from that of the labels before.
@@ -166,12 +152,8 @@ def found_in(place: Path) -> Path | None:
 
 
 def history(path: Path) -> list[dict[str, Any]]:
-    """Return every row of a person's file in the order of writing, overruled rows included; absent columns are None.
-
-    Raises UserError if the file is damaged.
-    """
-    table, _ = _told(path)
-    return table.to_pylist()
+    """Return every row of a person's file in the order of writing, overruled rows included; absent columns are None."""
+    return _table_and_head(path)[0].to_pylist()
 
 
 def finish(folder: Path) -> Path:
@@ -188,28 +170,22 @@ def write(
     seeds: np.ndarray,
     labels: Label,
     meaning: str = "",
-    **told: Any,
+    **more: Any,
 ) -> None:
-    """Write the valid labels of lanes as Parquet, replacing `path` atomically.
+    """Write the valid labels (lanes, slots, ...) of lanes with these seeds as Parquet, replacing `path` atomically.
 
-    Args:
-        path: the target.
-        task, answers, space, eps: see `LabelFile`.
-        seeds: the lanes' seeds, (lanes,).
-        labels: (lanes, slots, ...).
-        meaning: meaning of an answer's numbers, written into the file.
-        told: further entries of the file's head.
+    For the other arguments see `LabelFile` and `LabelWriter`.
     """
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
     seed = np.broadcast_to(np.asarray(seeds)[:, None], valid.shape)[valid]
-    write_file(path, LabelFile(task, answers, space, eps, seed, rows), meaning, fresh=False, **told)
+    write_file(path, LabelFile(task, answers, space, eps, seed, rows), meaning, fresh=False, **more)
 
 
-def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = True, **told: Any) -> None:
+def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = True, **more: Any) -> None:
     """Write labels as a Parquet file, with the details of a person's labels.
 
-    `meaning` and `told`: see `LabelWriter`. Raises UserError if the file exists although it should be `fresh`.
+    `meaning` and `more`: see `LabelWriter`. Raises UserError if the file exists although it should be `fresh`.
     """
     columns = {"seed": pa.array(np.asarray(file.seeds, np.int64))}
     for name in ROW:
@@ -218,19 +194,18 @@ def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = Tru
         person = {**file.people._asdict(), "said": [ANSWERED] * len(file.seeds)}
         columns |= {name: pa.array(list(person[name]), SCHEMA.type(name)) for name in PEOPLE}
     about = _about(file.task, file.answers, file.space, file.eps, meaning, file.session)
-    tables.write(path, pa.table(columns), SCHEMA, about={**about, **told}, fresh=fresh)
+    tables.write(path, pa.table(columns), SCHEMA, about={**about, **more}, fresh=fresh)
 
 
 def read(path: Path) -> LabelFile:
     """Read the labels that still count from a Parquet or JSONL file, or from the folder of one.
 
-    Raises:
-        UserError: the file is missing, damaged, of another format, or holds no labels.
+    Raises UserError if the file is missing, damaged, of another format, or holds no labels.
     """
     found = found_in(path)
     if found is None or not found.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
-    table, head = _told(found)
+    table, head = _table_and_head(found)
     said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
     table = _standing(table)
     if head is None or not table.num_rows:
@@ -269,10 +244,8 @@ def digest(path: Path) -> str:
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:
     """Return the lanes' label sets, padded: rows (lanes, slots, ...).
 
-    A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget.
-
-    Raises:
-        UserError: a seed's labels are missing, or fewer than a lane's budget.
+    A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget. Raises
+    UserError for a seed without labels, or with fewer than a lane's budget.
     """
     kept = np.unique(file.seeds)
     sets = []
@@ -309,27 +282,7 @@ def _about(
     }
 
 
-def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Raise UserError, with the first difference in words, unless labels may share a file."""
-    old: Any = {name: before.get(name) for name in TOLD}
-    new: Any = {name: now.get(name) for name in TOLD}
-    named = next(differences(old, new), None)
-    if named is None:
-        return
-    for part in named.split("."):
-        old, new = (value.get(part) for value in (old, new))
-    raise UserError(
-        f"{path} holds labels of another {named} ({_short(old)}; the command asks for {_short(new)}): "
-        "give the same, or another folder (--out)"
-    )
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
+def _table_and_head(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
     """Return a file's table and head in the current format; None: the file has just begun."""
     table = tables.read(path, SCHEMA)
     head = tables.about_of(table)

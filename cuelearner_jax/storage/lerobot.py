@@ -14,7 +14,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import re
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -26,7 +25,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from cuelearner_jax.errors import UserError, format_value
-from cuelearner_jax.storage.picture_files import Picture, inside
+from cuelearner_jax.storage.picture_files import Picture, inside, read_picture
 
 INFO = Path("meta/info.json")
 VERSION = "v3.0"  # of the format
@@ -55,18 +54,25 @@ def read(path: Path) -> Recording:
     Raises:
         UserError: the dataset has another version of the format, is damaged, or lacks vector observations or actions.
     """
-    info = _info(path)
-    features = info["features"]
-    parts = {name: _parts(path, features, name) for name in (OBSERVATION, ACTION)}
+    features = _features(path)
+    parts = [_parts(path, features, name) for name in (OBSERVATION, ACTION)]
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
     stored = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
-    table = _rows(path, [*parts[OBSERVATION], *parts[ACTION], "episode_index", "timestamp", *stored])
-    vectors = {
-        name: np.concatenate([_vectors(path, table, key, features[key]) for key in parts[name]], -1) for name in parts
-    }
-    entries = {name: _entries(features, parts[name]) for name in parts}
-    frames = _frames(path, info, table, cameras[0]) if cameras else None
-    return Recording(vectors[OBSERVATION], vectors[ACTION], entries[OBSERVATION], entries[ACTION], frames)
+    files = sorted((path / "data").glob("chunk-*/file-*.parquet"))
+    if not files:
+        raise _damaged(path / "data", "no frames")
+    columns = [*parts[0], *parts[1], "episode_index", "timestamp", *stored]
+    table = pa.concat_tables([_parquet(file, columns) for file in files], promote_options="permissive")
+    vectors = [
+        np.concatenate([_vectors(path, table, key, features[key]["shape"][0]) for key in keys], -1) for keys in parts
+    ]
+    entries = [_entries(features, keys) for keys in parts]
+    frames = _frames(path, features, table, cameras[0]) if cameras else None
+    return Recording(vectors[0], vectors[1], entries[0], entries[1], frames)
+
+
+def _damaged(path: Path, why: object) -> UserError:
+    return UserError(f"{path} cannot be read ({why}): restore it from where the dataset came from")
 
 
 def _parts(path: Path, features: dict[str, Any], name: str) -> list[str]:
@@ -81,20 +87,19 @@ def _parts(path: Path, features: dict[str, Any], name: str) -> list[str]:
     return parts
 
 
-def _info(path: Path) -> dict[str, Any]:
-    """Return the contents of info.json. Raises UserError for another version of the format or invalid contents."""
-    file = path / INFO
+def _features(path: Path) -> dict[str, Any]:
+    """Return the features that info.json describes. Raises UserError for another version or invalid contents."""
     try:
-        info = json.loads(file.read_text(encoding="utf-8"))
-        version, _ = info["codebase_version"], info["features"].items()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{file} is damaged: restore it from where the dataset came from") from error
+        info = json.loads((path / INFO).read_text(encoding="utf-8"))
+        version, features = info["codebase_version"], dict(info["features"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(path / INFO, error) from error
     if version != VERSION:
         raise UserError(
             f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is needed: convert it by "
             "LeRobot's own script first"
         )
-    return info
+    return features
 
 
 def _is_vector(feature: dict[str, Any]) -> bool:
@@ -102,34 +107,22 @@ def _is_vector(feature: dict[str, Any]) -> bool:
     return feature["dtype"].startswith(("float", "int", "uint", "bool")) and len(feature["shape"]) == 1
 
 
-def _rows(path: Path, columns: list[str]) -> pa.Table:
-    """Return these columns of all data files. Raises UserError for unreadable files or a missing column."""
-    files = sorted((path / "data").glob("chunk-*/file-*.parquet"))
-    if not files:
-        raise UserError(f"{path / 'data'} holds no frames: restore it from where the dataset came from")
-    return pa.concat_tables([_parquet(path, file, columns) for file in files], promote_options="permissive")
-
-
-def _parquet(path: Path, file: Path, columns: list[str]) -> pa.Table:
+def _parquet(file: Path, columns: list[str]) -> pa.Table:
     try:
-        opened = pq.ParquetFile(file)
-        if missing := [name for name in columns if name not in opened.schema_arrow.names]:
-            raise UserError(f"{file} has no column {missing[0]}: restore it from where the dataset came from")
-        return opened.read(columns=columns)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise UserError(f"{file} cannot be read: restore it from where the dataset came from") from error
+        return pq.read_table(file, columns=columns)
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        raise _damaged(file, error) from error
 
 
-def _vectors(path: Path, table: pa.Table, key: str, told: dict[str, Any]) -> Float[np.ndarray, "n size"]:
-    size = told["shape"][0]
+def _vectors(path: Path, table: pa.Table, key: str, size: int) -> Float[np.ndarray, "n size"]:
     try:
         found = np.asarray(table[key].to_pylist(), np.float32)
-        found = found.reshape(len(table), 1) if size == 1 else found
+        found = found.reshape(-1, 1) if size == 1 else found
         if found.shape != (len(table), size):
             raise ValueError
+        return found
     except (TypeError, ValueError) as error:
         raise UserError(f"{path}: {key} does not hold {size} numbers in every frame: leave the others out") from error
-    return found
 
 
 def _entries(features: dict[str, Any], parts: list[str]) -> tuple[str, ...]:
@@ -153,14 +146,14 @@ def _flat(names: Any) -> list[str]:
     return [] if names is None else [str(names)]
 
 
-def _frames(path: Path, info: dict[str, Any], table: pa.Table, key: str) -> Callable[[int], Picture]:
+def _frames(path: Path, features: dict[str, Any], table: pa.Table, key: str) -> Callable[[int], Picture]:
     """Return a function from a row to its camera picture."""
-    if info["features"][key]["dtype"] == "image":
+    if features[key]["dtype"] == "image":
         return lambda row: _embedded(path, key, table[key][row].as_py())
     names = [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     starts: dict[int, list[Any]] = {}
     for file in sorted((path / "meta/episodes").glob("chunk-*/file-*.parquet")):
-        episodes = _parquet(path, file, ["episode_index", *names])
+        episodes = _parquet(file, ["episode_index", *names])
         starts |= {row["episode_index"]: [row[name] for name in names] for row in episodes.to_pylist()}
 
     def frame(row: int) -> Picture:
@@ -178,14 +171,10 @@ def _embedded(path: Path, key: str, stored: Any) -> Picture:
     """Return the picture stored in a row, as {"bytes": ..., "path": ...}, or in a file that the row names."""
     data, name = (stored.get(part) for part in ("bytes", "path")) if isinstance(stored, dict) else (None, None)
     if data is None and isinstance(name, str):
-        try:
-            data = inside(path, name, "picture").read_bytes()
-        except OSError as error:
-            raise UserError(f"picture {name} of {path} cannot be read ({error.strerror}): put it there") from error
+        return read_picture(path, name)
     if not isinstance(data, bytes):
-        raise UserError(f"{path}: a frame of {key} holds no picture: restore it from where the dataset came from")
-    kind = "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png"
-    return Picture(data, kind)
+        raise _damaged(path, f"a frame of {key} holds no picture")
+    return Picture(data, "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png")
 
 
 @lru_cache(maxsize=64)
@@ -203,8 +192,7 @@ def _decoded(file: Path, time: float) -> bytes:
         picture = Image.frombytes("RGB", next(frames)["size"], next(frames))
         frames.close()
     except (OSError, RuntimeError, StopIteration, ZeroDivisionError) as error:
-        why = re.sub(r"\s+", " ", str(error))[:80]
-        raise UserError(f"{file} has no frame at {time:.3f} s ({why}): restore the video") from error
+        raise _damaged(file, f"no frame at {time:.3f} s") from error
     stored = io.BytesIO()
     picture.save(stored, "PNG")
     return stored.getvalue()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from cuelearner_jax.errors import UserError, format_value
 
@@ -28,30 +28,17 @@ def inside(folder: Path, name: str, what: str) -> Path:
 
     Links are followed: datasets lie in the hub's cache as links to files elsewhere.
     """
-    if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+    if Path(name).is_absolute() or ".." in Path(name).parts:
         raise UserError(f"{what} {format_value(name)} leads out of {folder}: give the name of a file in that folder")
     return folder / name
 
 
-class PictureFiles:
-    """Pictures in files beside a table."""
-
-    def __init__(self, table: Path, names: Any) -> None:
-        """Check the names, one a row, empty for none. Raises UserError for names that are none of a picture's file."""
-        self._folder, self._names = table.parent, [None if name in (None, "") else name for name in list(names)]
-        for name in {name for name in self._names if name is not None}:
-            if not isinstance(name, str) or Path(inside(self._folder, name, "picture")).suffix.lower() not in KINDS:
-                raise UserError(
-                    f"{table}: {format_value(name)} is no picture's file that the page shows: give one of "
-                    f"{', '.join(KINDS)}"
-                )
-
-    def __call__(self, row: int) -> Picture | None:
-        """Return the picture of a row; None if it has none. Raises UserError for a picture that cannot be read."""
-        if (name := self._names[row]) is None:
-            return None
-        place = inside(self._folder, name, "picture")
-        try:
-            return Picture(place.read_bytes(), KINDS[place.suffix.lower()])
-        except OSError as error:
-            raise UserError(f"picture {place} of row {row} cannot be read ({error.strerror}): put it there") from error
+def read_picture(folder: Path, name: str) -> Picture:
+    """Read a picture below a folder. Raises UserError for a name that leads out of it, or that is not a picture's."""
+    path = inside(folder, name, "picture")
+    if (kind := KINDS.get(path.suffix.lower())) is None:
+        raise UserError(f"{format_value(name)} is no picture's file that the page shows: give {', '.join(KINDS)}")
+    try:
+        return Picture(path.read_bytes(), kind)
+    except (OSError, ValueError) as error:
+        raise UserError(f"picture {path} cannot be read ({error}): put it there") from error

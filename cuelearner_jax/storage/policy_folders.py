@@ -51,22 +51,14 @@ def write(folder: Path, described: dict[str, Any], arrays: Any) -> None:
 
 
 def read_arrays(folder: Path, like: Any, described: dict[str, Any]) -> Any:
-    """Read the arrays of a policy.
+    """Read the arrays of a policy, a tree of the shapes `like`; `described`: the contents of its policy.json.
 
-    Args:
-        folder: the policy's folder.
-        like: a tree of the arrays' shapes.
-        described: the contents of its policy.json.
-
-    Raises:
-        UserError: the arrays cannot be read, are damaged, or belong to another policy.
+    Raises UserError if the arrays cannot be read, are damaged, or belong to another policy.
     """
     place, remedy = folder / ARRAYS, "restore it, or adapt the policy anew"
     if not place.is_dir():
         raise UserError(f"{place} is missing: {remedy}")
-    with checkpoints(place, read_only=True, damaged=f"it is damaged: {remedy}") as saved:
-        if saved.latest() is None:
-            raise UserError(f"{place} holds no arrays: {remedy}")
+    with checkpoints(place, read_only=True, remedy=remedy) as saved:
         found = saved.restore({"policy": like})["policy"]
     if digest(found) != described.get("arrays"):
         raise UserError(f"{place} holds the arrays of another policy: {remedy}")

@@ -42,15 +42,11 @@ def _commit() -> str:
     if not (root / ".git").exists():  # an installed package may lie inside an unrelated repository
         return ""
     git = ["git", "-C", str(root), "--no-optional-locks"]  # writes nothing to the repository
-    asked = (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+    describe = [*git, "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty"]
     try:
         with warnings.catch_warnings():
             # JAX warns of any fork; this one executes git at once.
             warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
-            told = [
-                subprocess.run([*git, *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-                for words in asked
-            ]
+            return subprocess.run(describe, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return ""
-    return told[0] + ("-dirty" if told[1] else "")

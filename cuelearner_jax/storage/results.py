@@ -47,7 +47,6 @@ from cuelearner_jax.storage.table import PathLike
 
 SCHEMA = tables.Schema(
     stem="results",
-    mark="step",
     required=("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash"),
     strings=("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command"),
     integers=("labels", "seed", "step"),
@@ -55,7 +54,6 @@ SCHEMA = tables.Schema(
 )
 GUIDES = tables.Schema(
     stem="guide",
-    mark="asked",
     required=(*SCHEMA.required, "asked", "round"),
     strings=SCHEMA.strings,
     integers=(*SCHEMA.integers, "asked", "round"),
@@ -89,19 +87,13 @@ def check_complete(folder: Path, step: int, count: int, run: str) -> None:
 def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> list[Path]:
     """Return the results files at or below the given files or folders, one per run, finished or not.
 
-    `schema` is that of the wanted tables. Raises UserError if a path does not exist or no file is below it.
+    `schema` is that of the wanted tables. Raises UserError if no file is at a path or below it.
     """
-    paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     found: dict[Path, Path] = {}
-    for path in map(Path, paths):
-        if not path.exists():
-            raise UserError(f"{path} does not exist: give the folder of a run, or a folder that holds runs")
+    for path in map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths):
         files = [path] if path.is_file() else sorted([*path.rglob(schema.jsonl), *path.rglob(schema.parquet)])
         if not files:
-            raise UserError(
-                f"no {schema.stem} below {path}: expected a {schema.jsonl} or {schema.parquet} in it or in a folder "
-                "below it"
-            )
+            raise UserError(f"no {schema.stem} at or below {path}: give the folder of a run, or one that holds runs")
         for file in files:
             # Both exist only after a crash between writing one and removing the other; they then hold equal rows.
             whole = file.with_name(schema.parquet)
@@ -122,8 +114,7 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None, schema: 
         A table with the columns listed at the top of this module and `folder`, the folder of the row's run. A column
         that a run lacks is null for that run.
 
-    Raises:
-        UserError: a path is missing, holds no rows or is damaged, or the runs are of several tasks.
+    Raises UserError if a path is missing, holds no rows or is damaged, or the runs are of several tasks.
     """
     files = find(paths, schema)
     parts = []

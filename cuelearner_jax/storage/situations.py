@@ -31,9 +31,10 @@ from pyarrow import csv
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError, format_numbers, format_value
 from cuelearner_jax.storage import lerobot
-from cuelearner_jax.storage.picture_files import Picture, PictureFiles
+from cuelearner_jax.storage.picture_files import Picture, read_picture
 
 STEM = "situations"
+SUFFIXES = (".parquet", ".csv", ".npz")
 OBSERVATION, ACTION, PICTURE = "observation", "action", "picture"
 MOST_NAMED = 64  # largest number of observation entries that each get a slice of their own
 
@@ -59,40 +60,37 @@ def read(path: Path) -> Situations:
     """
     if lerobot.is_dataset(path):
         found = lerobot.read(path)
-        slices = named_slices(found.observation_entries, found.observations.shape[1])
-        return _whole(path, found.observations, found.actions, slices, found.action_entries, found.frames)
+        names = found.observation_entries, found.action_entries
+        return _checked(path, found.observations, found.actions, *names, found.frames)
     table = _table_in(path)
-    columns = _READERS[table.suffix](table)
+    columns = _columns(table)
     known = (OBSERVATION, ACTION, PICTURE)
     if strange := [name for name in columns if name not in known and name.partition(".")[0] not in known[:2]]:
         raise UserError(
             f"{table} has an unknown column {format_value(strange[0])}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
             "or leave it out"
         )
-    observations, seen = _matrix(table, columns, OBSERVATION)
+    observations, names = _matrix(table, columns, OBSERVATION)
     actions, entries = _matrix(table, columns, ACTION)
     files = columns.get(PICTURE)
     if len({len(observations), len(actions), len(observations if files is None else files)}) > 1:
         raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
-    return _whole(
-        table,
-        observations,
-        actions,
-        named_slices(seen, observations.shape[1]),
-        entries,
-        None if files is None else PictureFiles(table, files),
-    )
+
+    def picture(row: int) -> Picture | None:
+        return read_picture(table.parent, str(files[row])) if files is not None and files[row] else None
+
+    return _checked(table, observations, actions, names, entries, None if files is None else picture)
 
 
-def _whole(
+def _checked(
     path: Path,
     observations: np.ndarray,
     actions: np.ndarray,
-    slices: tuple[Quantity, ...],
+    names: tuple[str, ...],
     entries: tuple[str, ...],
-    pictures: Any,
+    picture: Callable[[int], Picture | None] | None,
 ) -> Situations:
-    """Check and build `Situations`. Raises UserError if there are none or a number is not finite."""
+    """Build `Situations`. Raises UserError if there are none or a number is not finite."""
     for name, rows in ((OBSERVATION, observations), (ACTION, actions)):
         if not rows.size:
             raise UserError(f"{path} holds no {name}s: record some situations first")
@@ -100,12 +98,14 @@ def _whole(
             raise UserError(
                 f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave these rows out"
             )
-    told = hashlib.sha256()
+    slices = named_slices(names, observations.shape[1])
+    contents = hashlib.sha256()
     for rows in (observations, actions):
-        told.update(str(rows.shape).encode() + np.ascontiguousarray(rows).tobytes())
-    told.update("\n".join([quantity.name for quantity in slices] + ["", *entries]).encode())
-    there = (lambda row: None) if pictures is None else pictures
-    return Situations(observations, actions, slices, entries, told.hexdigest()[:12], pictures is not None, there)
+        contents.update(str(rows.shape).encode() + np.ascontiguousarray(rows).tobytes())
+    contents.update("\n".join([quantity.name for quantity in slices] + ["", *entries]).encode())
+    digest = contents.hexdigest()[:12]
+    none: Callable[[int], Picture | None] = lambda row: None  # noqa: E731
+    return Situations(observations, actions, slices, entries, digest, picture is not None, picture or none)
 
 
 def named_slices(entries: tuple[str, ...], size: int) -> tuple[Quantity, ...]:
@@ -116,68 +116,41 @@ def named_slices(entries: tuple[str, ...], size: int) -> tuple[Quantity, ...]:
 
 
 def _table_in(path: Path) -> Path:
-    """Return the table in a folder, or the given table. Raises UserError if there is none."""
-    if path.is_file():
-        if path.suffix not in _READERS:
-            raise UserError(f"{path} is not a table of situations: give a folder, or a file {', '.join(_READERS)}")
+    """Return the only table in a folder, or the given table."""
+    if path.is_file() and path.suffix in SUFFIXES:
         return path
-    if not path.is_dir():
-        raise UserError(f"there is no folder of situations at {path}: give one that holds {STEM}.parquet")
-    found = [path / f"{STEM}{suffix}" for suffix in _READERS if (path / f"{STEM}{suffix}").is_file()]
-    if not found:
-        empty = "is empty" if not any(path.iterdir()) else f"holds no {STEM}.parquet, .csv or .npz"
+    found = [path / f"{STEM}{suffix}" for suffix in SUFFIXES if (path / f"{STEM}{suffix}").is_file()]
+    if len(found) != 1:
+        if not path.exists():
+            raise UserError(f"there is no folder of situations at {path}: give one that holds {STEM}.parquet")
+        there = f"holds {' and '.join(table.name for table in found)}" if found else "is no LeRobot dataset either"
         raise UserError(
-            f"{path} {empty}, and is not a LeRobot dataset either: give a folder with such a table, with the columns "
-            f"{OBSERVATION} and {ACTION}"
+            f"{path} {there}: give the path of one table, or a folder with one {STEM}.parquet, .csv or .npz with the "
+            f"columns {OBSERVATION} and {ACTION}"
         )
-    if len(found) > 1:
-        raise UserError(f"{path} holds {' and '.join(table.name for table in found)}: give the path of one of them")
     return found[0]
 
 
-def _of_parquet(table: Path) -> dict[str, Any]:
+def _columns(table: Path) -> dict[str, Any]:
+    """Return the columns of a table by name."""
     try:
-        return _columns(table, pq.ParquetFile(table).read())
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise _damaged(table, error) from error
-
-
-def _of_csv(table: Path) -> dict[str, Any]:
-    try:
-        columns = _columns(table, csv.read_csv(table))
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise _damaged(table, error) from error
-    for name in columns.keys() & {OBSERVATION, ACTION}:
+        if table.suffix == ".npz":
+            with np.load(table, allow_pickle=False) as stored:
+                return {name: stored[name] for name in stored.files}
+        rows: pa.Table = csv.read_csv(table) if table.suffix == ".csv" else pq.ParquetFile(table).read()
+    except (pa.ArrowException, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        why = " ".join(str(error).split())[:120]
+        raise UserError(
+            f"{table} cannot be read ({why}): write the table anew, without Python objects in it"
+        ) from error
+    columns: dict[str, Any] = {
+        name.strip(): column.to_pylist() for name, column in zip(rows.column_names, rows.columns, strict=True)
+    }
+    if len(columns) < rows.num_columns:
+        raise UserError(f"{table} has two columns of one name: give each column a name of its own")
+    for name in columns.keys() & {OBSERVATION, ACTION} if table.suffix == ".csv" else ():
         columns[name] = [re.split(r"[\s;,]+", str(text).strip("[] ")) for text in columns[name]]
     return columns
-
-
-def _columns(table: Path, rows: pa.Table) -> dict[str, Any]:
-    """Return the columns of a table by name. Raises UserError for two columns with one name."""
-    names = [name.strip() for name in rows.column_names]
-    if doubled := [name for name in names if names.count(name) > 1]:
-        raise UserError(f"{table} has two columns {format_value(doubled[0])}: give each column a name of its own")
-    return {name: column.to_pylist() for name, column in zip(names, rows.columns, strict=True)}
-
-
-def _of_npz(table: Path) -> dict[str, Any]:
-    try:
-        with np.load(table, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise _damaged(table, error) from error
-
-
-_READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
-    ".parquet": _of_parquet,
-    ".csv": _of_csv,
-    ".npz": _of_npz,
-}
-
-
-def _damaged(table: Path, error: Exception) -> UserError:
-    why = " ".join(str(error).split())[:120] or type(error).__name__
-    return UserError(f"{table} cannot be read ({why}): write the table anew, without Python objects in it")
 
 
 def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.ndarray, "n size"], tuple[str, ...]]:
@@ -186,18 +159,15 @@ def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.n
     Raises UserError for a missing column, or sizes that do not fit.
     """
     entries = tuple(column.partition(".")[2] for column in columns if column.startswith(f"{name}."))
-    if name not in columns and not entries:
-        there = ", ".join(columns) or "none"
+    if (name in columns) == bool(entries):
         raise UserError(
-            f"{table} has no column {name} (its columns: {there}): give a list per row, or {name}.NAME columns"
+            f"{table} has the columns {', '.join(columns) or 'none'}: give one column {name} with a list per row, or "
+            f"{name}.NAME columns"
         )
-    if name in columns and entries:
-        raise UserError(f"{table} has the columns {name} and {name}.{entries[0]}: give only one of the two forms")
     if not entries:
         return _numbers(table, name, columns[name], 2), ()
-    return np.stack(
-        [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries], -1
-    ), entries
+    parts = [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries]
+    return np.stack(parts, -1), entries
 
 
 def _numbers(table: Path, name: str, values: Any, axes: int) -> np.ndarray:

@@ -13,7 +13,6 @@ as not written. A Parquet file holds a SHA-256 of its contents, and is refused i
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import json
 import math
@@ -21,22 +20,21 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.storage.whole import replacing, unreadable
-from cuelearner_jax.terminal import console
+from cuelearner_jax.storage.whole import replacing
 
 META = b"cuelearner"  # Parquet metadata key of the table's description
 DIGEST = b"cuelearner.sha256"  # Parquet metadata key of the digest of the contents
+HEADS = {"about", "constants"}  # keys of lines that are no rows
 
 PathLike = str | os.PathLike[str]
 Row = dict[str, Any]
-Writer = TypeVar("Writer", bound="TableWriter")
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,6 @@ class Schema:
     """Column types of a kind of table. Columns that are not named here hold floats."""
 
     stem: str  # of the file names; messages call the rows so
-    mark: str  # a JSON line with this key is a row
     required: tuple[str, ...]
     strings: tuple[str, ...] = ()
     integers: tuple[str, ...] = ()
@@ -74,11 +71,11 @@ class Schema:
         return pa.list_(pa.float32()) if name in self.lists else pa.float64()
 
 
-class TableWriter:
+class TableWriter(contextlib.AbstractContextManager):
     """Appends rows to the JSONL file of one table; each append is on disk when the call returns.
 
-    Opening an existing table continues it: a torn last line, left by a crash, is dropped first, and a table that was
-    already finished (Parquet) becomes JSONL again.
+    Opening an existing table continues it: a torn last line is dropped first, and a finished table (Parquet) becomes
+    JSONL again.
     """
 
     def __init__(
@@ -91,19 +88,16 @@ class TableWriter:
             constants: columns with one value for all rows to come; None: no such columns.
             about: the description written at the head of a new table; an existing table keeps its own.
         """
-        self.path = Path(folder) / schema.jsonl
-        self._schema, self._columns = schema, set(constants or ())
+        self.path, self._schema = Path(folder) / schema.jsonl, schema
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        _reopen(self.path, schema)
-        rows = _lines(self.path, schema) if self.path.exists() else []
-        header = None if constants is None else {name: _plain(value) for name, value in constants.items()}
-        last = next((row["constants"] for row in reversed(rows) if "constants" in row), None)
+        rows = _reopened(self.path, schema)
         self._file = self.path.open("ab", buffering=0)
         self._file.truncate(self.path.read_bytes().rfind(b"\n") + 1)
         if about is not None and not any("about" in row for row in rows):
             self._put([{"about": about}])
-        if header is not None and header != last:
-            self._put([{"constants": header}])
+        last = next((row["constants"] for row in reversed(rows) if "constants" in row), None)
+        if constants is not None and (constants := _plain(constants)) != last:
+            self._put([{"constants": constants}])
 
     def append(self, **columns: Any) -> None:
         """Append rows.
@@ -113,23 +107,16 @@ class TableWriter:
                 axis, all of one length. For instance `append(step=1000, seed=seeds, reward=rewards)`.
 
         Raises:
-            ValueError: a required column is missing or the lengths differ.
             OSError: the disk refuses the rows. None of them is in the table, now or later; the call may be repeated.
         """
-        missing = [name for name in self._schema.required if name not in columns and name not in self._columns]
-        if missing:
-            raise ValueError(f"a row of {self._schema.stem} needs the columns {', '.join(missing)}")
         arrays = {name: np.asarray(value) for name, value in columns.items()}
-        # one value for all rows
-        own = {name: array.ndim == (name in self._schema.lists) for name, array in arrays.items()}
-        lengths = {len(array) for name, array in arrays.items() if not own[name]}
-        if len(lengths) > 1:
-            raise ValueError(f"columns of one append must have one length, got {sorted(lengths)}")
+        many = {name for name, array in arrays.items() if array.ndim > (name in self._schema.lists)}
+        (count,) = {len(arrays[name]) for name in many} or {1}
         # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
         values = {name: array.tolist() for name, array in arrays.items()}
         self._put(
-            {name: _plain(value if own[name] else value[row]) for name, value in values.items()}
-            for row in range(lengths.pop() if lengths else 1)
+            {name: _plain(value[row] if name in many else value) for name, value in values.items()}
+            for row in range(count)
         )
 
     def _put(self, rows: Iterable[Row]) -> None:
@@ -148,9 +135,6 @@ class TableWriter:
         """Close the file; the table stays JSONL until `finish`."""
         self._file.close()
 
-    def __enter__(self: Writer) -> Writer:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -158,9 +142,8 @@ class TableWriter:
 def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
     """Drop a folder's rows for which `keep` is false, and a torn last line; do nothing without a table."""
     path = Path(folder) / schema.jsonl
-    _reopen(path, schema)
-    if path.exists():
-        _rewrite(path, [row for row in _lines(path, schema) if schema.mark not in row or keep(row)])
+    if rows := _reopened(path, schema):
+        _rewrite(path, [row for row in rows if row.keys() & HEADS or keep(row)])
 
 
 def finish(folder: PathLike, schema: Schema) -> Path:
@@ -173,7 +156,7 @@ def finish(folder: PathLike, schema: Schema) -> Path:
         table = read(path, schema)
         if table.num_rows == 0:
             raise UserError(f"{path} has no rows: a table of {schema.stem} cannot be finished before its first one")
-        write(target, table, schema)
+        write(target, table, schema, about_of(table))
         path.unlink()
     elif not target.exists():
         raise UserError(f"no {schema.stem} in {path.parent}: expected {schema.jsonl} or {schema.parquet}")
@@ -181,16 +164,12 @@ def finish(folder: PathLike, schema: Schema) -> Path:
 
 
 def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None, fresh: bool = False) -> None:
-    """Write a whole table as Parquet, atomically.
-
-    `about`: the table's description (default: its present one). `fresh`: see `whole.replacing`.
-    """
-    told = about_of(table) if about is None else about
+    """Write a whole table as Parquet, atomically. `about`: its description. `fresh`: see `whole.replacing`."""
+    described = {} if about is None else {META: json.dumps(about).encode()}
     table = _typed(table, schema)
-    told = {} if told is None else {META: json.dumps(told).encode()}
-    table = table.replace_schema_metadata({**told, DIGEST: digest(table, told.get(META, b"")).encode()})
+    sealed = {**described, DIGEST: digest(table, described.get(META, b"")).encode()}
     with replacing(path, "wb", fresh) as file:
-        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
+        pq.write_table(table.replace_schema_metadata(sealed), file, compression="zstd", write_page_checksum=True)
 
 
 def digest(table: pa.Table, about: bytes = b"") -> str:
@@ -214,20 +193,13 @@ def digest(table: pa.Table, about: bytes = b"") -> str:
 def read(path: Path, schema: Schema) -> pa.Table:
     """Read one file of a table with its column types; a table that has just begun has no rows and no columns.
 
-    Raises:
-        UserError: the file is damaged or is not a table of this schema.
+    Raises UserError if the file is damaged or is not a table of this schema.
     """
-    if path.suffix != ".parquet" and not path.exists():
-        path = path.with_name(schema.parquet)  # the table was finished after the file was found
     try:
-        with path.open("rb") as file:
-            is_parquet = file.read(4) == b"PAR1" or path.suffix == ".parquet"
-        table = _finished(path, schema) if is_parquet else _grown(path, schema)
-    except OSError as error:
-        if error.errno is None:  # an error of Arrow's own
-            raise _damaged(path, schema, error) from error
-        raise unreadable(path, error) from error
-    except (KeyError, TypeError, ValueError, MemoryError, OverflowError, pa.ArrowException) as error:
+        table = _growing(path, schema) if path.suffix == ".jsonl" else _finished(path, schema)
+    except (KeyError, TypeError, ValueError, OverflowError, pa.ArrowException, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # not one of Arrow's own
+            raise
         raise _damaged(path, schema, error) from error
     missing = [name for name in schema.required if name not in table.column_names]
     if missing and table.num_rows:
@@ -239,8 +211,8 @@ def read(path: Path, schema: Schema) -> pa.Table:
 
 def about_of(table: pa.Table) -> Row | None:
     """Return a table's description."""
-    told = (table.schema.metadata or {}).get(META)
-    return None if told is None else json.loads(told)
+    described = (table.schema.metadata or {}).get(META)
+    return None if described is None else json.loads(described)
 
 
 def _damaged(path: Path, schema: Schema, reason: object) -> UserError:
@@ -248,22 +220,25 @@ def _damaged(path: Path, schema: Schema, reason: object) -> UserError:
 
 
 def _typed(table: pa.Table, schema: Schema) -> pa.Table:
-    """Cast the columns to their types and keep the metadata."""
-    types = [(name, schema.type(name)) for name in table.column_names]
-    return table.cast(pa.schema(types, metadata=table.schema.metadata))
+    """Cast the columns to their types, without metadata."""
+    return table.cast(pa.schema([(name, schema.type(name)) for name in table.column_names]))
 
 
 def _finished(path: Path, schema: Schema) -> pa.Table:
     """Read the table of a Parquet file. Raises ValueError if it differs from what was written."""
-    table = _typed(pq.ParquetFile(path, page_checksum_verification=True).read(), schema)
-    metadata = table.schema.metadata or {}
-    if metadata.get(DIGEST, b"").decode() != digest(table, metadata.get(META, b"")):
+    with path.open("rb") as file:
+        stored = pq.ParquetFile(file).read()
+    table, metadata = _typed(stored, schema), stored.schema.metadata or {}
+    described = metadata.get(META)
+    if metadata.get(DIGEST, b"").decode() != digest(table, described or b""):
         raise ValueError("its contents are not those that were written")
-    return table.replace_schema_metadata({META: metadata[META]} if META in metadata else None)
+    return table if described is None else table.replace_schema_metadata({META: described})
 
 
 def _plain(value: Any) -> Any:
     """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, list):
         return [_plain(entry) for entry in value]
     value = value.item() if isinstance(value, np.generic) else value
@@ -277,26 +252,14 @@ def _text(rows: Iterable[Row]) -> bytes:
 
 def _lines(path: Path, schema: Schema) -> list[Row]:
     """Return the parsed whole lines of a JSONL file. Raises UserError if the file is damaged."""
-    *lines, torn = path.read_bytes().split(b"\n")
-    if torn:
-        _warn(f"warning: the last line of {path} is incomplete and is left out")
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = json.loads(line)
-            row.pop("crc", None)  # earlier versions ended each line in a checksum and the file in a closing line
-        except (ValueError, AttributeError, TypeError, RecursionError) as error:
-            raise _damaged(path, schema, f"line {number}: it is not a JSON object") from error
-        if row.keys() & {"about", "constants", schema.mark}:
-            rows.append(row)
-        elif row.keys() != {"end"}:
-            raise _damaged(path, schema, f"line {number}: it is not a row of {schema.stem}")
+    *lines, _torn = path.read_bytes().split(b"\n")
+    try:
+        rows = [json.loads(line) for line in lines]
+    except ValueError as error:
+        raise _damaged(path, schema, error) from error
+    if not all(isinstance(row, dict) for row in rows):
+        raise _damaged(path, schema, "a line is no row")
     return rows
-
-
-@functools.cache  # once, however often a file is read
-def _warn(line: str) -> None:
-    console.print(line)
 
 
 def _rewrite(path: Path, rows: Iterable[Row]) -> None:
@@ -304,31 +267,29 @@ def _rewrite(path: Path, rows: Iterable[Row]) -> None:
         file.write(_text(rows))
 
 
-def _reopen(path: Path, schema: Schema) -> None:
-    """Convert a finished table back to JSONL, so that it can be continued."""
+def _reopened(path: Path, schema: Schema) -> list[Row]:
+    """Return a table's lines; convert a finished table back to JSONL, so that it can be continued."""
     whole = path.with_name(schema.parquet)
-    if not whole.exists():
-        return
-    if not path.exists():
+    if whole.exists() and not path.exists():
         table = read(whole, schema)
-        told = about_of(table)
-        rows = [] if told is None else [{"about": told}]
-        _rewrite(path, [*rows, *({k: v for k, v in row.items() if v is not None} for row in table.to_pylist())])
-    whole.unlink()
+        head = [] if (about := about_of(table)) is None else [{"about": about}]
+        _rewrite(path, [*head, *({k: v for k, v in row.items() if v is not None} for row in table.to_pylist())])
+    whole.unlink(missing_ok=True)
+    return _lines(path, schema) if path.exists() else []
 
 
-def _grown(path: Path, schema: Schema) -> pa.Table:
+def _growing(path: Path, schema: Schema) -> pa.Table:
     """Return the table of a JSONL file, constants included."""
-    told: Row | None = None
+    about: Row | None = None
     constants: Row = {}
     rows = []
     for line in _lines(path, schema):
-        if schema.mark in line:
+        about, constants = line.get("about", about), line.get("constants", constants)
+        if not line.keys() & HEADS:
             rows.append(constants | line)
-        told, constants = line.get("about", told), line.get("constants", constants)
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: [row.get(name) for row in rows] for name in names}
     # Integers are cast last, since Arrow would truncate a fractional value.
     types = {name: None if name in schema.integers else schema.type(name) for name in names}
     table = _typed(pa.table({name: pa.array(column, types[name]) for name, column in columns.items()}), schema)
-    return table if told is None else table.replace_schema_metadata({META: json.dumps(told).encode()})
+    return table if about is None else table.replace_schema_metadata({META: json.dumps(about).encode()})

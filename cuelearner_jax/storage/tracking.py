@@ -6,8 +6,7 @@ Trackers get means over seeds; reports are made from the results table alone.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -26,19 +25,15 @@ class TensorBoard:
 
     def __init__(self, folder: Path, described: dict[str, Any], step: int) -> None:
         """Continue in a folder; points written after `step` are discarded."""
-        self._writer = importlib.import_module(self.package).SummaryWriter(
-            str(folder), purge_step=step + 1 if step else None
-        )
+        writer = importlib.import_module(self.package).SummaryWriter
+        self._writer = writer(str(folder), purge_step=step + 1 if step else None)
+        self.close = self._writer.close
 
     def log(self, step: int, metrics: dict[str, float]) -> None:
         """Log one point of each curve."""
         for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
         self._writer.flush()
-
-    def close(self) -> None:
-        """Write what is buffered and close."""
-        self._writer.close()
 
 
 class Wandb:
@@ -60,14 +55,11 @@ class Wandb:
             name=f"{run} {kind}",
             settings={"silent": True},  # its summary of forty lines would interrupt our output
         )
+        self.close = self._run.finish
 
     def log(self, step: int, metrics: dict[str, float]) -> None:
         """Log one point of each curve."""
         self._run.log(metrics, step=step)
-
-    def close(self) -> None:
-        """Write what is buffered and close."""
-        self._run.finish()
 
 
 Tracker = TensorBoard | Wandb
@@ -84,17 +76,11 @@ def check(name: str | None) -> None:
         raise UserError(f"--track {name} needs {package}: pip install {package}")
 
 
-@contextmanager
-def open_tracker(name: str | None, folder: Path, described: dict[str, Any], step: int) -> Iterator[Tracker | None]:
-    """Open a tracker that writes below a folder, continuing after `step`; yields None without a name."""
-    if name is None:
-        yield None
-        return
-    tracker = TRACKERS[name](folder / name, described, step)
-    try:
-        yield tracker
-    finally:
-        tracker.close()
+def open_tracker(
+    name: str | None, folder: Path, described: dict[str, Any], step: int
+) -> AbstractContextManager[Tracker | None]:
+    """Open a tracker that writes below a folder, continuing after `step`; None without a name."""
+    return nullcontext() if name is None else closing(TRACKERS[name](folder / name, described, step))
 
 
 def means(row: dict[str, Any]) -> dict[str, float]:

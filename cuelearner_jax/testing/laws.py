@@ -12,6 +12,8 @@ import numpy as np
 
 from cuelearner_jax.spaces import Space
 
+TRACED = "what depends on traced values must be jax.numpy, with jnp.where and lax.cond in place of if"
+
 
 class Laws:
     """The laws of one subject."""
@@ -34,8 +36,8 @@ class Laws:
         except AssertionError:
             raise
         except Exception as error:
-            told = (str(error).strip().splitlines() or [""])[0][:160]
-            raise AssertionError(f"{self.subject}: {deed} fails ({type(error).__name__}: {told}): {mend}") from error
+            why = (str(error).strip().splitlines() or [""])[0][:160]
+            raise AssertionError(f"{self.subject}: {deed} fails ({type(error).__name__}: {why}): {mend}") from error
 
     def same(self, one: Any, other: Any) -> bool:
         """Return whether two trees of arrays are equal, within the tolerance. Keys are compared by their words."""
@@ -48,14 +50,10 @@ class Laws:
     def actions(self, space: Space, actions: Any, called: str) -> None:
         """Raise AssertionError unless rows (..., size) are actions of a space."""
         shape = np.shape(actions)
-        self.hold(
-            shape[-1:] == (space.size,), f"{called} has shape {shape}: an action has {space.size} entries, in one axis"
-        )
+        self.hold(shape[-1:] == (space.size,), f"{called} has shape {shape}: an action has {space.size} entries")
         self.hold(np.isfinite(actions).all(), f"{called} is not finite everywhere: give an action in every situation")
-        self.hold(
-            self.same(space.retract(jnp.asarray(actions)), actions),
-            f"{called} is not an action of the space: pass it through the space's `retract` (directions: unit length)",
-        )
+        kept = self.same(space.retract(jnp.asarray(actions)), actions)
+        self.hold(kept, f"{called} is not an action of the space: pass it through the space's `retract`")
 
 
 class OnceTraced:
@@ -78,31 +76,20 @@ class OnceTraced:
 
 def pytree(laws: Laws, subject: Any, called: str) -> None:
     """Raise AssertionError unless an object is a pytree of numbers with comparable static fields."""
-    leaves, tree = jax.tree.flatten(subject)
+    leaves = jax.tree_util.tree_leaves_with_path(subject)
     laws.hold(
-        not (len(leaves) == 1 and leaves[0] is subject),
+        not (len(leaves) == 1 and leaves[0][1] is subject),
         f"{called} is not a pytree: derive its class from flax.struct.PyTreeNode",
     )
-    for path, leaf in jax.tree_util.tree_leaves_with_path(subject):
+    for path, leaf in leaves:
         laws.hold(
             isinstance(leaf, jax.Array | np.ndarray | np.generic | bool | int | float),
             f"field {jax.tree_util.keystr(path).lstrip('.')} is of type {type(leaf).__name__}, which is not traced: "
             "make it an array, or static by struct.field(pytree_node=False)",
         )
     with laws.attempted("hashing its static fields", "a static field must be hashable: a number, a string, a tuple"):
-        for static in _statics(tree):
+        for static in _statics(jax.tree.structure(subject)):
             hash(static)
-        again = jax.tree.structure(subject)
-        laws.hold(tree == again, f"{called} differs from itself: static fields must compare equal to themselves")
-
-
-def change_floats(tree: Any) -> Any:
-    """Return the tree with another value of every float, as a changed world has."""
-
-    def other(leaf: Any) -> Any:
-        return leaf * 1.01 if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating) else leaf
-
-    return jax.tree.map(other, tree)
 
 
 def _statics(tree: Any) -> Iterator[Any]:
@@ -112,6 +99,24 @@ def _statics(tree: Any) -> Iterator[Any]:
         yield node[1]
     for child in tree.children():
         yield from _statics(child)
+
+
+def same_shapes(one: Any, other: Any) -> bool:
+    """Return whether two trees have the same fields, shapes and types."""
+    described = [
+        (jax.tree.structure(tree), [(np.shape(leaf), leaf.dtype) for leaf in jax.tree.leaves(tree)])
+        for tree in (one, other)
+    ]
+    return described[0] == described[1]
+
+
+def change_floats(tree: Any) -> Any:
+    """Return the tree with another value of every float, as a changed world has."""
+
+    def other(leaf: Any) -> Any:
+        return leaf * 1.01 if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating) else leaf
+
+    return jax.tree.map(other, tree)
 
 
 def _numbers(leaf: Any) -> np.ndarray:

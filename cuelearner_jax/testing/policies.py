@@ -16,17 +16,14 @@ ROWS = 9
 
 
 def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None:
-    """Check that a policy keeps its laws.
+    """Check that a policy keeps its laws. Raises AssertionError for the first law that is broken.
 
     Args:
         policy: one policy, as `evaluate.evaluate_policy` takes it.
         env: the environment that it acts in.
         tolerance: relative and absolute, of actions.
-
-    Raises:
-        AssertionError: the first law that is broken.
     """
-    laws = Laws(policy, tolerance)
+    laws, space = Laws(policy, tolerance), actions_of(env)
     pytree(laws, policy, "the policy")
     leaves, tree = jax.tree.flatten(policy)
     with laws.attempted("rebuilding it from its leaves", "its constructor must take whatever stands for its fields"):
@@ -36,30 +33,21 @@ def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None
     states, obs = jax.vmap(env.reset)(keys)
     act = OnceTraced(lambda policy, key, states, obs: policy.act(key, states, obs))
     with laws.attempted("`act` under jit", "it gets a key, states and observations (n, obs), all traced"):
-        actions = act(policy, keys[0], states, obs)
-        other = act(policy, keys[1], states, obs)
-        again = act(policy, keys[0], states, obs)
+        actions, again, other = (act(policy, keys[number], states, obs) for number in (0, 0, 1))
         act(change_floats(policy), keys[0], states, obs)
     laws.hold(act.traces == 1, "other values of its floats are traced anew: keep them out of static fields")
-    size = actions_of(env).size
-    shape = np.shape(actions)
-    laws.hold(shape == (ROWS, size), f"`act` returns shape {shape} for {ROWS} observations: return {(ROWS, size)}")
-    laws.actions(actions_of(env), actions, "an action that `act` returns")
-    laws.hold(laws.same(actions, again), "the same key gives other actions: draw all random numbers from the key")
-    first = jax.tree.map(lambda leaf: leaf[:1], states)
     with laws.attempted("`act` of one observation", "n may be 1"):
-        alone = act(policy, keys[0], first, obs[:1])
-    laws.hold(
-        np.shape(alone) == (1, size), f"`act` returns shape {np.shape(alone)} for 1 observation: return {(1, size)}"
-    )
-    laws.actions(actions_of(env), alone, "the action for one observation")
+        alone = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[:1], states), obs[:1])
+    for rows, found in ((ROWS, actions), (1, alone)):
+        shape = np.shape(found)
+        laws.hold(shape == (rows, space.size), f"`act` returns shape {shape} for {rows} observations")
+        laws.actions(space, found, "an action that `act` returns")
+    laws.hold(laws.same(actions, again), "the same key gives other actions: draw all random numbers from the key")
     if laws.same(actions, other):  # random actions differ where rows have another order
         order = jnp.roll(jnp.arange(ROWS), 4)
-        turned = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[order], states), obs[order])
-        laws.hold(
-            laws.same(turned, actions[order]) and laws.same(alone, actions[:1]),
-            "the action in one situation depends on the others of the batch: rows must not look at each other",
-        )
+        moved = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[order], states), obs[order])
+        apart = laws.same(moved, actions[order]) and laws.same(alone, actions[:1])
+        laws.hold(apart, "the action in one situation depends on the others: rows must not look at each other")
 
 
 def _check_axes(laws: Laws, policy: Any) -> None:

@@ -17,7 +17,7 @@ from cuelearner_jax.runs import filming
 from cuelearner_jax.runs.grid import Grid, check_grid
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.testing.environments import check_environment
-from cuelearner_jax.testing.laws import Laws
+from cuelearner_jax.testing.laws import Laws, same_shapes
 from cuelearner_jax.types import ValuesDirections
 
 FILMED = 3  # steps
@@ -28,15 +28,14 @@ def check_task(
 ) -> None:
     """Check that a task keeps its laws. Without a small world nothing is compiled.
 
+    Raises AssertionError for the first law that is broken.
+
     Args:
         task: the task.
         small: a configuration of it that compiles quickly: its environment is checked, its teacher asked.
         steps: steps of that environment's roll-out.
         pictures: an empty folder, for pictures of the small world (default: none are drawn).
         tolerance: as for `check_environment`.
-
-    Raises:
-        AssertionError: the first law that is broken.
     """
     laws = Laws(f"task {task.name}", tolerance)
     laws.hold(task.about, "it says nothing of itself: fill `about`, for help pages")
@@ -45,12 +44,20 @@ def check_task(
             check(preset.config)
             task.check_evaluations(preset.config)
             check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
-        env = _shapes(laws, task, preset.config.task, f"preset {name!r}")
+        with laws.attempted(f"the environment of preset {name!r}", "it must follow from the configuration alone"):
+            env = shape_of(task, preset.config.task)
+            worlds = {other: shape_of(task, one.apply(preset.config.task)) for other, one in task.scenarios.items()}
         possible = registry.possible(env, taught=task.teacher is not None)
         odd = [kind for kind in preset.guidance if registry.resolve(kind).name not in possible]
         laws.hold(not odd, f"preset {name!r} compares guidance {odd[:1]}, which it cannot have: of {list(possible)}")
-        _check_splits(laws, task, preset.config.task, name)
-        _check_scenarios(laws, task, preset.config.task, env.obs_size)
+        with laws.attempted(f"the splits of preset {name!r}", f"make an environment of training and of {[*SPLITS]}"):
+            first, *others = (_of_split(task, preset.config.task, split) for split in ("training", *SPLITS))
+        same = all(same_shapes(one, first) for one in others)
+        laws.hold(same, f"preset {name!r} has environments of other shapes for other splits: only values may differ")
+        for other, world in worlds.items():
+            size = world.obs_size
+            told = f"scenario {other!r} has observations of {size} entries, not {env.obs_size}: policies must act in it"
+            laws.hold(size == env.obs_size, told)
     if small is not None:
         laws.hold(isinstance(small, task.config), f"`small` is a {type(small).__name__}: give a {task.config.__name__}")
         _check_longest(laws, task, small)
@@ -61,30 +68,9 @@ def check_task(
         _check_pictures(laws, task, small, pictures)
 
 
-def _shapes(laws: Laws, task: Task, config: Any, called: str) -> Any:
-    with laws.attempted(f"the environment of {called}", "it must follow from the configuration alone"):
-        return shape_of(task, config)
-
-
-def _check_splits(laws: Laws, task: Task, config: Any, name: str) -> None:
-    """Check that training, tuning and validation share one compiled program."""
-
-    def seen(split: str) -> Any:
-        env = jax.eval_shape(lambda: task.environment(config, split))
-        return jax.tree.structure(env), [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(env)]
-
-    with laws.attempted(f"an environment of the splits of preset {name!r}", f"make one of training and of {[*SPLITS]}"):
-        same = all(seen(split) == seen("training") for split in SPLITS)
-    laws.hold(same, f"preset {name!r} has environments of other shapes for other splits: only values may differ")
-
-
-def _check_scenarios(laws: Laws, task: Task, config: Any, obs_size: int) -> None:
-    for name, scenario in task.scenarios.items():
-        world = _shapes(laws, task, scenario.apply(config), f"scenario {name!r}")
-        laws.hold(
-            world.obs_size == obs_size,
-            f"scenario {name!r} has observations of {world.obs_size} entries, not {obs_size}: policies must act in it",
-        )
+def _of_split(task: Task, config: Any, split: str) -> Any:
+    """Return the shapes of an environment; all splits must share one compiled program."""
+    return jax.eval_shape(lambda: task.environment(config, split))
 
 
 def _check_longest(laws: Laws, task: Task, config: Any) -> None:

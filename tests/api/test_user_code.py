@@ -1,7 +1,6 @@
 """Policies, teachers and environments of the user's own that raise or give no actions: named in one line."""
 
 import dataclasses
-import functools
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from flax import struct
 
 import cuelearner_jax as cl
-from cuelearner_jax.cli import dispatch
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.policies import Opaque
 
@@ -127,17 +125,13 @@ class Failing:
             return obs @ jnp.ones((3, 2))
 
 
-def test_what_raises_while_it_is_compiled_is_named_with_its_cause():
-    error = one_line(lambda: adapted(Scaled(1.0), Failing.Teacher()), "^Failing.Teacher.best_action raised KeyErr")
+def test_what_raises_while_it_is_compiled_keeps_its_own_traceback():
+    error = one_line(lambda: adapted(Scaled(1.0), Failing.Teacher()), "^teacher cannot answer in this world.*KeyError")
     assert isinstance(error.__cause__, KeyError)
-    error = one_line(lambda: cl.CallablePolicy(Failing.Policy())(SEEN), "^Failing.Policy.act raised TypeError")
-    assert isinstance(error.__cause__, TypeError)
-    place = Failing.Window()
-    error = one_line(
-        lambda: cl.adapt(Scaled(1.0), place, TEACHER, sizes=SIZES, guidance="relative"),
-        "^Failing.Window.step raised ZeroDivisionError: no floor here",
-    )
-    assert isinstance(error.__cause__, ZeroDivisionError)
+    with pytest.raises(TypeError):
+        cl.CallablePolicy(Failing.Policy())(SEEN)
+    with pytest.raises(ZeroDivisionError, match="no floor"):
+        cl.adapt(Scaled(1.0), Failing.Window(), TEACHER, sizes=SIZES, guidance="relative")
 
 
 def test_a_function_without_a_description_is_measured():
@@ -168,12 +162,3 @@ def test_a_refusal_of_the_package_within_a_policy_is_told_as_it_is():
         raise cl.UserError("give another")
 
     assert str(one_line(lambda: cl.CallablePolicy(asking)(SEEN), "give another")) == "give another"
-
-
-def test_the_command_line_says_it_in_one_line_above_the_users_own_traceback(monkeypatch, capsys):
-    monkeypatch.setattr("cuelearner_jax.cli.train.run", functools.partial(Failing.Window().step, None, None))
-    assert dispatch.main(["train"]) == 2
-    first, second, place, *_, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("error: Failing.Window.step raised ZeroDivisionError: no floor here")
-    assert (second, last) == ("Traceback (most recent call last):", "here")
-    assert place.split(", ")[0].endswith('test_user_code.py"')

@@ -208,7 +208,7 @@ def test_policies_that_cannot_be_had_are_refused(refused, tmp_path, monkeypatch)
 
 
 def test_a_file_of_something_else_is_refused(labelled, refused, tmp_path):
-    refused(["label", OWN, "--out", labelled / "two"], "another session.seed (3; the command asks", labelled)
+    refused(["label", OWN, "--out", labelled / "two"], "another session.seed: give the same", labelled)
     refused(["label", OWN, "page_task:left_of", "--out", labelled / "one"], "another session.", labelled)
 
 

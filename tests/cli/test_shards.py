@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from small_runs import SMALL, rows
@@ -102,19 +101,6 @@ def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path, capsys)
     assert rows(killed) == rows(calm)
 
 
-def test_a_full_disk_stops_a_piece_and_damages_nothing(whole, tmp_path, capsys, monkeypatch):
-    out = tmp_path / "run"
-    full = SimpleNamespace(free=1000)
-    with monkeypatch.context() as patch:
-        patch.setattr(shutil, "disk_usage", lambda folder: full)
-        assert main([*SWEEP, "--shard", "1/1", "--out", str(out)]) == 1
-    told = capsys.readouterr().err.splitlines()
-    assert told[-1].startswith("error: the disk is full: free some")
-    assert main([*SWEEP, "--shard", "1/1", "--out", str(out)]) == 0
-    assert rows(out) == whole
-
-
-@pytest.mark.long
 def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path):
     # Every file but the shortest is too large for this process.
     script = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000));"

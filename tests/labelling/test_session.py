@@ -236,7 +236,7 @@ def test_files_of_something_else_are_refused(opened, tmp_path):
         ({"bound_deg": 5.0}, "session.bound"),
     ):
         before = (tmp_path / "labels" / JSONL).read_bytes()
-        with pytest.raises(UserError, match=f"holds labels of another {named} "):
+        with pytest.raises(UserError, match=f"holds labels of another {named}:"):
             Session(plan(**asked), tmp_path / "labels")
         assert (tmp_path / "labels" / JSONL).read_bytes() == before
 

@@ -205,7 +205,7 @@ def test_a_checkpoint_whose_lanes_had_another_state_is_refused(whole, tmp_path, 
         return {**made, "rest": [block.replace(arbiter=(block.arbiter, block.failed)) for block in made["rest"]]}
 
     monkeypatch.setattr(lane_checkpoints, "items", of_a_newer_program)
-    with pytest.raises(UserError, match="of another version of the program: use that one, or start a new run") as told:
+    with pytest.raises(UserError, match="of another configuration or version of the program, use that one") as told:
         run(out, resume=True)
     assert "\n" not in str(told.value)
     assert probes.files_of(out) == before

@@ -131,7 +131,7 @@ def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
     ("change", "message"),
     [
         (lambda values: values["task"].update(name="tennis"), "unknown task 'tennis'"),
-        (lambda values: values["scalars"].update(colour=1), "unknown field 'colour' for Scalars"),
+        (lambda values: values["scalars"].update(colour=1), "colour is 1 in a file of another version"),
     ],
 )
 def test_the_description_of_another_program_is_not_loaded(out, change, message):

@@ -59,15 +59,10 @@ def test_a_run_may_be_resumed_or_overwritten_and_nothing_else(out):
     refused(out, "give one of them", resume=True, overwrite=True)
 
 
-def test_nothing_to_resume(tmp_path):
-    refused(tmp_path / "new", "nothing to resume", resume=True)
+def test_what_is_no_run_is_neither_resumed_nor_deleted(tmp_path):
     refused(tmp_path, "nothing to resume", resume=True)
     (tmp_path / "photo.txt").write_text("mine")
     refused(tmp_path, "nothing to resume", resume=True)
-
-
-def test_overwriting_never_deletes_what_is_no_run(tmp_path):
-    (tmp_path / "photo.txt").write_text("mine")
     refused(tmp_path, "not a run folder, so --overwrite will not delete it", overwrite=True)
     refused(tmp_path / "photo.txt", "not a run folder, so --overwrite will not delete it", overwrite=True)
     refused(tmp_path / "photo.txt", "not empty")
@@ -83,17 +78,12 @@ def test_overwriting_never_deletes_what_is_no_run(tmp_path):
         ("split", described(split="validation")),
         ("task.name", described(task={"name": "another"})),
         ("shard", described(shard=[1, 2])),
+        (r"scalars\.k_max", {**DESCRIBED, "scalars": {"eps_deg": 20.0}}),
+        (r"agent\.batch_size, agent\.directions", described(agent={"directions": 32, "batch_size": 8})),
     ],
 )
 def test_resuming_with_another_option_names_it(out, name, other):
     refused(out, rf"was run with other values of {name}: give the same options", other, resume=True)
-
-
-def test_resuming_names_several_options_and_those_that_only_one_side_has(out):
-    other = described(scalars={"k_max": 3}, agent={"directions": 32, "batch_size": 8})
-    refused(out, r"other values of agent\.batch_size, agent\.directions, scalars\.k_max: give", other, resume=True)
-    refused(out, r"other values of scalars\.k_max: give", {**DESCRIBED, "scalars": {"eps_deg": 20.0}}, resume=True)
-    refused(out, r"other values of scalars\.more: give", described(scalars={"more": 1}), resume=True)
 
 
 def test_what_a_description_does_not_say_counts_as_the_default():
@@ -111,13 +101,6 @@ def test_what_a_description_does_not_say_counts_as_the_default():
     assert apart({"split": "tuning"}, {"split": "tuning", "sizes": {"frame": "raw"}}) == ["sizes"]
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b"3", b"null", b"{}"])
-def test_resuming_from_a_damaged_description_is_refused(out, content):
-    (out / "config.json").write_bytes(content)
-    refused(out, r"config\.json is damaged.*: restore it, or start anew with --overwrite", resume=True)
-    folders.check_folder(out, DESCRIBED, resume=False, overwrite=True)  # as the message says
-
-
 def test_a_clean_start_deletes_the_run_and_any_other_keeps_it(out):
     folders.prepare_folder(out, described(split="validation"), clean=False)
     assert (out / "none" / "results.jsonl").exists()
@@ -125,11 +108,6 @@ def test_a_clean_start_deletes_the_run_and_any_other_keeps_it(out):
     folders.prepare_folder(out, described(split="validation"), clean=True)
     assert [path.name for path in out.iterdir()] == ["config.json"]
     assert json.loads((out / "config.json").read_text())["split"] == "validation"
-
-
-def test_a_folder_inside_folders_is_made(tmp_path):
-    folders.prepare_folder(tmp_path / "a" / "b", DESCRIBED, clean=True)
-    assert formats.read("config", tmp_path / "a" / "b" / "config.json") == DESCRIBED
 
 
 def test_a_folder_is_kept_for_one_process_and_free_afterwards(tmp_path):
@@ -160,13 +138,3 @@ def test_a_clean_start_removes_links_and_never_what_they_lead_to(out, tmp_path):
     folders.prepare_folder(out, DESCRIBED, clean=True)
     assert [path.name for path in out.iterdir()] == ["config.json"]
     assert (elsewhere / "photo.txt").read_text() == "mine"
-
-
-def test_a_clean_start_that_is_cut_short_can_be_made_again(out, monkeypatch):
-    def killed(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(folders.shutil, "rmtree", killed)
-    with pytest.raises(KeyboardInterrupt):
-        folders.prepare_folder(out, DESCRIBED, clean=True)
-    folders.check_folder(out, DESCRIBED, resume=False, overwrite=True)

@@ -4,14 +4,12 @@ import json
 
 import numpy as np
 import probes
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files as files
-from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.table import META
 
 TASK = {"name": "window", "half_width_deg": 28.0}
@@ -49,13 +47,6 @@ def test_labels_come_back_as_they_were(path):
     assert sorted(entry.name for entry in path.parent.iterdir()) == ["labels.parquet"]
 
 
-def test_answers_have_the_width_of_their_form_and_a_strength_if_it_has_one(path):
-    labels = written(path, answers="demonstration", eps_deg=None, width=2)
-    file = files.read(path)
-    assert (file.answers, file.eps) == ("demonstration", None)
-    np.testing.assert_array_equal(file.labels.answer, labels.answer.reshape(40, 2))
-
-
 def test_only_labels_that_count_are_written(path):
     labels = label_sets()
     labels = labels.replace(valid=np.arange(20)[None] < np.array([[3], [0]]))
@@ -86,13 +77,10 @@ def test_lanes_get_their_own_seeds_labels_padded(path):
         np.testing.assert_array_equal(rows.answer[lane, budget:], 0)
 
 
-def test_one_set_serves_every_seed(path):
+def test_one_set_serves_every_seed_and_missing_labels_are_refused(path):
     labels = written(path, seeds=(7,))
     rows = files.for_lanes(files.read(path), np.array([0, 1]), np.array([20, 20]), 20)
     np.testing.assert_array_equal(rows.obs, np.repeat(labels.obs, 2, 0))
-
-
-def test_too_few_labels_and_missing_seeds_are_refused(path):
     written(path)
     with pytest.raises(UserError, match="has 20 labels for seed 4, the budget is 21"):
         files.for_lanes(files.read(path), np.array([4]), np.array([21]), 30)
@@ -115,50 +103,15 @@ def test_a_digest_tells_contents_apart(path):
 # Files that cannot be read.
 
 
-def test_a_missing_file_is_refused(path):
-    with pytest.raises(UserError, match="no label file"):
-        files.read(path)
-    with pytest.raises(UserError, match="no label file"):
-        files.read(path.parent)
-
-
-def test_a_file_without_labels_is_refused(path):
+def test_no_file_and_a_file_without_labels_are_refused(path):
+    for missing in (path, path.parent):
+        with pytest.raises(UserError, match="no label file"):
+            files.read(missing)
     labels = label_sets()
     files.write(
         path, TASK, "relative", DIRECTIONS, EPS, np.array([4, 9]), labels.replace(valid=np.zeros((2, 20), bool))
     )
     with pytest.raises(UserError, match="holds no labels"):
-        files.read(path)
-
-
-def test_damage_is_noticed_wherever_it_changes_anything(path):
-    labels = written(path)
-    whole = path.read_bytes()
-    columns = whole.index(META)  # the numbers lie before it, what the file says of itself twice after it
-    refusals = 0
-    for at in range(0, len(whole) - 60, 60):
-        path.write_bytes(whole[:at] + bytes(60) + whole[at + 60 :])
-        try:
-            file = files.read(path)
-        except UserError as refusal:
-            assert "damaged" in str(refusal)
-            refusals += 1
-            continue
-        assert at > columns
-        assert (file.task, file.answers, file.space, file.eps) == (TASK, "relative", DIRECTIONS, EPS)
-        np.testing.assert_array_equal(file.labels.obs, labels.obs.reshape(40, 3))
-    assert refusals > columns // 60
-
-
-def test_text_and_foreign_tables_are_refused(path):
-    path.write_text("seed,obs\n1,2\n")
-    with pytest.raises(UserError, match="not a label file"):
-        files.read(path)
-    pq.write_table(pa.table({"seed": [1]}), path)
-    with pytest.raises(UserError, match="not those that were written"):
-        files.read(path)
-    tables.write(path, pa.table({"seed": [1]}), files.SCHEMA)
-    with pytest.raises(UserError, match="lacks the columns obs, action"):
         files.read(path)
 
 
@@ -173,9 +126,7 @@ LINE = {"seed": 0, "obs": [0.1, 0.2], "action": [0.0, 1.0], "answer": [1.0]}
         ({"format": None}, {}, "not a label file"),
         ({"task": None}, {}, "not a label file"),
         ({"space": {}}, {}, "not a label file"),
-        ({"eps": "wide"}, {}, "not a label file"),
         ({}, {"obs": [0.1]}, "not a label file"),
-        ({}, {"action": "up"}, "not a label file"),
         ({}, {"seed": 0.5}, "not a label file"),
     ],
 )
@@ -206,12 +157,6 @@ def assert_holds(file, labels, count):
         np.testing.assert_array_equal(getattr(file.labels, name), getattr(labels, name)[0, :count])
 
 
-def test_a_file_cut_in_its_first_line_starts_anew(tmp_path):
-    (tmp_path / files.JSONL).write_text('{"about": {"form')
-    labels = said(tmp_path, range(2))
-    assert_holds(files.read(tmp_path / files.JSONL), labels, 2)
-
-
 def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
     labels = said(tmp_path, range(20))
     assert files.finish(tmp_path) == tmp_path / files.PARQUET
@@ -227,27 +172,16 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
 @pytest.mark.parametrize(
     ("other", "named"),
     [
-        ({"answers": "scalar"}, r"answers \(relative; the command asks for scalar\)"),
-        ({"eps_deg": 5.0}, r"eps \(20.0; the command asks for 5.0\)"),
-        ({"answers": "scalar", "eps_deg": None}, r"answers \(relative; the command asks for scalar\)"),
+        ({"answers": "scalar", "eps_deg": None}, "answers"),
+        ({"eps_deg": 5.0}, "eps"),
     ],
 )
-@pytest.mark.parametrize("done", [False, True])
-def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named, done):
+def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named):
     said(tmp_path, range(3))
-    if done:
-        files.finish(tmp_path)
+    files.finish(tmp_path)
     before = probes.files_of(tmp_path)
-    with pytest.raises(UserError, match=f"holds labels of another {named}: give the same, or another folder"):
+    with pytest.raises(UserError, match=f"holds labels of another {named}: give the same, or another --out"):
         said(tmp_path, [3], **other)
-    assert probes.files_of(tmp_path) == before
-
-
-def test_foreign_files_are_not_continued(tmp_path):
-    (tmp_path / files.JSONL).write_text('{"seed": 1, "obs": [1.0], "action": [1.0], "answer": [1.0]}\n')
-    before = probes.files_of(tmp_path)
-    with pytest.raises(UserError, match="not a label file"):
-        said(tmp_path, [3])
     assert probes.files_of(tmp_path) == before
 
 
@@ -255,11 +189,12 @@ def test_a_label_that_could_not_be_read_is_not_written(tmp_path):
     labels = said(tmp_path, range(2))
     row = {name: getattr(labels, name)[0, 2] for name in NAMES}
     with files.LabelWriter(tmp_path, TASK, "relative", DIRECTIONS, EPS) as writer:
+        writer.append(seed=7, **row)
         for name, wrong, message in (
-            ("obs", np.zeros(4), r"obs has the shape \(4,\), expected \(3,\)"),
+            ("answer", np.zeros(4), r"answer has the shape \(4,\), expected \(1,\)"),
             ("action", np.array(1.0), "action has the shape"),
             ("answer", np.array([np.nan]), "answer is not finite"),
         ):
             with pytest.raises(ValueError, match=message):
                 writer.append(seed=7, **{**row, name: wrong})
-    assert_holds(files.read(tmp_path / files.JSONL), labels, 2)
+    assert_holds(files.read(tmp_path / files.JSONL), labels, 3)

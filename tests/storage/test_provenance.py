@@ -11,17 +11,13 @@ from cuelearner_jax.storage.provenance import provenance
 ROOT = Path(cuelearner_jax.__file__).resolve().parents[1]
 
 
-def test_it_names_versions_and_hardware():
-    columns = provenance()
-    assert set(columns) == {"commit", "versions", "hardware", "command"}
-    assert "jax 0." in columns["versions"]
-    assert columns["versions"].startswith(f"python {sys.version.split()[0]}, ")
-    assert columns["hardware"]
-
-
 def test_the_command_can_be_given_again(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/some/where/cuelearner", "sweep", "a task", "--seeds", "2"])
-    assert provenance()["command"] == "cuelearner sweep 'a task' --seeds 2"
+    columns = provenance()
+    assert columns["command"] == "cuelearner sweep 'a task' --seeds 2"
+    assert columns["versions"].startswith(f"python {sys.version.split()[0]}, ")
+    assert "jax 0." in columns["versions"]
+    assert columns["hardware"]
 
 
 def test_the_commit_is_that_of_the_checkout_or_empty():
@@ -37,9 +33,3 @@ def test_the_commit_is_that_of_the_checkout_or_empty():
 def test_outside_a_checkout_there_is_no_commit(monkeypatch, tmp_path):
     monkeypatch.setattr(origin, "__file__", str(tmp_path / "package" / "records" / "provenance.py"))
     assert provenance()["commit"] == ""
-
-
-def test_a_package_that_is_not_there_is_left_out(monkeypatch):
-    monkeypatch.setattr(origin, "_version", lambda package: "" if package == "optax" else "1.0")
-    assert "optax" not in provenance()["versions"]
-    assert "flax 1.0" in provenance()["versions"]

@@ -1,35 +1,49 @@
-"""Whole files: nothing is left of a write that fails, and two writers do not mix."""
+"""Whole files and folders: a write that fails leaves nothing, two writers do not mix, a kill leaves the old or new."""
 
-import csv
 import os
+import shutil
 import threading
+from pathlib import Path
 
 import pytest
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.storage import whole
 from cuelearner_jax.storage.whole import replacing
+
+
+class Killed(BaseException):
+    """What is raised in the place of every change of the disk from a kill on."""
+
+
+def check(folder):
+    """Whatever holds a file `ours` may be replaced."""
+    if whole.is_used(folder) and not (folder / "ours").exists():
+        raise UserError(f"{folder} is not ours")
+
+
+def write(folder, text, overwrite=True, meanwhile=lambda: None):
+    with whole.place_of(folder, check, overwrite) as place, place.writing() as new:
+        if isinstance(text, BaseException):
+            raise text
+        (new / "ours").write_text(text)
+        meanwhile()
 
 
 def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("there", [False, True])
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt(), UserError("no")])
-def test_nothing_is_left_of_a_write_that_fails(tmp_path, there, error):
-    path = tmp_path / "l.csv"
-    if there:
-        path.write_text("before")
-
-    def write():
-        with replacing(path) as file:
-            csv.writer(file).writerow(["a"])
-            raise error
-
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_nothing_is_left_of_a_write_that_fails(tmp_path, error):
+    path, out = tmp_path / "l.csv", tmp_path / "out"
+    path.write_text("before")
+    with pytest.raises(type(error)), replacing(path) as file:  # noqa: PT012
+        file.write("after")
+        raise error
     with pytest.raises(type(error)):
-        write()
-    assert names(tmp_path) == ["l.csv"] * there
-    assert not there or path.read_text() == "before"
+        write(out, error)
+    assert (names(tmp_path), path.read_text()) == (["l.csv"], "before")
 
 
 def test_a_fresh_file_replaces_none(tmp_path):
@@ -42,24 +56,82 @@ def test_a_fresh_file_replaces_none(tmp_path):
 
 def test_two_at_once_leave_one_whole_file(tmp_path):
     path = tmp_path / "l.csv"
+
+    def second():
+        with replacing(path) as file:
+            file.write("second" * 1000)
+
     with replacing(path) as first:
         first.write("first")
-        thread = threading.Thread(target=write_second, args=(path,))
+        thread = threading.Thread(target=second)
         thread.start()
         thread.join()
         assert path.read_text() == "second" * 1000
     assert (names(tmp_path), path.read_text()) == (["l.csv"], "first")
 
 
-def write_second(path):
-    with replacing(path) as file:
-        file.write("second" * 1000)
+def test_a_folder_appears_as_a_whole_and_nothing_else_stays(tmp_path):
+    for text in ("one", "two"):
+        write(tmp_path / "a" / "out", text)
+        assert (tmp_path / "a" / "out" / "ours").read_text() == text
+        assert names(tmp_path / "a") == ["out"]
+    (tmp_path / "empty").mkdir()
+    write(tmp_path / "empty", "three", overwrite=False)
+    assert names(tmp_path / "empty") == ["ours"]
 
 
-def test_the_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
-    done = []
-    monkeypatch.setattr(os, "fsync", lambda number, usual=os.fsync: (done.append("sync"), usual(number)))
-    monkeypatch.setattr(os, "replace", lambda *pair, usual=os.replace: (done.append("replace"), usual(*pair)))
-    with replacing(tmp_path / "l.csv") as file:
-        file.write("whole")
-    assert done == ["sync", "replace", "sync"]
+def test_a_second_writer_is_refused_while_the_first_works(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "out")
+    with whole.place_of(tmp_path / "out", check):
+        for name in ("out", "link"):
+            with pytest.raises(UserError, match=f"{name} is being written by another process"):
+                write(tmp_path / name, "second")
+    write(tmp_path / "link", "second")
+    assert names(tmp_path) == ["link", "out"]
+
+
+@pytest.mark.parametrize(("made", "overwrite"), [("theirs", True), ("ours", False)])
+def test_what_was_made_meanwhile_stays(tmp_path, made, overwrite):
+    def meanwhile():
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / made).write_text("theirs")
+
+    with pytest.raises((UserError, OSError), match=r"is not ours|not empty"):
+        write(tmp_path / "out", "mine", overwrite, meanwhile)
+    assert (tmp_path / "out" / made).read_text() == "theirs"
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(tmp_path, monkeypatch):
+    changing = [(os, "rename"), (shutil, "rmtree"), (Path, "mkdir"), (Path, "unlink")]
+    steps, found = 0, set()
+    while True:
+        home, left = tmp_path / f"{steps}", [steps]
+        out = home / "out"
+        write(out, "old")
+
+        def counted(function, left=left):
+            def call(*arguments, **keywords):
+                left[0] -= 1
+                if left[0] < 0:
+                    raise Killed
+                return function(*arguments, **keywords)
+
+            return call
+
+        with monkeypatch.context() as patch:
+            for owner, name in changing:
+                patch.setattr(owner, name, counted(getattr(owner, name)))
+            try:
+                write(out, "new")
+                whole_again = True
+            except Killed:
+                whole_again = False
+        if whole_again:
+            break
+        with whole.place_of(out, lambda _: None):  # the next who writes there tidies up
+            found.add((out / "ours").read_text())
+        assert names(home) == ["out"]
+        steps += 1
+    assert steps >= 4
+    assert found == {"old", "new"}

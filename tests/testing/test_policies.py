@@ -49,10 +49,6 @@ def altered(change):
     return Altered()
 
 
-class Axeless(Turned):
-    axes = None
-
-
 class Sideways(Turned):
     @property
     def axes(self):
@@ -77,7 +73,7 @@ BROKEN = {
     "an if": (Branching(), "`act` under jit fails"),
     "a length": (altered(lambda key, actions: 2.0 * actions), "is not an action of the space"),
     "one for all": (altered(lambda key, actions: actions[0]), "`act` returns shape (2,) for 9 observations"),
-    "neighbours": (altered(lambda key, actions: retract(actions + actions[:1])), "depends on the others of the batch"),
+    "neighbours": (altered(lambda key, actions: retract(actions + actions[:1])), "depends on the others"),
     "not finite": (altered(lambda key, actions: actions / 0.0), "is not finite everywhere"),
 }
 
@@ -101,7 +97,7 @@ def test_a_policy_of_ones_own_keeps_them():
     check_policy(Turned(jnp.float32(1.0)), ENV)
 
 
-def test_actions_that_are_drawn_need_not_keep_their_rows():
+def test_drawn_actions_need_not_keep_their_rows():
     check_policy(altered(lambda key, actions: DIRECTIONS.sample(key, (len(actions),))), ENV)
 
 
