@@ -5,16 +5,14 @@
 
 All ways have the same networks, minibatches, updates a step, learning rates, discount and target entropy (-0.5 an
 entry, which brax fixes), and as many steps before the first update: uniform actions here and in Stable-Baselines3,
-brax's untrained actor there. brax's SAC runs in brax's environments and, through `to_brax`, in the pendulum. The
+brax's untrained actor there. brax's SAC runs in brax's environments and in the pendulum (`_brax_pendulum.py`). The
 packages of Gymnasium run in Gymnasium's Pendulum-v1, which `pendulum.py` is step for step.
 
 Ways take turns within one run: each turn is a whole training with a seed of its own. Seconds are of training alone,
 without evaluations, and without each training's first stretch, which compiles. `--seeds 64` trains as many seeds here
 side by side, against one of the peer; its steps a second are then those of all seeds.
 
-A peer that is not installed is skipped with a line. Give `--peer-python` a Python with sbx:
-
-    python -m venv peers && peers/bin/pip install sbx-rl
+A peer that is not installed is skipped with a line. Give `--peer-python` a Python with sbx (`pip install sbx-rl`).
 """
 
 from __future__ import annotations
@@ -34,11 +32,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _brax_pendulum import BraxPendulum, wrap
 from _measuring import timed
 from pendulum import STEPS, Pendulum
 
 from cuelearner_jax.agents import sac
-from cuelearner_jax.bridges.brax import from_brax, supply_device_put_replicated, to_brax, wrap_for_training
+from cuelearner_jax.bridges.brax import from_brax, supply_device_put_replicated
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.loop import start_clock
@@ -79,12 +78,11 @@ class Setting:
 
 def environment_of(name: str, backend: str) -> tuple[Any, Any, int]:
     """Return this package's environment, brax's, and the steps of an episode."""
+    supply_device_put_replicated()
     if name == PENDULUM:
-        env = Pendulum(jnp.array(STEPS))
-        return env, to_brax(env), STEPS
+        return Pendulum(jnp.array(STEPS)), BraxPendulum(), STEPS
     from brax import envs
 
-    supply_device_put_replicated()
     env = envs.get_environment(name, backend=backend)
     return from_brax(env, max_steps=LENGTH), env, LENGTH
 
@@ -145,7 +143,7 @@ def ours(env: Any, setting: Setting, seeds: int, length: int) -> Way:
 
 
 def of_brax(env: Any, setting: Setting, length: int, own: bool) -> Way:
-    """brax's SAC; `own`: the environment is one of ours, through `to_brax`."""
+    """brax's SAC; `own`: the environment is our pendulum."""
     from brax.training.agents.sac import networks, train
 
     factory: Any = functools.partial(networks.make_sac_networks, hidden_layer_sizes=setting.layers)
@@ -163,7 +161,7 @@ def of_brax(env: Any, setting: Setting, length: int, own: bool) -> Way:
             env,
             num_timesteps=setting.steps,
             episode_length=length,
-            wrap_env_fn=wrap_for_training if own else None,
+            wrap_env_fn=wrap if own else None,
             num_envs=1,
             num_eval_envs=setting.episodes,
             learning_rate=setting.rate,

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.devices import BY_LANE, SHARED, commit_arrays, over_lanes, portions
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.policies import Policy, PolicyBlock, call_policy, lanes_in, policy_name
+from cuelearner_jax.policies import Policy, PolicyNode, call_policy, lanes_in, policy_name
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
@@ -113,7 +113,7 @@ def _summed(walk: _Walk, steps: int) -> Rollout:
     return Rollout({name: values.mean() for name, values in each.items()}, each, walk.episode_steps)
 
 
-def _apart(policy: PolicyBlock) -> tuple[Any, Any]:
+def _apart(policy: PolicyNode) -> tuple[Any, Any]:
     """Split a policy into leaves that each lane has and leaves that lanes share, with None in place of the others."""
     by_lane = lambda axis, part: jax.tree.map(lambda _: axis is not None, part)  # noqa: E731
     own = jax.tree.map(by_lane, policy.axes, policy, is_leaf=lambda axis: axis is None)
@@ -189,7 +189,7 @@ def rollout_with_progress(
 
 def rollout_lanes(
     env: Environment,
-    policy: PolicyBlock,
+    policy: PolicyNode,
     key: PRNGKeyArray,
     num_envs: int,
     steps: int,

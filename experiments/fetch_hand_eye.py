@@ -34,7 +34,7 @@ from cuelearner_jax.bridges.gymnasium.source import make_registered
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import mean_interval
-from cuelearner_jax.policies import in_space, policy_of
+from cuelearner_jax.policies import policy_of
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import fetch_layout
 
@@ -146,7 +146,7 @@ def measure(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Itera
     first = FIRST_EPISODE[split] + int(number) * scale.episodes
     episodes, seed = range(first, first + scale.episodes), FIRST_SEED[split] + int(number)
     if kind == "base":
-        script = in_space(policy_of(jax.jit(SCRIPTS[environment])), world_of(environment).actions)
+        script = policy_of(jax.jit(SCRIPTS[environment]), world_of(environment).actions)
         for what, offset in (("unchanged", (0.0, 0.0, 0.0)), ("displaced", OFFSET)):
             if (what, "", False) not in done:
                 success = play(environment, script, offset, episodes)

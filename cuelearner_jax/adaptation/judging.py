@@ -24,7 +24,7 @@ from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
-from cuelearner_jax.policies import PolicyBlock
+from cuelearner_jax.policies import PolicyNode
 from cuelearner_jax.spaces import is_answered
 
 HELD_OUT = 5  # every fifth label is held out
@@ -142,7 +142,7 @@ class Judge:
             best = jnp.where(jnp.asarray(better), within.bound, best)
         return block.replace(bound=best), spent
 
-    def _rolled(self, policy: PolicyBlock, what: str, key: Any = None, num_envs: int | None = None) -> Rollout:
+    def _rolled(self, policy: PolicyNode, what: str, key: Any = None, num_envs: int | None = None) -> Rollout:
         how = self.how
         assert how.env is not None  # a metric needs episodes
         mesh = None if policy is self.of.bases else self.mesh  # the number of environments may differ

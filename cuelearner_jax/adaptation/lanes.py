@@ -33,7 +33,7 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, over_lanes
 from cuelearner_jax.environment import Environment, actions_of, view_of
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Guided, PolicyBlock
+from cuelearner_jax.policies import Guided, PolicyNode
 from cuelearner_jax.types import Label, Teacher
 
 
@@ -105,7 +105,7 @@ class Adaptation(struct.PyTreeNode):
     sizes: GuideSizes = struct.field(pytree_node=False)  # sizes that the guide was made with
     scalars: Scalars  # settings of refinement, of fitting and of a simulated teacher's faults
     env: Environment  # the changed world
-    bases: PolicyBlock  # leaves that are `BY_LANE` in its `axes` have a row for each base; or `policies.Common`
+    bases: PolicyNode  # leaves that are `BY_LANE` in its `axes` have a row for each base; or `policies.Common`
 
     def policy(self, block: LaneState, env: Any = None) -> Guided:
         """Return every lane's policy: its base's actions under its model, within its bound.

@@ -23,7 +23,7 @@ from cuelearner_jax.environment import Spaces, actions_of, offers, spaces_of, vi
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, in_space, layers, uniform_in
+from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, policy_of, uniform_in
 from cuelearner_jax.reading.policy import KIND as READING
 from cuelearner_jax.reading.policy import Read, unread
 from cuelearner_jax.run_config import kind_from_json, part_from_json
@@ -128,7 +128,7 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
             f"this policy is made of code, {values['named']}, which is not loaded because a file names it: add "
             f"--base {values['named']} if you trust that code"
         )
-    return in_space(code, actions_of(env))
+    return policy_of(code, actions_of(env))
 
 
 def _unread(values: dict[str, Any], env: Any, family: Any) -> Read:

@@ -30,7 +30,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.reading import KIND
-from cuelearner_jax.policies import Common, in_space
+from cuelearner_jax.policies import Common, policy_of
 from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
@@ -246,7 +246,7 @@ def correct(
     before = before if isinstance(before, LogsConfig) else None
     label_set = _labels(labels, space, cues, low, high, before)
     own = as_policy(policy)
-    acting = CallablePolicy(in_space(own, label_set.space), actions=label_set.space)
+    acting = CallablePolicy(policy_of(own, label_set.space), actions=label_set.space)
     acting(label_set.rows.obs)  # refuses what gives no actions
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
@@ -291,8 +291,8 @@ def agreement(
     if eps is None:
         eps = float((getattr(own, "scalars", None) or plain_scalars(label_set.space)).eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base)
-    base = None if base is None else in_space(base, label_set.space)
-    return agreement_of(in_space(own, label_set.space), label_set.rows, label_set.space, eps, base)
+    base = None if base is None else policy_of(base, label_set.space)
+    return agreement_of(policy_of(own, label_set.space), label_set.rows, label_set.space, eps, base)
 
 
 def _labels(

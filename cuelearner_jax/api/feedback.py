@@ -32,7 +32,7 @@ from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
-from cuelearner_jax.policies import Common, Guided, in_space
+from cuelearner_jax.policies import Common, Guided, policy_of
 from cuelearner_jax.spaces import DIRECTIONS, Space, says_something
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import GuidanceModel, Label, Teacher
@@ -165,7 +165,7 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
             least eps. A larger one is a warning: there the model was shown nothing.
     """
     space, labels, eps = model.space, model.labels, model.scalars.eps_deg
-    base, width = in_space(as_policy(policy), space), labels.obs.shape[1]
+    base, width = policy_of(as_policy(policy), space), labels.obs.shape[1]
     observation = getattr(policy, "observation", ()) or (Quantity("observation", width, ""),)
     if width != (seen := sum(quantity.size for quantity in observation)):
         raise UserError(

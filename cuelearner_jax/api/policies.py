@@ -18,7 +18,7 @@ from cuelearner_jax.api.worlds import World, numbers
 from cuelearner_jax.config import to_json
 from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name, policy_of
+from cuelearner_jax.policies import Policy, call_policy, policy_name, policy_of
 from cuelearner_jax.policies.foreign import FILES
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
@@ -51,7 +51,7 @@ class CallablePolicy:
 
     def __post_init__(self) -> None:
         """Make a policy of an object that acts. Raises UserError for any other."""
-        object.__setattr__(self, "policy", in_space(policy_of(self.policy), self.actions))
+        object.__setattr__(self, "policy", policy_of(self.policy, self.actions))
 
     @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
@@ -97,7 +97,7 @@ def as_policy(given: Any) -> Policy:
 
 def as_policy_in(given: Any, env: Any) -> Policy:
     """Return `as_policy` for a world. Raises UserError for a policy that cannot act there."""
-    policy = in_space(as_policy(given), actions_of(env))
+    policy = policy_of(as_policy(given), actions_of(env))
     if isinstance(given, CallablePolicy) and given.observation:
         check_layout("the policy", given.observation, given.actions, env)
     user_code.acts_in("policy", policy, env)

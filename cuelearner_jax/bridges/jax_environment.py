@@ -1,7 +1,7 @@
 """Simulators with brax's interface, MuJoCo Playground's included, as environments for our loop.
 
 Such a simulator has `reset(rng) -> State` and `step(state, action) -> State`; a State has `obs`, `reward`, `done`,
-`metrics` and `info`. This file imports neither library. `bridges.brax` and `bridges.playground` say what each brings.
+`metrics` and `info`. This file imports neither library.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space, box
+from cuelearner_jax.spaces import Box, Cue, Space, box
 from cuelearner_jax.types import Step
 
-State = Any  # a simulator's state: a pytree with the members that this module's docstring names
+Heuristic = Callable[[Float[Array, " obs"]], Float[Array, " action"]]
 
 
 class Running(struct.PyTreeNode):
     """State of a `JaxEnvironment` between steps."""
 
-    state: State  # the simulator's state
+    state: Any  # the simulator's state
     steps: Int[Array, ""]  # taken in this episode
 
 
@@ -44,9 +44,7 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     simulator: Callable[[], Any] = struct.field(pytree_node=False)
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
-    # action of ours -> the simulator's (n,); None: as it is
-    to_action: Callable[[Float[Array, " action"]], Float[Array, " n"]] | None = struct.field(pytree_node=False)
-    heuristic: Callable[[Float[Array, " obs"]], Float[Array, " action"]] | None = struct.field(pytree_node=False)
+    heuristic: Heuristic | None = struct.field(pytree_node=False, default=None)
 
     def reset(self, key: PRNGKeyArray) -> tuple[Running, Float[Array, " obs"]]:
         """Start an episode."""
@@ -56,23 +54,15 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     def step(self, key: PRNGKeyArray, state: Running, action: Float[Array, " action"]) -> tuple[Running, Step]:
         """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
         before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into their input dictionaries
-        given = action if self.to_action is None else self.to_action(action)
-        after = Running(_as_arrays(self.simulator().step(before, given)), state.steps + 1)
+        after = Running(_as_arrays(self.simulator().step(before, action)), state.steps + 1)
         stopped = jnp.asarray(after.state.info.get("truncation", 0)) > 0
         terminated = (after.state.done > 0) & ~stopped
         truncated = (stopped | (after.steps >= self.max_steps)) & ~terminated
         fresh, fresh_obs = self.reset(key)
         final_obs, ended = flat(after.state.obs), terminated | truncated
-        step = Step(
-            obs=jnp.where(ended, fresh_obs, final_obs),
-            final_obs=final_obs,
-            aftermath=final_obs,
-            reward=after.state.reward.astype(jnp.float32),
-            terminated=terminated,
-            truncated=truncated,
-            metrics={name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()},
-            outcome={},
-        )
+        obs, reward = jnp.where(ended, fresh_obs, final_obs), after.state.reward.astype(jnp.float32)
+        metrics = {name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()}
+        step = Step(obs, final_obs, final_obs, reward, terminated, truncated, metrics, outcome={})
         return jax.tree.map(partial(jnp.where, ended), fresh, after), step
 
 
@@ -96,37 +86,32 @@ class Layout(NamedTuple):
 
     @property
     def observation(self) -> tuple[Quantity, ...]:
-        """Return the slices as an environment has them."""
+        """The slices as an environment has them."""
         return tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in zip(self.slices, self.sizes, strict=True))
 
     def box(self, cues: Sequence[Cue] = ()) -> Box:
         """Return the space [-1, 1]^n of the actions, with a cue an entry: `cues`, or the entry's name."""
         size = len(self.entries)
-        named = tuple(cues) or box.plain_cues(self.entries)
-        return Box((-1.0,) * size, (1.0,) * size, named)
+        return Box((-1.0,) * size, (1.0,) * size, tuple(cues) or box.plain_cues(self.entries))
 
 
 def layout_of(simulator: Any, name: str) -> Layout:
     """Return the layout of a simulator without compiling. `name`: the simulator's, for messages.
 
-    Raises:
-        UserError: the simulator is a batch of several, hides the end of an episode, or observes images.
+    Raises UserError for a batch of several, a hidden end of episodes, or images.
     """
     shapes = jax.eval_shape(simulator.reset, jax.random.key_data(jax.random.key(0)))
     if shapes.reward.shape:
         raise UserError(f"{name}: it is a batch of shape {shapes.reward.shape}: give a single environment")
     if "first_obs" in shapes.info:
         raise UserError(f"{name}: AutoResetWrapper hides the last observation of an episode: pass what it wraps")
-    found = jax.tree_util.tree_leaves_with_path(shapes.obs)
-    slices = [("/".join(str(part.key) for part in path) or name.lower(), leaf.shape) for path, leaf in found]
+    leaves = jax.tree_util.tree_leaves_with_path(shapes.obs)
+    slices = [("/".join(str(part.key) for part in path) or name.lower(), leaf.shape) for path, leaf in leaves]
     for part, shape in slices:
         if len(shape) > 1 or part.startswith("pixels"):
             raise UserError(f"{name}: the observation {part!r} is an image {shape}: give numbers (n,), as its state")
-    return Layout(
-        tuple(part for part, _ in slices),
-        tuple(math.prod(shape) for _, shape in slices),
-        entries_of(simulator, int(simulator.action_size)),
-    )
+    parts, sizes = tuple(part for part, _ in slices), tuple(math.prod(shape) for _, shape in slices)
+    return Layout(parts, sizes, _entries_of(simulator, int(simulator.action_size)))
 
 
 def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:
@@ -140,37 +125,39 @@ def model_of(simulator: Any) -> Any:
     return getattr(simulator, "mj_model", None) or getattr(getattr(simulator, "sys", None), "mj_model", None)
 
 
-def entries_of(simulator: Any, size: int) -> tuple[str, ...]:
+def _entries_of(simulator: Any, size: int) -> tuple[str, ...]:
     """Return a name for each entry of an action: of the MuJoCo model's actuator or its joint, else its number."""
-    plain = tuple(f"entry {number}" for number in range(1, size + 1))
-    model = model_of(simulator)
-    if model is None or model.nu != size:
-        return plain
-    joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
-    named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
-    return tuple(named) if all(named) and len(set(named)) == size else plain
+    model, named = model_of(simulator), []
+    if model is not None and model.nu == size:
+        joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
+        named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
+    if named and all(named) and len(set(named)) == size:
+        return tuple(named)
+    return tuple(f"entry {number}" for number in range(1, size + 1))
 
 
-def space_of(
-    name: str,
-    layout: Layout,
-    to_action: Callable[[Float[Array, "2"]], Float[Array, " n"]] | None,
-    cues: Sequence[Cue] = (),
-) -> Space:
-    """Return directions where `to_action` maps them to actions, else the whole box.
+def from_simulator(
+    env: Any, max_steps: int = 1000, heuristic: Heuristic | None = None, *, cues: Sequence[Cue] = ()
+) -> JaxEnvironment:
+    """Return an environment of brax or MuJoCo Playground as one of ours, with its whole box [-1, 1]^n of actions.
 
-    Raises UserError where `to_action` gives other shapes, or cues are given beside it or do not fit the box.
+    `env` becomes a constant of what is compiled, `max_steps` is traced. Observations in a dictionary become one vector,
+    with a slice for each entry of the dictionary, in the order of their names.
+
+    Args:
+        env: bare, or in brax's `EpisodeWrapper`, whose truncations are then truncations here.
+        max_steps: an episode is truncated after this many steps.
+        heuristic: observation -> the obvious action. Without this the guidance "heuristic" is refused.
+        cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
+
+    Raises:
+        UserError: observations or actions do not fit.
     """
-    if to_action is None:
-        return layout.box(cues)
-    if cues:
-        raise UserError(f"{name}: cues are of the box, to_action of directions: give one of the two")
-    given, wanted = jax.eval_shape(to_action, jnp.zeros(2)).shape, (len(layout.entries),)
-    if given != wanted:
-        raise UserError(f"{name}: to_action returns shape {given}, but an action has shape {wanted}")
-    return DIRECTIONS
+    name = type(env.unwrapped).__name__
+    layout, steps = layout_of(env, name), jnp.array(max_steps, jnp.int32)
+    return JaxEnvironment(steps, FixedSimulator(env), layout.observation, layout.box(cues), heuristic)
 
 
-def _as_arrays(state: State) -> State:
+def _as_arrays(state: Any) -> Any:
     """Return a state's numbers as arrays, since some simulators return Python numbers."""
     return jax.tree.map(jnp.asarray, state)

@@ -40,7 +40,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.reading import KIND
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
-from cuelearner_jax.policies import NearAims, in_space, uniform_in
+from cuelearner_jax.policies import NearAims, policy_of, uniform_in
 from cuelearner_jax.reading.families import Family, declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
@@ -286,7 +286,7 @@ def _base(task: Task, options: Label, source: PolicySource | None, env: Any) -> 
         if lane != Lane():
             raise UserError("--base.… chooses a folder's lane, but no folder is given: leave it out")
         if named is not None:
-            return Base(in_space(code_of(named), actions_of(env)), named)
+            return Base(policy_of(code_of(named), actions_of(env)), named)
         if options.questions == UNIFORM:
             return Base(uniform_in(env), UNIFORM)
         if options.questions == PROPOSED:

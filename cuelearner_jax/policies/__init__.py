@@ -4,6 +4,7 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 (`evaluate.rollout_lanes` maps over them); what lanes share is there once.
 """
 
+# ruff: noqa: F401 (what other modules import from here)
 from cuelearner_jax.policies.layers import (
     Agent,
     Common,
@@ -21,37 +22,6 @@ from cuelearner_jax.policies.layers import (
     uniform_in,
     wanted_actions,
 )
-from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyBlock, PolicyNode, describe, lanes_in, layers
-from cuelearner_jax.policies.opaque import Opaque, call_policy, in_space, policy_name, policy_of
+from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyNode, describe, lanes_in, layers
+from cuelearner_jax.policies.opaque import Opaque, call_policy, policy_name, policy_of
 from cuelearner_jax.types import Policy
-
-__all__ = [
-    "BY_LANE",
-    "SHARED",
-    "Agent",
-    "Common",
-    "Corrected",
-    "Guided",
-    "Heuristic",
-    "Middle",
-    "NearAims",
-    "Opaque",
-    "Policy",
-    "PolicyBlock",
-    "PolicyNode",
-    "Taught",
-    "Teaching",
-    "Uniform",
-    "asked_from",
-    "best_actions",
-    "call_policy",
-    "describe",
-    "in_space",
-    "lanes_in",
-    "layers",
-    "policy_name",
-    "policy_of",
-    "teaching",
-    "uniform_in",
-    "wanted_actions",
-]

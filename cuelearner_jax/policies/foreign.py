@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax.environment import action_words
-from cuelearner_jax.errors import UserError, format_value
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Space
 
 ONNX = ".onnx"
@@ -28,16 +29,17 @@ LOADERS = {
 }
 FILES = (ONNX, *LOADERS)
 RECURRENT = {"RNN", "GRU", "LSTM", "RNNCell", "GRUCell", "LSTMCell"}  # parts of PyTorch with a memory
-ACTIONS = ("action", "actions")  # names of an output, where a file in ONNX has several
 REAL = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16}
 
 
 class Foreign:
-    """A function of a batch of observations (n, obs) that returns actions (n, action), in NumPy."""
+    """A function of a batch of observations (n, obs) that returns actions (n, action), in NumPy.
 
-    def __init__(self, given: Any, reference: str) -> None:
-        """`given`: the policy object; `reference`: its name in messages and folders."""
-        self.given, self.reference, self.__qualname__ = given, reference, reference.rpartition(":")[2]
+    Two functions of one object, or of one file, are equal: programs that call them are compiled once.
+    """
+
+    def __init__(self, given: Any, name: str, key: Hashable = None) -> None:
+        self.given, self.__qualname__, self._key = given, name, (type(self), id(given) if key is None else key)
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
         """Return actions for observations."""
@@ -46,12 +48,11 @@ class Foreign:
     def check(self, space: Space) -> None:
         """Raise UserError where the policy is known to give other actions than those of a space."""
 
-    # The same object is the same policy: programs that call it are compiled once.
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self.given is other.given  # pyright: ignore[reportAttributeAccessIssue]
+        return isinstance(other, Foreign) and self._key == other._key
 
     def __hash__(self) -> int:
-        return hash((type(self), id(self.given)))
+        return hash(self._key)
 
 
 def function_of(given: Any) -> Foreign | None:
@@ -74,14 +75,12 @@ def function_of(given: Any) -> Foreign | None:
             )
         return _Onnx(path) if path.suffix == ONNX else None
     owner = getattr(given, "__self__", None)
-    if _predicts(owner) and getattr(given, "__name__", "") == "predict":
-        given = owner
+    given = owner if _predicts(owner) and getattr(given, "__name__", "") == "predict" else given
     if _predicts(given) and not isinstance(given, type):
-        return _Predicting(given)
+        return _Predicting(given, type(given).__qualname__)
     torch = sys.modules.get("torch")
-    if torch is not None and hasattr(torch, "nn") and isinstance(given, torch.nn.Module):
-        return _Torch(given)
-    return None
+    is_module = torch is not None and hasattr(torch, "nn") and isinstance(given, torch.nn.Module)
+    return _Torch(given, type(given).__qualname__) if is_module else None
 
 
 def _predicts(given: Any) -> bool:
@@ -89,66 +88,77 @@ def _predicts(given: Any) -> bool:
     return callable(getattr(given, "predict", None)) and hasattr(given, "observation_space")
 
 
-def _reference(given: Any) -> str:
-    kind = type(given)
-    return f"{kind.__module__}:{kind.__qualname__}"
+def memory_error(whose: str) -> UserError:
+    """Return the UserError for a policy that gives a state beside its actions."""
+    return UserError(
+        f"{whose} gives a state beside its actions, and policies are asked without a memory: give one that depends on "
+        "the observation alone, or a function that returns actions alone"
+    )
 
 
 class _Torch(Foreign):
-    """A module in evaluation mode, without gradients, on its own device."""
+    """A module in evaluation mode, without gradients, on its own device; its modes are restored afterwards."""
 
-    def __init__(self, given: Any) -> None:
-        super().__init__(given, _reference(given))
-        self._alone = threading.Lock()  # evaluation mode is a state of the module, so calls must not overlap
+    alone = threading.Lock()  # evaluation mode is a state of the module, so calls must not overlap
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
-        """Return actions for observations; the module's modes are restored afterwards."""
-        torch = sys.modules["torch"]
-        weights = next((own for own in self.given.parameters() if own.is_floating_point()), None)
-        where = {"device": weights.device, "dtype": weights.dtype} if weights is not None else {"dtype": torch.float32}
+        """Return actions for observations."""
+        torch: Any = sys.modules["torch"]
+        floating = (own for own in self.given.parameters() if own.is_floating_point())
+        weights = next(floating, torch.zeros((), dtype=torch.float32))
         act = getattr(self.given, "act_inference", self.given)  # rsl_rl's name for the deterministic action
-        with self._alone:
+        with self.alone:
             # Frozen modules have no mode, and exported ones refuse `eval`.
             modes = [(part, part.training) for part in self.given.modules() if hasattr(part, "training")]
             try:
                 for part, _ in modes:
                     part.training = False
                 with torch.no_grad():
-                    found = act(torch.as_tensor(np.array(obs), **where))
+                    found = act(torch.as_tensor(np.array(obs), device=weights.device, dtype=weights.dtype))
             finally:
                 for part, mode in modes:
                     part.training = mode
         if isinstance(found, tuple | list) and found:
-            kinds = {getattr(part, "original_name", type(part).__name__) for part in self.given.modules()}
-            if kinds & RECURRENT:
+            if RECURRENT & {getattr(part, "original_name", type(part).__name__) for part in self.given.modules()}:
                 raise memory_error(f"policy {self.__qualname__}")
-            found = found[0]
-        is_tensor = isinstance(found, torch.Tensor)
-        return found.detach().to("cpu", torch.float32).numpy() if is_tensor else found  # pyright: ignore[reportAttributeAccessIssue]
+            return self._plain(found[0])
+        return self._plain(found)
+
+    def _plain(self, found: Any) -> Any:
+        tensor = sys.modules["torch"].Tensor
+        return found.detach().cpu().float().numpy() if isinstance(found, tensor) else found
+
+
+def _counts(space: Any) -> list[int]:
+    """Return the numbers of values of a `Discrete` or `MultiDiscrete` space, which vectors hold one-hot; else none."""
+    return np.ravel(getattr(space, "nvec", getattr(space, "n", ()))).tolist() if hasattr(space, "start") else []
 
 
 class _Predicting(Foreign):
     """A model's deterministic `predict` of observations as its own space has them, normalised as in its training."""
 
-    def __init__(self, given: Any) -> None:
-        super().__init__(given, _reference(given))
-
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
         """Return actions for observations. Raises UserError for observations of another size, or a memory."""
         space = self.given.observation_space
         parts = getattr(space, "spaces", {"": space})  # a dictionary's, in the order of its keys
-        ends = np.cumsum([_width(part) for part in parts.values()])
+        counts = {name: _counts(part) for name, part in parts.items()}
+        ends = np.cumsum([sum(counts[name]) or np.prod(part.shape, dtype=int) for name, part in parts.items()])
         if obs.shape[1] != ends[-1]:
             raise UserError(
                 f"policy {self.__qualname__} takes observations of {ends[-1]} entries, these have {obs.shape[1]}: give "
                 "the observations that it was trained on"
             )
-        cut = np.split(np.array(obs), ends[:-1], axis=1)
-        values = {name: _values(part, rows) for (name, part), rows in zip(parts.items(), cut, strict=True)}
-        seen: Any = values if hasattr(space, "spaces") else values[""]
+        values: Any = {}
+        for (name, part), rows in zip(parts.items(), np.split(np.array(obs), ends[:-1], axis=1), strict=True):
+            if counts[name]:
+                places = [one.argmax(1) for one in np.split(rows, np.cumsum(counts[name])[:-1], axis=1)]
+                rows = np.stack(places, 1) + np.ravel(part.start)  # noqa: PLW2901
+            values[name] = rows.reshape(len(rows), *part.shape).astype(part.dtype)
+        if not hasattr(space, "spaces"):
+            values = values[""]
         if (normalized := getattr(self.given, "get_vec_normalize_env", lambda: None)()) is not None:
-            seen = normalized.normalize_obs(seen)
-        action, state = self.given.predict(seen, deterministic=True)
+            values = normalized.normalize_obs(values)
+        action, state = self.given.predict(values, deterministic=True)
         if state is not None:
             raise memory_error(f"policy {self.__qualname__}")
         return action
@@ -163,32 +173,6 @@ class _Predicting(Foreign):
             )
 
 
-def memory_error(whose: str) -> UserError:
-    """Return the UserError for a policy that gives a state beside its actions."""
-    return UserError(
-        f"{whose} gives a state beside its actions, and policies are asked without a memory: give one that depends on "
-        "the observation alone, or a function that returns actions alone"
-    )
-
-
-def _counts(space: Any) -> list[int]:
-    """Return the numbers of values of a `Discrete` or `MultiDiscrete` space, which vectors hold one-hot; else none."""
-    return np.ravel(space.nvec if hasattr(space, "nvec") else space.n if hasattr(space, "start") else ()).tolist()
-
-
-def _width(space: Any) -> int:
-    """Return the number of entries of a space's values in a vector of observations."""
-    return int(sum(_counts(space)) or np.prod(space.shape))
-
-
-def _values(space: Any, rows: Float[np.ndarray, "n entries"]) -> np.ndarray:
-    """Return the values of a space that its entries in observations hold."""
-    if counts := _counts(space):
-        parts = np.split(rows, np.cumsum(counts)[:-1], axis=1)
-        rows = np.stack([part.argmax(1) for part in parts], 1) + np.ravel(getattr(space, "start", 0))
-    return rows.reshape(len(rows), *space.shape).astype(space.dtype)
-
-
 class _Onnx(Foreign):
     """A file in ONNX with one input of observations and one output of actions, run by onnxruntime on the CPU."""
 
@@ -199,49 +183,26 @@ class _Onnx(Foreign):
             raise UserError(f"{path} needs onnxruntime: pip install 'cuelearner-jax[onnx]'") from error
         if not path.is_file():
             raise UserError(f"there is no file {path}: give the path of a policy in ONNX")
-        super().__init__(path.resolve(), str(path))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own kinds
             why = " ".join(str(error).split())[:160]
             raise UserError(f"{path} cannot be run by onnxruntime ({why}): export the policy again") from error
-        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        super().__init__(session, str(path), path.resolve())
+        inputs, outputs = session.get_inputs(), [one.name for one in session.get_outputs()]
         if len(inputs) != 1 or inputs[0].type not in REAL or len(inputs[0].shape) != 2:
             told = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs)
             raise UserError(f"{path} has the inputs {told}: give a policy with one input of real numbers, (n, obs)")
-        named = [one.name for one in outputs if one.name in ACTIONS] or [one.name for one in outputs]
-        if len(named) != 1:
-            raise UserError(f"{path} has the outputs {', '.join(named)}: give a policy with one, or one called action")
-        self._name, self._kind, self._output = inputs[0].name, REAL[inputs[0].type], named[0]
-        self._rows, self._size = inputs[0].shape
-        if isinstance(self._rows, int) and self._rows != 1:
-            raise UserError(f"{path} takes batches of {self._rows} only: export it with batches of any size")
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Onnx) and self.given == other.given
-
-    def __hash__(self) -> int:
-        return hash(self.given)
+        self._outputs = [name for name in outputs if name in ("action", "actions")] or outputs
+        if len(self._outputs) != 1:
+            raise UserError(f"{path} has the outputs {', '.join(outputs)}: give a policy with one, or one named action")
+        self._input = inputs[0]
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
-        """Return actions for observations. Raises UserError for observations of another size."""
-        if isinstance(self._size, int) and obs.shape[1] != self._size:
-            raise UserError(
-                f"{self.reference} takes observations of {self._size} entries, these have {obs.shape[1]}: give the "
-                "observations that it was made for"
-            )
-        rows = np.ascontiguousarray(obs).astype(self._kind)
-        if self._rows != 1:
-            return self._run(rows)
-        return np.concatenate([self._run(rows[number : number + 1]) for number in range(len(rows))])
-
-    def _run(self, rows: np.ndarray) -> np.ndarray:
-        found = self._session.run([self._output], {self._name: rows})[0]
-        if not isinstance(found, np.ndarray):
-            raise UserError(
-                f"{self.reference} gives {format_value(found)} in place of actions: export the policy again"
-            )
-        return found
+        """Return actions for observations."""
+        rows = np.ascontiguousarray(obs).astype(REAL[self._input.type])
+        parts = np.split(rows, len(rows)) if self._input.shape[0] == 1 else [rows]
+        return np.concatenate([self.given.run(self._outputs, {self._input.name: part})[0] for part in parts])

@@ -20,7 +20,7 @@ from cuelearner_jax.feedback.answers import intended_action, relative_feedback
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyNode, describe
-from cuelearner_jax.policies.opaque import in_space, policy_of
+from cuelearner_jax.policies.opaque import policy_of
 from cuelearner_jax.run_config import kind_to_json, part_to_json
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
@@ -44,12 +44,13 @@ class Agent(PolicyNode):
 
     def describe(self) -> dict[str, Any]:
         """Return the agent's options and its frame, as JSON values."""
-        own = {"agent": part_to_json(self.functions.options), "frame": self.functions.frame}
-        return {"policy": "agent", **own}
+        return {"policy": "agent", "agent": part_to_json(self.functions.options), "frame": self.functions.frame}
 
 
 class Uniform(PolicyNode):
     """A policy of uniform actions."""
+
+    KIND = "uniform"
 
     actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
@@ -57,23 +58,17 @@ class Uniform(PolicyNode):
         """Return new uniform draws at each call (paper, Eq. 6)."""
         return self.actions.sample(key, (obs.shape[0],))
 
-    def describe(self) -> dict[str, Any]:
-        """Return {"policy": "uniform"}."""
-        return {"policy": "uniform"}
-
 
 class Middle(PolicyNode):
     """A policy of the action halfway between the bounds of a box."""
+
+    KIND = "middle"
 
     box: Box = struct.field(pytree_node=False)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the same action in every situation."""
         return jnp.broadcast_to(self.box.middle(), (len(obs), self.box.size))
-
-    def describe(self) -> dict[str, Any]:
-        """Return {"policy": "middle"}."""
-        return {"policy": "middle"}
 
 
 class NearAims(PolicyNode):
@@ -95,12 +90,15 @@ class NearAims(PolicyNode):
         return jnp.where(aims.possible.any(), space.exp(aims.actions[index], change), elsewhere)
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind of policy, as a JSON value."""
+        """Return the kind of policy and its reach, as JSON values."""
         return {"policy": "near aims", "reach": float(actions_of(self.view).to_unit(self.reach))}
 
 
 class Taught(PolicyNode):
     """A policy that executes a teacher's best actions."""
+
+    KIND = "teacher"
+    ASKS = True
 
     teacher: Teacher
 
@@ -108,23 +106,17 @@ class Taught(PolicyNode):
         """Return the teacher's best actions."""
         return best_actions(self.teacher, states, obs)
 
-    def describe(self) -> dict[str, Any]:
-        """Return the kind of policy, as a JSON value."""
-        return {"policy": "teacher", "asks": True}
-
 
 class Heuristic(PolicyNode):
     """A policy of the environment's heuristic."""
+
+    KIND = "heuristic"
 
     view: Any
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the environment's heuristic actions."""
         return jax.vmap(self.view.heuristic)(obs)
-
-    def describe(self) -> dict[str, Any]:
-        """Return the kind of policy, as a JSON value."""
-        return {"policy": "heuristic"}
 
 
 class Guided(PolicyNode):
@@ -192,6 +184,9 @@ class Common(PolicyNode):
 class Corrected(PolicyNode):
     """Another policy with actions refined by the teacher's own relative feedback, instead of a model of it."""
 
+    KIND = "corrected"
+    ASKS = True
+
     base: Any  # a policy
     teacher: Teacher
     scalars: GuideScalars
@@ -202,10 +197,7 @@ class Corrected(PolicyNode):
         space, first = self.actions, self.base.act(key, states, obs)
         eps = space.from_unit(self.scalars.eps_deg)
         best = wanted_actions(space, self.teacher, states, obs, first, self.scalars)
-
-        def told(action: Array, best: Array) -> Array:
-            return space.toward(action, relative_feedback(space, action, best, eps), eps) - action
-
+        told = lambda action, best: space.toward(action, relative_feedback(space, action, best, eps), eps) - action  # noqa: E731
         return refine(
             lambda current: jax.vmap(told)(current, best),
             first,
@@ -220,10 +212,6 @@ class Corrected(PolicyNode):
     def axes(self) -> Corrected:
         """Lane axes: each lane has its own base; all lanes share the teacher."""
         return self.replace(base=self.base.axes, teacher=SHARED, scalars=SHARED)
-
-    def describe(self) -> dict[str, Any]:
-        """Return the kind of policy and the base, as JSON values."""
-        return {"policy": "corrected", "asks": True, "base": describe(self.base)}
 
 
 def plain_part(kind: type, values: Any) -> dict[str, Any]:
@@ -246,14 +234,10 @@ class Teaching(struct.PyTreeNode):
 
 
 def teaching(given: Any, space: Space) -> Teacher:
-    """Return a teacher as given, or the teacher that shows what a given policy does.
-
-    Raises UserError for what is neither.
-    """
+    """Return a teacher as given, or the teacher that shows what a given policy does (`policy_of`)."""
     if callable(getattr(given, "best_action", None)) and not isinstance(given, type | Teaching):
         return given
-    policy = given.policy if isinstance(given, Teaching) else policy_of(given)
-    return Teaching(in_space(policy, space))
+    return Teaching(policy_of(given.policy if isinstance(given, Teaching) else given, space))
 
 
 def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:

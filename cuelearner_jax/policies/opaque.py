@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ class Opaque(PolicyNode):
         if self.on_host:
             # Tried while tracing, so that a fault is reported before anything is compiled.
             with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
-                _try(self, obs.shape[-1])
+                _try(cast(Any, self), obs.shape[-1])
             shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
             chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
         else:
@@ -94,33 +94,32 @@ class Opaque(PolicyNode):
         Of a pair of actions and None (models of Stable-Baselines3), or a dictionary (of brax), the actions are taken.
         Whole numbers in a space of choices are numbers of choices.
         """
-        wanted = (rows, self.actions.size)
+        name, wanted = policy_name(self), (rows, self.actions.size)
         if isinstance(chosen, tuple) and len(chosen) == 2 and (chosen[1] is None or np.ndim(chosen[0]) == 2):
             if not isinstance(chosen[1], dict | None):
-                raise foreign.memory_error(policy_name(self))
+                raise foreign.memory_error(name)
             chosen = chosen[0]
         try:
             found = as_array(chosen)
         except Exception as error:  # PyTorch's own kinds too
             why = " ".join(str(error).split())[:200]
             raise UserError(
-                f"{policy_name(self)} returned {format_value(chosen)} ({why}): return an array of shape {wanted}"
+                f"{name} returned {format_value(chosen)} ({why}): return an array of shape {wanted}"
             ) from error
-        if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
-            raise UserError(f"{policy_name(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
-        if isinstance(self.actions, Choices) and found.shape == (rows,) and getattr(found.dtype, "kind", "") in "iu":
+        is_whole = jnp.issubdtype(found.dtype, jnp.integer)
+        if not is_whole and not jnp.issubdtype(found.dtype, jnp.floating):
+            raise UserError(f"{name} returned {found.dtype} numbers: return real ones, of shape {wanted}")
+        if isinstance(self.actions, Choices) and found.shape == (rows,) and is_whole:
             inside = (found >= 0) & (found < self.actions.size)
             if isinstance(inside, np.ndarray) and not inside.all():
                 raise UserError(
-                    f"{policy_name(self)} chose {found[~inside][0]}: give the number of a choice, 0 to "
-                    f"{self.actions.size - 1}, whatever number the environment starts from"
+                    f"{name} chose {found[~inside][0]}: give the number of a choice, 0 to {self.actions.size - 1}, "
+                    "whatever number the environment starts from"
                 )
             one_hot = as_array(found[:, None] == np.arange(self.actions.size)).astype(np.float32)
             return one_hot if isinstance(inside, np.ndarray) else jnp.where(inside[:, None], one_hot, jnp.nan)
         if found.shape != wanted:
-            raise UserError(
-                f"{policy_name(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
-            )
+            raise UserError(f"{name} returned actions of shape {found.shape} for {rows} observations: return {wanted}")
         with np.errstate(over="ignore"):
             return found.astype(np.float32)
 
@@ -170,56 +169,54 @@ def _called(code: Any) -> str:
     return getattr(code, "__qualname__", type(code).__qualname__).replace("<locals>.", "")
 
 
-def in_space(policy: Any, space: Space) -> Any:
-    """Return a policy whose bare function gets this space of actions, if it was given without one.
-
-    Raises UserError for a model of another library that is known to give other actions.
-    """
-    if not isinstance(policy, Opaque):
-        return policy
-    if isinstance(policy.function, foreign.Foreign):
-        policy.function.check(space)
-    return policy.replace(actions=space)
-
-
-def policy_of(given: Any) -> Any:
+def policy_of(given: Any, space: Space | None = None) -> Any:
     """Return anything that acts as a policy.
 
     Args:
         given: a policy; a class or function that gives one when it is called with nothing; a function of a batch of
             observations: one that `jax.jit` made is compiled with what calls it, any other gets NumPy arrays; or a
             policy of another library, see `foreign.function_of`.
+        space: the space of the actions of a function (None: not known yet).
 
     Raises:
-        UserError: the object is none of these, or a policy that is not a pytree.
+        UserError: the object is none of these, a policy that is not a pytree, or a model of another library that is
+            known to give other actions than those of the space.
     """
     function = foreign.function_of(given)
-    if function is None and not (hasattr(given, "act") and not isinstance(given, type)) and _required(given) == []:
+    if function is None and not _acts(given) and _required(given) == []:
         try:
             given = given()
         except (Exception, SystemExit) as error:
             raise user_code_error(f"policy {_called(given)}", error) from error
         function = foreign.function_of(given)
-    if function is not None:
-        return Opaque(function, on_host=True)
-    if hasattr(given, "act"):
-        if any(leaf is given for leaf in jax.tree.leaves(given)):
-            kind = type(given).__name__
+    policy = given if function is None else Opaque(function, on_host=True)
+    if _acts(policy):
+        if any(leaf is policy for leaf in jax.tree.leaves(policy)):
+            kind = type(policy).__name__
             raise UserError(
                 f"a {kind} has `act` but is not a pytree: make it a flax.struct.PyTreeNode, or give a function"
             )
-        return given
-    if callable(given) and not isinstance(given, type):
+    elif callable(given) and not isinstance(given, type):
         if len(more := _required(given) or ()) > 1:
             raise UserError(
                 f"policy {_called(given)} takes {', '.join(more)}: give a function of observations alone, for instance "
                 f"jax.jit(lambda obs: policy(obs, {', '.join(more[1:])})[0])"
             )
-        return Opaque(given, on_host=not isinstance(given, jax.stages.Wrapped))
-    raise UserError(
-        f"{format_value(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
-        "model of Stable-Baselines3 or a file in ONNX, or load one"
-    )
+        policy = Opaque(given, on_host=not isinstance(given, jax.stages.Wrapped))
+    else:
+        raise UserError(
+            f"{format_value(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
+            "model of Stable-Baselines3 or a file in ONNX, or load one"
+        )
+    if space is None or not isinstance(policy, Opaque):
+        return policy
+    if isinstance(policy.function, foreign.Foreign):
+        policy.function.check(space)
+    return policy.replace(actions=space)
+
+
+def _acts(given: Any) -> bool:
+    return hasattr(given, "act") and not isinstance(given, type)
 
 
 def _required(given: Any) -> list[str] | None:
@@ -228,6 +225,6 @@ def _required(given: Any) -> list[str] | None:
         parameters = inspect.signature(given).parameters.values()
     except (TypeError, ValueError):  # not callable, or compiled code
         return None
-    if any(one.kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD) for one in parameters):
+    if any(one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters):
         return None
     return [one.name for one in parameters if one.default is one.empty]

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import in_space, policy_name, policy_of
+from cuelearner_jax.policies import policy_name, policy_of
 from cuelearner_jax.reading import fitting
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.fitting import Fit, Reader
@@ -66,7 +66,7 @@ class Reading:
     ) -> None:
         if not space.cues:
             raise UserError(f"actions of {space.name} have no order, so no answer says more or less: give them cues")
-        self.base, self.family, self.space = in_space(policy_of(policy), space), family, space
+        self.base, self.family, self.space = policy_of(policy, space), family, space
         self.eps, self.observation = float(space.from_unit(eps_deg)), tuple(observation)
         self.slots = labels
         self.rows: Labels | None = None  # all answers so far

@@ -19,7 +19,7 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import rollout_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Clock, TrainState
-from cuelearner_jax.policies import PolicyBlock
+from cuelearner_jax.policies import PolicyNode
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.program import Program, make_program
@@ -132,7 +132,7 @@ class LaneGroup:
 
     def evaluate(
         self,
-        policy_of: Callable[[TrainState], PolicyBlock],
+        policy_of: Callable[[TrainState], PolicyNode],
         env: Environment,
         key: PRNGKeyArray,
         num_envs: int,

@@ -21,7 +21,7 @@ from cuelearner_jax.policies import (
     Policy,
     Taught,
     asked_from,
-    in_space,
+    policy_of,
     uniform_in,
 )
 from cuelearner_jax.run_config import RunConfig
@@ -84,7 +84,7 @@ def make(
         adapted: a policy folder's lanes, for an adapted policy.
         code: a policy of the user's own.
     """
-    alone = {"uniform": uniform_in, "heuristic": Heuristic, "own": lambda view: in_space(code, actions_of(view))}
+    alone = {"uniform": uniform_in, "heuristic": Heuristic, "own": lambda view: policy_of(code, actions_of(view))}
     if name in alone:
         return alone[name](view)
     if name == "teacher":

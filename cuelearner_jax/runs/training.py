@@ -15,7 +15,7 @@ from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.loop import Clock, TrainState, start_clock
-from cuelearner_jax.policies import Agent, Guided, PolicyBlock, asked_from
+from cuelearner_jax.policies import Agent, Guided, PolicyNode, asked_from
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Label, Params, Teacher
@@ -143,13 +143,13 @@ class Training:
         own["failed"] = self.failed.astype(float)
         return {**own, **self._measured(lambda lane: self._policy(lane.agent.params, view_of(self.examined)))}
 
-    def policies(self, view: Any) -> PolicyBlock:
+    def policies(self, view: Any) -> PolicyNode:
         """The finished policies of all lanes as they stand, for a world of that view."""
         params = [lane.agent.params for lane in self.blocks]
         joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
         return self._policy(joined, view)
 
-    def _policy(self, params: Params, view: Any) -> PolicyBlock:
+    def _policy(self, params: Params, view: Any) -> PolicyNode:
         return Agent(params, self.group.config.agent_in(view), view)
 
     def guide_alone(self) -> dict[str, np.ndarray]:
@@ -164,7 +164,7 @@ class Training:
     def _of_guides(self) -> dict[str, np.ndarray]:
         group, base = self.group, asked_from(self.group.env, self.group.config.sizes)
 
-        def guide(lane: TrainState) -> PolicyBlock:
+        def guide(lane: TrainState) -> PolicyNode:
             return Guided(base, lane.guide.model, view_of(self.examined), group.config.scalars, group.guidance)
 
         return {f"guide_{name}": values for name, values in self._measured(guide).items()}

@@ -4,26 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+# ruff: noqa: F401 (what other modules import from here)
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.box import Box
 from cuelearner_jax.spaces.choices import Choices
 from cuelearner_jax.spaces.directions import DIRECTIONS, check_directions
 from cuelearner_jax.spaces.space import KNOWN, UNSAID, Cue, Space, is_answered, says_something
 from cuelearner_jax.spaces.words import cues_from
-
-__all__ = [
-    "DIRECTIONS",
-    "UNSAID",
-    "Box",
-    "Choices",
-    "Cue",
-    "Space",
-    "check_directions",
-    "cues_from",
-    "from_json",
-    "is_answered",
-    "says_something",
-]
 
 
 def from_json(about: Any) -> Space:

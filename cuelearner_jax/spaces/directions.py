@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -95,14 +95,14 @@ class Directions(Space):
     size = 2
     cues = (Cue("turn", ("counterclockwise", "clockwise"), ("ArrowLeft", "ArrowRight"), "degrees"),)
     reach = 180.0
+    sample: ClassVar[Any] = staticmethod(uniform)
+    spread: ClassVar[Any] = staticmethod(evenly_spaced)
+    retract: ClassVar[Any] = staticmethod(retract)
+    outward: ClassVar[Any] = staticmethod(outward)
 
     def words_of(self, action: Any) -> str:
         """Return the angle of a direction."""
         return f"{math.degrees(math.atan2(float(action[1]), float(action[0]))):.0f} degrees"
-
-    def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Direction:
-        """Draw directions uniformly (paper, Eq. 6)."""
-        return uniform(key, shape)
 
     def log(self, action: DirectionLike, other: DirectionLike) -> Float[Array, "... 1"]:
         """Return the angle from one direction to another, in (-pi, pi] [rad]."""
@@ -111,14 +111,6 @@ class Directions(Space):
     def exp(self, action: DirectionLike, change: Float[Array, "... 1"]) -> Direction:
         """Turn a direction counterclockwise [rad]."""
         return rotate(action, jnp.asarray(change)[..., 0])
-
-    def retract(self, vector: DirectionLike) -> Direction:
-        """Return the vector divided by its length; see the function `retract`."""
-        return retract(vector)
-
-    def spread(self, count: int) -> Float[Array, "count 2"]:
-        """Return `evenly_spaced(count)`."""
-        return evenly_spaced(count)
 
     def from_unit(self, amount: Any) -> Float[Array, "..."]:
         """Convert degrees to radians."""
@@ -131,10 +123,6 @@ class Directions(Space):
     def usable(self, vector: Any, xp: Any = jnp) -> Any:
         """Return which vectors have a direction: those that are finite and not zero."""
         return super().usable(vector, xp) & (vector != 0).any(-1)
-
-    def outward(self, vector: DirectionLike, action: DirectionLike) -> Float[Array, "... 2"]:
-        """Return a vector given along and across a direction in the frame in which the direction is given."""
-        return outward(vector, action)
 
 
 DIRECTIONS = Directions()

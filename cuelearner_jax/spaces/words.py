@@ -29,7 +29,17 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
     Raises:
         UserError: the words are no pairs, or not as many as there are names.
     """
-    pairs = _pairs(words)
+    given = words.split(";") if isinstance(words, str) else words
+    try:
+        pairs = [tuple(part.split(",")) if isinstance(part, str) else tuple(part) for part in given]
+        pairs = [tuple(" ".join(word.split()) for word in pair) for pair in pairs]
+    except (TypeError, AttributeError):
+        pairs = []
+    sound = (len({*pair}) == len(pair) == 2 and all(0 < len(word) <= LONGEST for word in pair) for pair in pairs)
+    if not pairs or not all(sound):
+        raise UserError(
+            f'cues is {format_value(words)}: give two words for each entry of an action, as "left,right;up,down"'
+        )
     if names and len(names) != len(pairs):
         raise UserError(
             f"cues are {len(pairs)} pairs of words for {len(names)} entries of an action: give one an entry"
@@ -42,28 +52,9 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
             key = ARROWS.get(word.lower())
             if key is None or key in taken:
                 letters = (letter for letter in word.lower() if letter.isascii() and letter.isalpha())
-                free = (letter for letter in (*letters, spare, *"".join(KEYS), *"ws") if letter not in taken)
-                key = next(free, "")
+                key = next((one for one in (*letters, spare, *"".join(KEYS), *"ws") if one not in taken), "")
             taken.add(key)
             keys.append(key)
-        cues.append(Cue(names[number] if names else " or ".join(pair), pair, tuple(keys) if all(keys) else (), unit))
+        name = names[number] if names else " or ".join(pair)
+        cues.append(Cue(name, (pair[0], pair[1]), tuple(keys) if all(keys) else (), unit))
     return tuple(cues)
-
-
-def _pairs(words: Any) -> list[tuple[str, str]]:
-    given = words.split(";") if isinstance(words, str) else words
-    try:
-        pairs = [tuple(part.split(",")) if isinstance(part, str) else tuple(part) for part in given]
-        pairs = [tuple(" ".join(word.split()) for word in pair) for pair in pairs]
-    except (TypeError, AttributeError):
-        pairs = []
-    sound = all(len(pair) == 2 and pair[0] != pair[1] and all(map(_is_word, pair)) for pair in pairs)
-    if not pairs or not sound:
-        raise UserError(
-            f'cues is {format_value(words)}: give two words for each entry of an action, as "left,right;up,down"'
-        )
-    return [(pair[0], pair[1]) for pair in pairs]
-
-
-def _is_word(word: str) -> bool:
-    return 0 < len(word) <= LONGEST and word.isprintable()

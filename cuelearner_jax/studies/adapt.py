@@ -33,7 +33,7 @@ from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.reading import KIND
-from cuelearner_jax.policies import Common, in_space, lanes_in
+from cuelearner_jax.policies import Common, lanes_in, policy_of
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import adapted, trained
@@ -93,7 +93,7 @@ def subject_of(
     if policy is not None:
         if base != BaseLanes(policy=source.default_policy):
             raise UserError(f"--base.… chooses among the lanes of a folder, but {named} is not a folder: leave it out")
-        policy = in_space(policy, actions_of(env))
+        policy = policy_of(policy, actions_of(env))
         user_code.acts_in(named or "policy", policy, env)
         return Subject(env, Common(policy), origin={"code": named}, task=source.task)
     source.check(base.policy, world, base.guidance)

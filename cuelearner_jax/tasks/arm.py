@@ -22,7 +22,7 @@ from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.tasks import fetch_layout
-from cuelearner_jax.types import Policy, Teacher
+from cuelearner_jax.types import Teacher
 
 FETCH = {"reach": "FetchReach", "push": "FetchPush", "pick": "FetchPickAndPlace"}
 RELATIVE = "object relative position"
@@ -99,10 +99,6 @@ def _pictures() -> Pictures:
         reel=recording.reel,
         legend="A clip holds the action for five steps.",
     )
-
-
-def _proposed(env: Any) -> Policy:
-    return Heuristic(env)
 
 
 GRIPPER = Body(
@@ -211,7 +207,7 @@ ARM = Task(
     config=ArmConfig,
     bodies=(GRIPPER, ROBOT),
     teacher=make_teacher,
-    proposed=_proposed,
+    proposed=Heuristic,
     longest=lambda config: config.max_steps,
     judge_by=lambda config: "success",
     labels_hold=("reward", "max_steps", "within"),  # a label depends on one observation only

@@ -9,7 +9,6 @@ folder imports no code beyond that of Gymnasium's own registry.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -21,21 +20,16 @@ import numpy as np
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax import plugins
-from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
-from cuelearner_jax.bridges.gymnasium.instances import Running, success_in
-from cuelearner_jax.bridges.gymnasium.layout import Actions, actions_of
+from cuelearner_jax.bridges.gymnasium.instances import Running
+from cuelearner_jax.bridges.gymnasium.layout import Actions
 from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
-from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, checked_quantities
 from cuelearner_jax.errors import UserError, format_value, user_code_error
-from cuelearner_jax.plugins import REFERENCE
-from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
-from cuelearner_jax.task import Body, Pictures, Preset, Task
+from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
 from cuelearner_jax.tasks import fetch_layout
+from cuelearner_jax.tasks.simulators import quickstart
 from cuelearner_jax.terminal import console
 
 FAMILY = "gymnasium"
@@ -99,46 +93,26 @@ class GymnasiumConfig:
 
     @property
     def space(self) -> Space:
-        """The space of actions. Raises UserError where none fits."""
-        return space_of(Actions(self.low, self.high, self.choices), self.cues, self.cue_names)
-
-
-def space_of(actions: Actions, cues: Sequence[str] = (), cue_names: Sequence[str] = ()) -> Space:
-    """Return the space of actions. Raises UserError for bounds or cues that fit none."""
-    if actions.choices:
-        if cues:
+        """The space of actions. Raises UserError for bounds or cues that fit none."""
+        if self.choices and self.cues:
             raise UserError(
-                f"cues is {format_value(tuple(cues))}, but actions are choices without an order: leave it out, and "
+                f"cues is {format_value(self.cues)}, but actions are choices without an order: leave it out, and "
                 "choose a guidance without relative answers"
             )
-        return Choices(actions.choices)
-    if cues and len(cues) != actions.size:
-        raise UserError(
-            f"cues are {len(cues)} pairs of words, and an action has {actions.size} entries: give a pair for each"
-        )
-    return Box(actions.low, actions.high, cues_from(cues, cue_names) if cues else ())
-
-
-def _refusal(config: GymnasiumConfig) -> str:
-    """Return why a configuration from a file cannot be made (it names code); empty if it can."""
-    if ":" not in config.environment:
-        return ""
-    return (
-        f"environment {config.environment} is code, which is not imported because a file names it: name it again, as "
-        f"{FAMILY}:{config.environment} in place of the task, or by cl.from_gymnasium"
-    )
+        if self.choices:
+            return Choices(self.choices)
+        if self.cues and len(self.cues) != len(self.low):
+            raise UserError(
+                f"cues are {len(self.cues)} pairs of words, and an action has {len(self.low)} entries: give a pair for "
+                "each"
+            )
+        return Box(self.low, self.high, cues_from(self.cues, self.cue_names) if self.cues else ())
 
 
 def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig, split: str) -> GymnasiumTask:
     """Return the environment of a configuration; Gymnasium is loaded only when it is reset.
 
-    Args:
-        factory: makes the environment; None: Gymnasium's registry.
-        config: the configuration.
-        split: has no effect, since episodes differ only in their keys.
-
-    Raises:
-        UserError: an invalid value.
+    `factory` makes it (None: Gymnasium's registry). Raises UserError for an invalid value.
     """
     if not config.environment:
         raise UserError(f"task.environment is empty: name the task {FAMILY}:ENVIRONMENT, as {FAMILY}:FetchReach-v4")
@@ -147,44 +121,35 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
     check_number("choices", config.choices, 0, MOST_STEPS, whole=True)
     observation = config.observation
     size = sum(quantity.size for quantity in observation)
-    _arguments(config.arguments)
+    try:
+        dict(**json.loads(config.arguments))
+    except (ValueError, TypeError):
+        given = format_value(config.arguments)
+        raise UserError(
+            f"task.arguments is {given}: give arguments by name as JSON, such as '{{\"size\": 3}}'"
+        ) from None
+    refusal = ""
+    if factory is None and ":" in config.environment:  # the configuration is a file's
+        refusal = (
+            f"environment {config.environment} is code, which is not imported because a file names it: name it again, "
+            f"as {FAMILY}:{config.environment} in place of the task, or by cl.from_gymnasium"
+        )
     return GymnasiumTask(
         source=Source(config.environment, config.arguments, config.max_steps, config.processes, size, factory),
         observation=observation,
         actions=config.space,
         succeeds=config.succeeds,
-        refusal="" if factory else _refusal(config),
+        refusal=refusal,
     )
 
 
-def _arguments(text: str) -> dict[str, Any]:
-    try:
-        found = json.loads(text)
-    except ValueError:
-        found = None
-    if not isinstance(found, dict):
-        raise UserError(
-            f"task.arguments is {format_value(text)}: give arguments by name as JSON, such as " + "'{\"size\": 3}'"
-        )
-    return found
-
-
-def _longest(config: GymnasiumConfig) -> int:
-    return config.max_steps
-
-
-def _judge_by(config: GymnasiumConfig) -> str:
-    return SUCCESS if config.succeeds else "return"
-
-
 def _pictures() -> Pictures:
-    from cuelearner_jax.tasks import gymnasium_pictures  # Pillow's loading is not for every command
+    from cuelearner_jax.tasks import frames  # Pillow's loading is not for every command
 
-    return gymnasium_pictures.PICTURES
+    return frames.GYMNASIUM
 
 
-def body(factory: Callable[..., Any] | None = None) -> Body:
-    """Return the body that acts in the task."""
+def _body(factory: Callable[..., Any] | None = None) -> Body:
     return Body(FAMILY, "Gymnasium's own simulation", partial(make_environment, factory), pictures=_pictures)
 
 
@@ -192,9 +157,9 @@ GYMNASIUM = Task(
     name=FAMILY,
     about="any environment of Gymnasium, as gymnasium:FetchReach-v4; of your own, as gymnasium:package.module:NAME",
     config=GymnasiumConfig,
-    bodies=(body(),),
-    longest=_longest,
-    judge_by=_judge_by,
+    bodies=(_body(),),
+    longest=lambda config: config.max_steps,
+    judge_by=lambda config: SUCCESS if config.succeeds else "return",
     labels_hold=("max_steps", "processes", "succeeds"),  # a label depends on one observation only
 )
 
@@ -202,12 +167,9 @@ GYMNASIUM = Task(
 def task_of(name: str) -> Task:
     """Return the task of an environment: an id of Gymnasium's registry, module:id, or package.module:NAME.
 
-    The module is imported.
-
-    Call this only with names from a caller or the command line, never from a file. Raises UserError if the environment
-    is not available.
+    The module is imported, so never give a name from a file. Raises UserError if the environment is not available.
     """
-    if REFERENCE.fullmatch(name):
+    if plugins.REFERENCE.fullmatch(name):
         return task_from(plugins.load(name, object, "an environment"), called=name)
     module, _, own = name.rpartition(":")
     if module:  # Gymnasium's own way to name an id that a package registers
@@ -247,12 +209,20 @@ def task_from(
             f"env is {format_value(given)}: give an id of Gymnasium's registry, or a class or function that "
             "gives environments"
         )
-    name = given if isinstance(given, str) else called or _called(given)
-    if factory is None and not max_steps:
-        max_steps = registry_spec(name).max_episode_steps
-    text = _kept(name, arguments or {})
-    source = Source(name, text, max_steps or 0, 1, factory=factory)
-    actions, slices, limit, succeeds, ends = _seen(source)
+    if isinstance(given, str):
+        name, fetch = given, fetch_layout.layout_of(given)
+        max_steps = max_steps or registry_spec(name).max_episode_steps
+    else:
+        inner, fetch = getattr(given, "func", given), None
+        name = called or f"{getattr(inner, '__module__', '')}:{getattr(inner, '__qualname__', type(inner).__name__)}"
+    try:
+        text = json.dumps(dict(arguments or {}))
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"the arguments of {name} cannot be kept in a file ({error}): give a function that makes the environment "
+            "with them"
+        ) from error
+    actions, slices, limit, succeeds, ends = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
     if not max_steps and not limit:
         if not ends:
             note(
@@ -260,13 +230,10 @@ def task_from(
                 "--task.max-steps, or max_steps in Python, for another limit)"
             )
         limit = UNLIMITED
-    fetch = fetch_layout.layout_of(name) if factory is None else None
     slices = _named(name, slices, observation or fetch, units or {})
     pairs = cues.split(";") if isinstance(cues, str) else cues
-    words = [pair if isinstance(pair, str) else ",".join(pair) for pair in pairs if pair]
-    names: tuple[str, ...] = ()
-    if not words and fetch and len(actions.low) == len(fetch_layout.CUES):
-        words, names = list(fetch_layout.CUES), fetch_layout.CUE_NAMES
+    words = tuple(pair if isinstance(pair, str) else ",".join(pair) for pair in pairs if pair)
+    is_fetch = not words and fetch is not None and len(actions.low) == len(fetch_layout.CUES)
     config = GymnasiumConfig(
         environment=name,
         arguments=text,
@@ -279,145 +246,78 @@ def task_from(
         low=actions.low,
         high=actions.high,
         choices=actions.choices,
-        cues=tuple(words),
-        cue_names=names,
+        cues=fetch_layout.CUES if is_fetch else words,
+        cue_names=fetch_layout.CUE_NAMES if is_fetch else (),
         succeeds=succeeds,
     )
-    _ = config.space, config.observation  # raises for cues, units or kinds that do not fit
+    _ = config.observation  # raises for units or kinds that do not fit
+    lanes: dict[str, Any] = {"guidance": ("none", "relative"), "labels": (100,), "seeds": 1}
+    preset = quickstart(config, config.space, num_envs, 10 * config.max_steps, (64, 64), **lanes)
     return dataclasses.replace(
         GYMNASIUM,
         about=f"Gymnasium's {name}",
         default=config,
-        bodies=(body(factory),),
-        presets=presets(config, num_envs),
+        bodies=(_body(factory),),
+        presets={QUICKSTART: preset},
     )
 
 
-def _kept(name: str, arguments: Mapping[str, Any]) -> str:
-    """Return arguments as JSON for a file."""
+def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
+    """Play an episode of one instance.
+
+    Return its actions, the slices of an observation, the limit of steps (0: none), whether it reports success, and
+    whether the episode ended by itself.
+    """
+    one, ended = Running(source.make, source.name, 0), False
     try:
-        return json.dumps(dict(arguments))
-    except (TypeError, ValueError) as error:
-        raise UserError(
-            f"the arguments of {name} cannot be kept in a file ({error}): give a function that makes the environment "
-            "with them"
-        ) from error
-
-
-def _called(code: Any) -> str:
-    """Return the name of code for files; nothing is imported by this name."""
-    inner = getattr(code, "func", code)
-    return f"{getattr(inner, '__module__', '')}:{getattr(inner, '__qualname__', type(inner).__name__)}"
-
-
-def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
-    """Return an environment's layout: actions, slices of an observation, limit of steps (0: none), whether it reports
-    success within an episode, and whether that episode ended by itself."""
-    whose, when, succeeds = f"environment {source.name}", "in its first reset,", False
-    try:
-        env = source.make()
-    except UserError:
-        raise
-    except Exception as error:
-        raise user_code_error(f"{whose}, while it was made,", error) from error
-    try:
-        if hasattr(env, "num_envs"):
-            raise UserError(
-                f"{whose} is a vector of {env.num_envs} environments: give a function that makes a single one"
-            )
-        actions = actions_of(whose, env.action_space)
-        one = Running(env, source.name)
         slices = [Quantity(leaf.name, leaf.size, UNKNOWN_UNIT) for leaf in one.leaves if leaf.size]
         if not slices:
-            raise UserError(f"{whose}: an observation has no entries: give one with some")
-        limit = _limit(env)
-        first, ended, cut = one.reset(0), False, False
-        env.action_space.seed(0)
-        for number in range(1, 1 + min(limit or TRIED, TRIED)):
-            when = f"in step {number} of its first episode,"
-            _, _, ended, cut, info = env.step(env.action_space.sample())
-            succeeds = succeeds or success_in(source.name, info) is not None
-            if ended or cut:
-                break
-        when = "in a second reset with the same seed,"
+            raise UserError(f"environment {source.name}: an observation has no entries: give one with some")
+        limit, first, space = _limit(one.env), one.reset(0), one.env.action_space
+        space.seed(0)
+        while not ended and one.steps < min(limit or TRIED, TRIED):
+            _, _, terminated, truncated, _ = one.execute(space.sample())
+            ended = terminated or truncated
         if not np.array_equal(first, one.reset(0)):
             raise UserError(
-                f"{whose} does not repeat itself: with the same seed, its reset gives another observation after an "
-                "episode: leave out wrappers that remember, such as NormalizeObservation"
+                f"environment {source.name} does not repeat itself: with the same seed, its reset gives another "
+                "observation after an episode: leave out wrappers that remember, such as NormalizeObservation"
             )
     except UserError:
         raise
     except Exception as error:
-        raise user_code_error(f"{whose}, {when}", error) from error
+        raise user_code_error(f"environment {source.name}, in its first episode,", error) from error
     finally:
-        with contextlib.suppress(Exception):  # what closing raises is no fault of the episodes
-            env.close()
-    return actions, slices, limit, succeeds, bool(ended or cut)
+        one.close()
+    return one.actions, slices, limit, one.reports_success, ended
 
 
 def _limit(env: Any) -> int:
     """Return the number of steps after which an environment truncates an episode; 0: unknown."""
-    spec = getattr(env, "spec", None)
-    limit = getattr(spec, "max_episode_steps", None)
+    limit = getattr(getattr(env, "spec", None), "max_episode_steps", None)
     while not limit and env is not None:
         limit, env = getattr(env, "_max_episode_steps", None), getattr(env, "env", None)
     return int(limit or 0)
 
 
 def _named(
-    name: str, slices: list[Quantity], given: Sequence[Any] | None, units: Mapping[str, str]
+    name: str, slices: Sequence[Quantity], given: Sequence[Any] | None, units: Mapping[str, str]
 ) -> tuple[Quantity, ...]:
     """Return the slices with names and units that the caller, or this package, knows."""
-    if given is not None:
-        try:
-            rest = list(Quantity("", 0, ""))[3:]  # said by a whole Quantity alone
-            found = tuple(one if isinstance(one, Quantity) else Quantity._make([*one, *rest]) for one in given)
-            total = sum(quantity.size for quantity in found)
-        except TypeError as error:
-            raise UserError(
-                f'observation is {format_value(given)}: give (name, entries, unit) for each slice, as ("goal", 3, "m") '
-                'or cuelearner_jax.environment.Quantity("goal", 3, "m", kind="own")'
-            ) from error
-        wanted = sum(quantity.size for quantity in slices)
-        if total != wanted:
-            raise UserError(f"observation names {total} entries, and {name} has {wanted}: name each entry once")
-    else:
-        found = tuple(slices)
+    wanted = sum(quantity.size for quantity in slices)
+    try:
+        own = slices if given is None else given
+        rest = Quantity("", 0, "")[3:]  # said by a whole Quantity alone
+        found = tuple(one if isinstance(one, Quantity) else Quantity._make([*one, *rest]) for one in own)
+        total = sum(quantity.size for quantity in found)
+    except TypeError as error:
+        raise UserError(
+            f'observation is {format_value(given)}: give (name, entries, unit) for each slice, as ("goal", 3, "m") '
+            'or cuelearner_jax.environment.Quantity("goal", 3, "m", kind="own")'
+        ) from error
+    if total != wanted:
+        raise UserError(f"observation names {total} entries, and {name} has {wanted}: name each entry once")
     known = {quantity.name for quantity in found}
     if unknown := sorted(set(units) - known):
         raise UserError(f"units names {unknown[0]!r}, and the slices are {', '.join(sorted(known))}: name one of them")
     return tuple(quantity._replace(unit=units.get(quantity.name, quantity.unit)) for quantity in found)
-
-
-def presets(config: GymnasiumConfig, num_envs: int = NUM_ENVS) -> dict[str, Preset]:
-    """Return the presets of one environment."""
-    every = num_envs * -(-1_000 // num_envs)
-    eval_envs = 10
-    run = RunConfig(
-        config,
-        Sizes(num_envs=num_envs, feedback_layers=(64, 64), fit_steps=400, fit_batch_size=64),
-        dataclasses.replace(plain_scalars(config.space), discount=0.95, max_grad_norm=10.0),
-        Schedule(
-            total_steps=6 * every,
-            random_steps=500,
-            learn_after=500,
-            guidance_until=3 * every,
-            eval_every=every,
-            eval_steps=eval_envs * config.max_steps,
-            eval_envs=eval_envs,
-            checkpoint_every=2 * every,
-        ),
-        ddqn.Config(
-            q_layers=(128, 128),
-            directions=256,
-            target_directions=64,
-            batch_size=64,
-            replay_capacity=num_envs * -(-50_000 // num_envs),
-            optimizer="adam",
-            learning_rate=0.001,
-            polyak=0.05,
-        ),
-        Paced(),
-    )
-    about = f"small networks, {6 * every:,} steps a seed"
-    return {"quickstart": Preset(about, run, guidance=("none", "relative"), labels=(100,), seeds=1)}

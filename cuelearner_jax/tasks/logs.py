@@ -90,8 +90,8 @@ def space_of(config: LogsConfig) -> Space:
     unit = STEPS if config.actions == "choices" else SHARE
     cues = cues_from(config.cues, config.cue_names, unit) if config.cues else ()
     if cues and config.keys:
-        pairs = [tuple(pair.split(",")) if pair else () for pair in config.keys]
-        if len(pairs) != len(cues) or not all(not pair or (len(pair) == 2 and all(pair)) for pair in pairs):
+        pairs = [tuple(filter(None, pair.split(","))) for pair in config.keys]
+        if len(pairs) != len(cues) or not {len(pair) for pair in pairs} <= {0, 2}:
             raise UserError(f"task.keys is {config.keys}: give two keys for each cue, as q,a")
         cues = tuple(dataclasses.replace(cue, keys=pair) for cue, pair in zip(cues, pairs, strict=True))
     return Choices(len(config.low), *cues) if config.actions == "choices" else Box(config.low, config.high, cues)
@@ -156,6 +156,8 @@ class Logs(Layout):
 class Recorded(PolicyNode):
     """The recorded actions: those of the states' rows, or else of the nearest recorded observations."""
 
+    KIND = "recorded"
+
     env: Logs
 
     def act(self, key: PRNGKeyArray, states: Any, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
@@ -165,10 +167,6 @@ class Recorded(PolicyNode):
         rows = jax.lax.map(nearest, obs) if states is None else states.row
         return env.actions.retract(env.recorded[rows])
 
-    def describe(self) -> dict[str, Any]:
-        """Describe the policy by its name."""
-        return {"policy": "recorded"}
-
 
 def task_of(
     folder: str | Path,
@@ -176,7 +174,6 @@ def task_of(
     low: Sequence[float] | None = None,
     high: Sequence[float] | None = None,
     actions: str = "box",
-    order: str = "shuffled",
     note: Callable[[str], None] = console.print,
 ) -> Task:
     """Return a folder of situations as a task.
@@ -186,32 +183,27 @@ def task_of(
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         low, high: bounds of the actions, one per entry (default: the recorded actions' range, reported by `note`).
         actions: kind of action space, "box", "directions" or "choices".
-        order: order of the situations, "shuffled" or "recorded".
         note: called with one line about each value that had to be chosen.
 
     Raises:
         UserError: the situations cannot be read, or bounds or cues do not fit their actions.
     """
-    path, found = Path(folder), _read(Path(folder))
+    found = _read(Path(folder))
     centre, spread = scales_of(found.observations)
-    for name, value, kind in (("actions", actions, Actions), ("order", order, Order)):
-        if value not in get_args(kind):
-            raise UserError(f"{name} is {value!r}{suggestion(value, get_args(kind))}")
-    size = found.actions.shape[1]
+    if actions not in get_args(Actions):
+        raise UserError(f"actions is {actions!r}{suggestion(actions, get_args(Actions))}")
+    size, names = found.actions.shape[1], ()
+    bounds: Any = (0.0,) * size, (1.0,) * size
     if actions == "box":
-        bounds = bounds_of(found.actions, low, high, found.entries, note)
+        names, bounds = found.entries, bounds_of(found.actions, low, high, found.entries, note)
     elif low is not None or high is not None:
         raise UserError(f"low and high are bounds of a box, but actions are {actions}: leave them out")
-    else:
-        bounds = (0.0,) * size, (1.0,) * size
-    names = found.entries if actions == "box" else ()
-    words = cues or (["more,less"] * size if names else ())
+    words = cues or ["more,less"] * len(names)
     pairs = cues_from(words, names) if words else ()
     config = LogsConfig(
-        path=str(path),
+        path=str(Path(folder)),
         digest=found.digest,
         rows=len(found.observations),
-        order=cast(Order, order),
         names=tuple(quantity.name for quantity in found.slices),
         entries=tuple(quantity.size for quantity in found.slices),
         actions=cast(Actions, actions),
@@ -222,7 +214,17 @@ def task_of(
         centre=centre,
         spread=spread,
     )
-    _check_actions(path, found, space_of(config))
+    space = space_of(config)
+    if space.size != size:
+        raise UserError(f"{folder} has actions of {size} entries, {space.name} have {space.size}: give another kind")
+    apart = np.abs(np.asarray(space.retract(found.actions)) - found.actions).max(-1)
+    wrong = np.flatnonzero(~(apart <= 1e-3 * max(1.0, float(np.abs(found.actions).max()))))
+    if len(wrong):
+        action = ", ".join(f"{value:.3g}" for value in found.actions[wrong[0]])
+        what = "bounds that hold the recorded actions" if actions == "box" else "another kind of actions"
+        raise UserError(
+            f"{folder}: the action of row {wrong[0]} ({action}) does not belong to {space.about}: give {what}"
+        )
     return configured(config)
 
 
@@ -254,12 +256,10 @@ def bounds_of(
 
     Raises UserError for one bound without the other, or an entry that never changes.
     """
-    if (low is None) != (high is None):
-        raise UserError(
-            f"{'high' if low is None else 'low'} is given alone: give both low and high, one number per entry"
-        )
     if low is not None and high is not None:
         return low, high
+    if low is not None or high is not None:
+        raise UserError(f"{'low' if high is None else 'high'} is given alone: give both low and high")
     least, most = actions.min(0).tolist(), actions.max(0).tolist()
     names = entries or [f"entry {number}" for number in range(1, len(least) + 1)]
     if still := [name for name, a, b in zip(names, least, most, strict=True) if not b > a]:
@@ -267,22 +267,6 @@ def bounds_of(
     told = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, a, b in zip(names, least, most, strict=True))
     note(f"bounds of the actions are their range ({told}): give low and high for others")
     return least, most
-
-
-def _check_actions(path: Path, found: Situations, space: Space) -> None:
-    """Raise UserError unless the recorded actions belong to a space."""
-    if space.size != found.actions.shape[1]:
-        raise UserError(
-            f"{path} has actions of {found.actions.shape[1]} entries, {space.name} have {space.size}: give another kind"
-        )
-    apart = np.abs(np.asarray(space.retract(found.actions)) - found.actions).max(-1)
-    wrong = np.flatnonzero(~(apart <= 1e-3 * max(1.0, float(np.abs(found.actions).max()))))
-    if len(wrong):
-        action = ", ".join(f"{value:.3g}" for value in found.actions[wrong[0]])
-        what = "bounds that hold the recorded actions" if space.name == "box" else "another kind of actions"
-        raise UserError(
-            f"{path}: the action of row {wrong[0]} ({action}) does not belong to {space.about}: give {what}"
-        )
 
 
 @lru_cache(maxsize=4)
@@ -297,13 +281,11 @@ def filled(config: LogsConfig, observations: Any = None, actions: Any = None) ->
     Raises UserError for an invalid configuration.
     """
     space, size = space_of(config), sum(config.entries)
-    sound = len(config.names) == len(config.entries) and min(config.entries, default=0) > 0 and config.rows > 0
+    sound = len(config.names) == len(config.entries) and min((*config.entries, config.rows, *config.spread)) > 0
     if not sound or not all(len(part) in (0, size) for part in (config.centre, config.spread)):
         raise UserError(
             "task.names, entries, rows, centre or spread do not describe situations: give the folder by logs:FOLDER"
         )
-    if not all(value > 0 for value in config.spread):
-        raise UserError(f"task.spread is {config.spread}: give a number above 0 for each entry of an observation")
     slices = (Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True))
     if observations is None:
         observations, actions = jnp.zeros((config.rows, size)), jnp.zeros((config.rows, space.size))
@@ -323,11 +305,9 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     found, layout = _read(Path(config.path)), filled(config)
     if config.digest not in ("", found.digest):
         raise UserError(f"{config.path} holds other situations than before: restore the folder, or collect new labels")
-    if (found.observations.shape[1], found.actions.shape[1]) != (layout.obs_size, layout.actions.size):
-        raise UserError(
-            f"{config.path} has observations of {found.observations.shape[1]} entries and actions of "
-            f"{found.actions.shape[1]}, not {layout.obs_size} and {layout.actions.size}: give another folder"
-        )
+    sizes, wanted = (found.observations.shape[1], found.actions.shape[1]), (layout.obs_size, layout.actions.size)
+    if sizes != wanted:
+        raise UserError(f"{config.path} has observations and actions of {sizes} entries, not {wanted}: give another")
     places = np.arange(len(found.observations))
     if config.order == "shuffled":
         places = np.random.default_rng(0).permutation(places)
@@ -335,61 +315,48 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     return made.replace(places=jnp.asarray(places, jnp.int32))
 
 
-# --- pictures --------------------------------------------------------------------------------------------------------
+def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
+    """Return the frames of a row's picture or clip, and the row's place in the recording.
 
-
-def _picture(env: Logs, row: Any) -> tuple[situations.Picture, int]:
-    """Return the picture of a row, and its place in the recording. Raises UserError if there is none."""
+    Raises UserError if there is none, or if it cannot be read.
+    """
     if not env.path:
         raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
     place = int(env.places[row])
-    found = _read(Path(env.path)).picture(place)
-    if found is None:
+    picture = _read(Path(env.path)).picture(place)
+    if picture is None:
         raise UserError(f"{env.path} has no picture of row {place}: add a column `picture` with the name of its file")
-    return found, place
-
-
-def _frames(picture: situations.Picture) -> list[Any]:
-    """Return the frames of a picture or clip. Raises UserError if it cannot be read."""
     if picture.kind.startswith("image/") and picture.kind != "image/gif":
-        return [picture.data]
+        return [picture.data], place
     try:
         suffix = "." + picture.kind.partition("/")[2]
         found = imageio.mimread(io.BytesIO(picture.data), format=suffix, memtest=False)  # pyright: ignore
     except Exception as error:  # film readers raise many exception types
         raise UserError(f"a clip cannot be read ({' '.join(str(error).split())[:80]}): give GIF or MP4") from error
     chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), CLIP_FRAMES)).round().astype(int))
-    return [np.ascontiguousarray(np.asarray(found[number])[..., :3]) for number in chosen]
+    return [np.ascontiguousarray(np.asarray(found[number])[..., :3]) for number in chosen], place
 
 
 def _sketch(env: Logs, state: Place) -> Sketch:
-    """Return the picture of a situation as a sketch; of a clip its first frame."""
-    picture, place = _picture(env, state.row)
-    return pictures.sketch(_frames(picture)[0], f"situation {place}")
+    frames, place = _frames(env, state.row)
+    return pictures.sketch(frames[0], f"situation {place}")
 
 
 def _reel(env: Logs, state: Place, action: Any) -> Reel | None:
-    """Return a situation's recorded clip; None if it has a single picture."""
-    frames = _frames(_picture(env, state.row)[0])
+    frames, _ = _frames(env, state.row)
     return pictures.clip(frames, CLIP_PERIOD, "as recorded") if len(frames) > 1 else None
 
 
 def _record(env: Logs, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Any], list[float]]:
     """Return one picture per situation, in order; there are no rewards."""
-    rows = [row % len(env.rows) for row in range(steps)]
-    return [pictures.pixels(_frames(_picture(env, row)[0])[0]) for row in rows], [0.0] * steps
-
-
-def _question(env: Logs, state: Place, obs: Any, action: Any, file: Path) -> None:
-    """Write the picture of a situation as PNG."""
-    pictures.still(_frames(_picture(env, state.row)[0])[:1], file)
+    return [pictures.pixels(_frames(env, row % len(env.rows))[0][0]) for row in range(steps)], [0.0] * steps
 
 
 PICTURES = Pictures(
     record=_record,
     still=lambda env, frames, file: pictures.still(frames, file),
     animate=lambda env, frames, file: pictures.animate(frames, file, fps=4.0),
-    question=_question,
+    question=lambda env, state, obs, action, file: pictures.still(_frames(env, state.row)[0][:1], file),
     sketch=_sketch,
     reel=_reel,
     simulates=False,

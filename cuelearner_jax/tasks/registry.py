@@ -24,17 +24,17 @@ BUILT_IN = {
     "gymnasium": "cuelearner_jax.tasks.gymnasium:GYMNASIUM",
     "logs": "cuelearner_jax.tasks.logs:LOGS",
     "navigation": "cuelearner_jax.tasks.navigation:NAVIGATION",
-    "brax": "cuelearner_jax.tasks.brax:BRAX",
-    "playground": "cuelearner_jax.tasks.playground:PLAYGROUND",
+    "brax": "cuelearner_jax.tasks.simulators:BRAX",
+    "playground": "cuelearner_jax.tasks.simulators:PLAYGROUND",
     "zoo": "cuelearner_jax.tasks.zoo:ZOO",
 }
-# Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task with the
-# family's name. The family's own task, which reads its folders, is built in.
+# Families, named FAMILY:ENVIRONMENT: the function from the environment's name to a task with the family's name. The
+# family's own task, which reads its folders, is built in.
 FAMILIES: dict[str, str] = {
     "gymnasium": "cuelearner_jax.tasks.gymnasium:task_of",
     "logs": "cuelearner_jax.tasks.logs:task_of",
-    "brax": "cuelearner_jax.tasks.brax:task_of",
-    "playground": "cuelearner_jax.tasks.playground:task_of",
+    "brax": "cuelearner_jax.tasks.simulators:brax_task",
+    "playground": "cuelearner_jax.tasks.simulators:playground_task",
     "zoo": "cuelearner_jax.tasks.zoo:task_of",
 }
 
@@ -52,22 +52,17 @@ def find(name: str) -> Task:
         return _built_in(BUILT_IN[name])
     if name in _registered:
         return _registered[name]
-    installed = _installed()
-    if name not in installed:
+    if (entry := _installed().get(name)) is None:
         raise UserError(
             f"unknown task {name!r}{suggestion(name, names())} (one of your own is named as package.module:NAME)"
         )
-    task = _loaded(installed[name].value)
-    if task.name != name:
-        raise UserError(f"the installed task {name!r} calls itself {task.name!r}: its package must use one name")
-    return task
+    return dataclasses.replace(_loaded(entry.value), name=name)
 
 
 def register(task: Task) -> Task:
     """Make a task known by its name to this process. Raises UserError if another task has the name."""
     before = _registered.get(task.name)
-    taken = task.name in BUILT_IN or task.name in _installed() or (before and before.origin != task.origin)
-    if taken:
+    if task.name in BUILT_IN or task.name in _installed() or (before and before.origin != task.origin):
         raise UserError(f"there is a task {task.name!r} already: give this one another name")
     _registered[task.name] = task
     return task

@@ -36,6 +36,4 @@ def folder_of(named: str | os.PathLike[str]) -> Path:
 
 def _place() -> Path:
     """Return the folder of all shipped agents, without importing the package that holds them."""
-    origin = getattr(find_spec("cuelearner_envs"), "origin", None)
-    assert origin is not None  # the package is installed beside this one
-    return Path(origin).parent / "agents"
+    return Path(str(getattr(find_spec("cuelearner_envs"), "origin", ""))).parent / "agents"

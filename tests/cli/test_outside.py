@@ -5,8 +5,7 @@ import sys
 
 import pytest
 
-from cuelearner_jax.cli import main, sweep
-from cuelearner_jax.cli.train import task_and_options
+from cuelearner_jax.cli import main
 from cuelearner_jax.storage import results
 from cuelearner_jax.tasks import registry
 
@@ -77,20 +76,6 @@ def test_a_file_does_not_have_code_loaded(run, refused, tmp_path):
     assert main(["evaluate", str(run), *EVALUATE]) == 0  # known to this process now
 
 
-def test_what_names_code_in_a_file_must_look_like_it(run, refused, tmp_path):
-    described = json.loads((run / "config.json").read_text())
-    described["task"]["from"] = "x; rm -r ~"
-    (tmp_path / "config.json").write_text(json.dumps(described))
-    refused(["evaluate", tmp_path], "damaged or of another program", tmp_path)
-
-
-def test_a_run_goes_on_wherever_its_task_has_moved(run, home):
-    (home / "own_moved.py").write_text(OWN)
-    command = ["--guidance", "none", "--out", str(run), "--resume"]
-    assert main(["train", "--task", "own_moved:TASK", *command]) == 0
-    assert json.loads((run / "config.json").read_text())["task"]["from"] == "own_window:TASK"
-
-
 def test_a_scenario_is_the_ground_for_options(run, tmp_path):
     worlds = []
     for number, option in enumerate(([], ["--scenario", "narrow"], ["--task.half-width-deg", "9"])):
@@ -115,18 +100,8 @@ def test_what_cannot_be_is_refused(run, refused, tmp_path):
     refused(["render", "own_window:TASK", "--policy", "uniform", *new], "window has no pictures of point", tmp_path)
     refused(["train", "own_window:MUTE", "--guidance", "relative", *new], "mute has no teacher to ask", tmp_path)
     refused(["train", "own_window:TASKS", *new], "own_window has no 'TASKS', did you mean 'TASK'", tmp_path)
-    refused(["train", "billiards", "--task", "navigation", *new], "the task is named twice", tmp_path)
-    refused(["train", "--task"], "--task: expected one argument", tmp_path)
     refused(["evaluate", "own_window:TASK", "--scenario", "narow"], "did you mean 'narrow'", tmp_path)
     forget()
     refused(["evaluate", run, "--task", "own_window:MUTE"], "add --task own_window:TASK", run)
     registry.resolve("own_window:TASK")
     refused(["evaluate", run, "--task", "own_window:MUTE"], "is a run of window, not of mute: leave out --task", run)
-
-
-def test_training_starts_from_the_preset_of_minutes_where_none_is_named():
-    task = registry.find("billiards")
-    words = ["billiards", "--schedule.eval-envs", "4"]
-    options = task_and_options(words, "sweep", sweep.Sweep, sweep._of_grid)[1]
-    assert options.out.name == "billiards-quickstart"
-    assert options.run.schedule.total_steps == task.presets["quickstart"].config.schedule.total_steps

@@ -9,30 +9,19 @@ import numpy as np
 import probes
 import pytest
 from box_task import EPS, SCALARS, SMALL, Reach
-from flax import struct
 
-import cuelearner_jax as cl
-from cuelearner_jax import asking
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.config import GuideSizes
-from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import (
-    DEMONSTRATION,
     RELATIVE,
-    SCALAR,
     demonstrate,
     human_answer,
     relative_feedback,
     scalar_answer,
 )
-from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import refine
-from cuelearner_jax.policies import Uniform
 from cuelearner_jax.spaces import UNSAID, Box, Cue, cues_from, from_json
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.testing import check_environment
 from cuelearner_jax.types import Label
 
 LARGE = Box((-1.0,) * 7, tuple(1.0 + 0.5 * entry for entry in range(7)))
@@ -92,12 +81,6 @@ def test_samples_and_the_even_spread_fill_the_box(box):
         np.testing.assert_allclose(shares.mean(0), 0.5, atol=0.06)  # of samples: standard deviation 0.013
         np.testing.assert_allclose(shares.std(0), 1 / np.sqrt(12), atol=0.03)
     np.testing.assert_allclose(box.spread(1)[0], (low + high) / 2, rtol=1e-6)
-
-
-@boxes
-def test_a_file_describes_a_box(box):
-    assert from_json(box.to_json()) == box
-    assert hash(from_json(box.to_json())) == hash(box)
 
 
 @pytest.mark.parametrize(
@@ -183,80 +166,23 @@ def test_a_perfect_model_ends_within_half_eps_along_every_entry(box):
     assert np.abs(box.log(first, near.actions)).max() <= 0.2 + 1e-5
 
 
-def test_a_probe_with_a_box_keeps_the_laws_of_environments():
-    check_environment(Reach())
-
-
-def test_relative_labels_lead_to_the_goal_of_a_box():
-    sizes = dataclasses.replace(probes.SIZES, labels_per_round=100, fit_steps=600)
-    env, scalars = Reach(), SCALARS
-    guidance = registry.make("relative", sizes, env)
-    guide = asking.start(guidance, env, 400, 400, jax.random.key(1), jax.random.key(2))
-    label_round = probes.label_rounds(guidance, sizes)
-    for _ in range(4):
-        guide = label_round(env, probes.Expert(env), scalars, Uniform(SMALL), guide, KEY)
-    assert guide.labels.answer.shape == (400, 3)
-    contexts = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    obs = jnp.repeat(contexts, 16, 0)
-    first, goals = SMALL.sample(KEY, (64,)), jax.vmap(env.best)(obs)
-    acted = jax.jit(guidance.act)(guide.model, env, obs, first, jnp.ones(64, bool), scalars)
-    away = np.asarray(SMALL.distance(acted.actions, goals))
-    assert np.mean(np.asarray(SMALL.distance(first, goals)) <= 0.1) < 0.1
-    assert np.mean(away <= 0.1) > 0.9
-
-
-@pytest.mark.parametrize("form", [RELATIVE, DEMONSTRATION, SCALAR], ids=lambda form: form.name)
-def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
-    action, other = pairs(SMALL, 12)
-    kinds = {
-        "relative": np.array(list(itertools.islice(itertools.product((-1, 0, 1, UNSAID), repeat=3), 12)), np.float32),
-        "demonstration": np.asarray(other),
-        "scalar": np.arange(12, dtype=np.float32)[:, None] % 2,
-    }
-    labels = Label(np.zeros((1, 12, 2), np.float32), action[None], kinds[form.name][None], np.ones((1, 12), bool))
-    eps = EPS if form.by_eps else None
-    path = tmp_path / "labels.parquet"
-    label_files.write(path, {"name": "reach"}, form.name, SMALL, eps, np.array([4]), labels, form.meaning(SMALL))
+def test_a_label_file_holds_answers_about_a_box(tmp_path):
+    action, _ = pairs(SMALL, 12)
+    given = np.array(list(itertools.islice(itertools.product((-1, 0, 1, UNSAID), repeat=3), 12)), np.float32)
+    labels = Label(np.zeros((1, 12, 2), np.float32), action[None], given[None], np.ones((1, 12), bool))
+    path, meaning = tmp_path / "labels.parquet", RELATIVE.meaning(SMALL)
+    label_files.write(path, {"name": "reach"}, "relative", SMALL, EPS, np.array([4]), labels, meaning)
     file = label_files.read(path)
-    assert (file.space, file.answers, file.eps) == (SMALL, form.name, eps)
+    assert (file.space, file.answers, file.eps) == (SMALL, "relative", EPS)
     np.testing.assert_array_equal(file.labels.action, action)
-    np.testing.assert_array_equal(file.labels.answer, kinds[form.name])
-    external_labels.check_file(file, None, form, "labels.parquet")
+    np.testing.assert_array_equal(file.labels.answer, given)
+    external_labels.check_file(file, None, RELATIVE, "labels.parquet")
     spoilt = file._replace(labels=file.labels.replace(action=file.labels.action + np.float32([5, 0, 0])))
     with pytest.raises(UserError, match="vectors between the bounds"):
-        external_labels.check_file(spoilt, None, form, "labels.parquet")
+        external_labels.check_file(spoilt, None, RELATIVE, "labels.parquet")
 
 
-@pytest.mark.parametrize(
-    ("what", "planar"),
-    [
-        ("agent.coarse_directions", lambda: ddqn.Config(coarse_directions=36).make("raw", spaces_of(Reach()))),
-    ],
-)
-def test_what_knows_directions_alone_refuses_a_box(what, planar):
-    with pytest.raises(UserError, match=f"{what} works for directions .* not for actions of a box of 3 entries: [a-z]"):
-        planar()
-
-
-class Saying(struct.PyTreeNode):
-    """A teacher of one action."""
-
-    action: jax.Array
-
-    def best_action(self, state, obs):
-        return self.action
-
-
-def test_a_teacher_is_blamed_by_the_rules_of_their_space():
-    """A vector of zeros is no direction, and an action of this box."""
-    env = Reach()
-    guide = asking.start(registry.make("relative", probes.SIZES, env), env, 20, 20, KEY, KEY)
-    asking.blame(env, Saying(jnp.zeros(3)), guide)
-    with pytest.raises(UserError, match="teacher Saying gave actions that are not finite"):
-        asking.blame(env, Saying(jnp.array([0.0, jnp.nan, 0.0])), guide)
-
-
-@pytest.mark.parametrize("size", [9, 14, 28])
+@pytest.mark.parametrize("size", [9, 28])
 def test_boxes_of_bimanual_arms_and_hands_need_no_cues_and_no_keys(size):
     plain = Box((-1.0,) * size, (1.0,) * size)
     assert [cue.name for cue in plain.cues][::8] == [f"entry {number}" for number in range(1, size + 1, 8)]
@@ -266,21 +192,3 @@ def test_boxes_of_bimanual_arms_and_hands_need_no_cues_and_no_keys(size):
         assert len(keys) == len(set(keys)) > 16
         assert from_json(box.to_json()) == box
         np.testing.assert_allclose(box.exp(*map(jnp.asarray, (box.low, np.ones(size)))), box.high)
-
-
-def test_a_policy_of_26_entries_is_corrected_by_labels_alone_and_its_folder_read(tmp_path):
-    random, size = np.random.default_rng(0), 26
-    best = random.uniform(-0.5, 0.5, (60, size))
-    actions = best + 0.2 + random.uniform(-0.2, 0.2, best.shape)
-    labels = cl.Labels(best, actions, np.sign(best - actions))
-    sizes = GuideSizes(frame="action", feedback_layers=(8,), fit_steps=20, fit_batch_size=8)
-    policy = cl.correct(shifted, labels, low=[-1] * size, high=[1] * size, guidance="relative", bound=0.25, sizes=sizes)
-    policy.save(tmp_path / "hand")
-    again = cl.load_policy(tmp_path / "hand", base=shifted)
-    assert again.actions == policy.actions
-    np.testing.assert_array_equal(again(best), policy(best))
-
-
-def shifted(obs):
-    """A policy that is wrong by a constant."""
-    return obs + 0.2

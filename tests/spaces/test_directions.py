@@ -20,20 +20,9 @@ def degrees_of(action):
     return float(directions.to_angle(action)) / DEG
 
 
-def test_from_angle_and_back():
-    np.testing.assert_allclose(direction(30.0), [math.sqrt(3) / 2, 0.5], atol=1e-7)
-    assert degrees_of(jnp.array([0.0, -2.0])) == pytest.approx(-90)
-    assert degrees_of(jnp.array([-1.0, 0.0])) == pytest.approx(180)
-
-
 def test_rotate_is_counterclockwise():
     np.testing.assert_allclose(directions.rotate(jnp.array([1.0, 0.0]), math.pi / 2), [0, 1], atol=1e-7)
     np.testing.assert_allclose(directions.rotate(jnp.array([3.0, 4.0]), -math.pi / 2), [4, -3], atol=1e-6)
-
-
-def test_rotate_has_leading_axes():
-    turned = directions.rotate(jnp.array([[1.0, 0.0], [0.0, 1.0]]), jnp.array([math.pi / 2, math.pi]))
-    np.testing.assert_allclose(turned, [[0, 1], [0, -1]], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -44,10 +33,6 @@ def test_difference_is_signed_and_wraps(start, end, turn):
     assert float(directions.difference(direction(start), direction(end))) / DEG == pytest.approx(turn, abs=1e-4)
 
 
-def test_difference_of_opposite_directions_is_a_half_turn():
-    assert abs(float(directions.difference(jnp.array([1.0, 0.0]), jnp.array([-1.0, 0.0])))) == pytest.approx(math.pi)
-
-
 def test_difference_undoes_rotate():
     rng = np.random.default_rng(0)
     base = directions.from_angle(jnp.array(rng.uniform(-math.pi, math.pi, 200)))
@@ -55,14 +40,7 @@ def test_difference_undoes_rotate():
     np.testing.assert_allclose(directions.difference(base, directions.rotate(base, jnp.array(turn))), turn, atol=2e-6)
 
 
-def test_retract_divides_by_the_length():
-    np.testing.assert_allclose(directions.retract(jnp.array([3.0, 4.0])), [0.6, 0.8], atol=1e-7)
-    np.testing.assert_allclose(
-        directions.retract(jnp.array([[-1e-6, 0.0], [0.0, 500.0]])), [[-1, 0], [0, 1]], atol=1e-6
-    )
-
-
-@pytest.mark.parametrize("length", [2e-38, 1e-30, 1.0, 1e30, 3e38])
+@pytest.mark.parametrize("length", [2e-38, 1.0, 3e38])
 def test_retract_takes_any_length(length):
     np.testing.assert_allclose(directions.retract(jnp.array([0.0, -length])), [0.0, -1.0], atol=1e-6)
 
@@ -76,10 +54,6 @@ def test_what_is_not_finite_is_no_direction(vector):
 def test_no_action_is_zero_and_actions_stay_as_they_are():
     given = np.float32([[0.0, 0.0], [0.6, -0.8], [1e30, 0.0]])
     np.testing.assert_array_equal(DIRECTIONS.only_actions(given), [[np.nan, np.nan], *given[1:]])
-
-
-def test_retract_of_zero_is_the_x_axis():
-    np.testing.assert_array_equal(directions.retract(jnp.zeros(2)), [1.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -119,10 +93,6 @@ def test_uniform_directions_are_units_that_cover_the_circle():
     assert counts.max() < 600
 
 
-def test_uniform_without_a_shape_is_one_direction():
-    assert directions.uniform(jax.random.key(0)).shape == (2,)
-
-
 def windows(count, *intervals):
     """1 on the given intervals of indices, 0 elsewhere."""
     values = np.zeros(count, np.float32)
@@ -135,32 +105,10 @@ def index_of(best, count):
     return round(float(directions.to_angle(best)) / (2 * math.pi / count)) % count
 
 
-def test_the_best_direction_lies_in_the_wide_window_and_in_its_middle():
-    values = windows(360, (50, 52), (200, 220))
-    best = directions.best_direction(values, 4 * DEG, 0.0)
-    assert index_of(best, 360) == 210
-
-
-def test_a_narrow_higher_window_loses_to_a_wide_one_only_with_an_imperfect_aim():
-    values = windows(360, (200, 220)).at[50].set(1.5)
-    assert index_of(directions.best_direction(values, 0.0, 0.0), 360) == 50
-    assert index_of(directions.best_direction(values, 4 * DEG, 0.0), 360) == 210
-
-
-def test_a_window_over_the_wrap_has_its_middle_at_the_wrap():
-    values = windows(360, (0, 10), (350, 359))
-    assert index_of(directions.best_direction(values, 4 * DEG, 0.0), 360) == 0
-
-
 @pytest.mark.parametrize("shift", [0, 7, 90])
 def test_habit_settles_exact_ties_by_the_smaller_turn_from_x(shift):
     values = windows(360, (20 + shift, 30 + shift), (150 + shift, 160 + shift), (240 + shift, 250 + shift))
     assert index_of(directions.best_direction(values, 1 * DEG, 0.1), 360) == pytest.approx(25 + shift, abs=3)
-
-
-def test_habit_does_not_override_a_clear_difference():
-    values = 0.5 * windows(360, (20, 30)) + windows(360, (300, 310))
-    assert 300 <= index_of(directions.best_direction(values, 1 * DEG, 0.1), 360) <= 310
 
 
 def test_no_spread_and_no_habit_is_a_plain_argmax():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from typing import Any
 
 import jax
@@ -12,8 +12,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
 
 from cuelearner_jax import user_code
-from cuelearner_jax.bridges.gymnasium.instances import PLACE_BYTES
-from cuelearner_jax.bridges.gymnasium.pool import Request, pool_of
+from cuelearner_jax.bridges.gymnasium.instances import PLACE_BYTES, Request
+from cuelearner_jax.bridges.gymnasium.pool import pool_of
 from cuelearner_jax.bridges.gymnasium.source import Source
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
@@ -72,19 +72,8 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
             state.actions.at[state.steps].set(action),
             place,
         )
-        outcome = {SUCCESS: success} if self.succeeds else {}
-        outcome[RETURN] = total
-        step = Step(
-            obs=obs,
-            final_obs=final_obs,
-            aftermath=final_obs,
-            reward=reward,
-            terminated=terminated,
-            truncated=truncated,
-            metrics={},
-            outcome=outcome,
-        )
-        return after, step
+        outcome = {**({SUCCESS: success} if self.succeeds else {}), RETURN: total}
+        return after, Step(obs, final_obs, final_obs, reward, terminated, truncated, {}, outcome)
 
     def _check(self) -> None:
         if self.refusal:
@@ -97,8 +86,10 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
     def _reset_here(self, seed: Any) -> tuple[np.ndarray, np.ndarray]:
         """Reset on the host: any leading axes."""
         seeds = np.asarray(seed)
-        obs, *_, place = self._carried([Request(one) for one in seeds.ravel().tolist()])
-        return obs.reshape((*seeds.shape, -1)), place.reshape((*seeds.shape, 2))
+        obs, *_, place = self._carried(
+            seeds.shape, {row: Request(one) for row, one in enumerate(seeds.ravel().tolist())}
+        )
+        return obs, place
 
     def _step_here(self, *given: Any) -> tuple[np.ndarray, ...]:
         """Step on the host: any leading axes."""
@@ -108,36 +99,32 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         history, actions = history.reshape(-1, *history.shape[-2:]), actions.reshape(-1, actions.shape[-1])
         places = [row.tobytes() for row in np.ascontiguousarray(places).reshape(-1, 2)]
         # What is no action is not executed, and what comes of nothing stays nothing.
-        acts: Any = np.isfinite(actions).all(-1).tolist()
-        requests = [
-            Request(*row) if sound and row[1] != NOWHERE else None
-            for sound, *row in zip(acts, seeds, places, steps, history, actions, next_seeds, strict=True)
-        ]
-        found = self._carried(requests)
-        return tuple(column.reshape((*shape, *column.shape[1:])) for column in found)
+        rows = [row for row in np.flatnonzero(np.isfinite(actions).all(-1)).tolist() if places[row] != NOWHERE]
+        requests = {row: Request(seeds[row], places[row], actions[row], next_seeds[row]) for row in rows}
+        return self._carried(shape, requests, lambda row: history[row, : steps[row]])
 
-    def _carried(self, requests: Sequence[Request | None]) -> tuple[np.ndarray, ...]:
+    def _carried(self, shape: tuple[int, ...], requests: dict[int, Request], history: Any = None) -> tuple[Any, ...]:
         """Return the results of requests, column by column; NaN where there is none, and after a failure.
 
         `user_code` then reports the failure.
         """
-        rows, asked = len(requests), [row for row, one in enumerate(requests) if one is not None]
+        rows = math.prod(shape)
         obs, final_obs = np.full((2, rows, self.obs_size), np.nan, np.float32)
         reward, success, total = np.full((3, rows), np.nan, np.float32)
         terminated, truncated = np.zeros((2, rows), bool)
         place = np.zeros((rows, 2), np.uint32)
-        if asked and not user_code.is_waiting():
+        if requests and not user_code.is_waiting():
             try:
-                went = pool_of(self.source).carry_out([one for one in requests if one is not None])
+                went = pool_of(self.source).carry_out(requests, history)
             except UserError as error:
                 user_code.leave(error)
             else:
-                columns = zip(*went, strict=True)
                 parts = obs, final_obs, reward, terminated, truncated, success, total
-                for part, column in zip(parts, columns, strict=False):  # all columns but the places
-                    part[asked] = column
-                place[asked] = np.frombuffer(b"".join(one.place for one in went), np.uint32).reshape(-1, 2)
-        return obs, final_obs, reward, terminated, truncated, success, total, place
+                for part, column in zip(parts, zip(*went, strict=True), strict=False):  # all columns but the places
+                    part[list(requests)] = column
+                place[list(requests)] = np.frombuffer(b"".join(one.place for one in went), np.uint32).reshape(-1, 2)
+        columns = obs, final_obs, reward, terminated, truncated, success, total, place
+        return tuple(column.reshape((*shape, *column.shape[1:])) for column in columns)
 
 
 def _seed(key: PRNGKeyArray) -> UInt[Array, ""]:

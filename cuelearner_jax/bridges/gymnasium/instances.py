@@ -11,7 +11,8 @@ import contextlib
 import hashlib
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,22 +22,22 @@ from cuelearner_jax.errors import UserError, user_code_error
 
 SUCCESS = ("success", "is_success", "succeed")  # names in `info`
 PLACE_BYTES = 8
+MOST_INSTANCES = 1024  # spare instances, beyond those that one call needs
+RECENT = 16  # an instance that was used within so many calls is kept
 
 
-class Order(NamedTuple):
-    """An instruction to one instance."""
+class Request(NamedTuple):
+    """One row of a call."""
 
-    slot: int  # number of the instance
     seed: int  # seed of the episode
-    place: bytes  # place before the action; empty: the episode begins
-    action: np.ndarray | None  # (action,); None: begin the episode
+    place: bytes = b""  # place before the action; empty: the episode begins
+    action: np.ndarray | None = None  # (action,); None: begin the episode
     next_seed: int = 0  # seed of the next episode, where this one ends
-    replay: np.ndarray | None = None  # (steps, action): go there first; None: it stands there
-    steps: int = 0  # number of steps so far in the episode
+    history: np.ndarray | None = None  # (steps, action) that lead to the place; None: not sent yet
 
 
 class Went(NamedTuple):
-    """The result of an order."""
+    """The result of a request."""
 
     obs: np.ndarray  # (obs,) to act on next
     final_obs: np.ndarray  # (obs,) what the action led to
@@ -48,56 +49,52 @@ class Went(NamedTuple):
     place: bytes  # the instance's place now
 
 
-class Shot(NamedTuple):
-    """A request for pictures of an episode."""
-
-    slot: int
-    seed: int  # seed of the episode
-    actions: np.ndarray  # (steps, action) from its beginning
-    first: int  # number of the first step that is filmed
-
-
-def success_in(whose: str, info: dict[str, Any]) -> bool | None:
-    """Return what `info` says of success; None: nothing. Raises UserError where that is neither true nor false."""
-    name = next((name for name in SUCCESS if info.get(name) is not None), None)
-    if name is None:
-        return None
-    value = np.asarray(info[name])
-    if value.size != 1 or value.dtype.kind not in "biuf" or not np.isfinite(value).all():
-        raise UserError(f"environment {whose} says info[{name!r}] = {info[name]!r}: give True, False or None")
-    return bool(value.ravel()[0])
-
-
 class Running:
     """One instance and its current place."""
 
-    def __init__(self, env: Any, whose: str) -> None:
-        """Raise UserError for an environment whose spaces cannot be vectors."""
-        self.env, self.whose = env, whose
-        self.leaves = leaves_of(whose, env.observation_space)
-        actions_of(whose, env.action_space)
-        self.to_action = action_maker(env.action_space)
+    def __init__(self, make: Callable[[], Any], whose: str, max_steps: int) -> None:
+        """Make the instance. Raises UserError for one that cannot be made, or whose spaces cannot be vectors."""
+        self.whose, self.max_steps = whose, max_steps
+        try:
+            self.env = make()
+        except UserError:
+            raise
+        except Exception as error:
+            raise user_code_error(f"environment {whose}, while it was made,", error) from error
+        if hasattr(self.env, "num_envs"):
+            raise UserError(
+                f"environment {whose} is a vector of {self.env.num_envs} environments: give a function that makes a "
+                "single one"
+            )
+        self.actions = actions_of(f"environment {whose}", self.env.action_space)
+        self.leaves = leaves_of(f"environment {whose}", self.env.observation_space)
+        self.to_action = action_maker(self.env.action_space)
         self.seed, self.steps, self.total, self.place = -1, 0, 0.0, b""
+        self.used = -RECENT  # number of the call that used it last
+        self.filmed = np.zeros((0, 0), np.float32)  # actions so far, where it is filmed
+        self.reports_success = False
 
     def reset(self, seed: int) -> np.ndarray:
         """Begin an episode. Raises UserError for what the environment raises, or gives that is no observation."""
         self.seed, self.steps, self.total = seed, 0, 0.0
-        try:
-            given, _ = self.env.reset(seed=seed)
-        except Exception as error:
-            raise user_code_error(f"environment {self.whose}, in its reset with seed {seed},", error) from error
-        obs = self._vector(given, f"its reset with seed {seed}")
+        when = f"its reset with seed {seed}"
+        obs = self._vector(self._called(when, self.env.reset, seed=seed)[0], when)
         self.place = hashlib.blake2b(seed.to_bytes(8, "little") + obs.tobytes(), digest_size=PLACE_BYTES).digest()
         return obs
 
-    def step(self, action: np.ndarray, max_steps: int) -> tuple[np.ndarray, float, bool, bool, float]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, float]:
         """Execute an action (action,). Return observation, reward, terminated, truncated, success. Raise as `reset`."""
+        obs, reward, terminated, truncated, success = self.execute(self.to_action(action))
+        told = struct.pack("<d??d", reward, terminated, truncated, success)
+        parts = self.place + action.tobytes() + obs.tobytes() + told
+        self.place = hashlib.blake2b(parts, digest_size=PLACE_BYTES).digest()
+        return obs, reward, terminated, truncated, success
+
+    def execute(self, action: Any) -> tuple[np.ndarray, float, bool, bool, float]:
+        """Like `step`, for an action as the environment takes it; `place` is not moved."""
         self.steps += 1
         when = f"step {self.steps} of the episode with seed {self.seed}"
-        try:
-            given, reward, terminated, truncated, info = self.env.step(self.to_action(action))
-        except Exception as error:
-            raise user_code_error(f"environment {self.whose}, in {when},", error) from error
+        given, reward, terminated, truncated, info = self._called(when, self.env.step, action)
         obs = self._vector(given, when)
         try:
             reward = float(reward)
@@ -105,14 +102,27 @@ class Running:
             raise UserError(f"environment {self.whose} gave no number as reward in {when}: mend it first") from None
         if not math.isfinite(reward):
             raise UserError(f"environment {self.whose} gave a reward of {reward} in {when}: mend it first")
-        terminated = bool(terminated)
-        truncated = (bool(truncated) or self.steps >= max_steps) and not terminated
-        success = float(success_in(self.whose, info) or 0.0)
         self.total += reward
-        told = struct.pack("<d??d", reward, terminated, truncated, success)
-        parts = self.place + action.tobytes() + obs.tobytes() + told
-        self.place = hashlib.blake2b(parts, digest_size=PLACE_BYTES).digest()
-        return obs, reward, terminated, truncated, success
+        terminated = bool(terminated)
+        truncated = (bool(truncated) or self.steps >= self.max_steps > 0) and not terminated
+        return obs, reward, terminated, truncated, self._success(info)
+
+    def _called(self, when: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        try:
+            return function(*arguments, **named)
+        except Exception as error:
+            raise user_code_error(f"environment {self.whose}, in {when},", error) from error
+
+    def _success(self, info: dict[str, Any]) -> float:
+        """Return what `info` says of success; 0 where nothing. Raises UserError for neither true nor false."""
+        name = next((name for name in SUCCESS if info.get(name) is not None), None)
+        if name is None:
+            return 0.0
+        value = np.asarray(info[name])
+        if value.size != 1 or value.dtype.kind not in "biuf" or not np.isfinite(value).all():
+            raise UserError(f"environment {self.whose} says info[{name!r}] = {info[name]!r}: give True, False or None")
+        self.reports_success = True
+        return float(bool(value.ravel()[0]))
 
     def _vector(self, given: Any, when: str) -> np.ndarray:
         try:
@@ -120,11 +130,8 @@ class Running:
         except NoVector as error:
             raise UserError(f"environment {self.whose} gave {error} in {when}: keep its shapes") from None
         if not (math.isfinite(obs.sum()) or np.isfinite(obs).all()):
-            start = 0
-            for leaf in self.leaves:
-                if not np.isfinite(obs[start : start + leaf.size]).all():
-                    break
-                start += leaf.size
+            ends = np.cumsum([leaf.size for leaf in self.leaves])
+            leaf = self.leaves[int(np.searchsorted(ends, np.flatnonzero(~np.isfinite(obs))[0], "right"))]
             raise UserError(
                 f"environment {self.whose} gave an observation {leaf.name!r} that is not finite in {when}: mend that"
             )
@@ -149,102 +156,120 @@ class Running:
             )
         return np.ascontiguousarray(found)
 
+    def close(self) -> None:
+        """Close the environment, whatever its closing raises."""
+        with contextlib.suppress(Exception):
+            self.env.close()
+
 
 class Instances:
     """The instances of one process."""
 
     def __init__(self, make: Callable[[], Any], whose: str, max_steps: int, size: int) -> None:
-        """`make` returns an environment; `size`: entries of an observation by the task (0: unknown)."""
+        """`make` returns an environment; `size`: entries of an observation by the task."""
         self.make, self.whose, self.max_steps, self.size = make, whose, max_steps, size
-        self.running: dict[int, Running] = {}
-        self.filmed: dict[int, np.ndarray] = {}  # actions (steps, action) of the episodes that are filmed
+        self.running: list[Running] = []
+        self.cameras: dict[bool, Running] = {}  # the instances that are filmed: for stills (True), and for films
+        self.calls = self.replays = 0  # number of calls, and of replayed steps
 
-    def carry_out(self, orders: Sequence[Order | Shot]) -> list[Any]:
-        """Carry out orders. Return a `Went` for each order, and pictures [(height, width, 3) uint8] for each shot.
+    def carry_out(self, requests: Sequence[Request]) -> list[Went | str | None]:
+        """Return the result of each request: the words of an error, or None where its history is needed.
 
-        Where one fails, its result is the words of the error, and its instance is dropped.
+        The instance for a request stands at the place, or is the least recently used one, or new.
         """
-        found: list[Any] = []
-        for order in orders:
-            try:
-                found.append(self._filmed(order) if isinstance(order, Shot) else self._one(order))
-            except UserError as error:
-                self.drop(order.slot)
-                found.append(str(error))
-        return found
+        self.calls += all(row.history is None for row in requests)  # with histories, a call goes on
+        standing: dict[bytes, list[Running]] = defaultdict(list)
+        for one in self.running:
+            standing[one.place].append(one)
+        chosen = [standing[row.place].pop() if row.place and standing[row.place] else None for row in requests]
+        for one in filter(None, chosen):
+            one.used = self.calls
+        free = iter(sorted((one for one in self.running if one.used < self.calls), key=lambda one: one.used))
+        return [self._result(request, one, free) for request, one in zip(requests, chosen, strict=True)]
 
-    def _one(self, order: Order) -> Went:
-        one = self._instance(order.slot)
-        if order.action is None:
-            obs = one.reset(order.seed)
-            return Went(obs, obs, 0.0, False, False, 0.0, 0.0, one.place)
-        if order.replay is not None:
-            self._go(one, order)
-        obs, reward, terminated, truncated, success = one.step(order.action, self.max_steps)
-        total, final_obs = one.total, obs
-        if terminated or truncated:
-            obs = one.reset(order.next_seed)
-        return Went(obs, final_obs, reward, terminated, truncated, success, total, one.place)
+    def _result(self, request: Request, one: Running | None, free: Iterator[Running]) -> Went | str | None:
+        if one is None and request.place and request.history is None:
+            return None
+        try:
+            if one is None:
+                one = self._vacated(free, request.history is not None and len(request.history) > 0)
+                if request.history is not None:
+                    self._replay(one, request, request.history)
+            if request.action is None:
+                obs = one.reset(request.seed)
+                return Went(obs, obs, 0.0, False, False, 0.0, 0.0, one.place)
+            final_obs, reward, terminated, truncated, success = one.step(request.action)
+            total, ended = one.total, terminated or truncated
+            obs = one.reset(request.next_seed) if ended else final_obs
+            return Went(obs, final_obs, reward, terminated, truncated, success, total, one.place)
+        except UserError as error:
+            if one is not None:
+                one.close()
+                self.running.remove(one)
+            return str(error)
 
-    def _go(self, one: Running, order: Order) -> None:
-        """Bring an instance to the place that an order names.
+    def _vacated(self, free: Iterator[Running], replays: bool) -> Running:
+        """Return the least recently used instance, or a new one where a state in use would be lost."""
+        one = next(free, None)
+        wanted = one is not None and one.used > self.calls - RECENT
+        if one is None or (wanted and replays and len(self.running) < MOST_INSTANCES):
+            one = self._made()
+            self.running.append(one)
+        one.used = self.calls
+        return one
 
-        Raises UserError if the environment does not repeat itself.
-        """
-        assert order.replay is not None
-        one.reset(order.seed)
-        for action in order.replay:
-            one.step(action, self.max_steps)
-        if one.place != order.place:
+    def _made(self) -> Running:
+        one = Running(self.make, self.whose, self.max_steps)
+        size = sum(leaf.size for leaf in one.leaves)
+        if size != self.size:
             raise UserError(
-                f"environment {self.whose} does not repeat itself: with seed {order.seed} and the same "
-                f"{len(order.replay)} actions it came elsewhere than before: let it draw from its own np_random alone, "
-                "and reset everything in reset(seed=...)"
+                f"environment {self.whose} has observations of {size} entries, its task says {self.size}: name the "
+                "environment anew"
+            )
+        return one
+
+    def _replay(self, one: Running, request: Request, history: np.ndarray) -> None:
+        """Bring an instance to a place. Raises UserError if the environment does not repeat itself."""
+        one.reset(request.seed)
+        for action in history:
+            one.step(action)
+        self.replays += len(history)
+        if one.place != request.place:
+            raise UserError(
+                f"environment {self.whose} does not repeat itself: with seed {request.seed} and the same "
+                f"{len(history)} actions it came elsewhere than before: let it draw from its own np_random alone, and "
+                "reset everything in reset(seed=...)"
             )
 
-    def _filmed(self, shot: Shot) -> list[np.ndarray]:
-        """Return pictures of an episode; fewer where the episode ends before its actions do."""
-        one = self._instance(shot.slot)
-        before = self.filmed.get(shot.slot, shot.actions[:0])
-        goes_on = one.seed == shot.seed and len(before) <= shot.first and len(before) == one.steps
-        if not goes_on or not np.array_equal(before, shot.actions[: len(before)]):
-            one.reset(shot.seed)
-        frames = [one.picture()] if one.steps >= shot.first else []
-        for action in shot.actions[one.steps :]:
-            *_, terminated, truncated, _ = one.step(action, self.max_steps)
-            if one.steps >= shot.first:
-                frames.append(one.picture())
-            if terminated or truncated:
-                break
-        self.filmed[shot.slot] = shot.actions[: one.steps]
-        return frames
+    def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray] | str:
+        """Return pictures of an episode after its first `first` actions, or the words of an error.
 
-    def _instance(self, slot: int) -> Running:
-        if slot not in self.running:
-            try:
-                env = self.make()
-            except UserError:
-                raise
-            except Exception as error:
-                raise user_code_error(f"environment {self.whose}, while it was made,", error) from error
-            one = Running(env, self.whose)
-            size = sum(leaf.size for leaf in one.leaves)
-            if self.size and size != self.size:
-                raise UserError(
-                    f"environment {self.whose} has observations of {size} entries, its task says {self.size}: name the "
-                    "environment anew"
-                )
-            self.running[slot] = one
-        return self.running[slot]
-
-    def drop(self, slot: int) -> None:
-        """Close an instance, if it exists."""
-        one = self.running.pop(slot, None)
-        if one is not None:
-            with contextlib.suppress(Exception):  # the instance is dropped, whatever closing raises
-                one.env.close()
+        There are fewer pictures where the episode ends before its actions do.
+        """
+        still = first == len(actions)
+        try:
+            if still not in self.cameras:
+                self.cameras[still] = self._made()
+            one = self.cameras[still]
+            goes_on = one.seed == seed and one.steps <= first and len(one.filmed) == one.steps
+            if not goes_on or not np.array_equal(one.filmed, actions[: one.steps]):
+                one.reset(seed)
+            frames = [one.picture()] if one.steps == first else []
+            for action in actions[one.steps :]:
+                *_, terminated, truncated, _ = one.step(action)
+                if one.steps >= first:
+                    frames.append(one.picture())
+                if terminated or truncated:
+                    break
+            one.filmed = actions[: one.steps]
+            return frames
+        except UserError as error:
+            if still in self.cameras:
+                self.cameras.pop(still).close()
+            return str(error)
 
     def close(self) -> None:
         """Close all instances."""
-        for slot in list(self.running):
-            self.drop(slot)
+        for one in (*self.running, *self.cameras.values()):
+            one.close()
+        self.running, self.cameras = [], {}

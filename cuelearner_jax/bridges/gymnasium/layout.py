@@ -5,14 +5,13 @@ This module imports neither JAX nor Gymnasium, so that worker processes start qu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from cuelearner_jax.errors import UserError
 
-IMAGE_AXES = 3
 LARGEST = 1e30  # a bound from here on is none: float32's own largest number, say
 
 
@@ -20,58 +19,47 @@ class Leaf(NamedTuple):
     """One entry of a (nested) space of observations."""
 
     path: tuple[Any, ...]  # keys and places that lead to it
-    kind: str  # "box", "bits" or "one of"
     shape: tuple[int, ...]  # shape of the environment's value
-    choices: tuple[int, ...] = ()  # for "one of": the number of values of each entry
-    start: tuple[int, ...] = ()  # for "one of": the first value of each entry
+    choices: tuple[int, ...] = ()  # number of values of each entry, which the vector holds one-hot; (): as they are
+    start: tuple[int, ...] = ()  # the first value of each entry with choices
 
     @property
     def size(self) -> int:
         """Number of entries that the leaf fills in the vector."""
-        return sum(self.choices) if self.kind == "one of" else int(np.prod(self.shape, dtype=int))
+        return sum(self.choices) or int(np.prod(self.shape, dtype=int))
 
     @property
     def name(self) -> str:
-        """The leaf's keys, joined by dots, as a name in messages."""
+        """The leaf's keys, joined by dots."""
         return ".".join(map(str, self.path)) or "observation"
 
 
-def leaves_of(whose: str, space: Any) -> tuple[Leaf, ...]:
+def leaves_of(whose: str, space: Any, path: tuple[Any, ...] = ()) -> tuple[Leaf, ...]:
     """Return the entries of a space of observations, in the order of the space.
 
     Raises UserError for images and for spaces that have no vectors; `whose`: for the message.
     """
-    return tuple(_leaves(whose, space, ()))
-
-
-def _leaves(whose: str, space: Any, path: tuple[Any, ...]) -> Iterator[Leaf]:
-    name, kind = ".".join(map(str, path)) or "observation", type(space).__name__
-    if kind == "Dict":
-        for key, inner in space.spaces.items():
-            yield from _leaves(whose, inner, (*path, key))
-    elif kind == "Tuple":
-        for number, inner in enumerate(space.spaces):
-            yield from _leaves(whose, inner, (*path, number))
-    elif kind == "Box":
-        shape = tuple(map(int, space.shape))
-        if len(shape) >= IMAGE_AXES or (len(shape) == 2 and space.dtype == np.uint8):
-            raise UserError(
-                f"{whose}: observation {name!r} is an image of shape {shape}: give one with observations of numbers (a "
-                "vector, or a dictionary of vectors); pictures for people come from render_mode='rgb_array'"
-            )
-        yield Leaf(path, "box", shape)
-    elif kind == "Discrete":
-        yield Leaf(path, "one of", (), (int(space.n),), (int(space.start),))
-    elif kind == "MultiDiscrete":
-        counts = tuple(map(int, np.ravel(space.nvec)))
-        yield Leaf(path, "one of", tuple(space.shape), counts, tuple(map(int, np.ravel(space.start))))
-    elif kind == "MultiBinary":
-        yield Leaf(path, "bits", tuple(space.shape))
-    else:
-        raise UserError(
-            f"{whose}: observation {name!r} is a {kind}: give one of Box, Discrete, MultiDiscrete or MultiBinary, or a "
-            "Dict or Tuple of these"
+    kind = type(space).__name__
+    if kind in ("Dict", "Tuple"):
+        parts = space.spaces.items() if kind == "Dict" else enumerate(space.spaces)
+        return tuple(leaf for key, inner in parts for leaf in leaves_of(whose, inner, (*path, key)))
+    leaf = Leaf(path, tuple(space.shape or ()))
+    if kind in ("Discrete", "MultiDiscrete"):
+        counts, start = (
+            np.ravel(part).tolist() for part in (getattr(space, "nvec", getattr(space, "n", 0)), space.start)
         )
+        return (leaf._replace(choices=tuple(counts), start=tuple(start)),)
+    if kind not in ("Box", "MultiBinary"):
+        raise UserError(
+            f"{whose}: observation {leaf.name!r} is a {kind}: give one of Box, Discrete, MultiDiscrete or MultiBinary, "
+            "or a Dict or Tuple of these"
+        )
+    if kind == "Box" and len(leaf.shape) + (space.dtype == np.uint8) >= 3:
+        raise UserError(
+            f"{whose}: observation {leaf.name!r} is an image of shape {leaf.shape}: give one with observations of "
+            "numbers (a vector, or a dictionary of vectors); pictures for people come from render_mode='rgb_array'"
+        )
+    return (leaf,)
 
 
 class NoVector(Exception):
@@ -80,31 +68,27 @@ class NoVector(Exception):
 
 def flatten(leaves: tuple[Leaf, ...], obs: Any) -> np.ndarray:
     """Return an observation as a vector (obs,) of float32. Raises NoVector for an observation outside its space."""
-    parts = [_vector(leaf, obs) for leaf in leaves]
-    return np.concatenate(parts, dtype=np.float32, casting="unsafe") if len(parts) > 1 else parts[0].astype(np.float32)
+    return np.concatenate([_vector(leaf, obs) for leaf in leaves], dtype=np.float32, casting="unsafe")
 
 
 def _vector(leaf: Leaf, obs: Any) -> np.ndarray:
-    value = obs
-    for key in leaf.path:
-        try:
-            value = value[key]
-        except (KeyError, IndexError, TypeError):
-            raise NoVector(f"no entry {leaf.name!r} in its observation, which its space has") from None
     try:
-        found = np.asarray(value)
-    except (TypeError, ValueError):
-        found = np.empty((0, 0), object)
-    if found.shape != leaf.shape or found.dtype.kind not in "biuf":
-        raise NoVector(f"an observation {leaf.name!r} of shape {found.shape}, where its space has {leaf.shape}")
-    if leaf.kind != "one of":
-        return found.ravel()
-    rows = np.zeros(sum(leaf.choices), np.float32)
-    ends = np.cumsum((0, *leaf.choices))
-    for end, count, start, number in zip(ends[:-1], leaf.choices, leaf.start, found.ravel(), strict=True):
-        if not 0 <= int(number) - start < count:
-            raise NoVector(f"an observation {leaf.name!r} of {number}, where its space has {start} to {start + count}")
-        rows[end + int(number) - start] = 1.0
+        for key in leaf.path:
+            obs = obs[key]
+        value = np.asarray(obs)
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise NoVector(f"no numbers {leaf.name!r} in its observation, which its space has") from None
+    if value.shape != leaf.shape or value.dtype.kind not in "biuf":
+        raise NoVector(f"an observation {leaf.name!r} of shape {value.shape}, where its space has {leaf.shape}")
+    if not leaf.choices:
+        return value.ravel()
+    places = value.ravel().astype(int) - np.array(leaf.start, int)
+    if ((places < 0) | (places >= leaf.choices)).any():
+        raise NoVector(
+            f"an observation {leaf.name!r} of {value}, beyond the {leaf.choices} values from {leaf.start} on"
+        )
+    rows = np.zeros(leaf.size, np.float32)
+    rows[places + np.cumsum((0, *leaf.choices[:-1]), dtype=int)] = 1.0
     return rows
 
 
@@ -114,11 +98,6 @@ class Actions(NamedTuple):
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
     choices: int = 0  # above 0: one of so many
-
-    @property
-    def size(self) -> int:
-        """Number of entries of an action."""
-        return self.choices or len(self.low)
 
 
 def actions_of(whose: str, space: Any) -> Actions:
@@ -131,18 +110,11 @@ def actions_of(whose: str, space: Any) -> Actions:
     if kind != "Box":
         raise UserError(f"{whose}: its actions are a {kind}: wrap the environment so that they are a Box or Discrete")
     low, high = np.ravel(space.low).astype(float), np.ravel(space.high).astype(float)
-    if (fixed := np.flatnonzero(low == high)).size:
-        raise UserError(
-            f"{whose}: entry {fixed[0] + 1} of its actions can only be {low[fixed[0]]:g}: wrap it so that the entry is "
-            "left out"
-        )
-    ends = (np.abs(low) < LARGEST) & (np.abs(high) < LARGEST)
-    if not ends.all():
-        number = int(np.flatnonzero(~ends)[0]) + 1
-        raise UserError(
-            f"{whose}: entry {number} of its actions has no bounds: wrap it, for instance in "
-            "gymnasium.wrappers.RescaleAction"
-        )
+    for number, (least, most) in enumerate(zip(low, high, strict=True), 1):
+        if least == most:
+            raise UserError(f"{whose}: entry {number} of its actions can only be {least:g}: wrap it to leave it out")
+        if not max(-least, most) < LARGEST:
+            raise UserError(f"{whose}: entry {number} of its actions has no bounds: wrap it, as in RescaleAction")
     return Actions(tuple(low.tolist()), tuple(high.tolist()))
 
 

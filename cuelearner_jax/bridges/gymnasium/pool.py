@@ -1,4 +1,4 @@
-"""The pool finds the instance at the place that a state names, or brings one there by replaying its actions."""
+"""The pool plays one environment in this process or in several: a call's rows are divided among them."""
 
 from __future__ import annotations
 
@@ -11,40 +11,33 @@ import subprocess
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from ctypes.util import find_library
-from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cuelearner_jax.bridges.gymnasium.instances import Instances, Order, Shot, Went
+from cuelearner_jax.bridges.gymnasium.instances import Instances, Request, Went
 from cuelearner_jax.bridges.gymnasium.source import Source
 from cuelearner_jax.errors import UserError
 
 WORKER = "cuelearner_jax.bridges.gymnasium.worker"
 PACKAGES = Path(__file__).parents[3]  # folder that this package is imported from
 MOST_POOLS = 8  # most pools open at once
-MOST_INSTANCES = 1024  # spare instances of a pool, beyond those that one call needs
-RECENT = 16  # an instance that was used within so many calls is kept
 
 
 class Process:
     """Instances in a process of their own."""
 
-    def __init__(self, sent: bytes, more: Mapping[str, str]) -> None:
-        """Start the process.
-
-        Args:
-            sent: the arguments of `Instances`, pickled.
-            more: variables of its environment beside ours.
-        """
+    def __init__(self, source: Source) -> None:
+        """Start the process. Raises UserError for code that cannot be sent to it."""
+        self.name, self.is_gone, sent = source.name, False, source.pickled()
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", WORKER, str(theirs.fileno()), str(os.getpid())]
         paths = os.pathsep.join([str(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])
-        environ = {**os.environ, "PYTHONPATH": paths, **more}
+        environ = {**os.environ, "PYTHONPATH": paths, **(drawing_variables() if source.drawn else {})}
         # An environment's prints must not mix with our output.
         self.child = subprocess.Popen(
             command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2, env=environ
@@ -54,17 +47,22 @@ class Process:
         self.link.send([entry or os.getcwd() for entry in sys.path])
         self.link.send_bytes(sent)
 
-    def send(self, orders: Sequence[Order | Shot]) -> None:
-        """Give orders, to be answered by `receive`."""
+    def send(self, method: str, *arguments: Any) -> None:
+        """Call a method of the instances; `receive` returns its result."""
         with contextlib.suppress(OSError):  # `receive` reports it
-            self.link.send_bytes(pickle.dumps(orders, pickle.HIGHEST_PROTOCOL))
+            self.link.send_bytes(pickle.dumps((method, *arguments), pickle.HIGHEST_PROTOCOL))
 
-    def receive(self, count: int) -> list[Any] | None:
-        """Return the results of the orders; None: the process is gone."""
+    def receive(self) -> Any:
+        """Return the result of a call, or the words of an error."""
         try:
             return pickle.loads(self.link.recv_bytes())
         except (EOFError, OSError):
-            return None
+            self.close()
+            self.is_gone = True
+            return (
+                f"environment {self.name}: a process that played it ended (exit status {self.child.returncode}): see "
+                "what it wrote on standard error, or give processes 1 to have it played in this process"
+            )
 
     def close(self) -> None:
         """End the process."""
@@ -76,160 +74,74 @@ class Process:
             self.child.wait()
 
 
-class LocalInstances:
+class Here:
     """Instances in this process."""
 
-    def __init__(self, instances: Instances) -> None:
-        """Make the instances of this process."""
-        self.instances = instances
-        self.found: list[Any] = []
+    is_gone = False
 
-    def send(self, orders: Sequence[Order | Shot]) -> None:
-        """Carry out orders."""
-        self.found = self.instances.carry_out(orders)
+    def __init__(self, source: Source) -> None:
+        self.instances, self.result = Instances(*source.arguments_of_instances), None
 
-    def receive(self, count: int) -> list[Any] | None:
-        """Return the results of the orders."""
-        return self.found
+    def send(self, method: str, *arguments: Any) -> None:
+        """Call a method of the instances."""
+        self.result = getattr(self.instances, method)(*arguments)
+
+    def receive(self) -> Any:
+        """Return the result of the call."""
+        return self.result
 
     def close(self) -> None:
         """Close all instances."""
         self.instances.close()
 
 
-@dataclass
-class Slot:
-    """An instance as the pool knows it."""
-
-    number: int
-    place: bytes = b""  # name of its place; empty: none
-    used: int = -1 - RECENT  # the number of the call that used it last
-
-
-@dataclass
-class Request:
-    """One row of a call."""
-
-    seed: int
-    place: bytes = b""  # name of the place that the state gives
-    steps: int = 0
-    history: np.ndarray | None = None  # (max_steps, action)
-    action: np.ndarray | None = None  # None: begin an episode
-    next_seed: int = 0
-
-
-@dataclass
 class Pool:
     """Instances of one source, in this process or in several."""
 
-    source: Source
-    slots: list[Slot] = field(default_factory=list)
-    calls: int = 0
-    lock: Any = field(default_factory=threading.RLock)
-    hosts: dict[int, Process | LocalInstances] = field(default_factory=dict)
-    replays: int = 0  # number of replayed steps
-    _standing: dict[bytes, list[Slot]] = field(default_factory=dict)
+    def __init__(self, source: Source) -> None:
+        self.source, self.lock = source, threading.RLock()
+        self.hosts: dict[int, Process | Here] = {}
 
-    def carry_out(self, requests: Sequence[Request]) -> list[Went]:
-        """Carry out the rows of a call. Raises UserError for the first that fails."""
+    def carry_out(self, requests: Mapping[int, Request], history: Callable[[int], np.ndarray] | None) -> list[Went]:
+        """Carry out the rows of a call. Raises UserError for the first that fails.
+
+        Args:
+            requests: by the number of the row, which says what process plays the row.
+            history: number of a row -> its actions (steps, action) so far, asked for where no instance stands at its
+                place; None: all rows begin episodes.
+        """
         with self.lock:
-            self.calls += 1
-            chosen = self._chosen(requests)
-            by_host: dict[int, list[int]] = {}
-            for row, slot in enumerate(chosen):
-                by_host.setdefault(slot.number % self.source.hosts, []).append(row)
-            orders = [self._order(request, slot) for request, slot in zip(requests, chosen, strict=True)]
-            for host, rows in by_host.items():
-                self._host(host).send([orders[row] for row in rows])
-            found: list[Went | str] = [""] * len(requests)
-            for host, rows in by_host.items():
-                answers = self._host(host).receive(len(rows))
-                if answers is None:
-                    answers = [self._lost(host)] * len(rows)
-                for row, answer in zip(rows, answers, strict=True):
-                    found[row] = answer
-            went: list[Went] = []
-            for slot, answer in zip(chosen, found, strict=True):
-                self._stand(slot, b"" if isinstance(answer, str) else answer.place)
-                if isinstance(answer, Went):
-                    went.append(answer)
-            for answer in found:
-                if isinstance(answer, str):
-                    raise UserError(answer)
-            return went
+            found = self._asked(requests)
+            if history is not None:
+                missing = [row for row, one in found.items() if one is None]
+                found.update(self._asked({row: requests[row]._replace(history=history(row)) for row in missing}))
+            if fault := next((one for one in found.values() if isinstance(one, str)), None):
+                raise UserError(fault)
+            return list(found.values())
 
-    def _chosen(self, requests: Sequence[Request]) -> list[Slot]:
-        """Return the instance for each row: one at the right place, a new one, or the least recently used one."""
-        chosen: list[Slot | None] = []
-        for request in requests:
-            there = self._standing.get(request.place) if request.action is not None else None
-            slot = there.pop() if there else None
-            if slot is not None:
-                slot.used = self.calls
-            chosen.append(slot)
-        free = iter(sorted((slot for slot in self.slots if slot.used < self.calls), key=lambda slot: slot.used))
-        return [
-            self._vacated(request, free) if slot is None else slot
-            for request, slot in zip(requests, chosen, strict=True)
-        ]
+    def _asked(self, requests: Mapping[int, Request]) -> dict[int, Any]:
+        rows: dict[int, list[int]] = {}
+        for row in requests:
+            rows.setdefault(row % self.source.hosts, []).append(row)
+        for number, own in rows.items():
+            self._host(number).send("carry_out", [requests[row] for row in own])
+        found = dict.fromkeys(requests)
+        for number, own in rows.items():
+            answers = self.hosts[number].receive()
+            found.update(zip(own, [answers] * len(own) if isinstance(answers, str) else answers, strict=True))
+        return found
 
-    def _vacated(self, request: Request, free: Iterator[Slot]) -> Slot:
-        """Return the least recently used instance, or a new one where a state in use would be lost."""
-        slot = next(free, None)
-        wanted = slot is not None and slot.place and slot.used > self.calls - RECENT
-        if slot is None or (wanted and request.steps and len(self.slots) < MOST_INSTANCES):
-            slot = Slot(len(self.slots))
-            self.slots.append(slot)
-        slot.used = self.calls
-        return slot
-
-    def _order(self, request: Request, slot: Slot) -> Order:
-        replay = None
-        if request.action is not None and slot.place != request.place:
-            assert request.history is not None
-            replay = np.array(request.history[: request.steps])
-            self.replays += request.steps
-        return Order(slot.number, request.seed, request.place, request.action, request.next_seed, replay, request.steps)
-
-    def _stand(self, slot: Slot, place: bytes) -> None:
-        before = self._standing.get(slot.place)
-        if before and slot in before:
-            before.remove(slot)
-        if not before:
-            self._standing.pop(slot.place, None)
-        slot.place = place
-        if place:
-            self._standing.setdefault(place, []).append(slot)
-
-    def _host(self, number: int) -> Process | LocalInstances:
-        if number not in self.hosts:
-            arguments = self.source.arguments_of_instances()
-            if self.source.plays_here:
-                self.hosts[number] = LocalInstances(Instances(*arguments))
-            else:
-                drawing = drawing_variables() if self.source.drawn else {}
-                self.hosts[number] = Process(self.source.pickled(arguments), drawing)
+    def _host(self, number: int) -> Process | Here:
+        if number not in self.hosts or self.hosts[number].is_gone:
+            self.hosts[number] = (Here if self.source.plays_here else Process)(self.source)
         return self.hosts[number]
 
-    def _lost(self, number: int) -> str:
-        """Forget a process that is gone with its instances; return the error message."""
-        gone = self.hosts.pop(number)
-        assert isinstance(gone, Process)
-        gone.close()
-        for slot in self.slots:
-            if slot.number % self.source.hosts == number:
-                self._stand(slot, b"")
-        return (
-            f"environment {self.source.name}: a process that played it ended (exit status {gone.child.returncode}): "
-            "see what it wrote on standard error, or give processes 1 to have it played in this process"
-        )
-
-    def filmed(self, slot: int, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
+    def filmed(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
         """Return pictures of an episode from step `first` on. Raises UserError if there are none."""
         with self.lock:
             host = self._host(0)
-            host.send([Shot(slot, seed, np.asarray(actions, np.float32), first)])
-            (found,) = host.receive(1) or [self._lost(0)]
+            host.send("film", seed, actions, first)
+            found = host.receive()
             if isinstance(found, str):
                 raise UserError(found)
             return found
@@ -239,7 +151,7 @@ class Pool:
         with self.lock:
             for host in self.hosts.values():
                 host.close()
-            self.hosts, self.slots, self._standing = {}, [], {}
+            self.hosts = {}
 
 
 def drawing_variables() -> dict[str, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import io
-import types
+from types import SimpleNamespace
 from typing import Any
 
 
@@ -29,25 +29,12 @@ def supply_joint_types() -> None:
 
     Does nothing where the members do so by themselves.
     """
-    import mujoco as library
     import numpy as np
     from gymnasium_robotics.utils import mujoco_utils
 
-    mujoco: Any = library  # `Any`, since type checkers do not know its members
-    own = mujoco.mjtJoint
-    if np.int32(int(own.mjJNT_HINGE)) in (own.mjJNT_HINGE,) or isinstance(mujoco_utils.mujoco, _View):
-        return
-    mujoco_utils.mujoco = _View(mujoco)  # pyright: ignore[reportAttributeAccessIssue]
-
-
-class _View(types.ModuleType):
-    """A module with everything that `mujoco` has, and joint types that are integers."""
-
-    def __init__(self, module: Any) -> None:
-        super().__init__(module.__name__)
-        names = [name for name in dir(module.mjtJoint) if name.startswith("mjJNT_")]
-        self.module = module
-        self.mjtJoint = enum.IntEnum("mjtJoint", {name: int(getattr(module.mjtJoint, name)) for name in names})
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.module, name)
+    library: Any = mujoco_utils.mujoco
+    own = library.mjtJoint
+    if np.int32(int(own.mjJNT_HINGE)) not in (own.mjJNT_HINGE,):
+        kinds = {name: int(getattr(own, name)) for name in dir(own) if name.startswith("mjJNT_")}
+        view: Any = SimpleNamespace(**{**vars(library), "mjtJoint": enum.IntEnum("mjtJoint", kinds)})
+        mujoco_utils.mujoco = view

@@ -14,9 +14,6 @@ from typing import Any
 
 from cuelearner_jax.errors import UserError, near
 
-DRAWN = "render_mode"
-MISSING = "Gymnasium is not installed: pip install 'cuelearner-jax[gymnasium]'"
-
 
 @dataclass(frozen=True)
 class Source:
@@ -24,9 +21,9 @@ class Source:
 
     name: str  # an id of Gymnasium's registry, or what the user's code is called
     arguments: str  # arguments of the environment, by name, as JSON
-    max_steps: int  # an episode is truncated after so many
+    max_steps: int  # an episode is truncated after so many; 0: as the environment says
     processes: int  # 0: one for each processor; 1: this one
-    size: int = 0  # entries of an observation; 0: not known yet
+    size: int = 0  # entries of an observation
     factory: Callable[..., Any] | None = None  # None: by the id
     drawn: bool = False  # True if its instances are drawn, which takes one process
 
@@ -44,8 +41,8 @@ class Source:
     def make(self) -> Callable[[], Any]:
         """A function without arguments that makes one instance."""
         named = json.loads(self.arguments)
-        if self.drawn and (self.factory is None or _takes(self.factory, DRAWN)):
-            named[DRAWN] = "rgb_array"
+        if self.drawn and (self.factory is None or _takes(self.factory, "render_mode")):
+            named["render_mode"] = "rgb_array"
         if self.factory is not None:
             return partial(make_from_code, self.factory, named)
         import gymnasium
@@ -53,19 +50,20 @@ class Source:
         spec = gymnasium.registry.get(self.name)  # of the caller's own registry, which another process lacks
         return partial(make_registered, self.name, named, self.max_steps, spec)
 
+    @property
     def arguments_of_instances(self) -> tuple[Any, ...]:
-        """Return the arguments of `Instances`."""
+        """The arguments of `Instances`."""
         return self.make, self.name, self.max_steps, self.size
 
-    def pickled(self, arguments: tuple[Any, ...]) -> bytes:
-        """Pickle the arguments for a process, with code of `__main__` and local functions.
+    def pickled(self) -> bytes:
+        """Pickle the arguments of `Instances`, with code of `__main__` and local functions.
 
-        Raises UserError for code that cannot be sent.
+        Raises UserError for code that cannot be sent to another process.
         """
         import cloudpickle  # Gymnasium needs it too
 
         try:
-            return cloudpickle.dumps(arguments)
+            return cloudpickle.dumps(self.arguments_of_instances)
         except Exception as error:
             raise UserError(
                 f"environment {self.name} cannot be sent to another process ({type(error).__name__}: {error}): give a "
@@ -76,22 +74,21 @@ class Source:
 def _takes(factory: Callable[..., Any], name: str) -> bool:
     """Return whether a function or class accepts an argument of that name."""
     try:
-        parameters = inspect.signature(factory).parameters
+        parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
         return False
-    return name in parameters or any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+    return any(one.name == name or one.kind is one.VAR_KEYWORD for one in parameters)
 
 
 def cores() -> int:
     """Return the number of processors that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_installed() -> None:
     """Raise UserError unless Gymnasium is installed."""
     if find_spec("gymnasium") is None:
-        raise UserError(MISSING)
+        raise UserError("Gymnasium is not installed: pip install 'cuelearner-jax[gymnasium]'")
 
 
 def registry_spec(name: str) -> Any:
@@ -107,18 +104,14 @@ def registry_spec(name: str) -> Any:
     import gymnasium
 
     # imported by the caller: its environments are registered, and fail
-    imported_before = "gymnasium_robotics" in sys.modules
-    if imported_before or (name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None):
+    is_imported = "gymnasium_robotics" in sys.modules
+    if is_imported or (name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None):
         from cuelearner_jax.bridges.gymnasium.robotics import register
 
         register()
-    if name in gymnasium.registry:
-        return gymnasium.registry[name]
     try:
-        return gymnasium.spec(name)  # an id without its version
-    except Exception as error:
-        if not isinstance(error, gymnasium.error.Error):
-            raise
+        return gymnasium.registry.get(name) or gymnasium.spec(name)  # `spec` finds an id without its version
+    except gymnasium.error.Error as error:
         raise UserError(
             f"Gymnasium has no environment {name!r}{near(name, gymnasium.registry)}; "
             "of an id that your own code registers give the class or function (gymnasium:package.module:NAME)"
@@ -126,10 +119,7 @@ def registry_spec(name: str) -> Any:
 
 
 def make_registered(name: str, arguments: dict[str, Any], max_steps: int, spec: Any = None) -> Any:
-    """Return an environment of Gymnasium's registry, or of a specification that this process's registry lacks.
-
-    Raises UserError for an id that is not there.
-    """
+    """Return an environment of Gymnasium's registry, or of a specification that this process's registry lacks."""
     try:
         spec = registry_spec(name)
     except UserError:

@@ -1,4 +1,4 @@
-"""A process that plays instances for the pool: it reads orders from a socket until the socket is closed.
+"""A process that plays instances for the pool: it reads calls from a socket until the socket is closed.
 
 The process is started as a program of its own, not forked: a fork of a process with threads may hang. The user's
 script is not run a second time.
@@ -13,7 +13,6 @@ import sys
 import threading
 import time
 from multiprocessing.connection import Connection
-from typing import Any
 
 LOOKED = 1.0  # time between two checks of the parent [s]
 
@@ -23,43 +22,26 @@ def main(descriptor: int, parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles an interrupt, and then ends this process
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     link = Connection(descriptor)
-    instances: Any = None
+    instances, fault = None, ""
     try:
-        path = link.recv()
-        sys.path[:] = path
-        instances = _begun(link)
+        sys.path[:] = link.recv()
+        from cuelearner_jax.bridges.gymnasium.instances import Instances
+        from cuelearner_jax.errors import user_code_error
+
+        sent = link.recv_bytes()
+        try:
+            instances = Instances(*pickle.loads(sent))
+        except Exception as error:
+            fault = str(user_code_error("the environment's code, when loaded,", error))
         while True:
-            orders = link.recv()
-            link.send_bytes(pickle.dumps(instances.carry_out(orders), pickle.HIGHEST_PROTOCOL))
+            method, *arguments = link.recv()
+            answer = getattr(instances, method)(*arguments) if instances else fault
+            link.send_bytes(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL))
     except (EOFError, OSError):
         pass
     finally:
         if instances is not None:
             instances.close()
-
-
-def _begun(link: Connection) -> Any:
-    """Return the instances that the pool's arguments describe; an error becomes the answer to every order."""
-    from cuelearner_jax.bridges.gymnasium.instances import Instances
-    from cuelearner_jax.errors import UserError, user_code_error
-
-    sent = link.recv_bytes()
-    try:
-        return Instances(*pickle.loads(sent))
-    except Exception as caught:
-        error = (
-            caught if isinstance(caught, UserError) else user_code_error("the environment's code, when loaded,", caught)
-        )
-        words = str(error)
-
-    class Failed:
-        def carry_out(self, orders: Any) -> list[str]:
-            return [words for _ in orders]
-
-        def close(self) -> None:
-            pass
-
-    return Failed()
 
 
 def _end_with(parent: int) -> None:

@@ -1,0 +1,187 @@
+"""Pictures of other libraries' environments: frames of Gymnasium's `render`, or of a MuJoCo model by its renderer."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, UInt8
+
+from cuelearner_envs.playing import played
+from cuelearner_jax import pictures, user_code
+from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Running, model_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.task import Pictures
+from cuelearner_jax.tasks import fetch_layout
+from cuelearner_jax.types import Reel, Sketch
+
+HELD = 5  # steps for which a clip holds an action, since one step is hardly visible
+PERIOD = 0.1  # time between two frames of a clip [s]
+FPS = 25.0  # of a film, one frame per step
+SIZE = (480, 360)  # width and height of a rendered model [pixels]
+
+Frame = UInt8[np.ndarray, "height width 3"]
+
+
+def pictures_of(
+    draw: Callable[[Any, Any, Any], list[Frame]],
+    seen: Callable[[Any], Any],
+    film: Callable[[Any, Any, Any], list[Frame]],
+    points: Callable[[Any], tuple[tuple[float, float] | None, ...]] = lambda env: (),
+    check: Callable[[Any], Any] | None = None,
+) -> Pictures:
+    """Return the drawing functions of environments that are drawn frame by frame.
+
+    Args:
+        draw: (environment, state, actions (n, action)) -> a frame of the state and one after each of the actions.
+        seen: what a film needs of a state.
+        film: (environment, what `seen` gives (steps, ...), actions (steps, action)) -> frames of a roll-out.
+        points: see `Sketch.points`.
+        check: see `Pictures.check`.
+    """
+
+    def sketch(env: Any, state: Any) -> Sketch:
+        (frame,) = draw(env, state, np.zeros((0, env.actions.size), np.float32))
+        return pictures.sketch(frame, f"step {int(state.steps) + 1}")._replace(points=points(env))
+
+    def clip(env: Any, state: Any, action: Any) -> list[Frame]:
+        return draw(env, state, np.repeat(np.asarray(action, np.float32)[None], HELD, 0))
+
+    def reel(env: Any, state: Any, action: Float[Array, " action"]) -> Reel:
+        frames = clip(env, state, action)
+        return pictures.clip(frames, PERIOD, f"held for {len(frames) - 1} steps")
+
+    def question(env: Any, state: Any, obs: Any, action: Any, file: Path) -> None:
+        frames = clip(env, state, action)
+        pictures.still([frames[0], frames[-1]], file)
+
+    def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
+        see = lambda env, state, action, step: (seen(state), action, step.reward)  # noqa: E731
+        states, actions, rewards = played(env, policy, key, steps, see)
+        user_code.tell()
+        return film(env, states, actions), rewards.tolist()
+
+    return Pictures(
+        record=record,
+        still=lambda env, frames, file: pictures.still(frames, file),
+        animate=lambda env, frames, file: pictures.animate(frames, file, FPS),
+        question=question,
+        sketch=sketch,
+        reel=reel,
+        check=check,
+    )
+
+
+# --- Gymnasium: a spare instance replays an episode's actions --------------------------------------------------------
+
+
+def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Frame]:
+    """Return pictures of an episode after its first `first` actions. Raises UserError where there are none."""
+    from cuelearner_jax.bridges.gymnasium.pool import pool_of
+
+    source = env.source
+    if source.factory is None:
+        source = dataclasses.replace(source, arguments=fetch_layout.picture_arguments(source.name, source.arguments))
+    rows = np.asarray(actions, np.float32).reshape(-1, env.actions.size)
+    return pool_of(dataclasses.replace(source, drawn=True)).filmed(int(seed), rows, first)
+
+
+def _drawn_instance(env: Any, state: Any, actions: Any) -> list[Frame]:
+    seed, steps, history = jax.device_get((state.seed, state.steps, state.actions))
+    return _replayed(env, seed, np.concatenate([history[:steps], actions]), int(steps))
+
+
+def _filmed_episodes(env: Any, states: Any, actions: Any) -> list[Frame]:
+    seeds, steps = states
+    begins = np.flatnonzero(steps == 0).tolist()
+    episodes = zip(begins, [*begins[1:], len(steps)], strict=True)
+    return [frame for first, end in episodes for frame in _replayed(env, seeds[first], actions[first:end], 0)]
+
+
+def _points(env: Any) -> tuple[tuple[float, float] | None, ...]:
+    return () if env.source.factory else fetch_layout.points_of(env.source.name, env.source.arguments)
+
+
+GYMNASIUM = pictures_of(
+    _drawn_instance,
+    lambda state: (state.seed, state.steps),
+    _filmed_episodes,
+    _points,
+    check=lambda env: _replayed(env, 0, (), 0),
+)
+
+
+# --- brax and Playground: the model of the simulator in the poses of its states --------------------------------------
+
+
+class Pose(NamedTuple):
+    """Positions of a model's bodies."""
+
+    qpos: Float[Array, "*steps qpos"]
+    mocap: Float[Array, "*steps bodies 3"] | None  # positions of bodies without joints; None: the simulator has none
+
+
+def pose_of(state: Running) -> Pose:
+    """Return the positions of a state's bodies. Raises UserError for a simulator unlike MuJoCo's."""
+    if hasattr(state.state, "data"):
+        return Pose(state.state.data.qpos, state.state.data.mocap_pos)
+    physics: Any = getattr(state.state, "pipeline_state", None)
+    if not hasattr(physics, "q"):
+        raise UserError("this simulator has no bodies to draw: evaluate a policy in it instead")
+    return Pose(physics.q, None)
+
+
+def draw_poses(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
+    """Return a picture of each pose. Raises UserError for an environment without a MuJoCo model, or without OpenGL."""
+    import mujoco
+
+    from cuelearner_envs.anymal.scene import Studio
+
+    library: Any = mujoco  # whose compiled module has no stubs
+    model = model_of(env.simulator())
+    if model is None:
+        raise UserError("this environment has no MuJoCo model to draw: evaluate a policy in it instead")
+    camera = library.MjvCamera()
+    library.mjv_defaultFreeCamera(model, camera)
+    if model.ncam:
+        camera.type, camera.fixedcamid = library.mjtCamera.mjCAMERA_FIXED, 0
+    frames = []
+    with Studio(model, *SIZE) as studio:
+        for pose in poses:
+            if pose.mocap is not None and model.nmocap:
+                studio.data.mocap_pos[:] = pose.mocap
+            studio.pose(np.asarray(pose.qpos))
+            frames.append(np.ascontiguousarray(studio.picture(camera)))
+    return frames
+
+
+@jax.jit
+def _poses_after(env: JaxEnvironment, state: Running, actions: Float[Array, "n action"]) -> tuple[Pose, Array]:
+    """Return the pose after each action, and whether that step ended the episode."""
+
+    def advance(state: Running, row: Any) -> Any:
+        number, action = row
+        after, step = env.step(jax.random.key(number), state, action)
+        return after, (pose_of(after), step.terminated | step.truncated)
+
+    return jax.lax.scan(advance, state, (jax.numpy.arange(len(actions)), actions))[1]
+
+
+def _drawn_model(env: JaxEnvironment, state: Running, actions: Any) -> list[Frame]:
+    poses = [jax.device_get(pose_of(state))]
+    if len(actions):
+        following, ended = jax.device_get(_poses_after(env, state, actions))
+        poses += _rows(following, int(np.flatnonzero(ended)[0]) if ended.any() else len(ended))
+    return draw_poses(env, poses)
+
+
+def _rows(poses: Pose, count: int) -> list[Pose]:
+    """Return the first `count` poses, one by one."""
+    return [jax.tree.map(lambda leaf, number=number: leaf[number], poses) for number in range(count)]
+
+
+SIMULATOR = pictures_of(_drawn_model, pose_of, lambda env, poses, actions: draw_poses(env, _rows(poses, len(actions))))
