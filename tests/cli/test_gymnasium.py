@@ -117,7 +117,7 @@ def test_pictures_are_written(tmp_path):
         (["label", REACH, "--out", "labels"], "cannot be drawn"),
         (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
         (["adapt", "model.zip", "--env", REACH], "my_policy.py, and give my_policy:POLICY (module:NAME"),
-        (["adapt", "./mine.py:policy", "--env", REACH], "give mine:policy (module:NAME), in the file's folder"),
+        (["adapt", "./mine.py:policy", "--env", REACH], "give package.module:NAME, for instance my_code:MINE"),
         (
             ["evaluate", REACH, "--policy", "uniform", "--task.arguments", "[]"],
             "task.arguments is '[]': give arguments",
