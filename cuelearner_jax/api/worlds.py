@@ -135,7 +135,7 @@ def teacher_of(source: World | Policy) -> Teacher:
     if isinstance(source, World):
         return source.task.make_teacher(source.config, source.env)
     # `CallablePolicy` is above this module, so its `policy` is looked up by name
-    return Teaching(source if hasattr(source, "policy") else policy_of(source))
+    return Teaching(policy_of(getattr(source, "policy", source)))
 
 
 def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:

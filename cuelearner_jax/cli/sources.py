@@ -90,7 +90,7 @@ def source_of(ahead: Namespace) -> PolicySource:
             source = _of_folder(folder, task, code, own)
             return dataclasses.replace(source, task=_with_teacher(source.task, ahead.teacher))
         if task is not None and not is_code(named):
-            raise UserError(f"{named!r} is no run folder of the task {task.name}: give one, or leave it out")
+            raise UserError(f"{named!r} is no run folder of the task {task.name}: give one, or code as module:NAME")
         if task is None and ":" not in named and named not in registry.names():
             raise UserError(
                 f"{named!r} is neither a run folder nor a task ({', '.join(registry.names())}) "

@@ -124,7 +124,10 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     """
     path = folder / CONFIG
     if not path.is_file():
-        raise UserError(f"{folder} is not a run folder (it has no config.json): give the --out of a train or sweep")
+        raise UserError(
+            f"{folder} is not a run folder (it has no config.json): give the --out of a train or sweep, or code as "
+            "module:NAME"
+        )
     values = formats.read("config", path)
     task, world = world_of(values["task"], find, path)
     config = run_config.from_json(world, values)
