@@ -209,6 +209,8 @@ def task_from(
             f"env is {format_value(given)}: give an id of Gymnasium's registry, or a class or function that "
             "gives environments"
         )
+    if max_steps is not None:
+        check_number("max_steps", max_steps, 1, MOST_STEPS, whole=True)
     if isinstance(given, str):
         name, fetch = given, fetch_layout.layout_of(given)
         max_steps = max_steps or registry_spec(name).max_episode_steps

@@ -146,7 +146,7 @@ def test_reports_that_cannot_be_made_are_refused(refused, copy, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     out = ["--out", tmp_path / "report"]
-    refused(["report", tmp_path / "nowhere", *out], "does not exist", tmp_path)
+    refused(["report", tmp_path / "nowhere", *out], "no results at or below", tmp_path)
     refused(["report", empty, *out], "no results", tmp_path)
     refused(["report", *out], "no folder to report on", tmp_path)
     refused(["report", copy, "--metric", "success", *out], "success", tmp_path)

@@ -100,7 +100,7 @@ def test_a_whole_policy_takes_no_base_action_and_code_can_be_in_no_file(better, 
 
 def test_a_reading_is_exported_whole_and_alone_unless_its_base_sees_something_else(better, tmp_path):
     own = jax.jit(lambda obs: jnp.stack([0.05 * obs[:, 0], jnp.tanh(obs[:, 1])], -1))
-    read = cl.correct(own, labels(15), low=LOW, high=HIGH, eps=EPS)
+    read = cl.correct(own, labels(20), low=LOW, high=HIGH, eps=EPS)
     correction = read.policy.correction
     correction = correction.replace(alpha=0.01 * jnp.ones_like(correction.alpha))  # so few labels leave no remainder
     read = dataclasses.replace(read, policy=read.policy.replace(correction=correction))

@@ -215,7 +215,7 @@ def test_a_kind_brings_options_of_its_own_which_a_run_keeps():
     assert run_config.to_json(elsewhere)["kinds"] == {"from-outside": {"way": 0.5}}
     for name, wrong, says in (
         ("intent", {"aim_doubt": -1.0}, "intent.aim_doubt"),
-        ("intent", {"doubt": 1.0}, "'doubt'"),
+        ("intent", {"doubt": 1.0}, "doubt"),
         ("relative", {"aim_doubt": 1.0}, "no options"),
     ):
         with pytest.raises(UserError, match=says):
