@@ -15,8 +15,12 @@
 Arguments and results are described in each function's docstring. All other modules are internal.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+# Of SciPy's BLAS, by which JAX factorizes matrices on a CPU: its threads wait for each other longer than they compute.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
     from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt, agreement, correct

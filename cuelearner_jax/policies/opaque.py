@@ -43,8 +43,11 @@ class Opaque(PolicyNode):
             # Tried while tracing, so that a fault is reported before anything is compiled.
             with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
                 _try(cast(Any, self), obs.shape[-1])
-            shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
-            chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
+            if isinstance(obs, jax.core.Tracer):
+                shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
+                chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
+            else:  # called here: one that computes with JAX would wait for the program that waits for it
+                chosen = jnp.asarray(self._called_back(np.asarray(obs)))
         else:
             chosen = self._checked(self.function(obs), obs.shape[0], jnp.asarray)
         return _valid(self.actions, chosen)
