@@ -13,7 +13,7 @@ help:
 	@echo "make test         run the tests (8 to 20 minutes on 2 cores, by their speed)"
 	@echo "make test-all     these, and what checks the same at length"
 	@echo "make test-quick   those in files that take little of that (under 3 minutes)"
-	@echo "make test-foreign those of policies of PyTorch, Stable-Baselines3 and onnxruntime, which it installs"
+	@echo "make test-foreign those of PyTorch, Stable-Baselines3, onnxruntime and Meta-World, which it installs"
 	@echo "make durations    make test, and tests/durations.txt: the seconds of each file"
 	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
 	@echo "make lint         ruff and pyright"
@@ -43,6 +43,7 @@ $(VENV)/.tested: $(VENV)/.installed
 $(VENV)/.foreign: $(VENV)/.tested
 	$(UV) pip install --python $(BIN)/python "pip>=25.1" # the first that knows groups
 	$(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt --group foreign
+	$(BIN)/python -m pip install --disable-pip-version-check --no-deps metaworld==3.1.1 # it asks for an older MuJoCo
 	@touch $@
 
 setup: $(VENV)/.tested

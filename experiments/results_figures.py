@@ -28,8 +28,8 @@ TITLES = {  # of the measured quantity
     "arms": "success",
     "bootstrapping": "mean over the curve",
     "corrections": "success [%]",
-    "fetch": "success [%]",
     "navigation": "success",
+    "scripted_arms": "success",
     "zoo": "success",
 }
 X = {"bootstrapping": "labels", **dict.fromkeys(("arms", "navigation"), "environment steps of a seed")}

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types, user_code
@@ -43,7 +44,7 @@ class Opaque(PolicyNode):
             # Tried while tracing, so that a fault is reported before anything is compiled.
             with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
                 _try(cast(Any, self), obs.shape[-1])
-            if isinstance(obs, jax.core.Tracer):
+            if isinstance(obs, Tracer):
                 shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
                 chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
             else:  # called here: one that computes with JAX would wait for the program that waits for it
