@@ -20,9 +20,6 @@ from cuelearner_jax.types import EnvState, Policy, Reel, Sketch, Teacher
 PAPER = "paper"  # preset that policies are assumed to be trained with, where no folder says so
 QUICKSTART = "quickstart"  # preset that training starts from where none is named: it takes minutes
 
-# Of a scenario's sizes: the paper's networks and their fitting, in place of the smaller ones that `adapt` else has
-PAPERS_FIT = {name: getattr(GuideSizes, name) for name in ("feedback_layers", "fit_steps", "fit_batch_size")}
-
 # (policy, environment, key, environments, steps, tell) -> values (environments,) by name, as `evaluate.Rollout.each`;
 # now and then it calls `tell` with how far it is, and of how much
 Rollout = Callable[[Any, Any, PRNGKeyArray, int, int, Callable[[int, int], None]], dict[str, Any]]

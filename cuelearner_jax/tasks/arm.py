@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from importlib.util import find_spec
 from typing import Any
 
@@ -12,16 +11,11 @@ from cuelearner_envs.arm import config as arm
 from cuelearner_envs.arm.config import SIDES, ArmConfig
 from cuelearner_envs.arm.environment import ACTIONS
 from cuelearner_envs.arm.places import BASE
-from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.agents import sac
-from cuelearner_jax.arbiters import Episodes, Paced
-from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import OWN, Environment, Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Heuristic
-from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
-from cuelearner_jax.tasks import fetch_layout
+from cuelearner_jax.task import Body, Pictures, Task
+from cuelearner_jax.tasks import fetch_layout, presets
 from cuelearner_jax.types import Teacher
 
 FETCH = {"reach": "FetchReach", "push": "FetchPush", "pick": "FetchPickAndPlace"}
@@ -115,91 +109,6 @@ ROBOT = Body(
     environment=make_fetch,
 )
 
-_CAMERA: dict[str, Any] = {"guidance": "reading"}
-SCENARIOS = {
-    "turned_camera": Scenario(
-        "the camera is turned by 10 degrees about the robot's base", {"camera_turn_deg": 10.0}, **_CAMERA
-    ),
-    "hand_eye": Scenario(
-        "the camera stands 2 cm to the right of where the arm believes", {"camera_offset": (0.0, 0.02, 0.0)}, **_CAMERA
-    ),
-    "slippery": Scenario("the cube is slippery", {"friction": 0.12}),
-    **{
-        f"past_{side}": Scenario(
-            f"a wish: push the cube past the post on the {side}",
-            {"preferred_side": side},
-            judge_by=f"passed_{side}",
-        )
-        for side in ("left", "right")
-    },
-}
-
-QUICKSTART = RunConfig(
-    ArmConfig(),
-    Sizes(num_envs=16, feedback_layers=(64, 64), fit_steps=400, fit_batch_size=64),
-    dataclasses.replace(plain_scalars(ACTIONS), discount=0.95, max_grad_norm=10.0),
-    Schedule(
-        total_steps=32_000,
-        random_steps=800,
-        learn_after=800,
-        guidance_until=16_000,
-        eval_every=4_000,
-        eval_steps=1_000,
-        eval_envs=20,
-        checkpoint_every=8_000,
-    ),
-    sac.Config(
-        actor_layers=(64, 64),
-        critic_layers=(64, 64),
-        batch_size=128,
-        replay_capacity=64_000,
-        actor_rate=1e-3,
-        critic_rate=1e-3,
-        temperature_rate=1e-3,
-        first_temperature=0.1,  # rewards are distances in metres
-        polyak=0.02,
-    ),
-    Paced(lead=0.0),
-)
-PAPER = dataclasses.replace(
-    QUICKSTART,
-    sizes=dataclasses.replace(QUICKSTART.sizes, **PAPERS_FIT),
-    schedule=dataclasses.replace(
-        QUICKSTART.schedule,
-        total_steps=1_000_000,
-        guidance_until=500_000,
-        eval_every=50_000,
-        eval_steps=5_000,
-        eval_envs=100,
-        checkpoint_every=100_000,
-    ),
-    agent=dataclasses.replace(
-        QUICKSTART.agent,
-        actor_layers=(256, 256),
-        critic_layers=(256, 256),
-        layer_norm=True,
-        batch_size=256,
-        replay_capacity=1_000_000,
-    ),
-)
-# In whole episodes each answer corrects the middle action by a quarter of a range, the strength at which such episodes
-# succeed most often (push 84%, pick 82%: measured in commit f02b6741). The corrected steps are half of every
-# minibatch.
-CORRECTED = dataclasses.replace(
-    PAPER,
-    sizes=dataclasses.replace(PAPER.sizes, store_labelled=True, ask_from="middle"),
-    scalars=dataclasses.replace(PAPER.scalars, eps_deg=0.25, refined_fraction=0.0),
-    schedule=dataclasses.replace(
-        PAPER.schedule,
-        total_steps=480_000,
-        guidance_until=480_000,
-        eval_every=24_000,
-        checkpoint_every=120_000,
-    ),
-    agent=dataclasses.replace(PAPER.agent, replay_capacity=480_000),
-    arbiter=Episodes(probability=0.0),
-)
-
 ARM = Task(
     name="arm",
     about="a gripper over a table: reach a place, push a cube past a post, pick a cube and place it",
@@ -211,29 +120,5 @@ ARM = Task(
     longest=lambda config: config.max_steps,
     judge_by=lambda config: "success",
     labels_hold=("reward", "max_steps", "within"),  # a label depends on one observation only
-    scenarios=SCENARIOS,
-    presets={
-        "paper": Preset(
-            "larger networks, 1 million steps a seed; --task.skill chooses the skill",
-            PAPER,
-            guidance=("none", "relative"),
-            labels=(100, 500),
-            takes="one seed: hours on 2 cores, by arithmetic",
-        ),
-        "corrected": Preset(
-            "as `paper`, but labels correct the steps that the agent begins to learn from, 480,000 steps a seed",
-            CORRECTED,
-            guidance=("none", "relative"),
-            labels=(500,),
-            takes="one seed: hours on 2 cores, by arithmetic; eight: 12 minutes on one H200",
-        ),
-        "quickstart": Preset(
-            "small networks, 32,000 steps a seed; --task.skill chooses the skill",
-            QUICKSTART,
-            guidance=("none", "relative"),
-            labels=(100,),
-            seeds=1,
-            takes="one seed under two kinds of guidance: minutes on 2 cores",
-        ),
-    },
+    **presets.read("arm", ArmConfig(), ACTIONS),
 )

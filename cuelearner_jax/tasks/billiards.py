@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from contextlib import suppress
 from pathlib import Path
@@ -15,13 +14,10 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.teacher import LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
 from cuelearner_jax import teachers
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import Paced
-from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
+from cuelearner_jax.task import Body, Pictures, Task
+from cuelearner_jax.tasks import presets
 from cuelearner_jax.types import Teacher
 
 SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
@@ -34,13 +30,6 @@ TRANSFERRED = (*TEACHERS, "mirrors", "action_turn_deg", "observation_bias")
 # largest tilt at which a learned teacher still proposes nearly good shots [m/s^2], see docs/billiards.md
 SLIGHT_TILT = 0.02
 LOCAL_SEARCH = "local_search"
-
-
-# The paper's networks, with the fastest search.
-AGENT = ddqn.Config(coarse_directions=720, coarse_dtype="bfloat16", peaks=8)
-# The action frame and pacing learn fastest here, see docs/results.
-SEEN_FROM_THE_STRIKE = Sizes(frame="action", num_envs=100)
-PACED = Paced(lead=0.5)  # a guide gets its whole share if it earns half a shot more than the agent, less below
 
 
 def teacher_folder(config: BilliardsConfig) -> Path | None:
@@ -133,36 +122,6 @@ POOLTOOL = Body(
     environment=_foreign,
 )
 
-# Settings of the adapted agents in docs/results/adaptation.md. The teacher tries shots in the changed world and prefers
-# the good shot nearest to the agent's, and the guide sees how far a shot has been turned.
-NEAREST: dict[str, Any] = {"answer": "nearest", "nearest_aim_deg": 0.1, "feedback_learning_rate": 3e-4}
-RECIPE: dict[str, Any] = {"eps_deg": 0.1, "guidance": "reading"}
-
-# The worlds of the paper's section on adaptation after training.
-SCENARIOS = {
-    "turned_strike": Scenario(
-        "every strike is turned by 0.8 degrees",
-        {"action_turn_deg": 0.8, "teacher": LOCAL_SEARCH},
-        bound_deg=1.0,
-        scalars={**NEAREST, "nearest_share": 0.9},
-        **RECIPE,
-    ),
-    "shifted_balls": Scenario(
-        "balls are seen 7.1 mm to the right of and above their places",
-        {"observation_bias": (0.0071, 0.0071), "teacher": LOCAL_SEARCH},
-        bound_deg=0.3,
-        scalars={**NEAREST, "nearest_share": 0.9},
-        **RECIPE,
-    ),
-    "tilted_table": Scenario(
-        "the table is tilted: balls are drawn along y",
-        {"acceleration": (0.0, 0.005), "teacher": LOCAL_SEARCH},
-        bound_deg=0.3,
-        scalars={**NEAREST, "nearest_share": 0.6},
-        **RECIPE,
-    ),
-}
-
 BILLIARDS = Task(
     name="billiards",
     about="pocket the target balls with one shot a step",
@@ -174,80 +133,6 @@ BILLIARDS = Task(
     bodies=(PLAYER, POOLTOOL),
     teacher=make_teacher,
     files=_files,
-    scenarios=SCENARIOS,
     labels_hold=("mirrors", *TEACHERS),
-    presets={
-        "paper": Preset(
-            "the paper's figure: regulation table, its networks, 10 million steps a seed",
-            RunConfig(
-                BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
-                # The reference alternates 1,000 steps with 1,000 gradient steps; this alternates 100 with 100.
-                Sizes(num_envs=100),
-                schedule=Schedule(guide_eval_every=50),
-                agent=AGENT,
-            ),
-            guidance=("none", "relative", "heuristic"),
-            labels=(500, 1000),
-            takes="one seed: 25 minutes on one H200; more than a day on 2 cores; both by arithmetic",
-        ),
-        "regulation": Preset(
-            "the paper's table seen from the strike: its reward after 10 million steps within 2 million",
-            RunConfig(
-                BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
-                SEEN_FROM_THE_STRIKE,
-                schedule=Schedule(
-                    total_steps=2_000_000,
-                    guidance_until=500_000,  # until this step guidance was measured to help
-                    eval_every=50_000,
-                    checkpoint_every=250_000,
-                    guide_eval_every=50,
-                ),
-                agent=dataclasses.replace(AGENT, replay_capacity=2_000_000),
-                arbiter=PACED,
-            ),
-            guidance=("none", "intent", "relative"),
-            labels=(100, 500),
-            takes="16 seeds under one guidance: 15 minutes on one H200; one: hours on 2 cores; both by arithmetic",
-        ),
-        "easy": Preset(
-            "larger balls and pockets, seen from the strike, the paper's networks, 1 million steps a seed",
-            RunConfig(
-                BilliardsConfig("easy", teacher="learned"),
-                SEEN_FROM_THE_STRIKE,
-                schedule=Schedule(
-                    total_steps=1_000_000, guidance_until=500_000, checkpoint_every=100_000, guide_eval_every=50
-                ),
-                agent=dataclasses.replace(AGENT, replay_capacity=1_000_000),
-                arbiter=PACED,
-            ),
-            guidance=("none", "intent", "relative", "heuristic"),
-            labels=(100, 500),
-            takes="16 seeds under one guidance: 10 minutes on one H200; one: hours on 2 cores; both by arithmetic",
-        ),
-        "quickstart": Preset(
-            "one ball, small networks, 3,000 steps a seed",
-            RunConfig(
-                BilliardsConfig("one_ball"),
-                Sizes(feedback_layers=(128, 128), num_envs=10, fit_steps=400, fit_batch_size=64),
-                Scalars(eps_deg=2.0, k_max=100),
-                Schedule(
-                    total_steps=3_000,
-                    random_steps=200,
-                    learn_after=200,
-                    guidance_until=1_500,
-                    eval_every=100,
-                    eval_steps=100,
-                    eval_envs=50,
-                    checkpoint_every=500,
-                ),
-                ddqn.Config(q_layers=(128, 128), directions=360, replay_capacity=20_000, learning_rate=0.01),
-                Paced(lead=0.25),
-            ),
-            guidance=("none", "relative"),
-            labels=(100,),
-            seeds=24,
-            first_seed=2000,  # the settings were chosen on seeds below 2000
-            takes="24 seeds under two kinds of guidance: two minutes on 2 cores",
-        ),
-    },
+    **presets.read("billiards", BilliardsConfig()),
 )

@@ -29,7 +29,7 @@ from cuelearner_jax.errors import UserError, format_value, user_code_error
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
 from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
 from cuelearner_jax.tasks import fetch_layout
-from cuelearner_jax.tasks.simulators import quickstart
+from cuelearner_jax.tasks.presets import quickstart
 from cuelearner_jax.terminal import console
 
 FAMILY = "gymnasium"

@@ -16,15 +16,10 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number, check_word
-from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout, layout_of
-from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.errors import UserError, format_value, suggestion
-from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.spaces import Space
-from cuelearner_jax.task import QUICKSTART, Body, Pictures, Preset, Task
+from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
+from cuelearner_jax.tasks.presets import quickstart
 
 Backend = Literal["generalized", "spring", "positional", "mjx"]
 
@@ -183,37 +178,3 @@ def _task_of(family: Task, about: str, name: str) -> Task:
     config = family.config(name, slices=layout.slices, slice_sizes=layout.sizes, entries=layout.entries)
     preset = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
     return dataclasses.replace(family, about=about, default=config, presets={QUICKSTART: preset})
-
-
-def quickstart(
-    config: Any, space: Space, num_envs: int, eval_steps: int, layers: tuple[int, ...], **lanes: Any
-) -> Preset:
-    """Return a preset of minutes for an environment of another library; `lanes`: fields of the preset."""
-    every = num_envs * -(-1_000 // num_envs)  # the first multiple from 1,000 on
-    run = RunConfig(
-        config,
-        Sizes(num_envs=num_envs, feedback_layers=layers, fit_steps=400, fit_batch_size=64),
-        dataclasses.replace(plain_scalars(space), discount=0.95, max_grad_norm=10.0),
-        Schedule(
-            total_steps=6 * every,
-            random_steps=500,
-            learn_after=500,
-            guidance_until=3 * every,
-            eval_every=every,
-            eval_steps=eval_steps,
-            eval_envs=10,
-            checkpoint_every=2 * every,
-        ),
-        ddqn.Config(
-            q_layers=(128, 128),
-            directions=256,
-            target_directions=64,
-            batch_size=64,
-            replay_capacity=num_envs * -(-50_000 // num_envs),
-            optimizer="adam",
-            learning_rate=0.001,
-            polyak=0.05,
-        ),
-        Paced(),
-    )
-    return Preset(f"small networks, {6 * every:,} steps a seed", run, **lanes)

@@ -13,7 +13,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.spaces import directions
-from cuelearner_jax.tasks.billiards import SCENARIOS, SHIPPED_TEACHERS, make_teacher
+from cuelearner_jax.tasks.billiards import BILLIARDS, SHIPPED_TEACHERS, make_teacher
 from cuelearner_jax.teachers import LearnedTeacher
 
 RACKS, DIRECTIONS = 50, 1440
@@ -86,10 +86,10 @@ def easy():
     return states, alone
 
 
-@pytest.fixture(scope="module", params=long_but(["turned_strike"], SCENARIOS))
+@pytest.fixture(scope="module", params=long_but(["turned_strike"], BILLIARDS.scenarios))
 def near(request, easy):
     """In a changed world: the search near proposals, the search of all directions, what these are worth, the states."""
-    config = SCENARIOS[request.param].apply(BilliardsConfig("easy", teacher="local_search"))
+    config = BILLIARDS.scenarios[request.param].apply(BilliardsConfig("easy", teacher="local_search"))
     env = make_environment(config)
     local = make_teacher(config, env)
     assert isinstance(local, LocalSearchTeacher)

@@ -1,0 +1,72 @@
+"""Read a task's presets and scenarios from the TOML file of its name.
+
+A table starts from the defaults, or from the earlier one that it names as `like`, and gives the fields that differ. A
+preset's tables are the groups of a `RunConfig`; a part with a `name` (agent, arbiter) starts from its own defaults.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from cuelearner_jax.adaptation.by_model import plain_scalars
+from cuelearner_jax.config import plain
+from cuelearner_jax.run_config import PARTS, RunConfig, kind_from_json, part_from_json
+from cuelearner_jax.spaces import DIRECTIONS, Space
+from cuelearner_jax.task import QUICKSTART, Preset, Scenario
+
+GROUPS = [field.name for field in dataclasses.fields(RunConfig)]
+
+
+def read(name: str, config: Any, space: Space = DIRECTIONS) -> dict[str, dict[str, Any]]:
+    """Return `presets` and `scenarios` of a task: fields of `task.Task`.
+
+    Args:
+        name: of the file.
+        config: the task's default configuration.
+        space: of the actions, in whose unit scalars are.
+    """
+    tables = tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
+    presets, scenarios = {}, {}
+    for key, own in tables["presets"].items():
+        start = Preset("", RunConfig(config, scalars=plain_scalars(space)))
+        start = presets.get(own.pop("like", None), start)
+        groups = {group: _group(start.config, group, own.pop(group)) for group in GROUPS if group in own}
+        presets[key] = _changed(start, own | {"config": dataclasses.replace(start.config, **groups)})
+    for key, own in tables.get("scenarios", {}).items():
+        scenarios[key] = _changed(scenarios.get(own.pop("like", None), Scenario("", {})), own)
+    return {"presets": presets, "scenarios": scenarios}
+
+
+def _group(start: RunConfig, name: str, values: dict[str, Any]) -> Any:
+    if name == "kinds":
+        return {kind: kind_from_json(kind, own) for kind, own in values.items()}
+    return part_from_json(PARTS[name], values) if "name" in values else _changed(getattr(start, name), values)
+
+
+def _changed(start: Any, values: dict[str, Any]) -> Any:
+    """Return a dataclass with fields changed; lists become tuples, also within a table."""
+    tuples = {key: _tuples(value) for key, value in values.items()}
+    return dataclasses.replace(start, **tuples)
+
+
+def _tuples(value: Any) -> Any:
+    return {key: plain(part) for key, part in value.items()} if isinstance(value, dict) else plain(value)
+
+
+def quickstart(
+    config: Any, space: Space, num_envs: int, eval_steps: int, layers: tuple[int, ...], **lanes: Any
+) -> Preset:
+    """Return a preset of minutes for an environment of another library; `lanes`: fields of the preset."""
+    start = read("other", config, space)["presets"][QUICKSTART].config
+    every = num_envs * -(-1_000 // num_envs)  # the first multiple from 1,000 on
+    counts = {"total_steps": 6 * every, "guidance_until": 3 * every, "eval_every": every, "checkpoint_every": 2 * every}
+    run = dataclasses.replace(
+        start,
+        sizes=dataclasses.replace(start.sizes, num_envs=num_envs, feedback_layers=layers),
+        schedule=dataclasses.replace(start.schedule, eval_steps=eval_steps, **counts),
+        agent=dataclasses.replace(start.agent, replay_capacity=num_envs * -(-50_000 // num_envs)),
+    )
+    return Preset(f"small networks, {6 * every:,} steps a seed", run, **lanes)
