@@ -60,7 +60,7 @@ def ours(name: str, num_envs: int, steps: int, processes: int) -> Callable[[int]
 
 def plain(name: str, num_envs: int, steps: int, mode: str) -> Callable[[int], float]:
     """Return a function that times `gymnasium.vector`."""
-    source.find_spec(name)  # registers gymnasium_robotics, and mends it beside the MuJoCo here
+    source.registry_spec(name)  # registers gymnasium_robotics, and mends it beside the MuJoCo here
     vector = [lambda: source.make_registered(name, {}, 0)] * num_envs
     kind = gymnasium.vector.SyncVectorEnv if mode == "sync" else gymnasium.vector.AsyncVectorEnv
     env: Any = kind(vector)

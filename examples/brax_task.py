@@ -22,8 +22,7 @@ from jaxtyping import Array, Float
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import Paced
-from cuelearner_jax.bridges.brax import from_brax
-from cuelearner_jax.bridges.jax_environment import JaxEnvironment
+from cuelearner_jax.bridges.brax import JaxEnvironment, from_brax
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Cue

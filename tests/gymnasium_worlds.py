@@ -122,7 +122,7 @@ class Faulty(Adder):
             if self.fault == "raises":
                 raise RuntimeError("a joint is jammed")
             obs = {"nan": np.array([np.nan, 0.0]), "shape": np.zeros(3)}.get(self.fault, obs)
-            reward = {"reward": np.inf, "words": "much"}.get(self.fault, reward)
+            reward = np.inf if self.fault == "reward" else reward
         return obs, reward, terminated, truncated, info
 
 

@@ -30,8 +30,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.reading import KIND
-from cuelearner_jax.policies import Common, policy_of
-from cuelearner_jax.policies.foreign import ONNX
+from cuelearner_jax.policies import ONNX, Common, policy_of
 from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from

@@ -18,8 +18,7 @@ from cuelearner_jax.api.worlds import World, numbers
 from cuelearner_jax.config import to_json
 from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Policy, call_policy, policy_name, policy_of
-from cuelearner_jax.policies.foreign import FILES
+from cuelearner_jax.policies import FILES, Policy, call_policy, policy_name, policy_of
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space

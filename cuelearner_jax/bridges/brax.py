@@ -1,17 +1,160 @@
-"""Environments of brax in our loop (`from_brax`), and what its own agents miss in this JAX. Written for brax 0.14.2."""
+"""Simulators with brax's interface, MuJoCo Playground's included, as environments for our loop (`from_brax`).
+
+Such a simulator has `reset(rng) -> State` and `step(state, action) -> State`; a State has `obs`, `reward`, `done`,
+`metrics` and `info`. This file imports neither library; it was written for brax 0.14.2.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.bridges.jax_environment import from_simulator
+from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, WholeObservations
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import Box, Cue, Space, box
+from cuelearner_jax.types import Step
 
-from_brax = from_simulator
+Heuristic = Callable[[Float[Array, " obs"]], Float[Array, " action"]]
+
+
+class Running(struct.PyTreeNode):
+    """State of a `JaxEnvironment` between steps."""
+
+    state: Any  # the simulator's state
+    steps: Int[Array, ""]  # taken in this episode
+
+
+class JaxEnvironment(WholeObservations, struct.PyTreeNode):
+    """A simulator as one of our environments (`cuelearner_jax.environment.Environment`).
+
+    The simulator is a constant of what is compiled, `max_steps` is traced. The other fields, all that policies look
+    at, do not need the simulator.
+    """
+
+    max_steps: Int[Array, ""]  # an episode is truncated after this many
+    # makes the simulator; equal makers share compiled programs
+    simulator: Callable[[], Any] = struct.field(pytree_node=False)
+    observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
+    actions: Space = struct.field(pytree_node=False)
+    heuristic: Heuristic | None = struct.field(pytree_node=False, default=None)
+
+    def reset(self, key: PRNGKeyArray) -> tuple[Running, Float[Array, " obs"]]:
+        """Start an episode."""
+        state = jax.tree.map(jnp.asarray, self.simulator().reset(jax.random.key_data(key)))
+        return Running(state, jnp.zeros((), jnp.int32)), flat(state.obs)
+
+    def step(self, key: PRNGKeyArray, state: Running, action: Float[Array, " action"]) -> tuple[Running, Step]:
+        """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
+        before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into their input dictionaries
+        after = Running(jax.tree.map(jnp.asarray, self.simulator().step(before, action)), state.steps + 1)
+        stopped = jnp.asarray(after.state.info.get("truncation", 0)) > 0
+        terminated = (after.state.done > 0) & ~stopped
+        truncated = (stopped | (after.steps >= self.max_steps)) & ~terminated
+        fresh, fresh_obs = self.reset(key)
+        final_obs, ended = flat(after.state.obs), terminated | truncated
+        obs, reward = jnp.where(ended, fresh_obs, final_obs), after.state.reward.astype(jnp.float32)
+        metrics = {name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()}
+        step = Step(obs, final_obs, final_obs, reward, terminated, truncated, metrics, outcome={})
+        return jax.tree.map(partial(jnp.where, ended), fresh, after), step
+
+
+class FixedSimulator(NamedTuple):
+    """A maker that returns the caller's simulator; two makers of one simulator are equal."""
+
+    simulator: Any
+
+    def __call__(self) -> Any:
+        """Return the simulator."""
+        return self.simulator
+
+
+class Layout(NamedTuple):
+    """The sizes and names of a simulator's observations and actions, as policies need them."""
+
+    slices: tuple[str, ...]  # names of an observation's slices, in their order
+    sizes: tuple[int, ...]  # entries of each slice
+    entries: tuple[str, ...]  # names of an action's entries
+
+    @property
+    def observation(self) -> tuple[Quantity, ...]:
+        """The slices as an environment has them."""
+        return tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in zip(self.slices, self.sizes, strict=True))
+
+    def box(self, cues: Sequence[Cue] = ()) -> Box:
+        """Return the space [-1, 1]^n of the actions, with a cue an entry: `cues`, or the entry's name."""
+        size = len(self.entries)
+        return Box((-1.0,) * size, (1.0,) * size, tuple(cues) or box.plain_cues(self.entries))
+
+
+def layout_of(simulator: Any, name: str) -> Layout:
+    """Return the layout of a simulator without compiling. `name`: the simulator's, for messages.
+
+    Raises UserError for a batch of several, a hidden end of episodes, or images.
+    """
+    shapes = jax.eval_shape(simulator.reset, jax.random.key_data(jax.random.key(0)))
+    if shapes.reward.shape:
+        raise UserError(f"{name}: it is a batch of shape {shapes.reward.shape}: give a single environment")
+    if "first_obs" in shapes.info:
+        raise UserError(f"{name}: AutoResetWrapper hides the last observation of an episode: pass what it wraps")
+    leaves = jax.tree_util.tree_leaves_with_path(shapes.obs)
+    slices = [("/".join(str(part.key) for part in path) or name.lower(), leaf.shape) for path, leaf in leaves]
+    for part, shape in slices:
+        if len(shape) > 1 or part.startswith("pixels"):
+            raise UserError(f"{name}: the observation {part!r} is an image {shape}: give numbers (n,), as its state")
+    parts, sizes = tuple(part for part, _ in slices), tuple(math.prod(shape) for _, shape in slices)
+    return Layout(parts, sizes, _entries_of(simulator, int(simulator.action_size)))
+
+
+def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:
+    """Return an observation as one vector; the slices of a dictionary stand in the order of their names."""
+    leaves = [jnp.ravel(leaf).astype(jnp.float32) for leaf in jax.tree.leaves(obs)]
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+
+
+def model_of(simulator: Any) -> Any:
+    """Return a simulator's MuJoCo model (`mujoco.MjModel`); None if there is none."""
+    return getattr(simulator, "mj_model", None) or getattr(getattr(simulator, "sys", None), "mj_model", None)
+
+
+def _entries_of(simulator: Any, size: int) -> tuple[str, ...]:
+    """Return a name for each entry of an action: of the MuJoCo model's actuator or its joint, else its number."""
+    model, named = model_of(simulator), []
+    if model is not None and model.nu == size:
+        joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
+        named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
+    if named and all(named) and len(set(named)) == size:
+        return tuple(named)
+    return tuple(f"entry {number}" for number in range(1, size + 1))
+
+
+def from_brax(
+    env: Any, max_steps: int = 1000, heuristic: Heuristic | None = None, *, cues: Sequence[Cue] = ()
+) -> JaxEnvironment:
+    """Return an environment of brax or MuJoCo Playground as one of ours, with its whole box [-1, 1]^n of actions.
+
+    `env` becomes a constant of what is compiled, `max_steps` is traced. Observations in a dictionary become one vector,
+    with a slice for each entry of the dictionary, in the order of their names.
+
+    Args:
+        env: bare, or in brax's `EpisodeWrapper`, whose truncations are then truncations here.
+        max_steps: an episode is truncated after this many steps.
+        heuristic: observation -> the obvious action. Without this the guidance "heuristic" is refused.
+        cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
+
+    Raises:
+        UserError: observations or actions do not fit.
+    """
+    name = type(env.unwrapped).__name__
+    layout, steps = layout_of(env, name), jnp.array(max_steps, jnp.int32)
+    return JaxEnvironment(steps, FixedSimulator(env), layout.observation, layout.box(cues), heuristic)
 
 
 def supply_device_put_replicated() -> None:
@@ -27,10 +170,4 @@ def _device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Copy every leaf to every device, stacked along a new first axis, one entry a device, as `pmap` takes it."""
     mesh = jax.sharding.Mesh(np.array(devices), ("device",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
-
-    def replicate(leaf: Any) -> jax.Array:
-        row = jnp.asarray(leaf)[None]
-        shape = (len(devices), *row.shape[1:])
-        return jax.make_array_from_single_device_arrays(shape, sharding, [jax.device_put(row, one) for one in devices])
-
-    return jax.tree.map(replicate, tree)
+    return jax.tree.map(lambda leaf: jax.device_put(np.stack([np.asarray(leaf)] * len(devices)), sharding), tree)

@@ -12,8 +12,7 @@ from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.options import about, look_ahead_of, parse
 from cuelearner_jax.environment import actions_of, check_layout
 from cuelearner_jax.errors import UserError, suggestion
-from cuelearner_jax.policies import policy_of, teaching
-from cuelearner_jax.policies.foreign import FILES
+from cuelearner_jax.policies import FILES, policy_of, teaching
 from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.spaces import cues_from

@@ -5,7 +5,9 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 """
 
 # ruff: noqa: F401 (what other modules import from here)
-from cuelearner_jax.policies.layers import (
+from cuelearner_jax.policies.policy import (
+    BY_LANE,
+    SHARED,
     Agent,
     Common,
     Corrected,
@@ -13,15 +15,18 @@ from cuelearner_jax.policies.layers import (
     Heuristic,
     Middle,
     NearAims,
+    PolicyNode,
     Taught,
-    Teaching,
     Uniform,
     asked_from,
     best_actions,
-    teaching,
+    call_policy,
+    describe,
+    lanes_in,
+    layers,
+    policy_name,
     uniform_in,
     wanted_actions,
 )
-from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyNode, describe, lanes_in, layers
-from cuelearner_jax.policies.opaque import Opaque, call_policy, policy_name, policy_of
+from cuelearner_jax.policies.user import FILES, ONNX, Opaque, Teaching, policy_of, teaching
 from cuelearner_jax.types import Policy

@@ -55,7 +55,7 @@ def make_fetch(config: ArmConfig, split: str = "training") -> Environment:
     observation = observation_of(config.skill)
     size = sum(quantity.size for quantity in observation)
     source = Source(f"{FETCH[config.skill]}-v4", "{}", config.max_steps, 0, size)
-    return fetch.make_environment(config, GymnasiumTask(source=source, observation=observation, actions=ACTIONS))
+    return fetch.make_environment(config, GymnasiumTask(source, observation, ACTIONS))
 
 
 def make_teacher(config: ArmConfig, env: Any) -> Teacher:

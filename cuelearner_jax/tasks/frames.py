@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
 from cuelearner_envs.playing import played
 from cuelearner_jax import pictures, user_code
-from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Running, model_of
+from cuelearner_jax.bridges.brax import JaxEnvironment, Running, model_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Pictures
 from cuelearner_jax.tasks import fetch_layout
@@ -21,7 +21,6 @@ from cuelearner_jax.types import Reel, Sketch
 
 HELD = 5  # steps for which a clip holds an action, since one step is hardly visible
 PERIOD = 0.1  # time between two frames of a clip [s]
-FPS = 25.0  # of a film, one frame per step
 SIZE = (480, 360)  # width and height of a rendered model [pixels]
 
 Frame = UInt8[np.ndarray, "height width 3"]
@@ -29,7 +28,7 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 def pictures_of(
     draw: Callable[[Any, Any, Any], list[Frame]],
-    seen: Callable[[Any], Any],
+    drawn: Callable[[Any], Any],
     film: Callable[[Any, Any, Any], list[Frame]],
     points: Callable[[Any], tuple[tuple[float, float] | None, ...]] = lambda env: (),
     check: Callable[[Any], Any] | None = None,
@@ -38,8 +37,8 @@ def pictures_of(
 
     Args:
         draw: (environment, state, actions (n, action)) -> a frame of the state and one after each of the actions.
-        seen: what a film needs of a state.
-        film: (environment, what `seen` gives (steps, ...), actions (steps, action)) -> frames of a roll-out.
+        drawn: the part of a state that a film needs.
+        film: (environment, these parts (steps, ...), actions (steps, action)) -> frames of a roll-out.
         points: see `Sketch.points`.
         check: see `Pictures.check`.
     """
@@ -60,7 +59,7 @@ def pictures_of(
         pictures.still([frames[0], frames[-1]], file)
 
     def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
-        see = lambda env, state, action, step: (seen(state), action, step.reward)  # noqa: E731
+        see = lambda env, state, action, step: (drawn(state), action, step.reward)  # noqa: E731
         states, actions, rewards = played(env, policy, key, steps, see)
         user_code.tell()
         return film(env, states, actions), rewards.tolist()
@@ -68,7 +67,7 @@ def pictures_of(
     return Pictures(
         record=record,
         still=lambda env, frames, file: pictures.still(frames, file),
-        animate=lambda env, frames, file: pictures.animate(frames, file, FPS),
+        animate=lambda env, frames, file: pictures.animate(frames, file),
         question=question,
         sketch=sketch,
         reel=reel,
@@ -87,7 +86,7 @@ def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Frame]:
     if source.factory is None:
         source = dataclasses.replace(source, arguments=fetch_layout.picture_arguments(source.name, source.arguments))
     rows = np.asarray(actions, np.float32).reshape(-1, env.actions.size)
-    return pool_of(dataclasses.replace(source, drawn=True)).filmed(int(seed), rows, first)
+    return pool_of(dataclasses.replace(source, drawn=True)).film(int(seed), rows, first)
 
 
 def _drawn_instance(env: Any, state: Any, actions: Any) -> list[Frame]:

@@ -21,11 +21,10 @@ import numpy as np
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax import plugins
 from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
-from cuelearner_jax.bridges.gymnasium.instances import Running
-from cuelearner_jax.bridges.gymnasium.layout import Actions
+from cuelearner_jax.bridges.gymnasium.instances import Actions, Running
 from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, checked_quantities
-from cuelearner_jax.errors import UserError, format_value, user_code_error
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
 from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
 from cuelearner_jax.tasks import fetch_layout
@@ -102,10 +101,7 @@ class GymnasiumConfig:
         if self.choices:
             return Choices(self.choices)
         if self.cues and len(self.cues) != len(self.low):
-            raise UserError(
-                f"cues are {len(self.cues)} pairs of words, and an action has {len(self.low)} entries: give a pair for "
-                "each"
-            )
+            raise UserError(f"cues are {len(self.cues)} pairs of words, and an action has {len(self.low)} entries")
         return Box(self.low, self.high, cues_from(self.cues, self.cue_names) if self.cues else ())
 
 
@@ -114,32 +110,29 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
 
     `factory` makes it (None: Gymnasium's registry). Raises UserError for an invalid value.
     """
-    if not config.environment:
+    if not (name := config.environment):
         raise UserError(f"task.environment is empty: name the task {FAMILY}:ENVIRONMENT, as {FAMILY}:FetchReach-v4")
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     check_number("processes", config.processes, 0, MOST_PROCESSES, whole=True)
     check_number("choices", config.choices, 0, MOST_STEPS, whole=True)
-    observation = config.observation
-    size = sum(quantity.size for quantity in observation)
     try:
         dict(**json.loads(config.arguments))
     except (ValueError, TypeError):
-        given = format_value(config.arguments)
         raise UserError(
-            f"task.arguments is {given}: give arguments by name as JSON, such as '{{\"size\": 3}}'"
+            f"task.arguments is {format_value(config.arguments)}: give arguments by name as JSON, '{{\"size\": 3}}'"
         ) from None
-    refusal = ""
-    if factory is None and ":" in config.environment:  # the configuration is a file's
-        refusal = (
-            f"environment {config.environment} is code, which is not imported because a file names it: name it again, "
-            f"as {FAMILY}:{config.environment} in place of the task, or by cl.from_gymnasium"
-        )
-    return GymnasiumTask(
-        source=Source(config.environment, config.arguments, config.max_steps, config.processes, size, factory),
-        observation=observation,
-        actions=config.space,
-        succeeds=config.succeeds,
-        refusal=refusal,
+    if factory is None and ":" in name:  # the configuration is a file's
+        factory = partial(_refuse, name)
+    observation = config.observation
+    size = sum(quantity.size for quantity in observation)
+    source = Source(name, config.arguments, config.max_steps, config.processes, size, factory)
+    return GymnasiumTask(source, observation, config.space, config.succeeds)
+
+
+def _refuse(name: str, **arguments: Any) -> Any:
+    raise UserError(
+        f"environment {name} is code, which is not imported because a file names it: name it again, as {FAMILY}:{name} "
+        "in place of the task, or by cl.from_gymnasium"
     )
 
 
@@ -174,7 +167,7 @@ def task_of(name: str) -> Task:
     module, _, own = name.rpartition(":")
     if module:  # Gymnasium's own way to name an id that a package registers
         plugins.load(f"{module}:__name__", str, "a module that registers environments")
-    return task_from(own, called=own)
+    return task_from(own)
 
 
 def task_from(
@@ -188,7 +181,6 @@ def task_from(
     cues: Any = (),
     observation: Sequence[Any] | None = None,
     units: Mapping[str, str] | None = None,
-    note: Callable[[str], None] = console.print,
 ) -> Task:
     """Return an environment as a task. One instance is made and plays an episode, to find out its layout.
 
@@ -197,26 +189,24 @@ def task_from(
         arguments: arguments of the environment, by name.
         called: name of code in messages and files (default: its module:NAME).
         num_envs, max_steps, processes, cues, observation, units: see `cl.from_gymnasium`.
-        note: called with one line if a limit of steps had to be chosen.
 
     Raises:
         UserError: the environment cannot be made, or its spaces are not supported.
     """
     check_installed()
-    factory = None if isinstance(given, str) else given
-    if factory is not None and not callable(factory):
+    if max_steps is not None:
+        check_number("max_steps", max_steps, 1, MOST_STEPS, whole=True)
+    factory, name, fetch = None, given, None
+    if isinstance(given, str):
+        fetch, max_steps = fetch_layout.layout_of(given), max_steps or registry_spec(given).max_episode_steps
+    elif callable(given):
+        factory, code = given, getattr(given, "func", given)
+        name = called or f"{getattr(code, '__module__', '')}:{getattr(code, '__qualname__', type(code).__name__)}"
+    else:
         raise UserError(
             f"env is {format_value(given)}: give an id of Gymnasium's registry, or a class or function that "
             "gives environments"
         )
-    if max_steps is not None:
-        check_number("max_steps", max_steps, 1, MOST_STEPS, whole=True)
-    if isinstance(given, str):
-        name, fetch = given, fetch_layout.layout_of(given)
-        max_steps = max_steps or registry_spec(name).max_episode_steps
-    else:
-        inner, fetch = getattr(given, "func", given), None
-        name = called or f"{getattr(inner, '__module__', '')}:{getattr(inner, '__qualname__', type(inner).__name__)}"
     try:
         text = json.dumps(dict(arguments or {}))
     except (TypeError, ValueError) as error:
@@ -225,29 +215,26 @@ def task_from(
             "with them"
         ) from error
     actions, slices, limit, succeeds, ends = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
-    if not max_steps and not limit:
-        if not ends:
-            note(
-                f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,} (give "
-                "--task.max-steps, or max_steps in Python, for another limit)"
-            )
-        limit = UNLIMITED
+    if not max_steps and not limit and not ends:
+        console.print(
+            f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,} (give "
+            "--task.max-steps, or max_steps in Python, for another limit)"
+        )
     slices = _named(name, slices, observation or fetch, units or {})
     pairs = cues.split(";") if isinstance(cues, str) else cues
     words = tuple(pair if isinstance(pair, str) else ",".join(pair) for pair in pairs if pair)
     is_fetch = not words and fetch is not None and len(actions.low) == len(fetch_layout.CUES)
+    names, sizes, slice_units, _, kinds, *_ = zip(*slices, strict=True)
     config = GymnasiumConfig(
         environment=name,
         arguments=text,
-        max_steps=max_steps or limit,
+        max_steps=max_steps or limit or UNLIMITED,
         processes=processes,
-        slices=tuple(quantity.name for quantity in slices),
-        slice_sizes=tuple(quantity.size for quantity in slices),
-        units=tuple(quantity.unit for quantity in slices),
-        slice_kinds=tuple(quantity.kind for quantity in slices),
-        low=actions.low,
-        high=actions.high,
-        choices=actions.choices,
+        slices=names,
+        slice_sizes=sizes,
+        units=slice_units,
+        slice_kinds=kinds,
+        **actions._asdict(),
         cues=fetch_layout.CUES if is_fetch else words,
         cue_names=fetch_layout.CUE_NAMES if is_fetch else (),
         succeeds=succeeds,
@@ -255,13 +242,8 @@ def task_from(
     _ = config.observation  # raises for units or kinds that do not fit
     lanes: dict[str, Any] = {"guidance": ("none", "relative"), "labels": (100,), "seeds": 1}
     preset = quickstart(config, config.space, num_envs, 10 * config.max_steps, (64, 64), **lanes)
-    return dataclasses.replace(
-        GYMNASIUM,
-        about=f"Gymnasium's {name}",
-        default=config,
-        bodies=(_body(factory),),
-        presets={QUICKSTART: preset},
-    )
+    changes: dict[str, Any] = {"default": config, "bodies": (_body(factory),), "presets": {QUICKSTART: preset}}
+    return dataclasses.replace(GYMNASIUM, about=f"Gymnasium's {name}", **changes)
 
 
 def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
@@ -274,7 +256,7 @@ def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
     try:
         slices = [Quantity(leaf.name, leaf.size, UNKNOWN_UNIT) for leaf in one.leaves if leaf.size]
         if not slices:
-            raise UserError(f"environment {source.name}: an observation has no entries: give one with some")
+            raise UserError(f"{one.whose}: an observation has no entries: give one with some")
         limit, first, space = _limit(one.env), one.reset(0), one.env.action_space
         space.seed(0)
         while not ended and one.steps < min(limit or TRIED, TRIED):
@@ -282,13 +264,9 @@ def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
             ended = terminated or truncated
         if not np.array_equal(first, one.reset(0)):
             raise UserError(
-                f"environment {source.name} does not repeat itself: with the same seed, its reset gives another "
-                "observation after an episode: leave out wrappers that remember, such as NormalizeObservation"
+                f"{one.whose} does not repeat itself: with the same seed, its reset gives another observation after an "
+                "episode: leave out wrappers that remember, such as NormalizeObservation"
             )
-    except UserError:
-        raise
-    except Exception as error:
-        raise user_code_error(f"environment {source.name}, in its first episode,", error) from error
     finally:
         one.close()
     return one.actions, slices, limit, one.reports_success, ended
@@ -309,9 +287,8 @@ def _named(
     wanted = sum(quantity.size for quantity in slices)
     try:
         own = slices if given is None else given
-        rest = Quantity("", 0, "")[3:]  # said by a whole Quantity alone
-        found = tuple(one if isinstance(one, Quantity) else Quantity._make([*one, *rest]) for one in own)
-        total = sum(quantity.size for quantity in found)
+        own = [one if isinstance(one, Quantity) else Quantity(*one) for one in own]
+        total = sum(quantity.size for quantity in own)
     except TypeError as error:
         raise UserError(
             f'observation is {format_value(given)}: give (name, entries, unit) for each slice, as ("goal", 3, "m") '
@@ -319,7 +296,7 @@ def _named(
         ) from error
     if total != wanted:
         raise UserError(f"observation names {total} entries, and {name} has {wanted}: name each entry once")
-    known = {quantity.name for quantity in found}
+    known = {quantity.name for quantity in own}
     if unknown := sorted(set(units) - known):
         raise UserError(f"units names {unknown[0]!r}, and the slices are {', '.join(sorted(known))}: name one of them")
-    return tuple(quantity._replace(unit=units.get(quantity.name, quantity.unit)) for quantity in found)
+    return tuple(quantity._replace(unit=units.get(quantity.name, quantity.unit)) for quantity in own)

@@ -46,7 +46,7 @@ Actions = Literal["box", "directions", "choices"]
 Order = Literal["shuffled", "recorded"]
 CLIP_FRAMES, CLIP_PERIOD = 60, 0.1  # most frames of a clip, and the time between two of them [s]
 FARTHEST = 5.0  # networks' input entries are clipped at this many spreads from the centre
-FRAME = "action"  # frame of the networks' input, computed by `Layout.features`
+FRAME = "action"  # frame of the networks' input, computed by `Logs.features`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,13 +97,32 @@ def space_of(config: LogsConfig) -> Space:
     return Choices(len(config.low), *cues) if config.actions == "choices" else Box(config.low, config.high, cues)
 
 
-class Layout(WholeObservations, struct.PyTreeNode):
-    """Layout of recorded situations, and the features that networks see of them."""
+class Place(struct.PyTreeNode):
+    """Position in a walk over the situations."""
+
+    row: Int[Array, ""]  # of the situation
+    met: Int[Array, ""]  # number of situations before it in this episode
+
+
+class Logs(WholeObservations, struct.PyTreeNode):
+    """A walk over recorded situations in their order, from a random one on; after the last comes the first.
+
+    An episode ends when it has met each situation once. There is no reward. The metric `change` is the distance of an
+    action from the recorded action, in the space's unit.
+    """
 
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
     centre: Float[Array, " obs"]
     scale: Float[Array, " obs"]
+    rows: Any = None  # (n, obs); None in a view, which has no situations
+    recorded: Any = None  # (n, action)
+    places: Any = None  # (n,) each row's place in the recording
+    path: str = struct.field(pytree_node=False, default="")
+
+    def view(self) -> Logs:
+        """Return the layout without the situations."""
+        return Logs(self.observation, self.actions, self.centre, self.scale)
 
     def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
         """Return the observation and actions, scaled to entries of the order of 1."""
@@ -112,30 +131,6 @@ class Layout(WholeObservations, struct.PyTreeNode):
             return Features(own, jnp.asarray(actions))
         middle = jnp.broadcast_to(self.actions.spread(1)[0], jnp.shape(actions))
         return Features(own, 2 * self.actions.log(middle, actions))
-
-
-class Place(struct.PyTreeNode):
-    """Position in a walk over the situations."""
-
-    row: Int[Array, ""]  # of the situation
-    met: Int[Array, ""]  # number of situations before it in this episode
-
-
-class Logs(Layout):
-    """A walk over recorded situations in their order, from a random one on; after the last comes the first.
-
-    An episode ends when it has met each situation once. There is no reward. The metric `change` is the distance of an
-    action from the recorded action, in the space's unit.
-    """
-
-    rows: Float[Array, "n obs"]
-    recorded: Float[Array, "n action"]
-    places: Int[Array, " n"]  # each row's place in the recording
-    path: str = struct.field(pytree_node=False, default="")
-
-    def view(self) -> Layout:
-        """Return the layout without the situations."""
-        return Layout(self.observation, self.actions, self.centre, self.scale)
 
     def reset(self, key: PRNGKeyArray) -> tuple[Place, Float[Array, " obs"]]:
         """Return a random situation."""
@@ -188,24 +183,24 @@ def task_of(
     Raises:
         UserError: the situations cannot be read, or bounds or cues do not fit their actions.
     """
-    found = _read(Path(folder))
-    centre, spread = scales_of(found.observations)
+    recording = _read(Path(folder))
     if actions not in get_args(Actions):
         raise UserError(f"actions is {actions!r}{suggestion(actions, get_args(Actions))}")
-    size, names = found.actions.shape[1], ()
+    size, names = recording.actions.shape[1], ()
     bounds: Any = (0.0,) * size, (1.0,) * size
     if actions == "box":
-        names, bounds = found.entries, bounds_of(found.actions, low, high, found.entries, note)
+        names, bounds = recording.entries, bounds_of(recording.actions, low, high, recording.entries, note)
     elif low is not None or high is not None:
         raise UserError(f"low and high are bounds of a box, but actions are {actions}: leave them out")
     words = cues or ["more,less"] * len(names)
     pairs = cues_from(words, names) if words else ()
+    centre, spread = scales_of(recording.observations)
     config = LogsConfig(
         path=str(Path(folder)),
-        digest=found.digest,
-        rows=len(found.observations),
-        names=tuple(quantity.name for quantity in found.slices),
-        entries=tuple(quantity.size for quantity in found.slices),
+        digest=recording.digest,
+        rows=len(recording.observations),
+        names=tuple(quantity.name for quantity in recording.slices),
+        entries=tuple(quantity.size for quantity in recording.slices),
         actions=cast(Actions, actions),
         low=tuple(map(float, bounds[0])),
         high=tuple(map(float, bounds[1])),
@@ -215,23 +210,24 @@ def task_of(
         spread=spread,
     )
     space = space_of(config)
-    if space.size != size:
-        raise UserError(f"{folder} has actions of {size} entries, {space.name} have {space.size}: give another kind")
-    apart = np.abs(np.asarray(space.retract(found.actions)) - found.actions).max(-1)
-    wrong = np.flatnonzero(~(apart <= 1e-3 * max(1.0, float(np.abs(found.actions).max()))))
-    if len(wrong):
-        action = ", ".join(f"{value:.3g}" for value in found.actions[wrong[0]])
-        what = "bounds that hold the recorded actions" if actions == "box" else "another kind of actions"
+    remedy = "bounds that hold the recorded actions" if actions == "box" else "another kind of actions"
+    apart = np.full(len(recording.actions), np.inf)
+    if space.size == size:
+        apart = np.abs(np.asarray(space.retract(recording.actions)) - recording.actions).max(-1)
+    wrong = ~(apart <= 1e-3 * max(1.0, float(np.abs(recording.actions).max())))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        action = ", ".join(f"{value:.3g}" for value in recording.actions[row])
         raise UserError(
-            f"{folder}: the action of row {wrong[0]} ({action}) does not belong to {space.about}: give {what}"
+            f"{folder}: the action of row {row} ({action}) does not belong to {space.about} ({space.name}, "
+            f"{space.size} entries): give {remedy}"
         )
     return configured(config)
 
 
 def configured(config: LogsConfig, body: Body | None = None) -> Task:
     """Return the task of a configuration; `body` gives it other situations."""
-    sizes, scalars = Sizes(frame=FRAME), plain_scalars(space_of(config))
-    run = RunConfig(config, sizes, scalars)
+    run = RunConfig(config, Sizes(frame=FRAME), plain_scalars(space_of(config)))
     preset = Preset("labels about recorded situations", run, (KIND.name,), (200,))
     return dataclasses.replace(LOGS, default=config, presets={PAPER: preset}, bodies=(body or BODY,))
 
@@ -264,8 +260,8 @@ def bounds_of(
     names = entries or [f"entry {number}" for number in range(1, len(least) + 1)]
     if still := [name for name, a, b in zip(names, least, most, strict=True) if not b > a]:
         raise UserError(f"{still[0]} of the actions never changes, so its bounds are unknown: give low and high")
-    told = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, a, b in zip(names, least, most, strict=True))
-    note(f"bounds of the actions are their range ({told}): give low and high for others")
+    ranges = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, a, b in zip(names, least, most, strict=True))
+    note(f"bounds of the actions are their range ({ranges}): give low and high for others")
     return least, most
 
 
@@ -302,17 +298,17 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     """
     if not config.path:
         raise UserError("no situations are given: name their folder, as logs:FOLDER or by --task.path")
-    found, layout = _read(Path(config.path)), filled(config)
-    if config.digest not in ("", found.digest):
+    recording, layout = _read(Path(config.path)), filled(config)
+    if config.digest not in ("", recording.digest):
         raise UserError(f"{config.path} holds other situations than before: restore the folder, or collect new labels")
-    sizes, wanted = (found.observations.shape[1], found.actions.shape[1]), (layout.obs_size, layout.actions.size)
-    if sizes != wanted:
+    sizes = (recording.observations.shape[1], recording.actions.shape[1])
+    if sizes != (wanted := (layout.obs_size, layout.actions.size)):
         raise UserError(f"{config.path} has observations and actions of {sizes} entries, not {wanted}: give another")
-    places = np.arange(len(found.observations))
+    places = np.arange(len(recording.observations))
     if config.order == "shuffled":
         places = np.random.default_rng(0).permutation(places)
-    made = filled(config, found.observations[places], found.actions[places])
-    return made.replace(places=jnp.asarray(places, jnp.int32))
+    env = filled(config, recording.observations[places], recording.actions[places])
+    return env.replace(places=jnp.asarray(places, jnp.int32))
 
 
 def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
@@ -330,11 +326,11 @@ def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
         return [picture.data], place
     try:
         suffix = "." + picture.kind.partition("/")[2]
-        found = imageio.mimread(io.BytesIO(picture.data), format=suffix, memtest=False)  # pyright: ignore
+        film = imageio.mimread(io.BytesIO(picture.data), format=suffix, memtest=False)  # pyright: ignore
     except Exception as error:  # film readers raise many exception types
         raise UserError(f"a clip cannot be read ({' '.join(str(error).split())[:80]}): give GIF or MP4") from error
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), CLIP_FRAMES)).round().astype(int))
-    return [np.ascontiguousarray(np.asarray(found[number])[..., :3]) for number in chosen], place
+    chosen = np.unique(np.linspace(0, len(film) - 1, min(len(film), CLIP_FRAMES)).round().astype(int))
+    return [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in chosen], place
 
 
 def _sketch(env: Logs, state: Place) -> Sketch:

@@ -20,7 +20,7 @@ from cuelearner_jax.task import QUICKSTART, Preset, Scenario
 GROUPS = [field.name for field in dataclasses.fields(RunConfig)]
 
 
-def read(name: str, config: Any, space: Space = DIRECTIONS) -> dict[str, dict[str, Any]]:
+def read(name: str, config: Any, space: Space = DIRECTIONS) -> dict[str, Any]:
     """Return `presets` and `scenarios` of a task: fields of `task.Task`.
 
     Args:
@@ -48,12 +48,10 @@ def _group(start: RunConfig, name: str, values: dict[str, Any]) -> Any:
 
 def _changed(start: Any, values: dict[str, Any]) -> Any:
     """Return a dataclass with fields changed; lists become tuples, also within a table."""
-    tuples = {key: _tuples(value) for key, value in values.items()}
-    return dataclasses.replace(start, **tuples)
-
-
-def _tuples(value: Any) -> Any:
-    return {key: plain(part) for key, part in value.items()} if isinstance(value, dict) else plain(value)
+    tables = {
+        key: {own: plain(part) for own, part in value.items()} for key, value in values.items() if type(value) is dict
+    }
+    return dataclasses.replace(start, **{key: plain(value) for key, value in values.items()} | tables)
 
 
 def quickstart(

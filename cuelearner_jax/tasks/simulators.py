@@ -10,13 +10,13 @@ import dataclasses
 import warnings
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number, check_word
-from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout, layout_of
+from cuelearner_jax.bridges.brax import JaxEnvironment, Layout, layout_of
 from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
 from cuelearner_jax.tasks.presets import quickstart
@@ -52,8 +52,7 @@ class BraxConfig(SimulatorConfig):
     """Physics backend of brax."""
 
 
-@dataclass(frozen=True)
-class Simulator:
+class Simulator(NamedTuple):
     """Makes the simulator of a name; equal instances return one object, and so share compilations."""
 
     family: str
@@ -63,19 +62,19 @@ class Simulator:
 
     def __call__(self) -> Any:
         """Return the simulator. Raises UserError if its library has none, or one of another layout."""
-        env = _made(self.family, self.environment, self.backend)
-        found, wanted = layout_of(env, self.environment), self.layout
-        if found != wanted:
+        env = _simulator(self.family, self.environment, self.backend)
+        own, wanted = layout_of(env, self.environment), self.layout
+        if own != wanted:
             raise UserError(
-                f"{self.family}:{self.environment} has observations of {sum(found.sizes)} entries and actions of "
-                f"{len(found.entries)}, the configuration {sum(wanted.sizes)} and {len(wanted.entries)}, or other "
+                f"{self.family}:{self.environment} has observations of {sum(own.sizes)} entries and actions of "
+                f"{len(own.entries)}, the configuration {sum(wanted.sizes)} and {len(wanted.entries)}, or other "
                 f"names: name the task {self.family}:{self.environment}, and install the {self.family} of the policy"
             )
         return env
 
 
 @cache
-def _made(family: str, name: str, backend: str) -> Any:
+def _simulator(family: str, name: str, backend: str) -> Any:
     # An environment holds arrays, and the caller may be tracing.
     with jax.ensure_compile_time_eval():
         return _from_brax(name, backend) if family == "brax" else _from_playground(name)
@@ -119,16 +118,14 @@ def make_environment(family: str, config: Any, split: str = "training") -> JaxEn
     Raises UserError for a value that makes none.
     """
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
-    backend = getattr(config, "backend", "")
-    if backend:
+    if backend := getattr(config, "backend", ""):
         check_word("backend", backend, get_args(Backend))
     layout = Layout(config.slices, config.slice_sizes, config.entries)
     whole = config.environment and layout.entries and len(layout.slices) == len(layout.sizes)
     if not whole or min(layout.sizes, default=0) < 1:
         raise UserError(
-            f"task.environment is {format_value(config.environment)}, of task.slices {format_value(layout.slices)}, "
-            f"task.slice_sizes {format_value(layout.sizes)} and task.entries {format_value(layout.entries)}: name the "
-            f"task {family}:ENVIRONMENT, which fills them"
+            f"task.environment is {format_value(config.environment)}, and task.slices, slice_sizes or entries are of "
+            f"another one: name the task {family}:ENVIRONMENT, which fills them"
         )
     simulator = Simulator(family, config.environment, backend, layout)
     return JaxEnvironment(jnp.array(config.max_steps, jnp.int32), simulator, layout.observation, layout.box())
@@ -140,24 +137,18 @@ def _pictures() -> Pictures:
     return frames.SIMULATOR
 
 
-def _family(name: str, about: str, physics: str, config: type, fields: tuple[str, ...]) -> Task:
+def _family(name: str, about: str, physics: str, config: type, *labels_hold: str) -> Task:
     body = Body(name, physics, partial(make_environment, name), pictures=_pictures)
-    return Task(name, about, config, (body,), labels_hold=fields)  # a label depends on one observation only
+    return Task(name, f"{about} for instance", config, (body,), labels_hold=("max_steps", *labels_hold))
 
 
-BRAX = _family(
-    "brax",
-    "brax's environments, each as brax:NAME, brax:pusher for instance",
-    "brax's own",
-    BraxConfig,
-    ("max_steps", "backend"),
-)
+# A label depends on one observation only.
+BRAX = _family("brax", "brax's environments, each as brax:NAME, brax:pusher", "brax's own", BraxConfig, "backend")
 PLAYGROUND = _family(
     "playground",
-    "MuJoCo Playground's dm_control tasks, each as playground:NAME, playground:CartpoleBalance for instance",
+    "MuJoCo Playground's dm_control tasks, each as playground:NAME, playground:CartpoleBalance",
     "MJX, MuJoCo in JAX",
     SimulatorConfig,
-    ("max_steps",),
 )
 
 
@@ -174,7 +165,7 @@ def playground_task(name: str) -> Task:
 
 
 def _task_of(family: Task, about: str, name: str) -> Task:
-    layout = layout_of(_made(family.name, name, getattr(family.config, "backend", "")), name)
+    layout = layout_of(_simulator(family.name, name, getattr(family.config, "backend", "")), name)
     config = family.config(name, slices=layout.slices, slice_sizes=layout.sizes, entries=layout.entries)
     preset = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
     return dataclasses.replace(family, about=about, default=config, presets={QUICKSTART: preset})

@@ -3,18 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 from brax import envs
 from brax.envs.wrappers import training
 
-from cuelearner_jax import loop
 from cuelearner_jax.bridges import brax as brax_adapter
 from cuelearner_jax.bridges.brax import from_brax
 from cuelearner_jax.environment import Environment, symmetries_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import Box, Cue
 
 
@@ -88,13 +84,6 @@ def test_a_step_leaves_the_state_that_it_was_given():
     assert state.state.metrics["length"] == 0
 
 
-def test_actions_of_another_size():
-    start, steps = walk(from_brax(Field(1)), [(-0.6,)])
-    np.testing.assert_allclose(steps[0].final_obs, start + np.array([-0.3, 0.0]), atol=1e-7)
-    start, steps = walk(from_brax(Field(3)), [(-0.6, 0.8, 0.5)])
-    np.testing.assert_allclose(steps[0].final_obs, start + np.array([-0.3, 0.4]), atol=1e-7)
-
-
 def test_actions_are_the_whole_box_with_names_of_the_model_or_cues_of_the_caller():
     box = from_brax(Field(3)).actions
     assert (box.low, box.high) == ((-1.0,) * 3, (1.0,) * 3)
@@ -149,24 +138,3 @@ def test_device_put_replicated_stacks_a_copy_for_each_device(monkeypatch):
     np.testing.assert_array_equal(jax.pmap(lambda a: a + 1, devices=devices)(copies["a"]), [[1, 2, 3]])
     brax_adapter.supply_device_put_replicated()
     assert jax.device_put_replicated is supplied  # pyright: ignore[reportAttributeAccessIssue]
-
-
-# Our loop on brax's.
-
-
-BOOTSTRAPPING = probes.config(scalars={"discount": 0.9}, agent={"target_every": 2})
-
-
-@pytest.mark.long
-def test_our_loop_learns_on_an_environment_of_brax():
-    env = from_brax(envs.get_environment("inverted_pendulum", backend="positional"), max_steps=5)
-    program = make_program(BOOTSTRAPPING, guidances.make("none", probes.SIZES, env), env, 0)
-    state = probes.start(program, [0], [0], env)
-    fresh = probes.lane(state.agent.params, 0)
-    clock, state, metrics = program.train(env, BOOTSTRAPPING.settings, loop.start_clock(), state, 12)
-    assert (int(clock.step), int(clock.update)) == (48, 48)
-    assert np.isfinite(metrics["loss"]).all()
-    assert np.isfinite(metrics["reward"]).all()
-    for old, new in zip(jax.tree.leaves(fresh), jax.tree.leaves(probes.lane(state.agent.params, 0)), strict=True):
-        assert np.isfinite(new).all()
-        assert (old != new).any()

@@ -17,7 +17,6 @@ import recorded_situations as recorded
 from cuelearner_jax import config as configuration
 from cuelearner_jax.cli import main
 from cuelearner_jax.feedback.answers import relative_feedback
-from cuelearner_jax.spaces import Box
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import logs
 from cuelearner_jax.types import Label
@@ -112,28 +111,10 @@ def in_file(folder, policy, wanted, count, seed):
     label_files.write_file(folder / "labels.parquet", file, "more")
 
 
-def on_page(folder, wanted, count):
-    """Has a script answer on the page, by the page's command; what was recorded is what the policy proposed."""
-    pytest.importorskip("nicegui")
-    from page_answers import labelled
-
-    space = Box(recorded.LOW, recorded.HIGH)
-    bounds = ["--task.low", *map(str, recorded.LOW), "--task.high", *map(str, recorded.HIGH)]
-    how = [*bounds, "--scalars.eps-deg", str(EPS)]
-    assert COMMANDS["label"][COMMANDS["label"].index("--labels") + 1] == str(count)
-    ask = lambda obs, action: told(space, wanted, obs[None], action[None])[0]  # noqa: E731
-    assert labelled([*COMMANDS["label"][1:], *how], ask) == folder
-
-
-@pytest.mark.parametrize("labels", ["file", pytest.param("page", marks=pytest.mark.long)])
-def test_the_commands_of_the_page_correct_a_policy_of_pytorch(labels, place, tmp_path, capsys):
+def test_the_commands_of_the_page_correct_a_policy_of_pytorch(place, tmp_path, capsys):
     policy = place
     wanted = lambda obs: np.clip(acted(policy, obs) + OFFSET, recorded.LOW, recorded.HIGH)  # noqa: E731
-    folder = Path("labels/arm")
-    if labels == "file":
-        in_file(folder, policy, wanted, 150, 0)
-    else:
-        on_page(folder, wanted, 150)
+    in_file(Path("labels/arm"), policy, wanted, 150, 0)
     in_file(Path("labels/others"), policy, wanted, 60, 1)
     assert main(COMMANDS["adapt"]) == 0
     capsys.readouterr()

@@ -44,27 +44,20 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
     succeeds: bool = struct.field(pytree_node=False, default=False)  # True if it reports success
-    refusal: str = struct.field(pytree_node=False, default="")  # reason why it cannot be made; empty: it can
 
     def reset(self, key: PRNGKeyArray) -> tuple[Episode, Float[Array, " obs"]]:
-        """Begin an episode with a seed drawn from the key. Raises UserError where the environment cannot be made."""
-        self._check()
-        seed = _seed(key)
-        shapes = (self._vector, jax.ShapeDtypeStruct((2,), jnp.uint32))
-        obs, place = jax.pure_callback(self._reset_here, shapes, seed, vmap_method="broadcast_all")
+        """Begin an episode with a seed drawn from the key."""
+        seed, (vector, *_, place) = _seed(key), self._shapes
+        obs, place = jax.pure_callback(self._reset_here, (vector, place), seed, vmap_method="broadcast_all")
         blank = jnp.zeros((self.source.max_steps, self.actions.size), jnp.float32)
         return Episode(seed, jnp.zeros((), jnp.int32), blank, place), obs
 
     def step(self, key: PRNGKeyArray, state: Episode, action: Float[Array, " action"]) -> tuple[Episode, Step]:
         """Execute an action. Where that ends the episode, another begins with a seed drawn from the key."""
-        self._check()
-        next_seed, number, flag = _seed(key), jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_)
-        place = jax.ShapeDtypeStruct((2,), jnp.uint32)
-        shapes = (self._vector, self._vector, number, flag, flag, number, number, place)
-        action = jnp.asarray(action, jnp.float32)
-        given = (state.seed, state.steps, state.actions, state.place, action, next_seed)
-        found = jax.pure_callback(self._step_here, shapes, *given, vmap_method="broadcast_all")
-        obs, final_obs, reward, terminated, truncated, success, total, place = found
+        next_seed, action = _seed(key), jnp.asarray(action, jnp.float32)
+        before = (state.seed, state.steps, state.actions, state.place, action, next_seed)
+        results = jax.pure_callback(self._step_here, self._shapes, *before, vmap_method="broadcast_all")
+        obs, final_obs, reward, terminated, truncated, success, total, place = results
         ended = terminated | truncated
         after = Episode(
             jnp.where(ended, next_seed, state.seed),
@@ -75,25 +68,23 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         outcome = {**({SUCCESS: success} if self.succeeds else {}), RETURN: total}
         return after, Step(obs, final_obs, final_obs, reward, terminated, truncated, {}, outcome)
 
-    def _check(self) -> None:
-        if self.refusal:
-            raise UserError(self.refusal)
-
     @property
-    def _vector(self) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((self.obs_size,), jnp.float32)
+    def _shapes(self) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """Shapes of the columns of `Went`."""
+        vector, number = jax.ShapeDtypeStruct((self.obs_size,), jnp.float32), jax.ShapeDtypeStruct((), jnp.float32)
+        flag, place = jax.ShapeDtypeStruct((), jnp.bool_), jax.ShapeDtypeStruct((2,), jnp.uint32)
+        return vector, vector, number, flag, flag, number, number, place
 
     def _reset_here(self, seed: Any) -> tuple[np.ndarray, np.ndarray]:
         """Reset on the host: any leading axes."""
         seeds = np.asarray(seed)
-        obs, *_, place = self._carried(
-            seeds.shape, {row: Request(one) for row, one in enumerate(seeds.ravel().tolist())}
-        )
+        requests = {row: Request(one) for row, one in enumerate(seeds.ravel().tolist())}
+        obs, *_, place = self._carried(seeds.shape, requests)
         return obs, place
 
-    def _step_here(self, *given: Any) -> tuple[np.ndarray, ...]:
+    def _step_here(self, *before: Any) -> tuple[np.ndarray, ...]:
         """Step on the host: any leading axes."""
-        seeds, steps, history, places, actions, next_seeds = map(np.asarray, given)
+        seeds, steps, history, places, actions, next_seeds = map(np.asarray, before)
         shape = seeds.shape
         seeds, steps, next_seeds = (column.ravel().tolist() for column in (seeds, steps, next_seeds))
         history, actions = history.reshape(-1, *history.shape[-2:]), actions.reshape(-1, actions.shape[-1])
@@ -109,21 +100,17 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         `user_code` then reports the failure.
         """
         rows = math.prod(shape)
-        obs, final_obs = np.full((2, rows, self.obs_size), np.nan, np.float32)
-        reward, success, total = np.full((3, rows), np.nan, np.float32)
-        terminated, truncated = np.zeros((2, rows), bool)
-        place = np.zeros((rows, 2), np.uint32)
+        blank = {np.float32: np.nan, np.bool_: False, np.uint32: 0}
+        columns = [np.full((rows, *one.shape), blank[one.dtype.type], one.dtype) for one in self._shapes]
         if requests and not user_code.is_waiting():
             try:
-                went = pool_of(self.source).carry_out(requests, history)
+                results = pool_of(self.source).carry_out(requests, history)
             except UserError as error:
                 user_code.leave(error)
             else:
-                parts = obs, final_obs, reward, terminated, truncated, success, total
-                for part, column in zip(parts, zip(*went, strict=True), strict=False):  # all columns but the places
-                    part[list(requests)] = column
-                place[list(requests)] = np.frombuffer(b"".join(one.place for one in went), np.uint32).reshape(-1, 2)
-        columns = obs, final_obs, reward, terminated, truncated, success, total, place
+                results = [one._replace(place=np.frombuffer(one.place, np.uint32)) for one in results]  # pyright: ignore
+                for column, values in zip(columns, zip(*results, strict=True), strict=True):
+                    column[list(requests)] = values
         return tuple(column.reshape((*shape, *column.shape[1:])) for column in columns)
 
 

@@ -1,5 +1,8 @@
 """Instances of one environment, which reset, step and replay: the work of one process of the pool.
 
+Observations become vectors, and vectors become actions. This module imports neither JAX nor Gymnasium, so that worker
+processes start quickly.
+
 Where an instance stands is named by a chain of hashes: of the seed and the first observation, then of each action with
 the observation, reward and end that followed. Equal places have equal names. An environment that does not repeat itself
 comes to another name, which is reported.
@@ -17,13 +20,121 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.bridges.gymnasium.layout import NoVector, action_maker, actions_of, flatten, leaves_of
-from cuelearner_jax.errors import UserError, user_code_error
+from cuelearner_jax.errors import UserError, format_value, user_code_error
 
 SUCCESS = ("success", "is_success", "succeed")  # names in `info`
 PLACE_BYTES = 8
 MOST_INSTANCES = 1024  # spare instances, beyond those that one call needs
 RECENT = 16  # an instance that was used within so many calls is kept
+LARGEST_FLOAT = np.finfo(np.float32).max
+LARGEST = 1e30  # a bound from here on is none: float32's own largest number, say
+
+
+class Leaf(NamedTuple):
+    """One entry of a (nested) space of observations."""
+
+    path: tuple[Any, ...]  # keys and places that lead to it
+    shape: tuple[int, ...]  # shape of the environment's value
+    choices: tuple[int, ...] = ()  # number of values of each entry, which the vector holds one-hot; (): as they are
+    start: tuple[int, ...] = ()  # the first value of each entry with choices
+
+    @property
+    def size(self) -> int:
+        """Number of entries that the leaf fills in the vector."""
+        return sum(self.choices) or int(np.prod(self.shape, dtype=int))
+
+    @property
+    def name(self) -> str:
+        """The leaf's keys, joined by dots."""
+        return ".".join(map(str, self.path)) or "observation"
+
+    def vector(self, obs: Any) -> np.ndarray:
+        """Return the leaf of an observation as a vector. Raises ValueError, which says what is wrong with it."""
+        try:
+            for key in self.path:
+                obs = obs[key]
+            value = np.asarray(obs)
+        except (KeyError, IndexError, TypeError, ValueError):
+            raise ValueError(f"no numbers {self.name!r} in its observation, which its space has") from None
+        if value.shape != self.shape or value.dtype.kind not in "biuf":
+            raise ValueError(f"an observation {self.name!r} of shape {value.shape}, where its space has {self.shape}")
+        if not (np.abs(value) <= LARGEST_FLOAT).all():
+            raise ValueError(f"an observation {self.name!r} that is not finite")
+        if not self.choices:
+            return value.ravel()
+        places = value.ravel().astype(int) - np.array(self.start, int)
+        if ((places < 0) | (places >= self.choices)).any():
+            raise ValueError(f"an observation {self.name!r} of {value}, beyond {self.choices} values from {self.start}")
+        rows = np.zeros(self.size, np.float32)
+        rows[places + np.cumsum((0, *self.choices[:-1]), dtype=int)] = 1.0
+        return rows
+
+
+def leaves_of(whose: str, space: Any, path: tuple[Any, ...] = ()) -> tuple[Leaf, ...]:
+    """Return the entries of a space of observations, in the order of the space.
+
+    Raises UserError for images and for spaces that have no vectors; `whose`: for the message.
+    """
+    kind = type(space).__name__
+    if kind in ("Dict", "Tuple"):
+        parts = space.spaces.items() if kind == "Dict" else enumerate(space.spaces)
+        return tuple(leaf for key, inner in parts for leaf in leaves_of(whose, inner, (*path, key)))
+    leaf = Leaf(path, tuple(space.shape or ()))
+    if kind in ("Discrete", "MultiDiscrete"):
+        counts = getattr(space, "nvec", getattr(space, "n", 0))
+        return (leaf._replace(choices=tuple(np.ravel(counts).tolist()), start=tuple(np.ravel(space.start).tolist())),)
+    if kind not in ("Box", "MultiBinary"):
+        raise UserError(
+            f"{whose}: observation {leaf.name!r} is a {kind}: give one of Box, Discrete, MultiDiscrete or MultiBinary, "
+            "or a Dict or Tuple of these"
+        )
+    if kind == "Box" and len(leaf.shape) + (space.dtype == np.uint8) >= 3:
+        raise UserError(
+            f"{whose}: observation {leaf.name!r} is an image of shape {leaf.shape}: give one with observations of "
+            "numbers (a vector, or a dictionary of vectors); pictures for people come from render_mode='rgb_array'"
+        )
+    return (leaf,)
+
+
+def flatten(leaves: tuple[Leaf, ...], obs: Any) -> np.ndarray:
+    """Return an observation as a vector (obs,) of float32. Raises ValueError for an observation outside its space."""
+    return np.concatenate([leaf.vector(obs) for leaf in leaves], dtype=np.float32, casting="unsafe")
+
+
+class Actions(NamedTuple):
+    """A space of actions as vectors: a box between bounds, or choices."""
+
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    choices: int = 0  # above 0: one of so many
+
+
+def actions_of(whose: str, space: Any) -> Actions:
+    """Return a space of actions as vectors. Raises UserError for one that is neither a bounded box nor choices."""
+    kind = type(space).__name__
+    if kind == "Discrete":
+        if int(space.n) < 2:
+            raise UserError(f"{whose}: there is only one action: give an environment with a choice")
+        return Actions(choices=int(space.n))
+    if kind != "Box":
+        raise UserError(f"{whose}: its actions are a {kind}: wrap the environment so that they are a Box or Discrete")
+    low, high = np.ravel(space.low).astype(float), np.ravel(space.high).astype(float)
+    for number, (least, most) in enumerate(zip(low, high, strict=True), 1):
+        if least == most:
+            raise UserError(f"{whose}: entry {number} of its actions can only be {least:g}: wrap it to leave it out")
+        if not max(-least, most) < LARGEST:
+            raise UserError(f"{whose}: entry {number} of its actions has no bounds: wrap it, as in RescaleAction")
+    return Actions(tuple(low.tolist()), tuple(high.tolist()))
+
+
+def action_maker(space: Any) -> Callable[[np.ndarray], Any]:
+    """Return the function that makes an environment's action from a vector (action,)."""
+    if type(space).__name__ == "Discrete":
+        return lambda vector: int(vector.argmax()) + int(space.start)
+    shape, dtype = space.shape, space.dtype
+    if np.issubdtype(dtype, np.integer):
+        return lambda vector: np.round(vector).reshape(shape).astype(dtype)
+    return lambda vector: vector.reshape(shape).astype(dtype)
 
 
 class Request(NamedTuple):
@@ -50,24 +161,23 @@ class Went(NamedTuple):
 
 
 class Running:
-    """One instance and its current place."""
+    """One instance and its current place. Its methods raise UserError for what the environment raises or gives."""
 
     def __init__(self, make: Callable[[], Any], whose: str, max_steps: int) -> None:
         """Make the instance. Raises UserError for one that cannot be made, or whose spaces cannot be vectors."""
-        self.whose, self.max_steps = whose, max_steps
+        self.whose, self.max_steps = f"environment {whose}", max_steps
         try:
             self.env = make()
         except UserError:
             raise
         except Exception as error:
-            raise user_code_error(f"environment {whose}, while it was made,", error) from error
+            raise user_code_error(f"{self.whose}, while it was made,", error) from error
         if hasattr(self.env, "num_envs"):
             raise UserError(
-                f"environment {whose} is a vector of {self.env.num_envs} environments: give a function that makes a "
-                "single one"
+                f"{self.whose} is a vector of {self.env.num_envs} environments: give a function that makes a single one"
             )
-        self.actions = actions_of(f"environment {whose}", self.env.action_space)
-        self.leaves = leaves_of(f"environment {whose}", self.env.observation_space)
+        self.actions = actions_of(self.whose, self.env.action_space)
+        self.leaves = leaves_of(self.whose, self.env.observation_space)
         self.to_action = action_maker(self.env.action_space)
         self.seed, self.steps, self.total, self.place = -1, 0, 0.0, b""
         self.used = -RECENT  # number of the call that used it last
@@ -75,43 +185,48 @@ class Running:
         self.reports_success = False
 
     def reset(self, seed: int) -> np.ndarray:
-        """Begin an episode. Raises UserError for what the environment raises, or gives that is no observation."""
+        """Begin an episode."""
         self.seed, self.steps, self.total = seed, 0, 0.0
-        when = f"its reset with seed {seed}"
-        obs = self._vector(self._called(when, self.env.reset, seed=seed)[0], when)
+        obs = self._vector(self._called(self.env.reset, seed=seed)[0])
         self.place = hashlib.blake2b(seed.to_bytes(8, "little") + obs.tobytes(), digest_size=PLACE_BYTES).digest()
         return obs
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, float]:
-        """Execute an action (action,). Return observation, reward, terminated, truncated, success. Raise as `reset`."""
+        """Execute an action (action,). Return observation, reward, terminated, truncated, success."""
         obs, reward, terminated, truncated, success = self.execute(self.to_action(action))
-        told = struct.pack("<d??d", reward, terminated, truncated, success)
-        parts = self.place + action.tobytes() + obs.tobytes() + told
+        outcome = struct.pack("<d??d", reward, terminated, truncated, success)
+        parts = self.place + action.tobytes() + obs.tobytes() + outcome
         self.place = hashlib.blake2b(parts, digest_size=PLACE_BYTES).digest()
         return obs, reward, terminated, truncated, success
 
     def execute(self, action: Any) -> tuple[np.ndarray, float, bool, bool, float]:
         """Like `step`, for an action as the environment takes it; `place` is not moved."""
         self.steps += 1
-        when = f"step {self.steps} of the episode with seed {self.seed}"
-        given, reward, terminated, truncated, info = self._called(when, self.env.step, action)
-        obs = self._vector(given, when)
+        raw, reward, terminated, truncated, info = self._called(self.env.step, action)
+        obs = self._vector(raw)
         try:
-            reward = float(reward)
+            number = float(reward)
         except (TypeError, ValueError):
-            raise UserError(f"environment {self.whose} gave no number as reward in {when}: mend it first") from None
-        if not math.isfinite(reward):
-            raise UserError(f"environment {self.whose} gave a reward of {reward} in {when}: mend it first")
-        self.total += reward
+            number = math.nan
+        if not math.isfinite(number):
+            raise UserError(
+                f"{self.whose} gave a reward of {format_value(reward)} in {self._when}: give a finite number"
+            )
+        self.total += number
         terminated = bool(terminated)
         truncated = (bool(truncated) or self.steps >= self.max_steps > 0) and not terminated
-        return obs, reward, terminated, truncated, self._success(info)
+        return obs, number, terminated, truncated, self._success(info)
 
-    def _called(self, when: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    @property
+    def _when(self) -> str:
+        step = f"step {self.steps} of the episode" if self.steps else "its reset"
+        return f"{step} with seed {self.seed}"
+
+    def _called(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         try:
             return function(*arguments, **named)
         except Exception as error:
-            raise user_code_error(f"environment {self.whose}, in {when},", error) from error
+            raise user_code_error(f"{self.whose}, in {self._when},", error) from error
 
     def _success(self, info: dict[str, Any]) -> float:
         """Return what `info` says of success; 0 where nothing. Raises UserError for neither true nor false."""
@@ -120,41 +235,34 @@ class Running:
             return 0.0
         value = np.asarray(info[name])
         if value.size != 1 or value.dtype.kind not in "biuf" or not np.isfinite(value).all():
-            raise UserError(f"environment {self.whose} says info[{name!r}] = {info[name]!r}: give True, False or None")
+            raise UserError(f"{self.whose} says info[{name!r}] = {info[name]!r}: give True, False or None")
         self.reports_success = True
         return float(bool(value.ravel()[0]))
 
-    def _vector(self, given: Any, when: str) -> np.ndarray:
+    def _vector(self, obs: Any) -> np.ndarray:
         try:
-            obs = flatten(self.leaves, given)
-        except NoVector as error:
-            raise UserError(f"environment {self.whose} gave {error} in {when}: keep its shapes") from None
-        if not (math.isfinite(obs.sum()) or np.isfinite(obs).all()):
-            ends = np.cumsum([leaf.size for leaf in self.leaves])
-            leaf = self.leaves[int(np.searchsorted(ends, np.flatnonzero(~np.isfinite(obs))[0], "right"))]
-            raise UserError(
-                f"environment {self.whose} gave an observation {leaf.name!r} that is not finite in {when}: mend that"
-            )
-        return obs
+            return flatten(self.leaves, obs)
+        except ValueError as error:
+            raise UserError(f"{self.whose} gave {error} in {self._when}: keep to its observation space") from None
 
     def picture(self) -> np.ndarray:
         """Return what `render` gives, (height, width, 3) uint8. Raises UserError where that is no picture."""
         try:
-            found = self.env.render()
+            frame = self.env.render()
         except Exception as error:
             words = " ".join(str(error).split())[:160]
             raise UserError(
-                f"environment {self.whose} cannot be drawn ({type(error).__name__}: {words}): if that is of OpenGL, "
-                "set MUJOCO_GL to egl or osmesa"
+                f"{self.whose} cannot be drawn ({type(error).__name__}: {words}): if that is of OpenGL, set MUJOCO_GL "
+                "to egl or osmesa"
             ) from error
-        if isinstance(found, list) and found:
-            found = found[-1]
-        if not isinstance(found, np.ndarray) or found.dtype != np.uint8 or found.shape[2:] != (3,) or not found.size:
+        if isinstance(frame, list) and frame:
+            frame = frame[-1]
+        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.shape[2:] != (3,) or not frame.size:
             raise UserError(
-                f"environment {self.whose} gives no pictures: let it take render_mode='rgb_array', and render return "
-                "uint8 (height, width, 3)"
+                f"{self.whose} gives no pictures: let it take render_mode='rgb_array', and render return uint8 "
+                "(height, width, 3)"
             )
-        return np.ascontiguousarray(found)
+        return np.ascontiguousarray(frame)
 
     def close(self) -> None:
         """Close the environment, whatever its closing raises."""
@@ -213,18 +321,17 @@ class Instances:
         one = next(free, None)
         wanted = one is not None and one.used > self.calls - RECENT
         if one is None or (wanted and replays and len(self.running) < MOST_INSTANCES):
-            one = self._made()
+            one = self._new()
             self.running.append(one)
         one.used = self.calls
         return one
 
-    def _made(self) -> Running:
+    def _new(self) -> Running:
         one = Running(self.make, self.whose, self.max_steps)
         size = sum(leaf.size for leaf in one.leaves)
         if size != self.size:
             raise UserError(
-                f"environment {self.whose} has observations of {size} entries, its task says {self.size}: name the "
-                "environment anew"
+                f"{one.whose} has observations of {size} entries, its task says {self.size}: name the environment anew"
             )
         return one
 
@@ -236,9 +343,9 @@ class Instances:
         self.replays += len(history)
         if one.place != request.place:
             raise UserError(
-                f"environment {self.whose} does not repeat itself: with seed {request.seed} and the same "
-                f"{len(history)} actions it came elsewhere than before: let it draw from its own np_random alone, and "
-                "reset everything in reset(seed=...)"
+                f"{one.whose} does not repeat itself: with seed {request.seed} and the same {len(history)} actions it "
+                "came elsewhere than before: let it draw from its own np_random alone, and reset everything in "
+                "reset(seed=...)"
             )
 
     def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray] | str:
@@ -248,9 +355,7 @@ class Instances:
         """
         still = first == len(actions)
         try:
-            if still not in self.cameras:
-                self.cameras[still] = self._made()
-            one = self.cameras[still]
+            one = self.cameras[still] = self.cameras.get(still) or self._new()
             goes_on = one.seed == seed and one.steps <= first and len(one.filmed) == one.steps
             if not goes_on or not np.array_equal(one.filmed, actions[: one.steps]):
                 one.reset(seed)

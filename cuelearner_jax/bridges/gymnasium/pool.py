@@ -1,4 +1,8 @@
-"""The pool plays one environment in this process or in several: a call's rows are divided among them."""
+"""The pool plays one environment in this process or in several: a call's rows are divided among them.
+
+Run as a program (`main`), this module is such a process. It reads calls from a socket until the socket is closed. It is
+not forked, since a fork of a process with threads may hang, and does not run the user's script a second time.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +10,12 @@ import atexit
 import contextlib
 import os
 import pickle
+import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from ctypes.util import find_library
@@ -21,11 +27,11 @@ import numpy as np
 
 from cuelearner_jax.bridges.gymnasium.instances import Instances, Request, Went
 from cuelearner_jax.bridges.gymnasium.source import Source
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, user_code_error
 
-WORKER = "cuelearner_jax.bridges.gymnasium.worker"
 PACKAGES = Path(__file__).parents[3]  # folder that this package is imported from
 MOST_POOLS = 8  # most pools open at once
+CHECK_PERIOD = 1.0  # time between two checks of the parent [s]
 
 
 class Process:
@@ -33,9 +39,24 @@ class Process:
 
     def __init__(self, source: Source) -> None:
         """Start the process. Raises UserError for code that cannot be sent to it."""
-        self.name, self.is_gone, sent = source.name, False, source.pickled()
+        import cloudpickle  # with code of `__main__` and local functions; Gymnasium needs it too
+
+        self.name, self.is_gone = source.name, False
+        try:
+            sent = cloudpickle.dumps((source.make, source.name, source.max_steps, source.size))
+        except Exception as error:
+            raise UserError(
+                f"environment {self.name} cannot be sent to another process ({type(error).__name__}: {error}): give a "
+                "function or class of a module, or processes 1"
+            ) from error
         ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", WORKER, str(theirs.fileno()), str(os.getpid())]
+        command = [
+            sys.executable,
+            "-m",
+            "cuelearner_jax.bridges.gymnasium.pool",
+            str(theirs.fileno()),
+            str(os.getpid()),
+        ]
         paths = os.pathsep.join([str(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])
         environ = {**os.environ, "PYTHONPATH": paths, **(drawing_variables() if source.drawn else {})}
         # An environment's prints must not mix with our output.
@@ -80,7 +101,8 @@ class Here:
     is_gone = False
 
     def __init__(self, source: Source) -> None:
-        self.instances, self.result = Instances(*source.arguments_of_instances), None
+        self.instances, self.result = Instances(source.make, source.name, source.max_steps, source.size), None
+        self.close = self.instances.close
 
     def send(self, method: str, *arguments: Any) -> None:
         """Call a method of the instances."""
@@ -89,10 +111,6 @@ class Here:
     def receive(self) -> Any:
         """Return the result of the call."""
         return self.result
-
-    def close(self) -> None:
-        """Close all instances."""
-        self.instances.close()
 
 
 class Pool:
@@ -111,47 +129,46 @@ class Pool:
                 place; None: all rows begin episodes.
         """
         with self.lock:
-            found = self._asked(requests)
+            results = self._results(requests)
             if history is not None:
-                missing = [row for row, one in found.items() if one is None]
-                found.update(self._asked({row: requests[row]._replace(history=history(row)) for row in missing}))
-            if fault := next((one for one in found.values() if isinstance(one, str)), None):
+                missing = [row for row, one in results.items() if one is None]
+                results.update(self._results({row: requests[row]._replace(history=history(row)) for row in missing}))
+            if fault := next((one for one in results.values() if isinstance(one, str)), None):
                 raise UserError(fault)
-            return list(found.values())
+            return list(results.values())
 
-    def _asked(self, requests: Mapping[int, Request]) -> dict[int, Any]:
+    def _results(self, requests: Mapping[int, Request]) -> dict[int, Any]:
         rows: dict[int, list[int]] = {}
         for row in requests:
             rows.setdefault(row % self.source.hosts, []).append(row)
         for number, own in rows.items():
             self._host(number).send("carry_out", [requests[row] for row in own])
-        found = dict.fromkeys(requests)
+        results = dict.fromkeys(requests)
         for number, own in rows.items():
             answers = self.hosts[number].receive()
-            found.update(zip(own, [answers] * len(own) if isinstance(answers, str) else answers, strict=True))
-        return found
+            results.update(zip(own, [answers] * len(own) if isinstance(answers, str) else answers, strict=True))
+        return results
 
     def _host(self, number: int) -> Process | Here:
         if number not in self.hosts or self.hosts[number].is_gone:
             self.hosts[number] = (Here if self.source.plays_here else Process)(self.source)
         return self.hosts[number]
 
-    def filmed(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
+    def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
         """Return pictures of an episode from step `first` on. Raises UserError if there are none."""
         with self.lock:
             host = self._host(0)
             host.send("film", seed, actions, first)
-            found = host.receive()
-            if isinstance(found, str):
-                raise UserError(found)
-            return found
+            frames = host.receive()
+            if isinstance(frames, str):
+                raise UserError(frames)
+            return frames
 
     def close(self) -> None:
         """End all processes and close all instances."""
         with self.lock:
-            for host in self.hosts.values():
-                host.close()
-            self.hosts = {}
+            while self.hosts:
+                self.hosts.popitem()[1].close()
 
 
 def drawing_variables() -> dict[str, str]:
@@ -172,8 +189,7 @@ def pool_of(source: Source) -> Pool:
             _pools[source] = Pool(source)
         _pools.move_to_end(source)
         while len(_pools) > MOST_POOLS:
-            _, oldest = _pools.popitem(last=False)
-            oldest.close()
+            _pools.popitem(last=False)[1].close()
         return _pools[source]
 
 
@@ -183,3 +199,34 @@ def close_all() -> None:
     with _opening:
         while _pools:
             _pools.popitem()[1].close()
+
+
+def main(descriptor: int, parent: int) -> None:
+    """Serve instances until the pool closes its end, or its process is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles an interrupt, and then ends this process
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    link, instances, fault = Connection(descriptor), None, ""
+    with contextlib.suppress(EOFError, OSError):
+        sys.path[:] = link.recv()
+        sent = link.recv_bytes()
+        try:
+            instances = Instances(*pickle.loads(sent))
+        except Exception as error:
+            fault = str(user_code_error("the environment's code, when loaded,", error))
+        while True:
+            method, *arguments = link.recv()
+            answer = getattr(instances, method)(*arguments) if instances else fault
+            link.send_bytes(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL))
+    if instances is not None:
+        instances.close()
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its parent is gone, even in the middle of a step."""
+    while os.getppid() == parent:
+        time.sleep(CHECK_PERIOD)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))

@@ -1,8 +1,16 @@
-"""Sources of instances: an environment id of Gymnasium's registry, or the user's own class or function."""
+"""Sources of instances: an environment id of Gymnasium's registry, or the user's own class or function.
+
+The last functions make gymnasium_robotics 1.4.2 work with MuJoCo 3.17. Its `utils.mujoco_utils` asks whether a joint's
+type, a NumPy integer, is in a list of members of `mujoco.mjtJoint`. MuJoCo 3.17's members equal no NumPy integer, and
+every reset would fail with an AssertionError.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import enum
 import inspect
+import io
 import json
 import os
 import sys
@@ -10,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
+from types import SimpleNamespace
 from typing import Any
 
 from cuelearner_jax.errors import UserError, near
@@ -50,26 +59,6 @@ class Source:
         spec = gymnasium.registry.get(self.name)  # of the caller's own registry, which another process lacks
         return partial(make_registered, self.name, named, self.max_steps, spec)
 
-    @property
-    def arguments_of_instances(self) -> tuple[Any, ...]:
-        """The arguments of `Instances`."""
-        return self.make, self.name, self.max_steps, self.size
-
-    def pickled(self) -> bytes:
-        """Pickle the arguments of `Instances`, with code of `__main__` and local functions.
-
-        Raises UserError for code that cannot be sent to another process.
-        """
-        import cloudpickle  # Gymnasium needs it too
-
-        try:
-            return cloudpickle.dumps(self.arguments_of_instances)
-        except Exception as error:
-            raise UserError(
-                f"environment {self.name} cannot be sent to another process ({type(error).__name__}: {error}): give a "
-                "function or class of a module, or processes 1"
-            ) from error
-
 
 def _takes(factory: Callable[..., Any], name: str) -> bool:
     """Return whether a function or class accepts an argument of that name."""
@@ -106,9 +95,7 @@ def registry_spec(name: str) -> Any:
     # imported by the caller: its environments are registered, and fail
     is_imported = "gymnasium_robotics" in sys.modules
     if is_imported or (name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None):
-        from cuelearner_jax.bridges.gymnasium.robotics import register
-
-        register()
+        register_robotics()
     try:
         return gymnasium.registry.get(name) or gymnasium.spec(name)  # `spec` finds an id without its version
     except gymnasium.error.Error as error:
@@ -135,13 +122,10 @@ def make_from_code(factory: Callable[..., Any], arguments: dict[str, Any]) -> An
     """Return an environment of the user's code. Raises UserError for any other object."""
     try:
         env = factory(**arguments)
-    except AssertionError:
-        # What gymnasium_robotics raises beside this MuJoCo, where the user's code makes one of its environments.
+    except AssertionError:  # of gymnasium_robotics, if the user's code makes one of its environments
         if "gymnasium_robotics" not in sys.modules:
             raise
-        from cuelearner_jax.bridges.gymnasium.robotics import supply_joint_types
-
-        supply_joint_types()
+        _supply_joint_types()
         env = factory(**arguments)
     wanted = ("reset", "step", "observation_space", "action_space")
     if lacking := [name for name in wanted if not hasattr(env, name)]:
@@ -150,3 +134,27 @@ def make_from_code(factory: Callable[..., Any], arguments: dict[str, Any]) -> An
             "class or function that gives a gymnasium.Env"
         )
     return env
+
+
+def register_robotics() -> None:
+    """Register the environments of gymnasium_robotics with Gymnasium, so that these work beside the MuJoCo here."""
+    import gymnasium
+
+    with contextlib.redirect_stderr(io.StringIO()):  # importing prints a notice about other environments
+        import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    _supply_joint_types()
+
+
+def _supply_joint_types() -> None:
+    """Give gymnasium_robotics a view of `mujoco` whose `mjtJoint` compares with NumPy integers, where it does not."""
+    import numpy as np
+    from gymnasium_robotics.utils import mujoco_utils
+
+    library: Any = mujoco_utils.mujoco
+    own = library.mjtJoint
+    if np.int32(int(own.mjJNT_HINGE)) not in (own.mjJNT_HINGE,):
+        kinds = {name: int(getattr(own, name)) for name in dir(own) if name.startswith("mjJNT_")}
+        view: Any = SimpleNamespace(**{**vars(library), "mjtJoint": enum.IntEnum("mjtJoint", kinds)})
+        mujoco_utils.mujoco = view

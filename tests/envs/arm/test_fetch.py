@@ -29,7 +29,7 @@ def here(config):
 
 def fetchs_own(name, seed, actions):
     """What Gymnasium's environment gives for a seed and actions: flattened observations, rewards, success."""
-    from cuelearner_jax.bridges.gymnasium.layout import flatten, leaves_of
+    from cuelearner_jax.bridges.gymnasium.instances import flatten, leaves_of
     from cuelearner_jax.bridges.gymnasium.source import make_registered
 
     env = make_registered(name, {}, 50)

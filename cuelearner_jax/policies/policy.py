@@ -1,9 +1,10 @@
-"""The package's policies, and policies that change another policy's actions."""
+"""The base class of policies, the package's own policies, and policies that change another policy's actions."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -16,18 +17,112 @@ from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, Sizes, to_json
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import intended_action, relative_feedback
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import refine
-from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyNode, describe
-from cuelearner_jax.policies.opaque import policy_of
 from cuelearner_jax.run_config import kind_to_json, part_to_json
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
-from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
+from cuelearner_jax.types import EnvState, GuidanceModel, Params, Policy, Teacher
+
+SHARED, BY_LANE = None, 0  # axis of a leaf: shared by all lanes, or one entry for each lane
+
+
+class PolicyNode(struct.PyTreeNode):
+    """A policy, or a block of policies with one entry a lane (`axes`). Inherit this for one of your own."""
+
+    KIND = ""  # name of the kind of policy in files; empty: code
+    ASKS = False  # True if the policy asks a teacher
+    LANES: ClassVar[tuple[str, ...]] = ()  # fields of a block with one entry for each lane
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Act as `types.Policy.act`."""
+        raise NotImplementedError
+
+    @property
+    def axes(self) -> Any:
+        """The policy with `BY_LANE` (`LANES`) or `SHARED` in place of fields; a base has its own axes."""
+        axes = {field.name: BY_LANE if field.name in self.LANES else SHARED for field in _traced(self)}
+        return self.replace(**axes | ({"base": self.base.axes} if "base" in axes else {}))  # pyright: ignore[reportAttributeAccessIssue]
+
+    def describe(self) -> dict[str, Any]:
+        """Return JSON values: the policy's kind under `policy`, and under `base` the policy that it changes."""
+        if not self.KIND:
+            return described_code(self)
+        base = getattr(self, "base", None)
+        asks, below = {"asks": True} if self.ASKS else {}, {} if base is None else {"base": describe(base)}
+        return {"policy": self.KIND, **asks, **below}
+
+    def lane(self, index: int | ArrayLike) -> Any:
+        """Return one lane's policy of a block; with several indices (lanes,), a block of these lanes."""
+        axes, names = self.axes, [field.name for field in _traced(self)]
+        return self.replace(**{name: _lane(getattr(self, name), getattr(axes, name), index) for name in names})
+
+
+def _traced(policy: Any) -> list[dataclasses.Field[Any]]:
+    return [field for field in dataclasses.fields(policy) if field.metadata.get("pytree_node", True)]
+
+
+def _lane(part: Any, axes: Any, index: int | ArrayLike) -> Any:
+    """Return the entries of some lanes; `axes` as `PolicyNode.axes`."""
+    if hasattr(part, "lane"):
+        return part.lane(index)
+    taken = lambda leaf: jnp.asarray(leaf)[index]  # noqa: E731
+    chosen = lambda axis, own: own if axis is SHARED else jax.tree.map(taken, own)  # noqa: E731
+    return jax.tree.map(chosen, axes, part, is_leaf=lambda axis: axis is SHARED)
+
+
+def lanes_in(policy: PolicyNode) -> int | None:
+    """Return the number of lanes of a block; None where no leaf has a lane axis."""
+    count = lambda axis, own: [] if axis is SHARED else [len(leaf) for leaf in jax.tree.leaves(own)]  # noqa: E731
+    found = jax.tree.leaves(jax.tree.map(count, policy.axes, policy, is_leaf=lambda axis: axis is SHARED))
+    return found[0] if found else None
+
+
+def described_code(policy: Any) -> dict[str, Any]:
+    """Return the description of a policy that is code."""
+    return {"policy": "code", "named": code_name(getattr(policy, "function", type(policy)))}
+
+
+def describe(policy: Any) -> dict[str, Any]:
+    """Return a policy's description (`PolicyNode.describe`); a policy without one is described as code."""
+    return policy.describe() if hasattr(policy, "describe") else described_code(policy)
+
+
+def code_name(code: Any) -> str:
+    """Return the qualified name of a function or class."""
+    return getattr(code, "__qualname__", type(code).__qualname__).replace("<locals>.", "")
+
+
+def policy_name(policy: Any) -> str:
+    """Return a policy's name for a message: that of the user's function or class below all layers."""
+    while (below := getattr(policy, "base", None) or getattr(policy, "policy", None)) is not None:
+        policy = below
+    return f"policy {code_name(getattr(policy, 'function', type(policy)))}"
+
+
+def call_policy(
+    policy: Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
+) -> Float[Array, "n action"]:
+    """Return a policy's actions, NaN in place of each invalid one. Raises UserError for another shape."""
+    chosen, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
+    if chosen.shape != wanted:
+        raise UserError(f"{policy_name(policy)} returned actions of shape {chosen.shape}: return {wanted}")
+    return actions.only_actions(chosen)
+
+
+def layers(described: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield a described policy, the policy whose actions it changes, and so on."""
+    layer: dict[str, Any] | None = described
+    while layer is not None:
+        yield layer
+        layer = layer.get("base")
 
 
 class Agent(PolicyNode):
-    """A finished agent."""
+    """A finished agent. In a block each lane has its own network."""
+
+    LANES = ("params",)
 
     params: Params
     functions: AgentFunctions = struct.field(pytree_node=False)
@@ -36,11 +131,6 @@ class Agent(PolicyNode):
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the finished agent's actions."""
         return self.functions.act(self.view, self.params, obs, key)
-
-    @property
-    def axes(self) -> Agent:
-        """Lane axes: each lane has its own network."""
-        return self.replace(params=BY_LANE, view=SHARED)
 
     def describe(self) -> dict[str, Any]:
         """Return the agent's options and its frame, as JSON values."""
@@ -140,20 +230,19 @@ class Guided(PolicyNode):
         return self.guidance.act_within(self.bound, *where).actions
 
     @property
-    def axes(self) -> Guided:
-        """Lane axes: each lane has its own base and model, and its own bound where there is more than one."""
-        bound = SHARED if self.bound is None or jnp.ndim(self.bound) == 0 else BY_LANE
-        return self.replace(base=self.base.axes, model=BY_LANE, view=SHARED, scalars=SHARED, bound=bound)
+    def LANES(self) -> tuple[str, ...]:
+        """Each lane has its own model, and its own bound where there is more than one."""
+        return ("model", "bound") if self.bound is not None and jnp.ndim(self.bound) else ("model",)
 
     def describe(self) -> dict[str, Any]:
         """Return the guidance, its sizes (None: not known) and scalars, its bound, and the base, as JSON values."""
-        scalars = plain_part(Scalars, self.scalars)
+        scalars = _plain_part(Scalars, self.scalars)
         space = self.guidance.spaces.actions
         bound = space.reach if self.bound is None else float(space.to_unit(np.max(self.bound), np))
         return {
             "policy": "guided",
             "guidance": self.guidance.name,
-            "sizes": None if self.sizes is None else plain_part(GuideSizes, self.sizes),
+            "sizes": None if self.sizes is None else _plain_part(GuideSizes, self.sizes),
             "options": kind_to_json(self.guidance.options),
             "scalars": scalars,
             "bounded": self.bound is not None,
@@ -208,13 +297,8 @@ class Corrected(PolicyNode):
             k_max=self.scalars.k_max,
         ).actions
 
-    @property
-    def axes(self) -> Corrected:
-        """Lane axes: each lane has its own base; all lanes share the teacher."""
-        return self.replace(base=self.base.axes, teacher=SHARED, scalars=SHARED)
 
-
-def plain_part(kind: type, values: Any) -> dict[str, Any]:
+def _plain_part(kind: type, values: Any) -> dict[str, Any]:
     """Return a configuration class's fields, read from an instance of this or another class."""
     plain = lambda value: value.item() if hasattr(value, "item") else value  # noqa: E731
     names = [field.name for field in dataclasses.fields(kind) if hasattr(values, field.name)]
@@ -222,28 +306,8 @@ def plain_part(kind: type, values: Any) -> dict[str, Any]:
     return {name: value for name, value in to_json(kind(**own)).items() if name in own}
 
 
-class Teaching(struct.PyTreeNode):
-    """A policy as a teacher (`types.Teacher`), which shows what the policy does."""
-
-    policy: Any
-
-    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """Return the policy's action; a random policy always draws the same."""
-        states = jax.tree.map(lambda leaf: leaf[None], state)
-        return self.policy.act(jax.random.key(0), states, obs[None])[0]
-
-
-def teaching(given: Any, space: Space) -> Teacher:
-    """Return a teacher as given, or the teacher that shows what a given policy does (`policy_of`)."""
-    if callable(getattr(given, "best_action", None)) and not isinstance(given, type | Teaching):
-        return given
-    return Teaching(policy_of(given.policy if isinstance(given, Teaching) else given, space))
-
-
 def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-    """Return a teacher's actions in n situations, a few at a time: a searching teacher simulates hundreds of actions
-    each.
-    """
+    """Return a teacher's actions in n situations, a few at a time: a searching teacher simulates hundreds for each."""
     ask = lambda pair: teacher.best_action(*pair)  # noqa: E731
     return jax.lax.map(ask, (states, obs), batch_size=min(len(obs), portions().states))
 
