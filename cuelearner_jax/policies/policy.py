@@ -47,11 +47,10 @@ class PolicyNode(struct.PyTreeNode):
 
     def describe(self) -> dict[str, Any]:
         """Return JSON values: the policy's kind under `policy`, and under `base` the policy that it changes."""
+        asks, base = {"asks": True} if self.ASKS else {}, getattr(self, "base", None)
         if not self.KIND:
-            return described_code(self)
-        base = getattr(self, "base", None)
-        asks, below = {"asks": True} if self.ASKS else {}, {} if base is None else {"base": describe(base)}
-        return {"policy": self.KIND, **asks, **below}
+            return described_code(self) | asks
+        return {"policy": self.KIND, **asks, **({} if base is None else {"base": describe(base)})}
 
     def lane(self, index: int | ArrayLike) -> Any:
         """Return one lane's policy of a block; with several indices (lanes,), a block of these lanes."""

@@ -202,7 +202,8 @@ def policy_of(given: Any, space: Space | None = None) -> Any:
         )
     if space is None or not isinstance(policy, Opaque):
         return policy
-    own, wanted = action_words(getattr(function and function.given, "action_space", None)), action_words(space)
+    model = getattr(policy.function, "given", None)
+    own, wanted = action_words(getattr(model, "action_space", None)), action_words(space)
     if own and wanted and own != wanted:
         raise UserError(
             f"{policy_name(policy)} gives actions {own}, this world takes actions {wanted}: give a world with the "
