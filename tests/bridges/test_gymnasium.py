@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium_worlds import Adder, Faulty, Forgetful, Nested, start_of
 
 import cuelearner_jax as cl
@@ -168,9 +169,7 @@ def test_nested_observations_are_named_and_flattened_in_the_order_of_their_space
     state, obs = here.reset(KEYS[0])
     arm, lights, modes, wheels = [0.1, 0.2, 0.3, 0.4], [1, 0], [0, 1, 0, 0, 1], [0.5, -0.5]
     np.testing.assert_array_equal(obs, np.float32([*arm, *lights, *modes, *wheels, 1, 0, 0]))
-    np.testing.assert_array_equal(
-        obs, gymnasium.spaces.flatten(Nested.observation_space, Nested().reset()[0]).astype(np.float32)
-    )
+    np.testing.assert_array_equal(obs, spaces.flatten(Nested.observation_space, Nested().reset()[0]).astype(np.float32))
     _, steps = walk(here, np.eye(3), state)
     assert rows(steps, "reward").tolist() == [5, 6, 7]
     np.testing.assert_array_equal(rows(steps, "final_obs")[:, -3:], np.eye(3))
@@ -183,17 +182,18 @@ class Odd(gymnasium.Env):
         self.observation_space, self.action_space = seen, does
 
 
-REAL = gymnasium.spaces.Box(-1, 1, (2,))
-IMAGE = gymnasium.spaces.Box(0, 255, (32, 32, 3), np.uint8)
+REAL = spaces.Box(-1, 1, (2,))
+IMAGE = spaces.Box(0, 255, (32, 32, 3), np.uint8)
+BOX = spaces.Box(-1, 1, (1,), np.float32)
 
 
 @pytest.mark.parametrize(
     ("seen", "does", "told"),
     [
         (IMAGE, REAL, r"'observation' is an image of shape \(32, 32, 3\): give one with observations of numbers"),
-        (gymnasium.spaces.Text(4), REAL, "is a Text: give one of Box, Discrete"),
-        (REAL, gymnasium.spaces.MultiBinary(3), "its actions are a MultiBinary: wrap the environment"),
-        (REAL, gymnasium.spaces.Discrete(1), "there is only one action"),
+        (spaces.Text(4), REAL, "is a Text: give one of Box, Discrete"),
+        (REAL, spaces.MultiBinary(3), "its actions are a MultiBinary: wrap the environment"),
+        (REAL, spaces.Discrete(1), "there is only one action"),
     ],
 )
 def test_spaces_that_are_not_served_are_told_in_one_line(seen, does, told):
@@ -261,3 +261,82 @@ def test_without_gymnasium_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr(source, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"Gymnasium is not installed: pip install 'cuelearner-jax\[gymnasium\]'"):
         cl.from_gymnasium("CartPole-v1")
+
+
+# --- environments as people have them: late or odd success, odd bounds, ids of their own -----------------------------
+
+
+class World(gymnasium.Env):
+    """One step an episode by default; `action_space` and `info` are what a test is about."""
+
+    observation_space = spaces.Box(-2, 2, (1,), np.float32)
+
+    def __init__(self, actions=BOX, info=None, length=1):
+        self.action_space, self.info, self.length, self.steps = actions, info or {}, length, 0
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        end = self.steps == self.length
+        return np.zeros(1, np.float32), float(np.sum(action)), end, False, self.info if end else {}
+
+    def close(self):
+        raise AttributeError("no viewer")  # forgiven
+
+
+def short(**about):
+    return world(lambda: World(**about), max_steps=200, num_envs=1)
+
+
+def measured(of, policy=lambda obs: 0 * obs):
+    return {name: float(value[0]) for name, value in cl.measure(policy, of, episodes=1).metrics.items()}
+
+
+@pytest.mark.parametrize(
+    ("info", "length", "success"),
+    [
+        ({"is_success": True}, 150, 1),
+        ({"succeed": True}, 1, 1),
+        ({"success": np.array([True])}, 1, 1),
+        ({"success": None}, 1, None),
+    ],
+)
+def test_success_is_read_whenever_and_however_it_is_told(info, length, success):
+    assert measured(short(info=info, length=length)).get("success") == success
+
+
+def test_what_is_neither_success_nor_a_choice_is_refused():
+    for value in (float("nan"), "yes"):
+        with pytest.raises(UserError, match="success"):
+            short(info={"success": value})
+    with pytest.raises(UserError, match="chose -1: give the number of a choice, 0 to 2"):
+        measured(short(actions=spaces.Discrete(3, start=-1)), lambda obs: np.full(len(obs), -1))
+
+
+def test_choices_count_from_the_start_of_the_space_and_integers_are_rounded():
+    assert measured(short(actions=spaces.Discrete(3, start=-1)), lambda obs: np.zeros(len(obs), int))["return"] == -1
+    whole = short(actions=spaces.Box(0, 9, (1,), np.int64))
+    assert measured(whole, lambda obs: 0 * obs + 2.7)["return"] == 3
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: World(spaces.Box(np.array([-1, 0]), np.array([1, 0]), dtype=np.float64)), "entry 2 .* only be 0"),
+        (lambda: World(spaces.Box(-3.4e38, 3.4e38, (1,), np.float32)), "entry 1 .* no bounds"),
+        (lambda: gymnasium.make_vec("Pendulum-v1", num_envs=3), "a vector of 3"),
+        (lambda: gymnasium.wrappers.NormalizeObservation(gymnasium.make("Pendulum-v1")), "does not repeat itself"),
+    ],
+)
+def test_what_is_no_environment_is_told_in_one_line(make, words):
+    with pytest.raises(UserError, match=words):
+        cl.from_gymnasium(make, num_envs=1, processes=1)
+
+
+def test_an_id_of_the_callers_own_is_played_in_other_processes():
+    gymnasium.register(id="doors/World-v0", entry_point=World, max_episode_steps=5)
+    found = cl.measure(lambda obs: obs, cl.from_gymnasium("doors/World-v0", num_envs=2, processes=2), episodes=2)
+    assert found.metrics["finished"][0] == 1

@@ -116,20 +116,6 @@ def test_pictures_are_of_the_state_that_is_shown(tmp_path):
     assert not is_alive(drawn)
 
 
-def test_an_environment_without_pictures_is_told():
-    world = cl.from_gymnasium(Blank, max_steps=6, processes=1)
-    state, _ = world.reset(KEY)
-    with pytest.raises(UserError, match=r"gives no pictures: let it take render_mode='rgb_array'"):
-        world.task.pictures().sketch(world.env, state)
-
-
-class Blank(Adder):
-    """Draws nothing."""
-
-    def render(self):
-        return None
-
-
 def test_fetch_reach_is_what_plain_gymnasium_plays():
     world = cl.from_gymnasium("FetchReach-v4", num_envs=2, processes=2)
     assert world.config.max_steps == 50
