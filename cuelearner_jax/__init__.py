@@ -24,7 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
     from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt, agreement, correct
-    from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
+    from cuelearner_jax.api.labels import Labels
     from cuelearner_jax.api.policies import (
         CallablePolicy,
         export_correction,
@@ -47,8 +47,7 @@ _PLACES = {
     "AdaptedPolicy": "api.adaptation",
     "CallablePolicy": "api.policies",
     "Distortion": "reading",
-    "FeedbackModel": "api.feedback",
-    "Labels": "api.feedback",
+    "Labels": "api.labels",
     "Run": "api.training",
     "UNSAID": "spaces",
     "Unknown": "reading",
@@ -56,17 +55,14 @@ _PLACES = {
     "World": "api.worlds",
     "adapt": "api.adaptation",
     "agreement": "api.adaptation",
-    "ask": "api.feedback",
     "correct": "api.adaptation",
     "export_correction": "api.policies",
     "export_policy": "api.policies",
-    "fit_feedback": "api.feedback",
     "from_gymnasium": "api.worlds",
     "load_exported": "api.policies",
     "load_policy": "api.policies",
     "make": "api.worlds",
     "measure": "api.policies",
-    "refine": "api.feedback",
     "teacher_of": "api.worlds",
     "train": "api.training",
 }
@@ -76,7 +72,6 @@ __all__ = [
     "AdaptedPolicy",
     "CallablePolicy",
     "Distortion",
-    "FeedbackModel",
     "Labels",
     "Run",
     "Unknown",
@@ -84,17 +79,14 @@ __all__ = [
     "World",
     "adapt",
     "agreement",
-    "ask",
     "correct",
     "export_correction",
     "export_policy",
-    "fit_feedback",
     "from_gymnasium",
     "load_exported",
     "load_policy",
     "make",
     "measure",
-    "refine",
     "teacher_of",
     "train",
 ]

@@ -212,10 +212,11 @@ def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
     if form is None or not form.by_eps:
         told = form.name if form else "no"
         raise UserError(f"{told} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
-    if int(np.asarray(block.guide.labels.valid).sum(-1).min()) < HELD_OUT:
+    failed = np.asarray(block.failed)
+    if np.asarray(block.guide.labels.valid).sum(-1)[~failed].min(initial=HELD_OUT) < HELD_OUT:
         raise UserError(f"fewer than {HELD_OUT} labels cannot judge a model: give more, or --judge-by a metric")
     zero, right = jax.device_get(_predicted(of, block))
-    used = ~np.asarray(block.failed) & (right >= zero)
+    used = ~failed & (right >= zero)
     unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
     return Judgement(LABELS, zero, right, used, bounds_of(of, block), unknown, none)
 

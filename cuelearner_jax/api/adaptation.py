@@ -21,7 +21,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.adaptation.lanes import blame
-from cuelearner_jax.api.feedback import Labels, LabelSet, divergence_error, labels_from_file, labels_of, rows_of
+from cuelearner_jax.api.labels import Labels, LabelSet, labels_from_file, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, config_of, load_policy
 from cuelearner_jax.api.worlds import World, numbers, teacher_of_world
 from cuelearner_jax.config import GuideSizes, Scalars, from_json, normalize_options
@@ -188,7 +188,7 @@ def adapt(
     result = outcome.found
     if result.failed.any():
         blame(result.of, teacher, result.block)
-        raise divergence_error()
+        raise UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")
     if not result.judged.used.all():
         warnings.warn(result.words[-1], stacklevel=3)
     inner, observation = result.policy(env).lane(0), getattr(env, "observation", ())

@@ -10,7 +10,7 @@ from typing import Any
 
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.api.adaptation import world_of
-from cuelearner_jax.api.feedback import labels_from_file
+from cuelearner_jax.api.labels import labels_from_file
 from cuelearner_jax.cli.options import Finished, Flag, Kinds, about, look_ahead_of, out, parse
 from cuelearner_jax.cli.sources import code_of, is_code, source_of
 from cuelearner_jax.errors import NotFinite, UserError

@@ -1,0 +1,81 @@
+"""Relative labels as arrays, and as the rows that a fit takes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from cuelearner_jax.api.worlds import numbers
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback import external_labels
+from cuelearner_jax.feedback.answers import RELATIVE
+from cuelearner_jax.spaces import Space, says_something
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.types import Label
+
+
+class Labels(NamedTuple):
+    """Labels as arrays: observations, the actions asked about, and the answers."""
+
+    obs: Float[np.ndarray, "labels obs"]
+    action: Float[np.ndarray, "labels action"]  # directions: unit vectors
+    # h: of directions +1 counterclockwise ("more to the left"), 0 already right, -1 clockwise; (labels, cues) where a
+    # space has several cues, `spaces.UNSAID` for a cue of which nothing was said
+    answer: Float[np.ndarray, "labels *cues"]
+
+
+class LabelSet(NamedTuple):
+    """Relative labels with what their file says of them."""
+
+    rows: Label
+    space: Space
+    eps: float | None = None  # strength of an answer in the space's unit; None: not known
+    task: dict[str, Any] = {}  # noqa: RUF012  # name and configuration of the labels' task; empty: not known
+
+    def strength(self, eps: float | None) -> float | None:
+        """Return the strength of the answers. Raises UserError for one that differs from the file's."""
+        if self.eps is None or eps is None:
+            return self.eps if eps is None else eps
+        if not math.isclose(eps, self.eps, rel_tol=1e-6):
+            raise UserError(f"the label file holds answers of {self.eps:g} {self.space.unit}: leave out eps")
+        return self.eps
+
+
+def labels_of(rows: Label) -> Labels:
+    """Return a lane's valid labels as arrays."""
+    given = jax.device_get(rows)
+    obs, action, answer = (np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer))
+    return Labels(obs, action, answer[:, 0] if answer.shape[1] == 1 else answer)
+
+
+def rows_of(labels: Labels) -> Label:
+    """Return labels as rows (labels, ...) of finite floats, without those that say nothing of any cue.
+
+    Raises UserError unless they are three arrays of one length.
+    """
+    obs, action, answer = (numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True))
+    if obs.ndim != 2 or not obs.size or action.shape[:1] != (len(obs),) or answer.shape[:1] != (len(obs),):
+        raise UserError(
+            f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "
+            "actions (n, action) and answers (n,), or (n, cues) where there are several"
+        )
+    answer = answer[:, None] if answer.ndim == 1 else answer
+    said = np.asarray(says_something(answer))
+    if not said.any():
+        raise UserError("labels say nothing of any cue: give labels with answers")
+    return Label(obs[said], action[said], answer[said], np.ones(said.sum(), bool))  # pyright: ignore[reportArgumentType]
+
+
+def labels_from_file(path: Path) -> LabelSet:
+    """Return the labels of a file's first seed. Raises UserError for a file of other answers."""
+    file = label_files.read(path)
+    if file.answers != RELATIVE.name:
+        raise UserError(f"{path} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
+    external_labels.check_file(file, None, RELATIVE, str(path))
+    own = file.seeds == file.seeds[0]
+    return LabelSet(jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels), file.space, file.eps, file.task)
