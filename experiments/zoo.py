@@ -59,8 +59,8 @@ class Asked(NamedTuple):
     labels: Labels
     plain: Hypothesis
     smooth: Hypothesis
-    fit: Fit  # the best hypothesis
-    nothing: Fit
+    fits: Fit  # all hypotheses
+    fit: Fit  # the best of them
     evidence: jax.Array  # log of the test martingale [nats]
 
 
@@ -113,18 +113,16 @@ def ask(
     say = lambda key, state, action: zoo.answer(key, world, state, action, reader.eps, wrong, one_cue)  # noqa: E731
     answer = jax.vmap(say)(jax.random.split(k_answer, count), states, from_even(robot, action))
     new = Labels(obs, action, answer, jnp.ones(count, bool))
-    ratio = reader.predict(state.fit, new)[2].sum() - reader.predict(state.nothing, new)[2].sum()
     at = number * count + jnp.arange(count)
     labels = Labels(*(leaf.at[at].set(part) for leaf, part in zip(state.labels, new, strict=True)))
-    return labels, state.evidence + jnp.where(begun, ratio, 0.0)
+    return labels, state.evidence + jnp.where(begun, reader.ratio(state.fits, new), 0.0)
 
 
 def read(world: Any, labels: Labels, evidence: jax.Array, plain: Hypothesis, smooth: Hypothesis) -> Asked:
     """Read all labels so far; start from the hypotheses of the fit before."""
     fits = reader_of(world.robot).read(labels, plain, smooth)
-    best, nothing = fitting.pick(fits, fitting.best_of(fits)), fitting.pick(fits, 0)
     plain, smooth = fitting.again(fits)
-    return Asked(labels, plain, smooth, best, nothing, evidence)
+    return Asked(labels, plain, smooth, fits, fitting.pick(fits, fitting.best_of(fits)), evidence)
 
 
 def begun(world: Any, labels: int) -> Asked:
@@ -135,9 +133,9 @@ def begun(world: Any, labels: int) -> Asked:
         jnp.zeros((labels, size)), jnp.zeros((labels, n)), jnp.zeros((labels, robot.cues)), jnp.zeros(labels, bool)
     )
     plain, smooth = fitting.unfitted(space_of(robot), (), size)
-    shapes = jax.eval_shape(lambda: fitting.pick(reader_of(robot).read(blank, plain, smooth), 0))
-    fit = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return Asked(blank, plain, smooth, fit, fit, jnp.zeros(()))
+    shapes = jax.eval_shape(lambda: reader_of(robot).read(blank, plain, smooth))
+    fits = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    return Asked(blank, plain, smooth, fits, fitting.pick(fits, 0), jnp.zeros(()))
 
 
 def played(world: Any, before: Any, after: Any) -> dict[str, jax.Array]:

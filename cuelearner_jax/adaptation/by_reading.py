@@ -195,7 +195,7 @@ def _padded(sets: list[Label]) -> Label:
 
 def to_json(results: tuple[Result, ...]) -> list[dict[str, Any]]:
     """Return the results as JSON values, without their policies."""
-    kept = ("used", "changed", "evidence", "depends", "wrong")
+    kept = ("used", "changed", "evidence", "depends", "near", "wrong")
     return [
         {name: getattr(one, name) for name in kept} | {"estimates": [estimate._asdict() for estimate in one.estimates]}
         for one in results

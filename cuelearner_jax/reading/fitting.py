@@ -20,7 +20,7 @@ from cuelearner_jax.devices import each_lane
 from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.correction import Correction, corrected, correction_of
 from cuelearner_jax.reading.families import Family
-from cuelearner_jax.reading.likelihood import curvature, predictive_log_likelihood
+from cuelearner_jax.reading.likelihood import Habits, curvature, log_likelihood, predictive_log_likelihood
 from cuelearner_jax.reading.linear import PARTS, SCALE, Change, Frame, Labels
 from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, Parts, Posterior, Priors
 from cuelearner_jax.spaces import Space
@@ -36,7 +36,10 @@ HYPOTHESES: tuple[tuple[str, ...], ...] = (
     ("seen", "shift", "gain"),
     ("seen", "mixed", "shift", "gain"),
 )
+ENTRIES = 3  # largest number of unknowns that a fit starts from
+TRIED = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)  # shifts of an unknown that are tried, in its steps
 WITH_PROCESS = 2  # hypotheses that are tried with the process: the first and the best
+EVEN = 0.2  # share of predictions that is the same for all hypotheses
 WORTH = 3.0  # nats by which a hypothesis must predict better than "nothing changed": a factor of 20
 # Logarithm of the width that a fit starts from: answers about actions far from the right one then still say which way
 # it lies, where a narrow width would take them for answers about something else.
@@ -114,6 +117,7 @@ class Reader:
     def read(self, labels: Labels, plain: Hypothesis, smooth: Hypothesis) -> Fit:
         """Return all hypotheses fitted to labels, stacked in the order of `HYPOTHESES`, those with the process last."""
         frame, steady = self._frame(labels)
+        plain = self._start(frame, labels, plain)
         labels = labels._replace(valid=labels.valid & steady)
         first = self._fit(frame, labels, plain)
         second = self._fit(frame, labels, _first_and_best(first, smooth))
@@ -133,6 +137,30 @@ class Reader:
             mixed = linear.influence(self.space, frame, labels, actions)
             frame = linear.frame_of((), labels, None, mixed)
         return frame, steady
+
+    def _start(self, frame: Frame, labels: Labels, plain: Hypothesis) -> Hypothesis:
+        """Return where fits start: where they were, or at shifts of few entries that explain the answers much better.
+
+        Slopes lead to the nearest optimum alone, and near its goal a policy may turn by any angle. So shifts of one
+        entry after another are tried on the policy itself.
+        """
+        nothing = linear.no_change(self.space, self.family, labels.obs.shape[-1])
+        moves, theta = _moves(self.family, frame), nothing.theta
+        for _ in range(ENTRIES):
+            tried = jax.vmap(lambda theta: nothing.replace(theta=theta))(theta + moves)
+            worth = self._worth(labels, tried) - WORTH * (jnp.arange(len(moves)) > 0)
+            theta = tried.theta[jnp.argmax(worth)]
+        change = nothing.replace(theta=theta)
+        both = jax.tree.map(lambda own, other: jnp.concatenate([own, other[None]]), plain.change, change)
+        worth = self._worth(labels, both)
+        better = (worth[-1] > worth[:-1] + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
+        chosen = lambda own, other: jnp.where(better.reshape(-1, *[1] * other.ndim), other[None], own)  # noqa: E731
+        return Hypothesis(plain.parts, jax.tree.map(chosen, plain.change, change), plain.hyper)
+
+    def _worth(self, labels: Labels, changes: Change) -> Float[Array, " k"]:
+        """Return the log likelihood of labels by each of stacked estimates, without the process."""
+        before = _undone_each(self.family, changes, labels.obs)
+        return _worth(self.space, self.family, changes, labels, before, self._ask(before), self.eps)
 
     def _fit(self, frame: Frame, labels: Labels, hypothesis: Hypothesis) -> Fit:
         """Return stacked hypotheses fitted to labels."""
@@ -167,6 +195,11 @@ class Reader:
         own = self.act(fitted, labels.obs)
         rest = (labels, asked, self._ask(asked), own, self.eps, self.priors)
         return _predicted(self.space, self.family, fitted, *rest)
+
+    def ratio(self, fits: Fit, labels: Labels) -> Float[Array, ""]:
+        """Return log p(answers | all hypotheses by their shares) less log p(answers | nothing changed)."""
+        each = [self.predict(pick(fits, number), labels)[2].sum() for number in range(len(fits.score))]
+        return jax.nn.logsumexp(jnp.nan_to_num(jnp.stack(each), nan=-jnp.inf) + shares(fits)) - each[0]
 
     def spread(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n cues"]:
         """Return the standard deviation of the right action along each cue, in the unit of `space.log`."""
@@ -205,6 +238,13 @@ def best_of(fitted: Fit) -> Array:
 
 
 @jax.jit
+def shares(fitted: Fit) -> Float[Array, " hypotheses"]:
+    """Return the logarithm of the share of each hypothesis in predictions: by its score, and a little of each."""
+    by_score = jax.nn.log_softmax(jnp.nan_to_num(fitted.score, nan=-jnp.inf))
+    return jnp.logaddexp(jnp.log1p(-EVEN) + by_score, jnp.log(EVEN / len(by_score)))
+
+
+@jax.jit
 def pick(fitted: Fit, number: Any) -> Fit:
     """Return one of stacked fits."""
     return jax.tree.map(lambda leaf: leaf[number], fitted)
@@ -235,6 +275,35 @@ def _predicted(
     mean = space.log(labels.action, own) / (SCALE * eps)
     habits = posterior.habits(found.hyper, 1 / SCALE, priors)
     return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, habits)
+
+
+def _moves(family: Family, frame: Frame) -> Float[Array, "k unknowns"]:
+    """Return no shift, and shifts of each unknown alone: of a family, or of the entries that matter most."""
+    size = len(frame.step)
+    entries = jnp.arange(size) if family else frame.mixed
+    each = jnp.eye(size)[entries] * frame.step[None]
+    several = (jnp.array(TRIED)[:, None, None] * each[None]).reshape(-1, size)
+    return jnp.concatenate([jnp.zeros((1, size)), several])
+
+
+@partial(jax.jit, static_argnames="family")
+def _undone_each(family: Family, changes: Change, obs: Array) -> Array:
+    return jax.vmap(lambda change: linear.undone(family, change, obs))(changes)
+
+
+@partial(jax.jit, static_argnames=("space", "family"))
+def _worth(
+    space: Space, family: Family, changes: Change, labels: Labels, before: Array, actions: Array, eps: Any
+) -> Array:
+    answers = linear.answers_of(space, labels, eps)
+    usual = Habits(jnp.float32(PRIORS.tau / SCALE), jnp.float32(1 / SCALE), jnp.float32(0.1))
+
+    def one(change: Change, before: Array, action: Array) -> Array:
+        base = linear.meant(family, change.theta, before, action)
+        own = space.exp(base, SCALE * eps * (linear.basis(space, base) @ change.action.T))
+        return log_likelihood(space.log(labels.action, own) / (SCALE * eps), answers, usual).sum()
+
+    return jax.vmap(one)(changes, before, actions)
 
 
 @partial(jax.jit, static_argnames="family")

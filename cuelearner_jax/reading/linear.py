@@ -19,9 +19,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_jax.reading.families import Family, undo_action, undo_observation, undo_physics, unknowns_of
-from cuelearner_jax.reading.likelihood import intervals
+from cuelearner_jax.reading.likelihood import Answers, intervals
 from cuelearner_jax.reading.posterior import PRIORS, Data
-from cuelearner_jax.spaces import Space
+from cuelearner_jax.spaces import DIRECTIONS, Space
 
 SCALE = 3.0  # unit of changes of an action, in eps: the size of a usual correction
 STEP = 0.35  # of the central differences of an entry, in its standard deviations
@@ -66,15 +66,15 @@ def unknowns(family: Family, obs_size: int) -> int:
 
 def no_change(space: Space, family: Family, obs_size: int) -> Change:
     """Return the estimate that changes nothing."""
-    zeros, basis_size = jnp.zeros(obs_size), 1 + space.size
+    zeros = jnp.zeros(obs_size)
     mix = jnp.zeros((obs_size, obs_size)) if not family else jnp.zeros((0, 0))
-    return Change(jnp.zeros(unknowns(family, obs_size)), mix, zeros, jnp.zeros((len(space.cues), basis_size)))
+    return Change(jnp.zeros(unknowns(family, obs_size)), mix, zeros, jnp.zeros((len(space.cues), basis_size(space))))
 
 
 def groups(space: Space, family: Family, obs_size: int) -> tuple[int, ...]:
     """Return the number in `PARTS` of each weight, in the order of `weights_of`."""
     mixed = 0 if family else min(MIXED, obs_size) ** 2
-    own = tuple(3 if term else 2 for term in terms(len(space.cues), 1 + space.size)[1].tolist())
+    own = tuple(3 if term else 2 for term in terms(len(space.cues), basis_size(space))[1].tolist())
     return (0,) * unknowns(family, obs_size) + (1,) * mixed + own
 
 
@@ -101,16 +101,21 @@ def meant(
     return jax.vmap(partial(undo_action, family, theta))(action)
 
 
+def basis_size(space: Space) -> int:
+    """Return the number of terms of `basis`."""
+    return 5 if space == DIRECTIONS else 1 + space.size
+
+
 def basis(space: Space, action: Float[Array, "n action"]) -> Float[Array, "n basis"]:
-    """Return 1 and the entries of actions, of the order of one."""
-    return jnp.concatenate([jnp.ones((len(action), 1)), space.even(action)], 1)
+    """Return 1 and the entries of actions, of the order of one; of directions also the second harmonics.
 
-
-def apply(
-    space: Space, change: Change, action: Float[Array, "n action"], more: Float[Array, "n cues"], eps: Float[Array, ""]
-) -> Float[Array, "n action"]:
-    """Return actions with beta and `more` (in units of `SCALE` eps) applied."""
-    return space.exp(action, SCALE * eps * (basis(space, action) @ change.action.T + more))
+    A drift of the executed motion turns directions by a first harmonic, another gain along one axis by a second.
+    """
+    even = space.even(action)
+    if space == DIRECTIONS:
+        x, y = even[:, :1], even[:, 1:]
+        even = jnp.concatenate([even, x**2 - y**2, 2 * x * y], 1)
+    return jnp.concatenate([jnp.ones((len(action), 1)), even], 1)
 
 
 def frame_of(
@@ -202,11 +207,13 @@ def data(
     x = features(space, frame, slope, labels.obs, base)
     cut = size + len(frame.mixed) ** 2
     offset = space.log(labels.action, base) / scale - x[:, :, :cut] @ weights_of(frame, change)[:cut]
-    below, above = space.room(labels.action)
-    answers = intervals(labels.answer, labels.valid, below, above, PRIORS.tau * eps)
-    return Data(
-        offset, x, inputs(space, frame, labels.obs, actions[0]), answers, groups(space, family, len(frame.mean))
-    )
+    seen = inputs(space, frame, labels.obs, actions[0])
+    return Data(offset, x, seen, answers_of(space, labels, eps), groups(space, family, len(frame.mean)))
+
+
+def answers_of(space: Space, labels: Labels, eps: Float[Array, ""]) -> Answers:
+    """Return the interval that each answer names."""
+    return intervals(labels.answer, labels.valid, *space.room(labels.action), PRIORS.tau * eps)
 
 
 def features(
@@ -216,7 +223,7 @@ def features(
     n, cues, _ = slope.shape
     z = ((obs - frame.mean[None]) / frame.deviation[None])[:, frame.mixed]
     mixed = (-slope[:, :, frame.mixed, None] * z[:, None, None, :]).reshape(n, cues, len(frame.mixed) ** 2)
-    cue, term = terms(cues, 1 + space.size)
+    cue, term = terms(cues, basis_size(space))
     own = jnp.eye(cues)[:, cue][None] * basis(space, base)[:, None, term]
     return jnp.concatenate([slope, mixed, own], 2)
 

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -22,6 +23,8 @@ from cuelearner_jax.spaces import Box, Space
 Floats = np.ndarray
 NORMAL = 1.96  # half width of a 95% interval, in standard deviations
 ALIKE = 0.98  # correlation of the effects of two entries that the policy cannot tell apart
+ALIKE_SITUATION = 0.5  # correlation of the process from which a situation is near a labelled one
+HARMONICS = ("cos of", "sin of", "cos of twice", "sin of twice")
 SMALL = 0.25  # effect on actions from which an estimate is told, in eps
 PER_CENT = 100.0
 
@@ -48,6 +51,7 @@ class Result(NamedTuple):
     evidence: float  # log of the product of p(answers | corrected) / p(answers | as it was), each predicted [nats]
     estimates: tuple[Estimate, ...]
     depends: float  # typical correction that depends on the situation, in the space's unit; 0: none
+    near: float | None  # share of the situations met that are like labelled ones, which corrections may depend on
     wrong: float  # share of answers about something else
     policy: Any  # the corrected policy
 
@@ -57,21 +61,23 @@ class Result(NamedTuple):
             return ["The answers ask for no change."]
         lines = [one.words() for one in self.estimates]
         if self.depends:
-            lines.append(f"beyond that, corrections depend on the situation: {self.depends:.3g} typically")
+            near = f", near labels, where {self.near:.0%} of the situations met lie" if self.near is not None else ""
+            lines.append(f"beyond that, corrections depend on the situation: {self.depends:.3g} typically{near}")
         if self.wrong > 0.1:
             lines.append(f"{self.wrong:.0%} of the answers seem to be about something else")
         return lines
 
 
 def describe_fit(
-    fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity]
-) -> tuple[tuple[Estimate, ...], float, float]:
-    """Return the estimates that matter, the typical correction that depends on the situation, and the wrong share.
+    fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity], met: Float[Floats, "m z"]
+) -> tuple[tuple[Estimate, ...], float, float | None, float]:
+    """Return the entries of `Result` from `estimates` to `wrong`.
 
     Args:
         fitted: one hypothesis.
         space, family, eps: as for `Reading`; eps in the unit of `space.log`.
         observation: slices of the observation; empty: entries have numbers alone.
+        met: situations that the policy met, as `linear.inputs` has them.
     """
     weights = np.asarray(linear.weights_of(fitted.frame, fitted.hypothesis.change), np.float64)
     root = np.asarray(fitted.posterior.root, np.float64) * np.asarray(fitted.hypothesis.parts.weights)[:, None]
@@ -90,8 +96,10 @@ def describe_fit(
     more = np.asarray(posterior.process(fitted.posterior, inputs, inputs, priors))[valid]
     depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
     depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
+    alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(met), inputs[valid])
+    near = float((alike.max(1) >= ALIKE_SITUATION).mean()) if len(met) else None
     wrong = float(posterior.habits(hyper, 1 / SCALE, priors).lapse)
-    return tuple(estimates), depends, wrong
+    return tuple(estimates), depends, near, wrong
 
 
 def _names(family: Family, count: int, observation: Sequence[Quantity]) -> list[tuple[str, str]]:
@@ -146,7 +154,7 @@ def _of_action(
 ) -> list[Estimate]:
     """Return changes of the action: the shift of each cue, and of a box the share of each entry in it."""
     estimates, typical = [], np.sqrt((effect**2).mean(0))
-    numbers = linear.terms(len(space.cues), 1 + space.size).T
+    numbers = linear.terms(len(space.cues), linear.basis_size(space)).T
     for (cue, term), value, row, size in zip(numbers, mean, root, typical, strict=True):
         deviation = float(np.linalg.norm(row))
         if not _matters(value, deviation, float(size)):
@@ -157,7 +165,7 @@ def _of_action(
             factor, unit, start = 2 * SCALE * eps * PER_CENT, "percent", PER_CENT if term - 1 == cue else 0.0
             name += ": gain" if term - 1 == cue else f": share of {space.cues[term - 1].name}"
         elif term:
-            name += f", with entry {term} of the action"
+            name += f", times {HARMONICS[term - 1]} the action's angle"
         ends = (start + factor * (value - NORMAL * deviation), start + factor * (value + NORMAL * deviation))
         estimates.append(Estimate(name, unit, start + factor * value, *ends))
     return estimates

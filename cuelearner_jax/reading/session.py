@@ -4,9 +4,9 @@
     reading.learn(obs, actions, answers)    # as often as there are new ones
     reading.policy(), reading.result()
 
-Before a batch of answers is read, the correction so far and "nothing changed" predict it. The product of the ratios of
-the two is a test martingale: where nothing changed it exceeds 20 with probability 1/20 at most, however often one looks
-(Ville's inequality). From 20 on the correction is used.
+Before a batch of answers is read, all hypotheses so far, each by its share, and "nothing changed" predict it. The
+product of the ratios of the two is a test martingale: where nothing changed it exceeds 20 with probability 1/20 at
+most, however often one looks (Ville's inequality). From 20 on the correction is used.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_name, policy_of
-from cuelearner_jax.reading import fitting
+from cuelearner_jax.reading import fitting, linear
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.fitting import Fit, Reader
 from cuelearner_jax.reading.linear import Labels
@@ -37,6 +37,7 @@ from cuelearner_jax.spaces import Space
 BATCHES = 5  # in which a budget of labels is asked or read
 LEAST_BATCH = 10
 USED = math.log(20)  # log of the test martingale from which a correction is used
+MET = 200  # situations met that are kept
 FIRST = 3.0  # spread of the first questions about the policy's actions, in eps
 
 
@@ -73,6 +74,7 @@ class Reading:
         self.fits: Fit | None = None  # all hypotheses
         self.fit: Fit | None = None  # the best of them
         self.evidence = 0.0  # log of the test martingale [nats]
+        self.met = np.zeros((0, 0), np.float32)  # situations that the policy met last
         self._acts = acts_of(self.base)
         self._reader: Reader | None = None
 
@@ -95,6 +97,7 @@ class Reading:
             Numbers of the situations (count,), and actions (count, action).
         """
         k_where, k_action = jax.random.split(key)
+        self.met = np.concatenate([self.met.reshape(-1, obs.shape[1]), obs])[-MET:]
         index = np.asarray(jax.random.choice(k_where, len(obs), (count,), replace=len(obs) < count))
         rows = jnp.asarray(np.asarray(obs)[index], jnp.float32)
         if self.fit is None or self._reader is None:
@@ -114,11 +117,8 @@ class Reading:
         if not len(new[0]):
             return
         reader = self._reader_of(new[0])
-        if self.fits is not None and self.fit is not None:
-            rows = _padded(new, self._batch(len(new[0])))
-            nothing, best = fitting.pick(self.fits, 0), self.fit
-            ratio = [float(jnp.sum(reader.predict(one, rows)[2])) for one in (best, nothing)]
-            self.evidence += ratio[0] - ratio[1]
+        if self.fits is not None:
+            self.evidence += float(reader.ratio(self.fits, _padded(new, self._batch(len(new[0])))))
         if self.rows is not None:
             new = [np.concatenate(both) for both in zip(self.rows[:3], new, strict=True)]
         self.rows = Labels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]
@@ -147,10 +147,13 @@ class Reading:
     def result(self) -> Result:
         """Return the verdict."""
         if self.fits is None or self.fit is None:
-            return Result(False, False, 0.0, (), 0.0, 0.0, self.policy())
+            return Result(False, False, 0.0, (), 0.0, None, 0.0, self.policy())
         number = int(fitting.best_of(self.fits))
         used = number > 0 and self.evidence >= USED
-        described = describe_fit(self.fit, self.space, self.family, self.eps, self.observation)
+        met = jnp.asarray(self.met)
+        inputs = linear.inputs(self.space, self.fit.frame, met, self._acts(met)) if len(met) else met
+        rest = (self.space, self.family, self.eps, self.observation, np.asarray(inputs))
+        described = describe_fit(self.fit, *rest)
         return Result(used, number > 0, self.evidence, *described, self.policy())
 
     def act(self, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
