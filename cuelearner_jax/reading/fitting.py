@@ -147,7 +147,7 @@ class Reader:
         nothing = linear.no_change(self.space, self.family, labels.obs.shape[-1])
         moves, theta = _moves(self.family, frame), nothing.theta
         for _ in range(ENTRIES):
-            tried = jax.vmap(lambda theta: nothing.replace(theta=theta))(theta + moves)
+            tried = jax.vmap(lambda theta: nothing.replace(theta=theta))(theta[None] + moves)
             worth = self._worth(labels, tried) - WORTH * (jnp.arange(len(moves)) > 0)
             theta = tried.theta[jnp.argmax(worth)]
         change = nothing.replace(theta=theta)
