@@ -1,7 +1,7 @@
 """Arbiters decide in which episodes the guide acts: each with the same probability, or as far as guided ones earn more.
 
 An arbiter is a class of options (`config.part`) with a `NAME`, a line `ABOUT` it, and functions of one lane. Name your
-own as package.module:NAME, or add it with `ARBITERS.register`.
+own as package.module:NAME, or add it to `ARBITERS`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import SHARE, Bounds, Scalars, part
-from cuelearner_jax.plugins import PartRegistry
 
 WINDOW = 200.0  # episodes, own and guided together, within which what they earned fades to 1/e
 FLOOR = 0.02  # least share of guided episodes, and of own ones, so that both go on being seen
@@ -203,4 +202,4 @@ def guided_share(sums: ArmSums, options: Paced) -> Float[Array, ""]:
     return jnp.where((sums.episodes >= ENOUGH).all(), jnp.minimum(paced, most), most)
 
 
-ARBITERS = PartRegistry[Arbiter]("arbiter", "follow", Episodes, Paced)
+ARBITERS: dict[str, type[Arbiter]] = {kind.NAME: kind for kind in (Episodes, Paced)}

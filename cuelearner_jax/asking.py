@@ -111,7 +111,7 @@ def start(
             action=jnp.zeros((slots, size)),
             answer=jnp.zeros((slots, guidance.form.width(actions_of(env)) if guidance.form else 0)),
             valid=jnp.zeros((slots,), bool),
-            base=jnp.zeros((slots, size)) if guidance.kind.sees_base else None,
+            base=jnp.zeros((slots, size)) if guidance.sees_base else None,
         ),
         budget=jnp.asarray(budget, jnp.int32),
         asked=jnp.zeros((), jnp.int32),
@@ -239,7 +239,7 @@ def ask(
         state, *there = _chosen(of, guide, actions, proposals)
         told = answer(keys.answer, state, there[0], there[1])
         obs, about, first, answers, answered = (row[None] for row in (*there, *told))
-    recorded = record(guide, position, obs, about, answers, answered, first if of.guidance.kind.sees_base else None)
+    recorded = record(guide, position, obs, about, answers, answered, first if of.guidance.sees_base else None)
     if of.pack is None:
         return proceed(of.env, recorded, actions, keys)
     assert form.correct is not None  # see `RunConfig.guide_in`

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.agents.networks import all_finite, as_function, q_network
-from cuelearner_jax.agents.view import network_inputs
+from cuelearner_jax.agents.networks import all_finite, as_function, network_inputs, q_network
 from cuelearner_jax.config import from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.spaces import directions as geometry

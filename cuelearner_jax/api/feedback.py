@@ -31,7 +31,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.relative import KIND
+from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.policies import Common, Guided, policy_of
 from cuelearner_jax.spaces import DIRECTIONS, Space, says_something
 from cuelearner_jax.storage import label_files
@@ -102,7 +102,7 @@ def fit_feedback(
         raise UserError(f"{len(rows.obs)} labels are too few to fit a model: give more labels")
     external_labels.check(rows, spaces, RELATIVE)
     sizes, scalars = settings(label_set.space, sizes, scalars, label_set.strength(eps_deg))
-    guidance = KIND.make(sizes, spaces)
+    guidance = Relative(sizes, spaces)
     k_init, k_fit = jax.random.split(jax.random.key(seed))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
     model = fit(k_fit, jax.tree.map(jnp.asarray, rows), guidance.init(k_init), scalars)
@@ -143,7 +143,7 @@ def ask(
     teacher = teacher_of_world(teacher, space)
     check_teacher(teacher, scalars)
     user_code.answers_in("teacher", teacher, env)
-    guidance = KIND.make(sizes, spaces_of(env))
+    guidance = Relative(sizes, spaces_of(env))
     of = Adaptation(guidance, sizes, scalars, env, Common(as_policy_in(policy, env)))
     block = by_model.learn_lanes(of, product(1, (seed,), (labels,), (bound,)), teacher)
     if block.failed.any():

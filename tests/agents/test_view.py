@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from cuelearner_jax.guides.model import guide_model
 
-from cuelearner_jax.agents import ddqn, view
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents import networks as view
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Features, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides.model import guide_model
 from cuelearner_jax.spaces import directions as geometry
 
 ENV = probes.Window()

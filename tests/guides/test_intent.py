@@ -9,7 +9,6 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides import intent, registry
 from cuelearner_jax.spaces import DIRECTIONS, directions
@@ -60,11 +59,6 @@ def test_what_is_not_open_may_be_meant_and_is_not_followed(fitted):
     meant = bundle.act(model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
     np.testing.assert_allclose(DIRECTIONS.distance(meant, second), 0.0, atol=1e-3)
     assert np.asarray(DIRECTIONS.distance(found, second)).min() > 0.5
-
-
-def test_who_reads_intent_needs_aims():
-    with pytest.raises(UserError, match="needs an environment with `aims`"):
-        registry.make("intent", SIZES, probes.Window())
 
 
 class Alone(probes.Aimed):
@@ -142,14 +136,6 @@ def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
         found, sure = intent.choose_aim(space, share, aims, directions.from_angle(jnp.deg2rad(degrees)), 100.0)
         np.testing.assert_array_equal(found, aims[aim], err_msg=str(degrees))
         assert sure
-
-
-def test_an_impossible_aim_has_no_weight(fitted):
-    _, model = fitted
-    network, aims = intent.Weights(OPTIONS.aim_layers), ENV.aims(OBS[0])
-    weights = jax.nn.softmax(jnp.asarray(network.apply(model.params, aims.features, aims.possible)))
-    assert weights[3] == 0.0
-    assert weights[1] > 0.9
 
 
 def test_members_weigh_aims_each_by_itself_and_their_mean_leads():

@@ -88,8 +88,8 @@ def test_samples_and_the_even_spread_fill_the_box(box):
     [
         (((0.0, 1.0), (1.0,)), "as many of both"),
         (((0.0, 1.0), (1.0, 1.0)), "each high above its low"),
-        (((0.0,), (float("inf"),)), "finite number"),
-        (((0.0,), (1.0,), (Cue("a", ("more", "less"), ("q", "a"), "degrees"),)), "has the unit 'degrees'"),
+        (((0.0,), (float("inf"),)), "as many of both, finite"),
+        (((0.0,), (1.0,), (Cue("a", ("more", "less"), ("q", "a"), "degrees"),)), "of the unit 'shares'"),
         (((0.0, 0.0), (1.0, 1.0), (Cue("a", ("more", "less"), ("q", "a"), "shares"),)), "one cue an entry"),
     ],
 )
