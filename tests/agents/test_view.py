@@ -27,12 +27,6 @@ class Turned(probes.Window):
         return Features(jnp.zeros(1), geometry.inward(jnp.broadcast_to(obs, action.shape), action))
 
 
-def test_raw_networks_see_what_there_is():
-    assert view.network_inputs("raw", None, OBS, CHOSEN) == (OBS, CHOSEN)
-    assert view.widths("raw", spaces_of(ENV)) == (2, 2)
-    assert view.outward("raw", spaces_of(ENV), OBS, CHOSEN) is OBS
-
-
 def test_rows_are_seen_each_from_its_own_action():
     own, turned = view.network_inputs("action", ENV, OBS, CHOSEN)
     for row in range(3):
