@@ -5,13 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from cuelearner_jax.guides.model import guide_model
 
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents import networks as view
+from cuelearner_jax.agents import ddqn, networks
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Features, spaces_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides.fitting import guide_model
 from cuelearner_jax.spaces import directions as geometry
 
 ENV = probes.Window()
@@ -28,12 +27,12 @@ class Turned(probes.Window):
 
 
 def test_rows_are_seen_each_from_its_own_action():
-    own, turned = view.network_inputs("action", ENV, OBS, CHOSEN)
+    own, turned = networks.network_inputs("action", ENV, OBS, CHOSEN)
     for row in range(3):
         alone = ENV.features(OBS[row], CHOSEN[row])
         np.testing.assert_allclose(own[row], alone.own, atol=1e-6)
         np.testing.assert_allclose(turned[row], alone.turned, atol=1e-6)
-    assert view.widths("action", spaces_of(ENV)) == (2, 4)
+    assert networks.widths("action", spaces_of(ENV)) == (2, 4)
 
 
 def test_a_vector_goes_outward_as_it_came_inward():
