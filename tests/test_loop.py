@@ -236,24 +236,6 @@ def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would(taught):
             np.testing.assert_allclose(rows[small, :15], rows[large, :15], atol=1e-6)
 
 
-def test_questions_before_the_first_fit_are_uniform_and_later_ones_refined():
-    program, seeds, budgets = probes.window_program("relative"), [1, 2, 3, 4], [LARGEST] * 4
-    refined = labelled(program, seeds, budgets)[1].guide.labels
-    error = np.abs(directions.difference(ENV.best(refined.obs), refined.action))
-    assert error[:, :10].mean() == pytest.approx(math.pi / 2, abs=0.4)  # standard deviation 0.14
-    assert error[:, 30:].mean() < 0.6
-    plain = dataclasses.replace(probes.SCALARS, refined_fraction=0.0)
-    uniform = labelled(program, seeds, budgets, scalars=plain)[1].guide.labels
-    np.testing.assert_array_equal(uniform.action[:, :10], refined.action[:, :10])
-    assert np.abs(directions.difference(ENV.best(uniform.obs), uniform.action))[:, 30:].mean() > 1.2
-
-
-def test_a_lane_whose_budget_is_spent_stays_as_it_is(taught):
-    _, two = labelled(probes.window_program("relative"), SEEDS, BUDGETS, 2)
-    assert_equal(probes.lane(two, 0), probes.lane(taught[1], 0))
-    assert not np.array_equal(two.guide.labels.obs[2], taught[1].guide.labels.obs[2])
-
-
 def assert_equal(one, other):
     for mine, yours in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(mine, yours)

@@ -56,11 +56,6 @@ def test_after_a_truncation_the_value_counts_but_no_reward_does():
     assert returned(window((1, 2, 4), (1, 1, 1), (0, 0, 1))) == (3, 1 / 4, 2)
 
 
-def test_what_ends_a_later_episode_changes_nothing():
-    assert returned(window((1, 2, 1e6), (1, 1, 0), (0, 1, 1))) == (2, 1 / 2, 1)
-    assert returned(window((1, 2, 1e6), (1, 0, 0), (0, 1, 1))) == (2, 0, 1)
-
-
 def test_steps_that_have_not_been_made_yet_shorten_the_window():
     assert returned(window((1, 2, 1e6), (1, 1, 0), (0, 0, 1), (True, True, False))) == (2, 1 / 2, 1)
     assert returned(window((1, 1e6, 1e6), (1, 0, 0), (0, 1, 1), (True, False, False))) == (1, 1, 0)

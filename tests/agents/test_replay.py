@@ -124,10 +124,3 @@ def test_rows_of_each_sort_are_drawn_alike_and_no_others(steps):
         assert set(np.flatnonzero(found)) == set(there)
         expected = 3000 / len(there)
         assert np.abs(found[there] - expected).max() < 5 * expected**0.5
-
-
-@pytest.mark.parametrize("sort", [True, False])
-def test_a_sort_without_rows_leaves_its_place_to_the_other(sort):
-    counts = counted(np.full(6, sort), 8, 1)[:, 0]
-    drawn = draw_sorts(jax.random.key(0), counts, jnp.array(6), jnp.arange(600) < 300)
-    assert set(np.asarray(drawn).tolist()) == set(range(6))

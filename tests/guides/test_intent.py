@@ -155,19 +155,3 @@ def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     assert apart[0] > 10 * bundle.disagreement(model, ENV, OBS, BASE)[0]
     np.testing.assert_allclose(apart[0], shares.var(0).sum(), rtol=1e-4)
     np.testing.assert_array_equal(apart, bundle.disagreement(outvoted, ENV, OBS, OBS))  # whatever the action
-
-
-def test_what_an_answer_says_of_aims_depends_on_its_strength():
-    """The second aim lies 10 degrees to the left: on the edge of what is right for a label of 20 degrees."""
-    asked = directions.rotate(ENV.best(OBS[0]), -jnp.deg2rad(10.0))
-    label = Label(OBS[0], asked, jnp.array([1.0]), jnp.array(True))
-
-    def of(eps_deg):
-        scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg)
-        return intent.evidence_of(ENV.aims(OBS[0]), DIRECTIONS, label, scalars).likelihood
-
-    # Logistic, of one degree: half at the edge of 10; e^-10 within that of 20; all but e^-8 beyond that of 2.
-    for strength, said in ((20.0, 0.5), (40.0, math.exp(-10)), (4.0, 1 - math.exp(-8))):
-        assert float(of(strength)[1]) == pytest.approx(said, abs=2e-4 * (said > 0.1) + 1e-6)
-    everywhere = of(20.0)[-1], of(40.0)[-1]
-    np.testing.assert_allclose(everywhere, [170 / 360, 160 / 360], atol=2e-3)  # degrees that are more to the left

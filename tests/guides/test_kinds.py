@@ -72,12 +72,6 @@ def test_demonstrations_are_cloned_and_replace_whatever_the_agent_would_do(frame
     np.testing.assert_allclose(guide.labels.answer, jax.vmap(ENV.best)(guide.labels.obs), atol=1e-6)
 
 
-def test_a_scalar_guide_that_asks_about_its_own_choices_comes_to_choose_what_is_called_good():
-    answers = taught("scalar", 15).labels.answer[:, 0]
-    assert answers[:30].mean() < 0.3
-    assert answers[-50:].mean() > 0.5
-
-
 def test_a_share_of_the_scalar_questions_explores():
     bundle, _, _ = compiled("scalar")
     model = bundle.init(KEY).replace(fitted=jnp.array(True))

@@ -175,13 +175,6 @@ def test_the_search_finds_the_least_energy_within_the_bound_and_always_the_same(
     np.testing.assert_allclose(log(MIDDLE, near[0]), [0.1, -0.1, 0.0], atol=0.02)
 
 
-@pytest.mark.parametrize("kind", ["clic", "bdcoach"])
-def test_labels_that_say_nothing_fit_nothing(kind):
-    guide = made(kind)
-    silent = labels(jnp.tile(MIDDLE, (5, 1)), jnp.full((5, 3), UNSAID))
-    assert not bool(jax.jit(guide.fit)(KEY, ENV, silent, guide.init(KEY), SCALARS).fitted)
-
-
 # BD-COACH.
 
 
@@ -208,18 +201,6 @@ def test_the_human_model_is_taught_answers_and_nothing_of_other_cues():
     rows = [examples(labels(MIDDLE[None], jnp.array([answer])), SCALARS) for answer in told]
     found = [float(loss(ENV, params, row, SCALARS)) for row in rows]
     np.testing.assert_allclose(found, [1.0, 1.0, 2.0], rtol=1e-4)
-
-
-def test_bd_coach_goes_on_from_where_it_was_by_what_is_new():
-    guide = made("bdcoach")
-    action = SMALL.sample(KEY, (8,))
-    given = labels(action, jnp.sign(log(action, ENV.best(SEEN[0]))))
-    fit, fresh = jax.jit(guide.fit), guide.init(KEY)
-    half = fit(KEY, ENV, given.replace(valid=jnp.arange(8) < 4), fresh, SCALARS)
-    assert int(half.params.learned) == 4
-    whole, at_once = (fit(KEY, ENV, given, former, SCALARS) for former in (half, fresh))
-    jax.tree.map(np.testing.assert_array_equal, whole, at_once)
-    jax.tree.map(np.testing.assert_array_equal, fit(KEY, ENV, given, whole, SCALARS), whole)  # nothing is new
 
 
 @pytest.mark.long

@@ -177,20 +177,3 @@ def test_under_vmap_each_lane_has_its_own_number_of_passes():
         return refine(residual, start, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=math.pi, k_max=50)
 
     assert jax.vmap(one)(first).passes.tolist() == [[6], [1]]
-
-
-def test_one_row_a_batch_jit_and_vmap_agree():
-    weights, first = network(5, 0.3), jnp.asarray(starts(5, 5), jnp.float32)
-    active = jnp.array([True, True, False, True, True])
-
-    def refined(first, active):
-        residual = residual_of(weights, jnp.tanh, lambda x: jnp.asarray(x, jnp.float32))
-        return refine(residual, first, active, space=DIRECTIONS, tau=0.5 * DEG, tau_max=1.0, k_max=20)
-
-    alone = [refined(first[row : row + 1], active[row : row + 1]) for row in range(5)]
-    passes = [int(result.passes[0]) for result in alone]
-    assert len(set(passes)) > 2
-    lanes = jax.vmap(refined)(first[:, None], active[:, None])
-    for together in (refined(first, active), jax.jit(refined)(first, active), jax.tree.map(lambda x: x[:, 0], lanes)):
-        assert together.passes.tolist() == passes
-        np.testing.assert_allclose(together.actions, [result.actions[0] for result in alone], atol=1e-6)

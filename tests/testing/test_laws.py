@@ -57,10 +57,6 @@ def altered_step(**changes):
     return stepping(lambda state, after, step: (after, change(step)))
 
 
-class Listed(Window):
-    extra: str = "a word"
-
-
 class Branching(Window):
     def step(self, key, state, action):
         return super().step(key, state, -action if action[0] > 0 else action)
@@ -79,8 +75,6 @@ def mirrored(image):
 
 ENVIRONMENTS = {
     "sizes": (other(observation=(Quantity("a", 3, "1"),)), "observation is float32 of shape (2,): make it"),
-    "a name twice": (other(observation=(Quantity("a", 1, "1"),) * 2), "give each a name of its own"),
-    "no array": (Listed(), "its fields are numbers, or static"),
     "an if": (Branching(), "with jnp.where and lax.cond in place of if"),
     "random numbers": (Outside(), "draw all random numbers from the key alone"),
     "no end": (
@@ -91,23 +85,16 @@ ENVIRONMENTS = {
         stepping(lambda state, after, step: (state, step.replace(obs=step.final_obs))),
         "Step.obs is Step.final_obs wherever an episode ends",
     ),
-    "a leap": (
-        stepping(lambda state, after, step: (after, step.replace(obs=-step.obs)), Chain),
-        "Step.obs is not Step.final_obs where an episode goes on",
-    ),
     "recall": (other(recall=lambda self, memory: -memory), "recall(remember(state, obs)) is not obs"),
     "recall_next": (
         other(recall_next=lambda self, memory, action, aftermath: memory + aftermath),
         "recall_next(remember(state, obs), action, aftermath) is not Step.final_obs",
     ),
-    "no action": (other(heuristic=lambda self, obs: 2.0 * obs), "what `heuristic` gives is not an action of the space"),
     "own features": (
         other(features=lambda self, obs, action: Features(action.ravel()[:1], action)),
         "`features` hold values in `own` that depend on the action",
     ),
-    "possible aims": (other(Aimed, possible=(False,) * 4), "no aim was possible in any step"),
     "an integer": (altered_step(reward=lambda step: jnp.array(1)), "Step.reward is int32 of shape (): make it float32"),
-    "not finite": (altered_step(reward=lambda step: step.reward + jnp.inf), "reward is not finite after step"),
     "an identity": (mirrored(lambda which, obs, v: (-obs, -v)), "`mirror` 0 is not the identity"),
     "no group": (mirrored(lambda which, *both: tuple(rotate(v, which * 1.0) for v in both)), "no symmetry undoes"),
 }
@@ -147,10 +134,6 @@ def in_python(act):
     return lambda *given: act(*given) if float(given[-1].eps_deg) > 1 else None
 
 
-def everywhere(act):
-    return lambda self, model, env, obs, actions, active, scalars: Refinement(-actions, active.astype(jnp.int32))
-
-
 def unfitted_too(act):
     def guided(self, model, env, obs, actions, active, scalars):
         return Refinement(jnp.where(active[:, None], -actions, actions), active.astype(jnp.int32))
@@ -165,11 +148,8 @@ GUIDANCES = {
         guide(fit=result(lambda model: model.replace(fitted=jnp.array(False)))),
         "`fit` of valid labels returns an unfitted model",
     ),
-    "another model": (guide(fit=result(lambda model: model.replace(params={}))), "a model of other fields or shapes"),
     "a branch": (guide(act=in_python), "`act` under jit fails"),
-    "all rows": (guide(act=everywhere), "`act` changes rows that are not active"),
     "an unfitted guide": (guide(act=unfitted_too), "`act` of an unfitted model changes actions"),
-    "a question of no action": (guide(question=result(lambda asked: asked[:1])), "`question` returns shape (1,)"),
 }
 
 
@@ -207,12 +187,6 @@ class Turned(struct.PyTreeNode):
         return self.replace(sign=SHARED)
 
 
-class Sideways(Turned):
-    @property
-    def axes(self):
-        return self.replace(sign=1)
-
-
 def hidden_noise(key, actions):
     shape = jax.ShapeDtypeStruct(actions.shape, jnp.float32)
     drawn = jax.pure_callback(lambda: np.random.default_rng().normal(size=actions.shape).astype(np.float32), shape)
@@ -220,12 +194,9 @@ def hidden_noise(key, actions):
 
 
 POLICIES = {
-    "other axes": (Sideways(), "`axes` holds something else than BY_LANE and SHARED"),
     "an if": (Turned(change=lambda key, actions: actions if actions[0, 0] > 0 else -actions), "`act` under jit fails"),
     "a length": (Turned(change=lambda key, actions: 2.0 * actions), "is not an action of the space"),
-    "one for all": (Turned(change=lambda key, actions: actions[0]), "`act` returns shape (2,) for 9 observations"),
     "neighbours": (Turned(change=lambda key, actions: retract(actions + actions[:1])), "depends on the others"),
-    "not finite": (Turned(change=lambda key, actions: actions / 0.0), "is not finite everywhere"),
     "hidden noise": (Turned(change=hidden_noise), "the same key gives other actions"),
 }
 
@@ -263,13 +234,6 @@ class Wider(Window):
     observation = (Quantity("context", 2, "1"), Quantity("half the width", 1, "rad"))
 
 
-class Mistaken(Expert):
-    """Answers no direction."""
-
-    def best_action(self, state, obs):
-        return 2.0 * super().best_action(state, obs)
-
-
 def with_preset(**changes):
     """The probe with one preset."""
     return dataclasses.replace(PROBE, presets={"small": Preset("seconds", CONFIG, **changes)})
@@ -304,18 +268,6 @@ TASKS = {
     "a wider scenario": (
         dataclasses.replace(BY_WIDTH, scenarios={"narrow": Scenario("", {"half_width_deg": 5.0})}),
         "scenario 'narrow' has observations of 3 entries, not 2",
-    ),
-    "splits": (
-        with_environment(lambda config, split: Window(jnp.zeros(() if split == "training" else 2))),
-        "environments of other shapes for other splits",
-    ),
-    "episodes of no length": (
-        with_environment(lambda config, split: altered_step(outcome=lambda step: {"success": step.reward})),
-        "its episodes have outcomes ['success'], but it does not say how long they last: fill `longest`",
-    ),
-    "no direction": (
-        dataclasses.replace(PROBE, teacher=lambda config, env: Mistaken(env)),
-        "its teacher's best action is not an action of the space",
     ),
     "nothing is written": (with_pictures(DRAWN._replace(still=lambda *_: None)), "window.png was not written"),
 }
