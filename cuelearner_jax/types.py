@@ -35,7 +35,6 @@ class Teacher(Protocol):
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the action that the teacher would choose."""
-        ...
 
 
 @runtime_checkable
@@ -50,12 +49,10 @@ class ValuesDirections(Protocol):
         spread: Float[Array, ""] | float,
         share: Float[Array, ""] | float,
     ) -> Float[Array, " action"]:
-        """Return the good action nearest to `action`: its value is at least a share of the best, averaged over an error
-        of aim.
+        """Return the good action nearest to `action`: its value is at least a `share` of the best.
 
         `spread` is the standard deviation of the aim [rad]; see `spaces.directions.nearest_direction`.
         """
-        ...
 
 
 @runtime_checkable
@@ -64,7 +61,6 @@ class Policy(Protocol):
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return actions in n situations; `states` are for teachers, and no agent uses them."""
-        ...
 
 
 class Label(struct.PyTreeNode):

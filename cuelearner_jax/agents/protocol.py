@@ -26,37 +26,30 @@ class AgentFunctions(Protocol):
     @property
     def options(self) -> Any:
         """The options that the agent was made from."""
-        ...
 
     @property
     def frame(self) -> Frame:
         """The frame of the networks' inputs."""
-        ...
 
     @property
     def described(self) -> dict[str, Any]:
         """Facts for an export's contract, as JSON values."""
-        ...
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, Any]:
         """Return parameters that act, and the rest of the learning state."""
-        ...
 
     def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
         """Return actions of the finished agent. `env` gives the features of observations (`Sizes.frame`)."""
-        ...
 
     def explore(
         self, env: Any, options: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return actions during learning; `options`: see `update`."""
-        ...
 
     def value(
         self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
     ) -> Float[Array, "*m"]:
         """Return the expected value of each action; `obs` is one situation for all actions, or one for each."""
-        ...
 
     def update(
         self,
@@ -69,21 +62,11 @@ class AgentFunctions(Protocol):
         memory: Memory,
         key: PRNGKeyArray,
     ) -> tuple[Params, Any, Float[Array, ""], Float[Array, ""]]:
-        """Make one gradient step.
+        """Make gradient step number `count` (from 1); return parameters, the rest, the loss and the gradient's norm.
 
-        Args:
-            env: as for `act`; its `recall` rebuilds the memory's observations.
-            options: those that the agent was made from, their floats traced.
-            scalars: settings that all parts share, such as the discount factor.
-            count: gradient steps, this one included.
-            params, rest: as `init` returns them.
-            memory: the steps to learn from.
-            key: random key of this step.
-
-        Returns:
-            Parameters; the rest; the loss; the norm of the gradient.
+        `options` are those that the agent was made from, their floats traced; `scalars` are settings that all parts
+        share; `params` and `rest` are as `init` returns them; `env` rebuilds the memory's observations.
         """
-        ...
 
 
 @runtime_checkable
@@ -96,7 +79,6 @@ class AgentOptions(Protocol):
     @property
     def replay_capacity(self) -> int:
         """Number of transitions in replay, a multiple of `Sizes.num_envs`."""
-        ...
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> AgentFunctions:
         """Return the agent for an environment's spaces; floats of the options may be None.
@@ -105,11 +87,9 @@ class AgentOptions(Protocol):
 
         Raises UserError for a frame in which the environment cannot be seen.
         """
-        ...
 
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
         """Raise UserError for options that do not work together; each is within its bounds."""
-        ...
 
 
 AGENTS: dict[str, Any] = {kind.NAME: kind for kind in (ddqn.Config, sac.Config)}
