@@ -92,10 +92,12 @@ class View(Protocol):
     @property
     def observation(self) -> tuple[Quantity, ...]:
         """The slices of an observation, in their order."""
+        ...
 
     @property
     def obs_size(self) -> int:
         """Number of entries of an observation: the sum of its slices."""
+        ...
 
 
 @runtime_checkable
@@ -104,20 +106,25 @@ class Environment(View, Protocol):
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
         """Start an episode."""
+        ...
 
     def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"]) -> tuple[EnvState, Step]:
         """Execute an action; reset automatically when the episode ends."""
+        ...
 
     def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " memory"]:
         """Return what replay stores of an observation: as little as `recall` needs."""
+        ...
 
     def recall(self, memory: Float[Array, " memory"]) -> Float[Array, " obs"]:
         """Return the observation that was acted on."""
+        ...
 
     def recall_next(
         self, memory: Float[Array, " memory"], action: Float[Array, " action"], aftermath: Float[Array, " aftermath"]
     ) -> Float[Array, " obs"]:
         """Return `Step.final_obs` of the step that `action` led to."""
+        ...
 
 
 class Aims(NamedTuple):

@@ -35,6 +35,7 @@ class Teacher(Protocol):
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the action that the teacher would choose."""
+        ...
 
 
 @runtime_checkable
@@ -53,6 +54,7 @@ class ValuesDirections(Protocol):
 
         `spread` is the standard deviation of the aim [rad]; see `spaces.directions.nearest_direction`.
         """
+        ...
 
 
 @runtime_checkable
@@ -61,6 +63,7 @@ class Policy(Protocol):
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return actions in n situations; `states` are for teachers, and no agent uses them."""
+        ...
 
 
 class Label(struct.PyTreeNode):

@@ -26,30 +26,37 @@ class AgentFunctions(Protocol):
     @property
     def options(self) -> Any:
         """The options that the agent was made from."""
+        ...
 
     @property
     def frame(self) -> Frame:
         """The frame of the networks' inputs."""
+        ...
 
     @property
     def described(self) -> dict[str, Any]:
         """Facts for an export's contract, as JSON values."""
+        ...
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, Any]:
         """Return parameters that act, and the rest of the learning state."""
+        ...
 
     def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
         """Return actions of the finished agent. `env` gives the features of observations (`Sizes.frame`)."""
+        ...
 
     def explore(
         self, env: Any, options: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return actions during learning; `options`: see `update`."""
+        ...
 
     def value(
         self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
     ) -> Float[Array, "*m"]:
         """Return the expected value of each action; `obs` is one situation for all actions, or one for each."""
+        ...
 
     def update(
         self,
@@ -67,6 +74,7 @@ class AgentFunctions(Protocol):
         `options` are those that the agent was made from, their floats traced; `scalars` are settings that all parts
         share; `params` and `rest` are as `init` returns them; `env` rebuilds the memory's observations.
         """
+        ...
 
 
 @runtime_checkable
@@ -79,6 +87,7 @@ class AgentOptions(Protocol):
     @property
     def replay_capacity(self) -> int:
         """Number of transitions in replay, a multiple of `Sizes.num_envs`."""
+        ...
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> AgentFunctions:
         """Return the agent for an environment's spaces; floats of the options may be None.
@@ -87,9 +96,11 @@ class AgentOptions(Protocol):
 
         Raises UserError for a frame in which the environment cannot be seen.
         """
+        ...
 
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
         """Raise UserError for options that do not work together; each is within its bounds."""
+        ...
 
 
 AGENTS: dict[str, Any] = {kind.NAME: kind for kind in (ddqn.Config, sac.Config)}

@@ -191,17 +191,12 @@ def fit_model(
 ) -> GuidanceModel:
     """Fit a model from scratch, and keep the parameters with the least validation loss.
 
-    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five nothing validates: the
-    last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
+    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five labels nothing
+    validates: the last parameters are kept. A fit that diverged before anything validated gives parameters that are
+    NaN. Without a valid label to train on, the model's `fitted` is False.
 
-    Args:
-        rows: a record of what is learned from (slots, ...), such as examples, of which the `valid` ones count.
-        init: parameters from a key; with `sizes.ensemble` those of `ensemble`, whose members are fitted each by itself.
-        losses: (params, rows (n, ...)) -> the loss of each.
-        augment: what to train on in place of a batch; validation rows stay.
-
-    Returns:
-        The model; its `fitted` is False if there was no valid label to train on.
+    `rows` are what is learned from (slots, ...), such as examples, of which the `valid` ones count; `init` gives the
+    parameters of `sizes.ensemble` members, which are fitted each by itself; `losses` gives the loss of each row.
     """
     held = held_out(rows.valid.shape[0])
     validation, training = rows.valid & held, rows.valid & ~held
