@@ -256,13 +256,14 @@ class Clic(Guide):
         self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the action of least energy within tau_max of a, in active rows of a fitted model."""
+        guided = active & model.fitted
 
         def choose(where: Array) -> Array:
             seen, base = jnp.split(where, [obs.shape[1]])
             return self.minimise_energy(env, model.params, seen, base, scalars)
 
         chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
-        return replaced(chosen, actions, active & model.fitted)
+        return replaced(chosen, actions, guided)
 
 
 class ClicShown(Clic):

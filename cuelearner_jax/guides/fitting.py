@@ -198,9 +198,31 @@ def fit_model(
     `rows` are what is learned from (slots, ...), such as examples, of which the `valid` ones count; `init` gives the
     parameters of `sizes.ensemble` members, which are fitted each by itself; `losses` gives the loss of each row.
     """
+
+    def fit(key: PRNGKeyArray, init: Init) -> GuidanceModel:
+        return _fit_member(key, rows, scalars, init, losses, sizes, augment)
+
+    if sizes.ensemble == 1:
+        return fit(key, init)
+    # A member is fitted as an ensemble of one, whose mean is its own prediction.
+    first = lambda key: jax.tree.map(lambda leaf: leaf[:1], init(key))  # noqa: E731
+    each = jax.vmap(lambda key: fit(key, first))(jax.random.split(key, sizes.ensemble))
+    return GuidanceModel(jax.tree.map(lambda leaf: leaf[:, 0], each.params), each.fitted.all())
+
+
+def _fit_member(
+    key: PRNGKeyArray,
+    rows: Any,
+    scalars: GuideScalars,
+    init: Init,
+    losses: Callable[[Params, Any], Float[Array, " n"]],
+    sizes: GuideSizes,
+    augment: Augment,
+) -> GuidanceModel:
     held = held_out(rows.valid.shape[0])
     validation, training = rows.valid & held, rows.valid & ~held
     order, count = jnp.argsort(~training, stable=True), jnp.maximum(training.sum(), 1)
+    k_init, k_steps = jax.random.split(key)
     adam = optimizer(scalars)
 
     def loss(params: Params, batch: Any) -> jax.Array:
@@ -209,8 +231,9 @@ def fit_model(
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
         k_draw, k_augment = jax.random.split(key)
-        drawn = order[jax.random.randint(k_draw, (sizes.fit_batch_size,), 0, count)]
-        batch = augment(k_augment, jax.tree.map(lambda leaf: leaf[drawn], rows))
+        # Drawn for each leaf: drawn once, the energies of CLIC would have other last bits.
+        draw = lambda: order[jax.random.randint(k_draw, (sizes.fit_batch_size,), 0, count)]  # noqa: E731
+        batch = augment(k_augment, jax.tree.map(lambda leaf: leaf[draw()], rows))
         updates, opt_state = adam.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 
@@ -222,19 +245,10 @@ def fit_model(
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), running[0], best)
         return (running, best, jnp.where(better, score, best_score)), None
 
-    def fit(key: PRNGKeyArray, init: Init) -> GuidanceModel:
-        k_init, k_steps = jax.random.split(key)
-        params = init(k_init)
-        keys = jax.random.split(k_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
-        start = ((params, adam.init(params)), params, jnp.inf)
-        (_, best, score), _ = jax.lax.scan(stretch, start, keys)
-        diverged = ~jnp.isfinite(score) & validation.any()
-        best = jax.tree.map(lambda leaf: jnp.where(diverged, jnp.nan, leaf), best)
-        return GuidanceModel(best, training.any())
-
-    if sizes.ensemble == 1:
-        return fit(key, init)
-    # A member is fitted as an ensemble of one, whose mean is its own prediction.
-    first = lambda key: jax.tree.map(lambda leaf: leaf[:1], init(key))  # noqa: E731
-    each = jax.vmap(lambda key: fit(key, first))(jax.random.split(key, sizes.ensemble))
-    return GuidanceModel(jax.tree.map(lambda leaf: leaf[:, 0], each.params), each.fitted.all())
+    params = init(k_init)
+    keys = jax.random.split(k_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
+    start = ((params, adam.init(params)), params, jnp.inf)
+    (_, best, score), _ = jax.lax.scan(stretch, start, keys)
+    diverged = ~jnp.isfinite(score) & validation.any()
+    best = jax.tree.map(lambda leaf: jnp.where(diverged, jnp.nan, leaf), best)
+    return GuidanceModel(best, training.any())

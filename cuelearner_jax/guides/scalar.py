@@ -57,9 +57,10 @@ class Scalar(Guide):
         self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the best of all actions in active rows of a fitted model."""
+        guided = active & model.fitted
         value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
         chosen = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
-        return replaced(chosen, actions, active & model.fitted)
+        return replaced(chosen, actions, guided)
 
     def question(
         self,
