@@ -231,7 +231,7 @@ def _fit_member(
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
         k_draw, k_augment = jax.random.split(key)
-        # Drawn for each leaf: drawn once, the energies of CLIC would have other last bits.
+        # One draw for every leaf: the compiler merges them
         draw = lambda: order[jax.random.randint(k_draw, (sizes.fit_batch_size,), 0, count)]  # noqa: E731
         batch = augment(k_augment, jax.tree.map(lambda leaf: leaf[draw()], rows))
         updates, opt_state = adam.update(jax.grad(loss)(params, batch), opt_state, params)
