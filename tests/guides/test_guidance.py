@@ -85,7 +85,7 @@ def test_within_a_bound_no_kind_leads_farther_and_rows_that_are_not_active_stay(
 
 def test_a_share_of_the_questions_is_about_refined_actions_and_the_rest_about_the_base():
     guide, model = made("relative", fitted=True)
-    refined = guide.act(model, ENV, OBS[:1], BASE[:1], jnp.array([True]), probes.SCALARS).actions[0]
+    refined = np.asarray(guide.act(model, ENV, OBS[:1], BASE[:1], jnp.array([True]), probes.SCALARS).actions[0])
     assert np.abs(refined - BASE[0]).max() > 1e-3
     keys = jax.random.split(jax.random.key(0), 200)
     ask = jax.jit(jax.vmap(guide.question, (0, None, None, None, None, None)))
