@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-from cuelearner_jax.agents import view
+from cuelearner_jax.agents import networks
 from cuelearner_jax.agents.choice import values_per_choice
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.run_config import RunConfig
@@ -32,7 +32,7 @@ class Operations(NamedTuple):
 
 def step_operations(config: RunConfig, spaces: Spaces) -> Operations:
     """Operations of one environment step, of a run of double DQN in an environment with these spaces."""
-    own, widths = config.agent, view.widths(config.sizes.frame, spaces)
+    own, widths = config.agent, networks.widths(config.sizes.frame, spaces)
     rows = own.batch_size * (2 if own.n_step > 1 else 1) if config.bootstraps else 0
     return Operations(
         acting=forward(own.q_layers, widths, values_per_choice(own.directions, own.coarse_directions, own.peaks)),

@@ -1,7 +1,7 @@
 """Arbiters decide in which episodes the guide acts: each with the same probability, or as far as guided ones earn more.
 
 An arbiter is a class of options (`config.part`) with a `NAME`, a line `ABOUT` it, and functions of one lane. Name your
-own as package.module:NAME, or add it with `ARBITERS.register`.
+own as package.module:NAME, or add it to `ARBITERS`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import SHARE, Bounds, Scalars, part
-from cuelearner_jax.plugins import PartRegistry
 
 WINDOW = 200.0  # episodes, own and guided together, within which what they earned fades to 1/e
 FLOOR = 0.02  # least share of guided episodes, and of own ones, so that both go on being seen
@@ -51,12 +50,10 @@ class Arbiter:
         raise NotImplementedError(f"{type(self).__name__} does not say which episodes are guided: write `follow`")
 
 
-def redraw(
-    key: PRNGKeyArray,
-    guided: Bool[Array, " num_envs"],
-    done: Bool[Array, " num_envs"],
-    probability: Float[Array, ""] | float,
-) -> Bool[Array, " num_envs"]:
+Flags = Bool[Array, " num_envs"]
+
+
+def redraw(key: PRNGKeyArray, guided: Flags, done: Flags, probability: Float[Array, ""] | float) -> Flags:
     """Return which episodes are guided, with a new draw where an episode is done."""
     return jnp.where(done, jax.random.bernoulli(key, probability, done.shape), guided)
 
@@ -71,9 +68,7 @@ class Episodes(Arbiter):
     probability: Annotated[float, SHARE] = 0.5
     """Probability that an episode is guided."""
 
-    def follow(
-        self, state: Bool[Array, " num_envs"], outcome: Outcome, scalars: Scalars, key: PRNGKeyArray
-    ) -> Bool[Array, " num_envs"]:
+    def follow(self, state: Flags, outcome: Outcome, scalars: Scalars, key: PRNGKeyArray) -> Flags:
         """Draw whether to guide each episode that begins."""
         return redraw(key, state, outcome.done, self.probability)
 
@@ -92,7 +87,7 @@ class ArmSums(struct.PyTreeNode):
 class Pace(struct.PyTreeNode):
     """The returns of guided and own episodes so far, and the running episodes' sums."""
 
-    guided: Bool[Array, " num_envs"]  # True where the running episode is guided
+    guided: Flags  # True where the running episode is guided
     gain: Float[Array, " num_envs"]  # gain of the running episode so far
     steps: Float[Array, " num_envs"]  # steps of the running episode so far
     whole: Bool[Array, " num_envs"]  # True where the running episode belonged to its arm from its first step on
@@ -133,15 +128,10 @@ class Paced(Arbiter):
 
     def init(self, num_envs: int) -> Pace:
         """Return the state before the first episode."""
-        return Pace(
-            guided=jnp.zeros(num_envs, bool),
-            gain=jnp.zeros(num_envs),
-            steps=jnp.zeros(num_envs),
-            whole=jnp.ones(num_envs, bool),
-            sums=ArmSums(*[jnp.zeros(2)] * 6),
-        )
+        guided, gain, steps = jnp.zeros(num_envs, bool), jnp.zeros(num_envs), jnp.zeros(num_envs)
+        return Pace(guided, gain, steps, whole=~guided, sums=ArmSums(*[jnp.zeros(2)] * 6))
 
-    def guided(self, state: Pace) -> Bool[Array, " num_envs"]:
+    def guided(self, state: Pace) -> Flags:
         """Return which running episodes are guided."""
         return state.guided
 
@@ -161,13 +151,8 @@ class Paced(Arbiter):
         new = ArmSums(*[(arms * each[None]).sum(-1) for each in earned])
         fade = (1 - 1 / jnp.float32(WINDOW)) ** finished.sum()
         sums = jax.tree.map(lambda old, added: fade * old + added, state.sums, new)
-        return Pace(
-            guided=redraw(key, state.guided, done, guided_share(sums, self)),
-            gain=jnp.where(done, 0, gain),
-            steps=jnp.where(done, 0, steps),
-            whole=whole | done,
-            sums=sums,
-        )
+        guided = redraw(key, state.guided, done, guided_share(sums, self))
+        return Pace(guided, jnp.where(done, 0, gain), jnp.where(done, 0, steps), whole | done, sums)
 
 
 def scores(sums: ArmSums) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
@@ -197,10 +182,9 @@ def guided_share(sums: ArmSums, options: Paced) -> Float[Array, ""]:
     better = jax.scipy.stats.norm.cdf((guided - own) / error)
     lead = jnp.clip((guided - own) / jnp.maximum(options.lead, TINY), 0, 1)
     worth = jnp.where(options.lead > 0, lead, 1)
-    most = options.probability
-    floor = jnp.float32(FLOOR)
+    most, floor = options.probability, jnp.float32(FLOOR)
     paced = jnp.clip(most * jnp.minimum(2 * better, 1) * worth, floor, 1 - floor)
     return jnp.where((sums.episodes >= ENOUGH).all(), jnp.minimum(paced, most), most)
 
 
-ARBITERS = PartRegistry[Arbiter]("arbiter", "follow", Episodes, Paced)
+ARBITERS: dict[str, type[Arbiter]] = {kind.NAME: kind for kind in (Episodes, Paced)}

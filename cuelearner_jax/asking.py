@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import user_code
 from cuelearner_jax.agents.networks import all_finite
@@ -111,7 +111,7 @@ def start(
             action=jnp.zeros((slots, size)),
             answer=jnp.zeros((slots, guidance.form.width(actions_of(env)) if guidance.form else 0)),
             valid=jnp.zeros((slots,), bool),
-            base=jnp.zeros((slots, size)) if guidance.kind.sees_base else None,
+            base=jnp.zeros((slots, size)) if guidance.sees_base else None,
         ),
         budget=jnp.asarray(budget, jnp.int32),
         asked=jnp.zeros((), jnp.int32),
@@ -210,23 +210,14 @@ def ask(
     position: Int[Array, ""],
     every: bool = False,
 ) -> GuideState:
-    """Ask a simulated teacher question number `position`, record the answer, and step on.
+    """Ask a simulated teacher question number `position` (from 0), record the answer, and step on.
 
-    Args:
-        of: the guide, environment and base policy of the questions.
-        teacher: the teacher who answers.
-        guide: the current guide state.
-        lane_key: random key of all questions.
-        position: number of this question, from 0.
-        every: ask about every candidate, as many questions at once, the first of them number `position`.
-
-    Raises:
-        ValueError: the guidance asks nothing.
+    `lane_key`: random key of all questions. `every`: ask about every candidate, as many questions at once, the first of
+    them number `position`.
     """
-    form = of.guidance.form
+    form, keys = of.guidance.form, question_keys(lane_key, position)
     if form is None:
         raise ValueError(f"guidance {of.guidance.name!r} asks nothing")
-    keys = question_keys(lane_key, position)
     actions, proposals = question(of, guide, keys)
 
     def answer(key: PRNGKeyArray, state: EnvState, obs: Array, action: Array) -> tuple[Array, Array]:
@@ -237,32 +228,21 @@ def ask(
         answers, answered = jax.vmap(answer)(jax.random.split(keys.answer, len(obs)), guide.env, obs, about)
     else:
         state, *there = _chosen(of, guide, actions, proposals)
-        told = answer(keys.answer, state, there[0], there[1])
-        obs, about, first, answers, answered = (row[None] for row in (*there, *told))
-    recorded = record(guide, position, obs, about, answers, answered, first if of.guidance.kind.sees_base else None)
+        one = answer(keys.answer, state, there[0], there[1])
+        obs, about, first, answers, answered = (row[None] for row in (*there, *one))
+    recorded = record(guide, position, obs, about, answers, answered, first if of.guidance.sees_base else None)
     if of.pack is None:
         return proceed(of.env, recorded, actions, keys)
     assert form.correct is not None  # see `RunConfig.guide_in`
+    assert guide.stored is not None
     space = actions_of(of.env)
     corrected = form.correct(space, about[0], answers[0], space.from_unit(of.scalars.eps_deg))
-    return _proceed_corrected(of, recorded, position, jnp.where(answered[0], corrected, about[0]), keys)
-
-
-def _proceed_corrected(
-    of: Inquiry,
-    guide: GuideState,
-    position: Int[Array, ""],
-    action: Float[Array, " action"],
-    keys: QuestionKeys,
-) -> GuideState:
-    """Return the guide after the step of a corrected action, which is kept at its label's place."""
-    assert of.pack is not None
-    assert guide.stored is not None
+    action = jnp.where(answered[0], corrected, about[0])
     before = of.env.remember(guide.env, guide.obs)
     state, step = of.env.step(keys.env, guide.env, action)
     rows = of.pack(before[None], action[None], jax.tree.map(lambda leaf: leaf[None], step))
     stored = jax.lax.dynamic_update_slice_in_dim(guide.stored, rows, position, 0)
-    return guide.replace(env=state, obs=step.obs, stored=stored)
+    return recorded.replace(env=state, obs=step.obs, stored=stored)
 
 
 def _chosen(
@@ -307,16 +287,6 @@ def blame(
         user_code.check_actions(given, f"teacher {type(teacher).__name__}")
 
 
-def walk_unanswered(of: Inquiry, guide: GuideState, keys: Key[Array, " steps"]) -> GuideState:
-    """Return the guide after steps with its own actions, without questions."""
-
-    def step(guide: GuideState, key: PRNGKeyArray) -> tuple[GuideState, None]:
-        own = QuestionKeys(*jax.random.split(key, 4))
-        return proceed(of.env, guide, question(of, guide, own)[0], own), None
-
-    return jax.lax.scan(step, guide, keys)[0]
-
-
 def label_round(
     of: Inquiry, sizes: GuideSizes, teacher: Teacher, guide: GuideState, lane_key: PRNGKeyArray
 ) -> GuideState:
@@ -324,12 +294,17 @@ def label_round(
     first = guide.asked
     at_once = sizes.candidates if sizes.ask_all else 1
 
+    def walk(guide: GuideState, key: PRNGKeyArray) -> tuple[GuideState, None]:
+        """Make a step with the guide's own action, without a question."""
+        own = QuestionKeys(*jax.random.split(key, 4))
+        return proceed(of.env, guide, question(of, guide, own)[0], own), None
+
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
         asked = ask(of, teacher, guide, lane_key, first + offset, sizes.ask_all)
         if sizes.question_every == 1:
             return asked, None
         key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), first + offset)
-        return walk_unanswered(of, asked, jax.random.split(key, sizes.question_every - 1)), None
+        return jax.lax.scan(walk, asked, jax.random.split(key, sizes.question_every - 1))[0], None
 
     asked, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
     fitted = fit(of.guidance, of.env, of.scalars, asked, lane_key, first // sizes.labels_per_round)
@@ -342,8 +317,8 @@ def with_guide(lane: LaneT, guide: GuideState) -> LaneT:
     `lane`: a record with `guide` and `failed`.
     """
     failed = lane.failed | ~all_finite((guide.model, guide.labels))
-    kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, lane.guide)
-    return lane.replace(guide=kept, failed=failed)
+    guide = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, lane.guide)
+    return lane.replace(guide=guide, failed=failed)
 
 
 def take_labels(

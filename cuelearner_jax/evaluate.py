@@ -34,12 +34,10 @@ def rollout(
 ) -> dict[str, Float[Array, ""]]:
     """Return means over `steps` environment steps, shared by `num_envs` environments that reset automatically.
 
-    Outcomes are those of each environment's first episode: the same episodes for every policy, long
-    ones included. Give steps enough for the longest one, since without it there is no mean over all of them.
-
-    Returns:
-        "reward" a step, every metric of the environment's, and, where it has outcomes, these (nan unless all first
-        episodes have ended) and "finished", the share of first episodes that have.
+    These are "reward" a step, every metric of the environment's, and, where it has outcomes, these (nan unless all
+    first episodes have ended) and "finished", the share of first episodes that have. Outcomes are those of each
+    environment's first episode: the same episodes for every policy, long ones included. Give steps enough for the
+    longest one, since without it there is no mean over all of them.
     """
     return _rolled(policy, env, key, num_envs, steps).means
 
@@ -75,12 +73,14 @@ def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
     keys = jax.random.split(k_reset, num_envs)
     state, obs = jax.vmap(env.reset)(keys)
     _, step = jax.eval_shape(jax.vmap(env.step), keys, state, jnp.zeros((num_envs, actions_of(env).size)))
-    names: list[str] = ["reward", *step.metrics]
-    sums = dict.fromkeys(names, jnp.zeros(num_envs))
+    sums = {name: jnp.zeros(num_envs) for name in ("reward", *step.metrics)}
     # NaN of the dtypes that steps have, so that one program serves both
     outcomes = dict.fromkeys(step.outcome, jnp.full(num_envs, jnp.nan, jnp.float32))
     yes = jnp.ones(num_envs, bool)
     return _Walk(state, obs, yes, jnp.zeros(num_envs, jnp.int32), sums, outcomes, yes)
+
+
+_begin = jax.jit(_begun, static_argnames="num_envs")
 
 
 def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, indices: Array) -> _Walk:
@@ -117,11 +117,8 @@ def _apart(policy: PolicyNode) -> tuple[Any, Any]:
     """Split a policy into leaves that each lane has and leaves that lanes share, with None in place of the others."""
     by_lane = lambda axis, part: jax.tree.map(lambda _: axis is not None, part)  # noqa: E731
     own = jax.tree.map(by_lane, policy.axes, policy, is_leaf=lambda axis: axis is None)
-    each, shared = (
-        jax.tree.map(lambda own, leaf, wanted=wanted: leaf if own is wanted else None, own, policy)
-        for wanted in (True, False)
-    )
-    return each, shared
+    each = jax.tree.map(lambda own, leaf: leaf if own else None, own, policy)
+    return each, jax.tree.map(lambda own, leaf: None if own else leaf, own, policy)
 
 
 def _together(each: Any, shared: Any) -> Any:
@@ -148,7 +145,7 @@ def mean_interval(
 ) -> Float[np.ndarray, "3 *lanes"]:
     """Return the mean of independent values and its 95% percentile bootstrap interval (NaN for a single value).
 
-    The same values always give the same interval. For differences of two policies, pass those of each environment.
+    The same values give the same interval. For the difference of two policies, pass each environment's difference.
     """
     values = np.asarray(values, float)
     count, mean = values.shape[-1], values.mean(-1)
@@ -196,20 +193,11 @@ def rollout_lanes(
     tell: Tell = ignore_progress,
     mesh: Mesh | None = None,
 ) -> Rollout:
-    """Roll out a block of lanes on the same episodes; a policy that all lanes share counts as one lane.
+    """Roll out a block of lanes on the same episodes. Returns NumPy arrays with a leading axis of lanes.
 
-    Without a mesh in stretches, as many lanes at once as the device takes well.
-
-    Args:
-        env: the environment.
-        policy: leaves that are `BY_LANE` in its `axes` have a leading axis of lanes.
-        key: random key of the episodes.
-        num_envs, steps: as for `rollout`.
-        tell: the progress callback.
-        mesh: devices that share the lanes, in one stretch without progress.
-
-    Returns:
-        NumPy arrays with a leading axis of lanes.
+    Leaves of the policy that are `BY_LANE` in its `axes` have a leading axis of lanes; a policy that all lanes share
+    counts as one lane. With a `mesh` its devices share the lanes, in one stretch without progress; without one it is
+    done in stretches, as many lanes at once as the device takes well.
     """
     lanes = lanes_in(policy)
     if lanes is None:
@@ -220,14 +208,13 @@ def rollout_lanes(
     if mesh is not None:
         return jax.device_get(_on_mesh(env, each, shared, key, mesh=mesh, num_envs=num_envs, steps=steps))
     size = min(lanes, portions().agents)
-    firsts, found = range(0, lanes, size), []
+    firsts, results = range(0, lanes, size), []
     for number, first in enumerate(firsts):
         # the last lanes are repeated, which saves a compile
         rows = np.minimum(np.arange(first, first + size), lanes - 1)
         part = jax.tree.map(lambda leaf, rows=rows: jnp.asarray(leaf)[rows], each)
-        told = part_of(tell, number, len(firsts))
-        found.append(_in_stretches(env, part, shared, key, num_envs, steps, told))
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *found)
+        results.append(_in_stretches(env, part, shared, key, num_envs, steps, part_of(tell, number, len(firsts))))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *results)
 
 
 @partial(jax.jit, static_argnames=("mesh", "num_envs", "steps"))
@@ -262,11 +249,6 @@ def _stretches(steps: int) -> int:
     XLA unrolls a loop of one step, whose numbers may then differ in their last bit.
     """
     return max(count for count in range(1, MOST_STRETCHES + 1) if steps % count == 0 and (count == 1 or steps > count))
-
-
-@partial(jax.jit, static_argnames="num_envs")
-def _begin(env: Any, key: PRNGKeyArray, *, num_envs: int) -> _Walk:
-    return _begun(env, key, num_envs)
 
 
 @partial(jax.jit, static_argnames="lanes")

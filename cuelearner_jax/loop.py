@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
 from cuelearner_jax.agents.networks import all_finite
-from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions, draws_sorts
+from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions
 from cuelearner_jax.agents.replay import Memory, RingBuffer, buffer_for, count_guided, stored_step
 from cuelearner_jax.arbiters import Arbiter, Outcome
 from cuelearner_jax.asking import GuideState, Stream, label_slots
@@ -102,7 +102,7 @@ class Lane(NamedTuple):
     @property
     def counts_guided(self) -> bool:
         """Whether replay counts guided steps: for an agent that draws them separately, under a guide that acts."""
-        return draws_sorts(self.learner.options) and self.guidance.moves and not self.stores
+        return getattr(self.learner.options, "SORTS", False) and self.guidance.moves and not self.stores
 
     @property
     def stores(self) -> bool:

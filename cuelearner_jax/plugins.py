@@ -6,7 +6,7 @@ import importlib
 import os
 import re
 import sys
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from cuelearner_jax.errors import UserCodeError, UserError, suggestion
 
@@ -52,41 +52,36 @@ def load(reference: str, kind: type[T], called: str) -> T:
     return found
 
 
-class PartRegistry(Generic[T]):
-    """A registry of option classes of parts of one sort (agents, say), by `NAME` or package.module:NAME."""
+# The parts that a user may bring, by their sort: the function that the class of such a part must have
+NEEDS = {"agent": "make", "arbiter": "follow", "guidance": "act"}
 
-    def __init__(self, sort: str, needs: str, *built_in: type[T]) -> None:
-        """`sort`: the word for such a part in messages. `needs`: the function that such a class must have."""
-        self._sort, self._needs, self._found = sort, needs, {kind.NAME: kind for kind in built_in}  # pyright: ignore[reportAttributeAccessIssue]
 
-    @property
-    def known(self) -> tuple[type[T], ...]:
-        """The registered classes."""
-        return tuple(self._found.values())
+def add(table: dict[str, type[T]], kind: type[T], sort: str) -> type[T]:
+    """Put a class into a table of parts, under its name. Raises UserError if another class has the name."""
+    name = getattr(kind, "NAME", None) or kind.name  # pyright: ignore[reportAttributeAccessIssue]
+    if table.setdefault(name, kind) is not kind:
+        raise UserError(f"another {sort} is already called {name!r}: give yours another name")
+    return kind
 
-    def register(self, kind: type[T]) -> type[T]:
-        """Make a class known under its name. Raises UserError if another one has the name."""
-        name = kind.NAME  # pyright: ignore[reportAttributeAccessIssue]
-        if self._found.setdefault(name, kind) is not kind:
-            raise UserError(f"another {self._sort} is already called {name!r}: give yours another name")
-        return kind
 
-    def find(self, name: str) -> type[T]:
-        """Return the class of that name without loading code. Raises UserError if no class has the name."""
-        if name not in self._found:
-            own = f"name your own by --{self._sort} package.module:NAME, if you trust that code"
-            raise UserError(f"unknown {self._sort} {name!r}{suggestion(name, self._found)} ({own})")
-        return self._found[name]
+def find(table: dict[str, type[T]], name: str, sort: str) -> type[T]:
+    """Return the class of that name without loading code. Raises UserError if no class has the name."""
+    if name not in table:
+        raise UserError(f"unknown {sort} {name!r}{suggestion(name, table)} (name your own as package.module:NAME)")
+    return table[name]
 
-    def resolve(self, text: str) -> type[T]:
-        """Return the class that a user names, by its name or as `package.module:NAME`, whose code is loaded.
 
-        Never pass text from a file. Raises UserError if there is no such class.
-        """
-        if ":" not in text:
-            return self.find(text)
-        kind: Any = load(text, type, f"options of the {self._sort}")
-        if not hasattr(kind, "NAME") or not callable(getattr(kind, self._needs, None)):
-            wanted = f"a class of options with NAME, ABOUT and {self._needs}"
-            raise UserError(f"{text} is not an {self._sort}: give {wanted}")
-        return self.register(kind)
+def resolve(table: dict[str, type[T]], text: str, sort: str) -> type[T]:
+    """Return the class that a user names, by its name or as `package.module:NAME`, whose code is loaded.
+
+    Never pass text from a file. Raises UserError if there is no such class.
+    """
+    return add(table, load_part(text, sort), sort) if ":" in text else find(table, text, sort)
+
+
+def load_part(reference: str, sort: str) -> Any:
+    """Return the class of a part that a reference names. Raises UserError if there is none."""
+    kind: Any = load(reference, type, f"a class of a part ({sort})")
+    if not (hasattr(kind, "NAME") or hasattr(kind, "name")) or not callable(getattr(kind, NEEDS[sort], None)):
+        raise UserError(f"{reference} is no {sort}: give a class with a name and a function `{NEEDS[sort]}`")
+    return kind

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from cuelearner_jax import config as configuration
+from cuelearner_jax import plugins
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions
-from cuelearner_jax.agents.registry import AGENTS
+from cuelearner_jax.agents.protocol import AGENTS, AgentFunctions, AgentOptions
 from cuelearner_jax.arbiters import ARBITERS, Arbiter, Episodes
 from cuelearner_jax.config import Scalars, Schedule, Sizes, check_guide, check_multiple, check_part
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.plugins import PartRegistry
 from cuelearner_jax.spaces import Box
 
 TaskT = TypeVar("TaskT")
@@ -26,7 +25,7 @@ ArbiterT = TypeVar("ArbiterT", bound=Arbiter)
 KindsT = TypeVar("KindsT")
 
 GROUPS: Mapping[str, type] = {"sizes": Sizes, "scalars": Scalars, "schedule": Schedule}
-PARTS: Mapping[str, PartRegistry[Any]] = {"agent": AGENTS, "arbiter": ARBITERS}
+PARTS: Mapping[str, dict[str, Any]] = {"agent": AGENTS, "arbiter": ARBITERS}
 
 
 class Settings(NamedTuple):
@@ -87,7 +86,7 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
         kinds: Any = self.kinds
         if isinstance(own := kinds.get(kind), dict):
             return kind_from_json(kind, own)
-        config = getattr(guidances.find_or_none(kind), "config", None)
+        config = getattr(guidances.guides().get(kind), "config", None)
         if own is not None and not (config and isinstance(own, config)):
             raise UserError(f"the options of guidance {kind!r} are {own!r}: give its own, or leave them out")
         return own
@@ -135,7 +134,7 @@ def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
     Raises UserError for an unknown field or part, or a value of another type.
     """
     shared = {name: configuration.from_json(kind, values[name]) for name, kind in GROUPS.items()}
-    parts = {name: part_from_json(known, values[name]) for name, known in PARTS.items()}
+    parts = {sort: part_from_json(sort, values[sort]) for sort in PARTS}
     kinds = {name: kind_from_json(name, own) for name, own in values["kinds"].items()}
     return RunConfig(task, **shared, **parts, kinds=kinds)
 
@@ -150,7 +149,7 @@ def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
 
     Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
     """
-    kind = guidances.find_or_none(name)
+    kind = guidances.guides().get(name)
     if values is None or kind is None:
         return values
     if kind.config is None:
@@ -165,8 +164,7 @@ def part_to_json(options: Any) -> dict[str, Any]:
     return {"name": options.NAME, **configuration.to_json(options)}
 
 
-def part_from_json(parts: PartRegistry[Any], values: Mapping[str, Any]) -> Any:
+def part_from_json(sort: str, values: Mapping[str, Any]) -> Any:
     """Return a part's options from JSON values. Raises as `from_json`."""
-    return configuration.from_json(
-        parts.find(values["name"]), {name: value for name, value in values.items() if name != "name"}
-    )
+    options = {name: value for name, value in values.items() if name != "name"}
+    return configuration.from_json(plugins.find(PARTS[sort], values["name"], sort), options)

@@ -138,7 +138,7 @@ class Task:
     judge_by: Callable[[Any], str] = lambda config: "reward"
 
     def __post_init__(self) -> None:
-        """Raise ValueError for the first part that cannot work."""
+        """Raise ValueError for a part that cannot work."""
         fields = {entry.name for entry in dataclasses.fields(self.config)}
         names = [body.name for body in self.bodies]
         if not self.name.isidentifier() or "name" in fields:
@@ -147,10 +147,6 @@ class Task:
             raise ValueError(f"task {self.name}: it needs at least one body, each of another name, not {names}")
         if unknown := sorted(set(self.labels_hold) - fields):
             raise ValueError(f"task {self.name}: labels_hold names {unknown[0]!r}, no field of {self.config.__name__}")
-        for name, preset in self.presets.items():
-            if not isinstance(preset.config.task, self.config):
-                kind = type(preset.config.task).__name__
-                raise ValueError(f"task {self.name}: preset {name!r} configures {kind}, not {self.config.__name__}")
         for name, scenario in self.scenarios.items():
             try:
                 dataclasses.replace(GuideSizes(), **scenario.sizes)
@@ -165,15 +161,9 @@ class Task:
         return self.config() if self.default is None else self.default
 
     def configure(self, scenario: str | None = None, **changes: Any) -> Any:
-        """Return the task's configuration in a scenario, with fields changed.
-
-        Raises UserError for no such scenario or field, or a value that its field cannot hold.
-        """
-        config = self.plain()
-        if scenario is not None:
-            config = self.scenario(scenario).apply(config)
-        values = check_types(config, "task", **changes) if changes else {}
-        return dataclasses.replace(config, **values)
+        """Return the task's configuration in a scenario, with fields changed. Raises UserError if there is no such."""
+        config = self.plain() if scenario is None else self.scenario(scenario).apply(self.plain())
+        return dataclasses.replace(config, **(check_types(config, "task", **changes) if changes else {}))
 
     def first_preset(self, default: str = PAPER) -> str:
         """Return the name of the default preset: `default`, or the first."""
@@ -198,11 +188,8 @@ class Task:
         """Return the teacher of a world, who gets so many questions, if known. Raises UserError if there is none."""
         if self.teacher is None:
             raise UserError(f"{self.name} has no teacher to ask: give --labels-from, or a guidance without labels")
-        if questions is not None and self.brief_teacher is not None:
-            brief = self.brief_teacher(config, env, questions)
-            if brief is not None:
-                return brief
-        return self.teacher(config, env)
+        brief = questions is not None and self.brief_teacher and self.brief_teacher(config, env, questions)
+        return brief or self.teacher(config, env)
 
     def check_whole(self, config: Any, envs: int, steps: int, envs_option: str, steps_option: str) -> None:
         """Raise UserError if an episode may outlast the steps of each environment.
@@ -217,9 +204,8 @@ class Task:
 
     def check_evaluations(self, config: RunConfig) -> None:
         """Raise UserError unless the evaluations of a training see whole episodes."""
-        schedule = config.schedule
         options = "--schedule.eval-envs", "--schedule.eval-steps"
-        self.check_whole(config.task, schedule.eval_envs, schedule.eval_steps, *options)
+        self.check_whole(config.task, config.schedule.eval_envs, config.schedule.eval_steps, *options)
 
     def on(self, body: str | None) -> Task:
         """Return the task with that body first (None: unchanged); NAME:FOLDER adds the user's files in a folder.
@@ -234,12 +220,11 @@ class Task:
         known = {one.name: one for one in self.bodies}
         if body not in known:
             raise UserError(f"unknown robot {body!r}{suggestion(body, known)}")
-        others, found = tuple(one for one in self.bodies if one.name != body), known[body]
-        if folder:
-            if found.made_of is None:
-                raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
-            found = found.made_of(Path(folder))
-        return dataclasses.replace(self, bodies=(found, *others), robot=robot)
+        others, first = tuple(one for one in self.bodies if one.name != body), known[body]
+        if folder and first.made_of is None:
+            raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
+        first = first.made_of(Path(folder)) if folder and first.made_of else first
+        return dataclasses.replace(self, bodies=(first, *others), robot=robot)
 
     def engine(self, name: str | None) -> Rollout | None:
         """Return the first body's roll-out in other physics (None: its own). Raises UserError for an unknown engine."""
@@ -256,10 +241,7 @@ class Task:
         return engines[name]
 
     def pictures(self, otherwise: str = "evaluate it instead") -> Pictures:
-        """Return the first body's drawing functions.
-
-        Raises UserError, with the remedy `otherwise`, if there are none.
-        """
+        """Return the first body's drawing functions. Raises UserError, with the remedy `otherwise`, if none are."""
         if self.bodies[0].pictures is None:
             raise UserError(f"{self.name} has no pictures of {self.bodies[0].name}: {otherwise}")
         return self.bodies[0].pictures()

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.agents.networks import all_finite, as_function, q_network
-from cuelearner_jax.agents.view import network_inputs
+from cuelearner_jax.agents.networks import all_finite, as_function, network_inputs, q_network
 from cuelearner_jax.config import from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.spaces import directions as geometry
@@ -75,9 +74,7 @@ class LearnedTeacher(struct.PyTreeNode):
 
 
 def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
-    """Write a teacher's folder: its network in half precision, and teacher.json.
-
-    `about` must hold the `layers` and `directions` of the network under `config`.
+    """Write a teacher's folder; `about` must hold the `layers` and `directions` of the network under `config`.
 
     Raises NotFinite, and writes nothing, for weights that half precision cannot hold.
     """
@@ -97,7 +94,7 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
 
 def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     """Return a teacher that `save` wrote. Raises UserError if there is none, or its observations differ."""
-    sizes = _about(folder)["config"]
+    sizes = read_about(folder)["config"]
     layers = tuple(sizes["layers"])
     template = jax.eval_shape(lambda key: init_params(layers, env, key), jax.random.key(0))
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
@@ -109,17 +106,13 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
 
 
 def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> Any:
-    """Return the configuration of the world that a teacher learned in.
+    """Return the configuration of the world that a teacher learned in, who is asked in a task's configuration.
+
+    `apart`: fields in which the two may differ, because they change nothing or the task handles them.
 
     Raises UserError for no teacher, one of another task, or one that does not know a change of this world.
-
-    Args:
-        folder: folder of the teacher.
-        task: name of the task in which it is to be asked.
-        config: the configuration in which it is to be asked.
-        apart: fields in which the two may differ, because they change nothing or the task handles them.
     """
-    world = dict(_about(folder)["task"])
+    world = dict(read_about(folder)["task"])
     if (name := world.pop("name")) != task:
         raise UserError(f"the teacher in {folder} is one of {name}, not of {task}: give another folder")
     own = from_json(type(config), world)
@@ -136,7 +129,7 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
 
 def digest(folder: Path) -> str:
     """Return a short hash of a teacher's files. Raises UserError if there is no teacher."""
-    _about(folder)
+    read_about(folder)
     found = hashlib.sha256()
     for file in [folder / ABOUT, *sorted((folder / "network").rglob("*"))]:
         if file.is_file():
@@ -144,7 +137,7 @@ def digest(folder: Path) -> str:
     return found.hexdigest()[:12]
 
 
-def _about(folder: Path) -> dict[str, Any]:
+def read_about(folder: Path) -> dict[str, Any]:
     """Return the content of teacher.json. Raises UserError if it is missing or damaged."""
     if not (folder / ABOUT).is_file():
         raise UserError(

@@ -50,8 +50,7 @@ class ValuesDirections(Protocol):
         spread: Float[Array, ""] | float,
         share: Float[Array, ""] | float,
     ) -> Float[Array, " action"]:
-        """Return the good action nearest to `action`: its value is at least a share of the best, averaged over an error
-        of aim.
+        """Return the good action nearest to `action`: its value is at least a `share` of the best.
 
         `spread` is the standard deviation of the aim [rad]; see `spaces.directions.nearest_direction`.
         """

@@ -2,9 +2,9 @@
 
 Run in the folder above this one, with any task that has a teacher:
 
-    cuelearner sweep examples.reach:TASK --guidance none examples.clone:KIND --clone.way 0.9 --out runs/clone
+    cuelearner sweep examples.reach:TASK --guidance none examples.clone:Clone --clone.way 0.9 --out runs/clone
     cuelearner report runs/clone --out runs/clone/report --metric success
-    cuelearner evaluate runs/clone --task examples.reach:TASK --guidance none examples.clone:KIND --policy guide
+    cuelearner evaluate runs/clone --task examples.reach:TASK --guidance none examples.clone:Clone --policy guide
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, Scalars
 from cuelearner_jax.config.parts import Bounds, part
-from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.feedback.answers import AnswerForm
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces.directions import evenly_spaced, rotate
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Params, Teacher
@@ -67,6 +67,9 @@ class Clone(Guide):
     network would do, so that the situations which follow are those that it will meet.
     """
 
+    name, about = "clone", "a network of the points that the teacher names"
+    form, colour, config = FORM, "#CC79A7", Config
+
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, "2"]:
         """The direction of the point that was named."""
         return evenly_spaced(POINTS)[label.answer[0].astype(int)]
@@ -84,8 +87,3 @@ class Clone(Guide):
             return self.options.way * (self.predict(env, model.params, obs, current) - current)
 
         return self.refined(way, actions, active & model.fitted, scalars, k_max=1)
-
-
-KIND = Kind(
-    "clone", "a network of the points that the teacher names", Clone, form=FORM, colour="#CC79A7", config=Config
-)

@@ -188,7 +188,7 @@ def by_labels(bench: Bench) -> Iterator[Row]:
     lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (piece.bound_deg,))
     envs = min(bench.envs, JUDGED)
     judge = Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)
-    of = Adaptation(kind.make(sizes, spaces_of(env), options), sizes, bench.scalars(), env, bench.agents)
+    of = Adaptation(kind(sizes, spaces_of(env), options), sizes, bench.scalars(), env, bench.agents)
     after = by_model.adapt(of, lanes, judge, bench.task.make_teacher(bench.world, env))
     which = {"base": bench.seeds[lanes.base], "label_seed": lanes.seed, "labels": lanes.budget, "steps": 0}
     judged = {
@@ -203,7 +203,7 @@ def by_answers(bench: Bench) -> Iterator[Row]:
     """Read answers, which also decide whether the correction is used."""
     piece, env = bench.piece, bench.env("training")
     kind, scalars = guidances.find("reading"), by_reading.settling(bench.scalars(), None)
-    guidance = kind.make(by_model.SIZES, spaces_of(env), None)
+    guidance = kind(by_model.SIZES, spaces_of(env))
     lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (actions_of(env).reach,))
     family = declared_distortions(env)
     of = by_reading.ReadingAdaptation(guidance, by_model.SIZES, scalars, env, bench.agents, family)

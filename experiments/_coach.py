@@ -5,12 +5,11 @@ one network, which would begin at random where a finished policy is at hand. So 
 policy's action. Its last layer begins at zero: before the first correction the policy stays what it was.
 
 They are kinds of guidance, so the program of adaptation runs them as it runs relative feedback; on the command line
-they are named as `_coach:KIND` and `_coach:BATCH`, with this folder on the path of Python.
+they are `_coach:CoachedCorrection` and `_coach:BatchCoachedCorrection`, with this folder on the path of Python.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -19,13 +18,16 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.guides import bdcoach, dcoach
-from cuelearner_jax.guides.fitting import Lesson
+from cuelearner_jax.guides.fitting import Example
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 
 class CoachedCorrection(dcoach.DeepCoach):
     """A correction of the base policy's action, moved by each label; labels keep that action (`base`)."""
+
+    name, sees_base = "dcoach-correction", True
+    about = "a correction moved by each label, which begins at nothing"
 
     @property
     def looks_again(self) -> bool:
@@ -49,10 +51,10 @@ class CoachedCorrection(dcoach.DeepCoach):
         """The corrected actions of a base policy that does `actions`."""
         return actions + self.network.predict(env, params, obs, actions)
 
-    def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
+    def examples(self, labels: Label, scalars: GuideScalars) -> Example:
         """Labels (slots, ...) with their targets, seen from what the base policy did."""
         assert labels.base is not None  # `asking` keeps it for a kind that `sees_base`
-        return super().lessons(labels, scalars).replace(action=labels.base)
+        return super().examples(labels, scalars).replace(action=labels.base)
 
     def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
@@ -65,18 +67,5 @@ class CoachedCorrection(dcoach.DeepCoach):
 class BatchCoachedCorrection(CoachedCorrection, bdcoach.BatchCoach):
     """A correction moved by a model of the teacher, which is asked about the corrected actions."""
 
-
-KIND = replace(
-    dcoach.KIND,
-    name="dcoach-correction",
-    about="a correction moved by each label, which begins at nothing",
-    guide=CoachedCorrection,
-    sees_base=True,
-)
-BATCH = replace(
-    bdcoach.KIND,
-    name="bdcoach-correction",
-    about="a correction moved by a model of the teacher, which begins at nothing",
-    guide=BatchCoachedCorrection,
-    sees_base=True,
-)
+    name = "bdcoach-correction"
+    about = "a correction moved by a model of the teacher, which begins at nothing"

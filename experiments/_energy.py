@@ -7,12 +7,11 @@ A few labels tell that, where no energy of the situation can be learned from the
     E(s, a, log(a_0, a) / eps),  a <- argmin over b within tau_max of a_0 of E
 
 It is a kind of guidance, so the program of adaptation runs it as it runs relative feedback; on the command line it is
-named as `_energy:KIND`, with this folder on the path of Python.
+named as `_energy:CorrectingEnergy`, with this folder on the path of Python.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -21,12 +20,15 @@ from jaxtyping import Array, Float
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.guides import clic
-from cuelearner_jax.guides.model import GuideModel, guide_model
+from cuelearner_jax.guides.fitting import GuideModel, guide_model
 from cuelearner_jax.types import Params
 
 
 class CorrectingEnergy(clic.Clic):
     """An energy that sees how far an action has been turned; labels keep what the policy did (`base`)."""
+
+    name, sees_base = "clic-correction", True
+    about = "an energy over corrections, low in the sets that labels leave possible"
 
     @cached_property
     def network(self) -> GuideModel:
@@ -54,12 +56,3 @@ class CorrectingEnergy(clic.Clic):
         """Variance of the members' energies of actions that nothing has turned."""
         still = jnp.zeros((len(actions), len(self.spaces.actions.cues)))
         return self.network.disagreement(env, model.params, obs, jnp.concatenate([actions, still], -1))
-
-
-KIND = replace(
-    clic.KIND,
-    name="clic-correction",
-    about="an energy over corrections, low in the sets that labels leave possible",
-    guide=CorrectingEnergy,
-    sees_base=True,
-)

@@ -31,7 +31,7 @@ from cuelearner_jax.devices import compiler_options, each_lane, each_lane_in_pla
 from cuelearner_jax.environment import Environment, Spaces, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.baselines import NONE
+from cuelearner_jax.guides.base import NoGuide
 from cuelearner_jax.loop import Clock, Lane, TrainState, make_lane, start_clock
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig, Settings, check
@@ -147,7 +147,7 @@ class FineTuning:
         self.config = dataclasses.replace(config, agent=agent, schedule=schedule)
         check(self.config)
         self.env, self.lanes, self.clock = env, lanes, start_clock()
-        self._lane = make_lane(self.config, guidances.make(NONE.name, config.sizes, env), env, 0)
+        self._lane = make_lane(self.config, guidances.make(NoGuide.name, config.sizes, env), env, 0)
         self._train = jax.jit(
             _stretch,
             static_argnames=("lane", "iterations"),

@@ -8,7 +8,7 @@ more passes correct what it has made of the action, about which questions are fr
 `scalars.refined_fraction`).
 
 It is a kind of guidance, so the program of adaptation runs it as it runs relative feedback; on the command line it is
-named as `_residual:KIND`, with this folder on the path of Python.
+named as `_residual:Residual`, with this folder on the path of Python.
 """
 
 from __future__ import annotations
@@ -17,22 +17,17 @@ from jaxtyping import Array, Float
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION
-from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.types import Label
 
 
-class _Shown(Guide):
-    """Mixin for a guide that learns the difference between the teacher's action and the action asked about."""
+class Residual(Relative):
+    """A guide that learns the difference between the teacher's action and the action asked about."""
+
+    name, about = "residual", "the correction itself, from optimal actions"
+    form, colour = DEMONSTRATION, "#D55E00"
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """Return the correction to the teacher's action, clipped at the bound."""
         space = self.spaces.actions
         return space.clip(label.answer, label.action, space.from_unit(scalars.tau_max_deg)) - label.action
-
-
-class Residual(_Shown, Relative):
-    """Residual learning."""
-
-
-KIND = Kind("residual", "the correction itself, from optimal actions", Residual, form=DEMONSTRATION, colour="#D55E00")

@@ -124,7 +124,7 @@ def content_of(kind: str) -> Content:
 
 def plot(what: Content, kind: str) -> Figure:
     """Draw the one picture that all kinds share; readable on white and on black."""
-    found = registry.find_or_none(kind)
+    found = registry.guides().get(kind)
     colour = found.colour if found else "#0072B2"
     figure = Figure(figsize=(4.2, 2.5), layout="constrained", facecolor="none")
     axes = figure.subplots()

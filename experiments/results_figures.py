@@ -56,7 +56,7 @@ def colours(rows: Sequence[Row]) -> dict[str, str]:
     hues = {}
     for name in names:
         plain = name.startswith(("no ", "not ", "without", "SAC alone"))
-        is_kind = registry.find_or_none(name) is not None
+        is_kind = registry.guides().get(name) is not None
         hues[name] = GREY if plain else colour_of(name) if is_kind else spare.pop(0)
     return hues
 

@@ -34,18 +34,18 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Quantity, WholeObservations, spaces_of
 from cuelearner_jax.guides import registry
-from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, Heuristic
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Step
 
 SIZES = GuideSizes(feedback_layers=(64, 64), labels_per_round=20, fit_steps=300, fit_batch_size=32, question_every=5)
-KINDS: Mapping[str, Kind] = {
+KINDS: Mapping[str, type[Guide]] = {
     "relative": registry.find("relative"),
-    "demonstration": _residual.KIND,
-    "dcoach": _coach.KIND,
-    "bdcoach": _coach.BATCH,
-    "clic": _energy.KIND,
+    "demonstration": _residual.Residual,
+    "dcoach": _coach.CoachedCorrection,
+    "bdcoach": _coach.BatchCoachedCorrection,
+    "clic": _energy.CorrectingEnergy,
 }
 # strength of an answer and largest correction [half of a cue's range; 90 degrees], rate of learning
 SETTINGS = tuple(product((0.1, 0.3), (0.6, 1.2), (1e-3, 3e-3)))
@@ -136,7 +136,7 @@ def measure(
     space, (strength, most, rate) = study.space_of(robots), setting
     env = Even.of(zoo.unchanged(jax.tree.map(lambda leaf: leaf[0], robots)), jax.random.key(0))
     of = KINDS[kind]
-    guidance = of.make(SIZES, spaces_of(env), of.config() if of.config else None)
+    guidance = of(SIZES, spaces_of(env))
     unit = unit_of(space)
     eps = strength * unit
     scalars = replace(

@@ -16,7 +16,6 @@ from cuelearner_jax.arbiters import Outcome, Paced
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.program import make_program
-from cuelearner_jax.tasks import registry
 
 HALF = Paced(lead=0.0)  # any lead will do
 FADE = 1 - 1 / pace.WINDOW  # of the sums, with each episode
@@ -73,12 +72,6 @@ def test_the_standard_error_is_that_of_a_bootstrap():
 def test_sums_fade_with_every_episode_of_either_arm():
     found = seen([[1.0]] * 3, [1] * 3, [False, True, True])
     np.testing.assert_allclose(found.episodes, [FADE**2, FADE + 1], rtol=1e-6)
-
-
-def test_an_episode_earns_its_reward_and_its_steps():
-    found = seen([[1.0], [0.0, 1.0, 1.0]], [1, 3], [False, True])
-    np.testing.assert_allclose(found.gain, [FADE, 2], rtol=1e-6)
-    np.testing.assert_allclose(found.size, [FADE, 3], rtol=1e-6)
 
 
 def test_with_a_discount_an_episode_earns_its_discounted_return_however_long():
@@ -183,14 +176,6 @@ def test_a_guide_that_becomes_worse_half_way_is_followed_within_a_window():
     assert back[:, 650:].mean() > 0.4  # a guide that becomes better is tried, though seldom seen before
 
 
-def test_every_preset_is_paced_but_the_papers():
-    offered = map(registry.find, ("arm", "billiards", "navigation"))
-    found = {(task.name, name): preset.config.arbiter.NAME for task in offered for name, preset in task.presets.items()}
-    others = {("billiards", "paper"): "episodes", ("navigation", "paper"): "episodes"}
-    others[("arm", "corrected")] = "episodes"  # labels correct steps there, and guide no episode
-    assert found == {named: others.get(named, "paced") for named in found}
-
-
 # In the loop, on the bandit: the heuristic turns by -1 rad, and is right in a world of that offset alone.
 
 PACED = probes.config(arbiter=HALF)
@@ -230,13 +215,3 @@ def test_after_the_cut_off_nothing_is_guided_nor_counted(program):
     _, state, metrics = run(program, right, [0, 1], 1, short, clock, state)
     assert float(metrics["guided_share"][0]) == 0
     jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.asarray, state.arbiter.sums))
-
-
-def test_random_steps_are_no_arms(program):
-    late = dataclasses.replace(SCHEDULE, random_steps=200)  # of 400
-    _, state, metrics = run(program, probes.Window(), [0, 1], 1, late)
-    rewards, faded = probes.stored(state, 0, 400)["reward"].reshape(100, 4)[50:], 0.0
-    for row in rewards:
-        faded = faded * FADE**4 + row.sum()
-    assert float(state.arbiter.sums.gain[0].sum()) == pytest.approx(faded, rel=1e-4)
-    assert 0 < float(metrics["guided_share"][0]) < 0.5

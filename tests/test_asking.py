@@ -142,34 +142,6 @@ def test_answers_past_the_budget_do_not_count():
     chex.assert_trees_all_equal(after, spent)
 
 
-def test_questions_without_an_answer_do_not_count():
-    guide = begun()
-    for position in range(ROUND):
-        guide = record(guide, position, jnp.array([1.0, 0.0]), jnp.array([1.0]), False)
-    assert not np.asarray(guide.labels.valid).any()
-    assert not bool(fit(ENV, probes.SCALARS, guide, LANE_KEY, jnp.asarray(0)).model.fitted)
-    once = record(guide, ROUND, jnp.array([1.0, 0.0]), jnp.array([1.0]), True)
-    assert bool(fit(ENV, probes.SCALARS, once, LANE_KEY, jnp.asarray(0)).model.fitted)
-
-
-def test_each_question_and_each_fit_has_random_numbers_of_its_own():
-    drawn = [asking.question_keys(LANE_KEY, position) for position in range(3)]
-    words = {tuple(np.asarray(jax.random.key_data(key)).tolist()) for keys in drawn for key in keys}
-    assert len(words) == 3 * 4
-    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY)
-    models = [fit(ENV, probes.SCALARS, guide, LANE_KEY, jnp.asarray(number)).model for number in (0, 0, 1)]
-    chex.assert_trees_all_equal(models[0], models[1], guide.model)
-    assert not np.array_equal(jax.tree.leaves(models[0].params)[1], jax.tree.leaves(models[2].params)[1])
-
-
-def test_labels_given_elsewhere_are_fitted_once():
-    labels = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY).labels
-    taken = jax.jit(partial(asking.take_labels, RELATIVE))(ENV, probes.SCALARS, labels, begun(), LANE_KEY)
-    given = begun().replace(labels=labels, asked=begun().budget)
-    chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, given, LANE_KEY))
-    assert bool(taken.model.fitted)
-
-
 def test_shuffled_answers_are_those_given_each_with_another_label():
     """A control that can fail: how often each answer is given stays, and no answer is about its action."""
     answer, valid = np.arange(20.0)[:, None], np.arange(20) % 7 != 3  # told apart; three count for nothing

@@ -13,7 +13,6 @@ from cuelearner_jax.environment import (
     UNKNOWN_UNIT,
     Features,
     Quantity,
-    actions_of,
     check_layout,
     offers,
     random_symmetries,
@@ -89,13 +88,6 @@ def test_a_layout_is_compared_as_far_as_it_is_known():
 # What is optional.
 
 
-def test_what_an_environment_offers_is_what_it_has():
-    everything = [offers(probes.Window(), name) for name in ("heuristic", "mirror", "features")]
-    little = [offers(probes.Chain(), name) for name in ("heuristic", "mirror", "features")]
-    assert everything == [True, True, True]
-    assert little == [True, False, False]
-
-
 def test_a_member_that_is_none_is_not_offered():
     class Silent(probes.Window):
         heuristic = None
@@ -112,30 +104,7 @@ def test_shapes_in_place_of_arrays_offer_the_same():
     assert spaces_of(shapes) == spaces_of(probes.Window())
 
 
-def test_environments_without_a_mirror_have_the_identity_alone():
-    assert [symmetries_of(env) for env in PROBES.values()] == [1, 4, 1]
-
-
-def test_actions_are_directions_where_nothing_else_is_said():
-    assert actions_of(probes.Window()) is DIRECTIONS
-    assert spaces_of(probes.Chain())[:2] == (2, DIRECTIONS)
-
-    class Other(probes.Chain):
-        actions = Box((0.0,) * 5, (1.0,) * 5)
-
-    assert actions_of(Other()).size == 5
-    assert spaces_of(Other()).actions.size == 5
-
-
 # Symmetries.
-
-
-@pytest.mark.parametrize("env", [probes.Window(), probes.Chain()], ids=["not asked for", "none"])
-def test_without_symmetries_rows_stay_the_very_arrays(env):
-    rows, vectors = np.ones((ROWS, 2), np.float32), np.zeros((ROWS, 2), np.float32)
-    image = random_symmetries(jax.random.key(0), env, ROWS)
-    assert image(rows, vectors)[0] is rows
-    assert image(rows, vectors)[1] is vectors
 
 
 def test_every_symmetry_is_drawn_and_maps_a_row_as_a_whole():

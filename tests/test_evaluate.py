@@ -50,16 +50,6 @@ def test_means_over_first_episodes_are_of_all_of_them_or_of_none():
     assert np.isfinite([cut["reward"], cut["hit"]]).all()
 
 
-def test_each_environment_tells_its_own_steps_and_its_first_episode():
-    found = evaluate.rollout_with_progress(ENV, Uniform(), KEY, 400, 400 * (LONGEST - 1))
-    ended = found.each["finished"] == 1
-    np.testing.assert_array_equal(np.isnan(found.each["success"]), ~ended)
-    np.testing.assert_array_equal(found.each["duration"][ended], found.episode_steps[ended])
-    assert set(found.episode_steps[~ended]) == {LONGEST - 1}
-    assert found.each["reward"].mean() == pytest.approx(float(found.means["reward"]))
-    assert len(set(found.each["reward"])) > 1
-
-
 @pytest.mark.parametrize("steps", [1, 2, 5, 6, 48])
 def test_a_roll_out_in_stretches_is_bitwise_that_in_one(steps):
     told = []

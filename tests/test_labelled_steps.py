@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from box_task import SMALL, Reach
 
 from cuelearner_jax.agents.replay import Memory, buffer_for
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import asked_from
 from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import difference, rotate
@@ -105,10 +103,6 @@ def test_a_minibatch_has_its_share_of_labelled_steps(share, count):
     assert marks(memory(100, 30), 8, guided_share=jnp.float32(share)).tolist() == [7.0] * count + [1.0] * (8 - count)
 
 
-def test_without_labelled_steps_a_minibatch_is_the_agents_own():
-    assert set(marks(memory(100, 0), 64, guided_share=jnp.float32(0.5))) == {1.0}
-
-
 def test_without_a_share_every_step_is_as_likely():
     drawn = marks(memory(100, 50), 6_000) == 7.0
     assert abs(drawn.mean() - 1 / 3) < 4 * np.sqrt(2 / 9 / 6_000)  # four standard errors
@@ -127,10 +121,3 @@ def test_without_a_share_every_step_is_as_likely():
 def test_sizes_that_do_not_suit_are_refused(sizes, kind, told):
     with pytest.raises(UserError, match=told):
         probes.config(sizes=sizes).guide_in(ENV, kind)
-
-
-def test_in_a_box_questions_begin_with_its_middle():
-    policy = asked_from(Reach(), dataclasses.replace(probes.SIZES, ask_from="middle"))
-    actions = policy.act(jax.random.key(0), None, jnp.zeros((2, 2)))
-    np.testing.assert_allclose(actions, [SMALL.middle()] * 2)
-    np.testing.assert_allclose(actions, [[0.0, 2.0, -1.0]] * 2)

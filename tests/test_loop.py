@@ -1,7 +1,6 @@
 """The training loop on probes: values known by hand, who acts when, and what lanes owe each other (nothing)."""
 
 import dataclasses
-import itertools
 import math
 from functools import cache, partial
 
@@ -13,11 +12,10 @@ import pytest
 
 from cuelearner_jax import evaluate, loop
 from cuelearner_jax.agents.networks import as_function, q_network
-from cuelearner_jax.agents.replay import Transition, apply_symmetries
 from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Agent, Guided, Uniform
+from cuelearner_jax.policies import Agent
 from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.types import Step
@@ -116,16 +114,6 @@ def test_values_of_a_chain_that_is_truncated():
     (start, end), _ = chain_values(truncates=True)
     np.testing.assert_allclose(end, [2, 1, 0, 1], atol=0.1)
     np.testing.assert_allclose(start, [1.0, 1.5, 1.0, 0.5], atol=0.1)
-
-
-def test_the_target_network_follows_at_its_rate():
-    _, never = chain_values(False, polyak=0.0)
-    fresh = probes.start(chain_program(), [3], [0], probes.Chain(jnp.array(False)))
-    before, after = (jax.tree.leaves(state.agent.training.target_params) for state in (fresh, never))
-    for one, other in zip(after, before, strict=True):
-        np.testing.assert_array_equal(one, other)
-    _, always = chain_values(False)
-    assert np.abs(jax.tree.leaves(always.agent.training.target_params)[1] - before[1]).max() > 1e-3
 
 
 def test_replay_keeps_what_each_step_led_to():
@@ -248,44 +236,9 @@ def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would(taught):
             np.testing.assert_allclose(rows[small, :15], rows[large, :15], atol=1e-6)
 
 
-def test_questions_before_the_first_fit_are_uniform_and_later_ones_refined():
-    program, seeds, budgets = probes.window_program("relative"), [1, 2, 3, 4], [LARGEST] * 4
-    refined = labelled(program, seeds, budgets)[1].guide.labels
-    error = np.abs(directions.difference(ENV.best(refined.obs), refined.action))
-    assert error[:, :10].mean() == pytest.approx(math.pi / 2, abs=0.4)  # standard deviation 0.14
-    assert error[:, 30:].mean() < 0.6
-    plain = dataclasses.replace(probes.SCALARS, refined_fraction=0.0)
-    uniform = labelled(program, seeds, budgets, scalars=plain)[1].guide.labels
-    np.testing.assert_array_equal(uniform.action[:, :10], refined.action[:, :10])
-    assert np.abs(directions.difference(ENV.best(uniform.obs), uniform.action))[:, 30:].mean() > 1.2
-
-
-def test_a_lane_whose_budget_is_spent_stays_as_it_is(taught):
-    _, two = labelled(probes.window_program("relative"), SEEDS, BUDGETS, 2)
-    assert_equal(probes.lane(two, 0), probes.lane(taught[1], 0))
-    assert not np.array_equal(two.guide.labels.obs[2], taught[1].guide.labels.obs[2])
-
-
 def assert_equal(one, other):
     for mine, yours in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(mine, yours)
-
-
-def test_refined_uniform_actions_win_far_more_often_than_chance(taught):
-    _, state = taught
-    guidance = guidances.make("relative", probes.SIZES, ENV)
-
-    def reward(model):
-        guide = Guided(Uniform(), model, ENV, probes.SCALARS, guidance)
-        found = evaluate.rollout_lanes(ENV, guide, jax.random.key(3), 100, 1000, mesh=MESH).means
-        return np.asarray(found["reward"])
-
-    guided = reward(state.guide.model)
-    chance = reward(state.guide.model.replace(fitted=jnp.zeros(4, bool)))
-    np.testing.assert_allclose(chance, 1 / (2 * math.pi), atol=0.05)
-    assert guided[2:].min() > 0.5
-    assert guided[2:].mean() > 0.75
-    assert (guided[2:] > guided[:2]).all()  # sixty labels against fifteen
 
 
 # Lanes.
@@ -303,41 +256,12 @@ def grid():
     return trained(probes.window_program("relative"), SEEDS, BUDGETS)
 
 
-def test_every_seed_differs(grid):
-    state, _ = grid
-    fresh = probes.start(probes.window_program("relative"), SEEDS, BUDGETS)
-    for one, other in itertools.combinations([0, 1], 2):
-        for tree in (fresh.agent.params, fresh.guide.model.params, state.agent.params, state.guide.model.params):
-            mine, yours = jax.tree.leaves(probes.lane(tree, one)), jax.tree.leaves(probes.lane(tree, other))
-            assert all(not np.array_equal(a, b) for a, b in zip(mine, yours, strict=True) if a.any())
-        assert not np.array_equal(state.agent.replay[one], state.agent.replay[other])
-        assert not np.array_equal(state.guide.labels.action[one], state.guide.labels.action[other])
-
-
-def test_lanes_of_one_seed_start_alike_and_differ_by_their_budget(grid):
-    state, _ = grid
-    fresh = probes.start(probes.window_program("relative"), SEEDS, BUDGETS)
-    assert_equal(probes.lane(fresh.agent.params, 0), probes.lane(fresh.agent.params, 2))
-    assert not np.array_equal(
-        jax.tree.leaves(state.guide.model.params)[1][0], jax.tree.leaves(state.guide.model.params)[1][2]
-    )
-
-
 def test_a_lane_is_the_same_beside_any_others(grid):
     state, metrics = grid
     beside, measured = trained(probes.window_program("relative"), [5, 6, 7, SEEDS[3]], BUDGETS)
     assert not np.array_equal(beside.agent.replay[0], state.agent.replay[0])
     assert_equal(probes.lane(state, 3), probes.lane(beside, 3))  # to the last bit
     assert_equal(probes.lane(metrics, 3), probes.lane(measured, 3))
-
-
-@pytest.mark.long
-def test_a_lane_alone_is_the_lane_beside_others(grid):
-    state, metrics = grid
-    program = probes.window_program("relative")
-    alone, measured = trained(program, SEEDS[3:], BUDGETS[3:])
-    assert_equal(probes.lane(state, 3), probes.lane(alone, 0))  # to the last bit
-    assert_equal(probes.lane(metrics, 3), probes.lane(measured, 0))
 
 
 # Lanes that are no longer finite.
@@ -448,30 +372,3 @@ def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
         clock, state = program.label_round(env, probes.Expert(env), scalars, clock, state)
         clock, state, _ = program.train(env, settings, clock, state, STRETCH)
     assert probes.compilations(*functions) == before
-
-
-def test_evaluation_compiles_once_for_all_parameters_and_worlds():
-    before = probes.compilations(evaluate._on_mesh)[0]
-    for index in range(3):
-        params = probes.start(probes.window_program("none"), [index], [0]).agent.params
-        env = probes.Window(0.1 * index, 0.6)
-        agents = Agent(params, probes.FUNCTIONS)
-        evaluate.rollout_lanes(env, agents, jax.random.key(index), 3, 6, mesh=MESH)
-    assert probes.compilations(evaluate._on_mesh) == [before + 1]
-
-
-def test_transitions_are_mirrored_as_a_whole():
-    rng = np.random.default_rng(0)
-    obs, action, following = jnp.array(rng.normal(size=(3, 64, 2)), jnp.float32)
-    batch = Transition(obs, action, jnp.arange(64.0), jnp.ones(64), following)
-    image = apply_symmetries(jax.random.key(0), probes.Window(mirrors=True), batch)
-    quarters = np.round(np.asarray(directions.difference(obs, image.obs)) / (math.pi / 2)).astype(int) % 4
-    assert set(quarters) == {0, 1, 2, 3}
-    for name in ("obs", "action", "next_obs"):
-        expected = directions.rotate(getattr(batch, name), jnp.array(quarters * math.pi / 2))
-        np.testing.assert_allclose(getattr(image, name), expected, atol=1e-5)
-    np.testing.assert_array_equal(image.reward, batch.reward)
-    without = apply_symmetries(jax.random.key(0), probes.Window(mirrors=True), batch.replace(next_obs=following[:, :0]))
-    np.testing.assert_array_equal(without.obs, image.obs)
-    same = apply_symmetries(jax.random.key(0), ENV, batch)
-    assert all(one is other for one, other in zip(jax.tree.leaves(same), jax.tree.leaves(batch), strict=True))

@@ -87,21 +87,21 @@ def test_success_of_robots_drawn_by_chance():
 
 def test_each_kind_of_feedback_has_a_page():
     index = (PAGES / "index.md").read_text(encoding="utf-8")
-    for kind in registry._BUILT_IN:
+    for kind in registry.BUILT_IN:
         page = (PAGES / f"{PAGE_OF.get(kind.name, kind.name)}.md").read_text(encoding="utf-8")
         assert f"`{kind.name}`" in index or kind.name == "none"
         assert kind.name in page
         assert {"## Equation", "## Run", "## When"} <= set(page.splitlines()), kind.name
         assert re.search(r"!\[.+\]\(\.\./figures/feedback/\w+\.svg\)", page), kind.name
     arbiters = (PAGES / "arbiters.md").read_text(encoding="utf-8")
-    assert [name for name in (kind.NAME for kind in ARBITERS.known) if f"`{name}`" not in arbiters] == []
+    assert [name for name in (kind.NAME for kind in ARBITERS.values()) if f"`{name}`" not in arbiters] == []
 
 
 def test_the_table_says_what_a_kind_serves():
     lines = (PAGES / "index.md").read_text(encoding="utf-8").splitlines()
     head = next(line for line in lines if line.startswith("| `--guidance` | you say"))
     names = [cell.strip() for cell in head.strip("|").split("|")]
-    for kind in registry._BUILT_IN:
+    for kind in registry.BUILT_IN:
         if kind.name in UNTAUGHT:
             continue
         (line,) = [line for line in lines if line.startswith(f"| [`{kind.name}`](")]

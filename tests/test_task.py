@@ -9,8 +9,7 @@ import probes
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.task import Body, Preset, Scenario, shape_of
+from cuelearner_jax.task import Body, Preset, Scenario
 
 PRESET = Preset("small", probes.CONFIG)
 TASK = dataclasses.replace(
@@ -40,10 +39,8 @@ class Picky:
 
 CANNOT_BE = [
     ({"name": "my task"}, "task 'my task': its name must be an identifier"),
-    ({"bodies": ()}, "at least one body"),
     ({"bodies": (WIDE, WIDE)}, "each of another name, not ['wide', 'wide']"),
     ({"labels_hold": ("wide",)}, "labels_hold names 'wide', no field of WindowConfig"),
-    ({"presets": {"x": Preset("", RunConfig(Picky()))}}, "preset 'x' configures Picky, not WindowConfig"),
     ({"scenarios": {"x": Scenario("", {"half_with_deg": 1.0})}}, "unexpected keyword argument 'half_with_deg'"),
     ({"scenarios": {"x": Scenario("", {}, sizes={"members": 5})}}, "unexpected keyword argument 'members'"),
     (
@@ -91,17 +88,3 @@ def test_a_scenario_changes_its_fields_alone():
         TASK.scenario("narow")
     with pytest.raises(UserError, match="window has no scenarios"):
         probes.make_task().scenario("narrow")
-
-
-def test_a_task_without_a_teacher_says_so_when_one_is_needed():
-    mute = dataclasses.replace(TASK, teacher=None)
-    env = mute.environment(probes.WindowConfig())
-    with pytest.raises(UserError, match="window has no teacher to ask"):
-        mute.make_teacher(probes.WindowConfig(), env)
-    assert TASK.make_teacher(probes.WindowConfig(), env).env is env
-
-
-def test_shapes_stand_in_for_arrays():
-    shapes = jax.tree.leaves(shape_of(TASK, probes.WindowConfig()))
-    assert shapes
-    assert all(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in shapes)

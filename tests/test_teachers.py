@@ -32,14 +32,6 @@ def test_it_comes_back_from_disk_in_half_precision(made, tmp_path):
     np.testing.assert_allclose(loaded.values(OBS[1], OBS), made.values(OBS[1], OBS), atol=5e-3)
 
 
-def test_saving_again_replaces_the_network(made, tmp_path):
-    teachers.save(tmp_path, made, ABOUT)
-    other = made.replace(params=jax.tree.map(lambda leaf: 2 * leaf, made.params))
-    teachers.save(tmp_path, other, ABOUT)
-    weights = jax.tree.leaves(teachers.load(tmp_path, ENV, 0.0, 0.0).params)[1]
-    np.testing.assert_allclose(weights, 2 * jax.tree.leaves(made.params)[1], rtol=2e-3)
-
-
 def test_a_folder_without_a_teacher_is_refused(tmp_path):
     with pytest.raises(UserError, match="no teacher"):
         teachers.load(tmp_path, ENV, 0.0, 0.0)

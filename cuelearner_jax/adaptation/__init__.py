@@ -2,5 +2,5 @@
 
 `lanes` asks and fits, `judging` compares a policy with its base, `by_model` and `by_reading` run both to the end,
 `serialization` stores policies. A new way of correcting is a new kind
-(`guides.base.Kind`). `studies.adapt` checks requests.
+(`guides.base.Guide`). `studies.adapt` checks requests.
 """

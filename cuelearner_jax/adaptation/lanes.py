@@ -166,7 +166,7 @@ def take_labels(of: Adaptation, labels: Label, block: LaneState, mesh: Mesh) -> 
 
     def of_device(of: Adaptation, labels: Label, block: LaneState) -> LaneState:
         def one(labels: Label, lane: LaneState) -> LaneState:
-            if of.guidance.kind.sees_base:  # files do not keep the base policy's actions: ask it again
+            if of.guidance.sees_base:  # files do not keep the base policy's actions: ask it again
                 labels = labels.replace(base=of.bases.lane(lane.base).act(lane.key, None, labels.obs))
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
             last = (lane.guide.budget - 1) // of.sizes.labels_per_round  # number of the last round

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import changes as own_changes
 from cuelearner_jax.agents.protocol import AgentFunctions
-from cuelearner_jax.agents.registry import AGENTS
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Spaces, actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
@@ -138,13 +137,13 @@ def _unread(values: dict[str, Any], env: Any, family: Any) -> Read:
 
 def _agent(values: dict[str, Any], spaces: Spaces) -> AgentFunctions:
     """Return an agent's functions. Raises UserError if no agent of that name is known."""
-    return part_from_json(AGENTS, values["agent"]).make(values["frame"], spaces)
+    return part_from_json("agent", values["agent"]).make(values["frame"], spaces)
 
 
 def _guidance(values: dict[str, Any], env: Any) -> Guide:
     """Return the guide of a guided policy. Raises UserError if no kind of that name is known."""
     name = values["guidance"]
-    if guidances.find_or_none(name) is None:
+    if name not in guidances.guides():
         raise UserError(
             f"the policy is under a guidance from outside, {name!r}: name its code by --guidance package.module:NAME, "
             "if you trust that code"

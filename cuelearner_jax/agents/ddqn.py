@@ -16,9 +16,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.agents import view
 from cuelearner_jax.agents.choice import best_near_peaks, best_of
-from cuelearner_jax.agents.networks import as_function, q_network, widen_layers
+from cuelearner_jax.agents.networks import as_function, network_inputs, q_network, widen_layers, widths
 from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
@@ -73,7 +72,7 @@ class Config:
         """
         if self.coarse_directions:
             check_directions(spaces.actions, "agent.coarse_directions", "give 0")
-        view.widths(frame, spaces)
+        widths(frame, spaces)
         return DoubleDQN(self, frame, spaces, bootstraps)
 
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
@@ -117,7 +116,7 @@ class DoubleDQN:
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, DDQNState]:
         """Return random parameters, and a target network that is a copy of them."""
-        params = q_network(self.options.q_layers).init(key, *map(jnp.zeros, view.widths(self.frame, self.spaces)))
+        params = q_network(self.options.q_layers).init(key, *map(jnp.zeros, widths(self.frame, self.spaces)))
         copy = jax.tree.map(jnp.copy, params) if self.bootstraps else None
         return params, DDQNState(copy, optimizer(self.options.optimizer, 0.0, 0.0).init(params))
 
@@ -142,7 +141,7 @@ class DoubleDQN:
         look = as_function(q_network(layers, jnp.dtype(own.coarse_dtype)))
         return best_near_peaks(
             partial(self.value, env, params),
-            lambda one, actions: look(rough, *view.network_inputs(self.frame, env, one, actions))[:, 0],
+            lambda one, actions: look(rough, *network_inputs(self.frame, env, one, actions))[:, 0],
             self._directions,
             obs,
             own.coarse_directions,
@@ -154,7 +153,7 @@ class DoubleDQN:
     ) -> Float[Array, "*m"]:
         """Return Q of each action; `obs` is one situation for all actions, or one for each."""
         network = as_function(q_network(self.options.q_layers))
-        return network(params, *view.network_inputs(self.frame, env, obs, actions))[..., 0]
+        return network(params, *network_inputs(self.frame, env, obs, actions))[..., 0]
 
     def update(
         self,

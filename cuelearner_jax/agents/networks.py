@@ -1,4 +1,10 @@
-"""MLPs of an observation and an action, for action values and feedback models."""
+"""MLPs of an observation and an action, for action values and feedback models; and their inputs.
+
+Inputs are observation and action as they are, or the observation as it looks from the action. In the action's frame
+(`frame` "action"), situations that differ by a rotation have the same inputs, and a network's output for one holds for
+all of them. This is equivariance by the input (Wang, Walters, Platt, "SO(2)-equivariant reinforcement learning", ICLR
+2022; van der Pol et al., "MDP homomorphic networks", NeurIPS 2020).
+"""
 
 from __future__ import annotations
 
@@ -12,6 +18,9 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
+from cuelearner_jax.config import Frame
+from cuelearner_jax.environment import Spaces
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Params
 
 
@@ -75,6 +84,35 @@ def as_function(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Ar
     return lambda params, obs, actions: jnp.asarray(network.apply(params, obs, actions))
 
 
+def network_inputs(
+    frame: Frame, env: Any, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
+) -> tuple[Float[Array, "*n own"], Float[Array, "*m turned"]]:
+    """Return a network's inputs for observation and action.
+
+    Args:
+        frame: "raw": the two as they are; "action": the environment's `features`.
+        env: provides the features; not used in the raw frame.
+        obs: one observation (obs,) with any number of actions, or n observations with one action each.
+        actions: (*m, action) or (n, action).
+    """
+    if frame == "raw":
+        return obs, actions
+    features = env.features(obs, actions) if obs.ndim == 1 else jax.vmap(env.features)(obs, actions)
+    return features.own, features.turned
+
+
+def widths(frame: Frame, spaces: Spaces) -> tuple[int, int]:
+    """Return the sizes of a network's two inputs. Raises UserError if the environment has no `features`."""
+    if frame == "raw":
+        return spaces.obs_size, spaces.actions.size
+    if spaces.features is None:
+        raise UserError(
+            "sizes.frame is 'action', but this task does not define an observation as seen from an action "
+            "(`features`): give --sizes.frame raw"
+        )
+    return spaces.features
+
+
 def all_finite(tree: Any) -> Bool[Array, ""]:
     """Return whether every number of a tree of arrays is finite."""
     numbers = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
@@ -84,15 +122,7 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
 def widen_layers(params: Params, layers: Sequence[int], multiple: int) -> tuple[Params, tuple[int, ...]]:
     """Return the same function with hidden widths rounded up to multiples, as tensor cores need aligned rows.
 
-    The units that are added are zero throughout and add exactly nothing.
-
-    Args:
-        params: parameters of a network of this module.
-        layers: the network's hidden widths.
-        multiple: the new widths are multiples of this number.
-
-    Returns:
-        Parameters and hidden widths of the wider network.
+    `layers` are the hidden widths of the network. The units that are added are zero throughout and add exactly nothing.
     """
     wider = tuple(-(-width // multiple) * multiple for width in layers)
     extra = [0, *(new - old for new, old in zip(wider, layers, strict=True)), 0]

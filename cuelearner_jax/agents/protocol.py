@@ -1,7 +1,9 @@
 """The agent protocol: pure functions of one lane, made from options (`config.parts`), for any space and environment.
 
-The options are a class with a `NAME`, a line `ABOUT` it, and `make`; `registry` finds them by name. An agent made from
-equal options for equal spaces is equal, so that a program compiled for one serves the other.
+The options are a class with a `NAME`, a line `ABOUT` it, and `make`. Add your own to `AGENTS`, or name it as
+package.module:NAME. An agent made from equal options for equal spaces is equal, so that a program compiled for one
+serves the other. Where the class of options has `SORTS = True`, `update` draws guided and own steps separately, and
+replay counts guided steps.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from cuelearner_jax.agents import ddqn, sac
 from cuelearner_jax.agents.replay import Memory
 from cuelearner_jax.config import Frame, Scalars, Sizes
 from cuelearner_jax.environment import Spaces
@@ -66,19 +69,10 @@ class AgentFunctions(Protocol):
         memory: Memory,
         key: PRNGKeyArray,
     ) -> tuple[Params, Any, Float[Array, ""], Float[Array, ""]]:
-        """Make one gradient step.
+        """Make gradient step number `count` (from 1); return parameters, the rest, the loss and the gradient's norm.
 
-        Args:
-            env: as for `act`; its `recall` rebuilds the memory's observations.
-            options: those that the agent was made from, their floats traced.
-            scalars: settings that all parts share, such as the discount factor.
-            count: gradient steps, this one included.
-            params, rest: as `init` returns them.
-            memory: the steps to learn from.
-            key: random key of this step.
-
-        Returns:
-            Parameters; the rest; the loss; the norm of the gradient.
+        `options` are those that the agent was made from, their floats traced; `scalars` are settings that all parts
+        share; `params` and `rest` are as `init` returns them; `env` rebuilds the memory's observations.
         """
         ...
 
@@ -109,12 +103,4 @@ class AgentOptions(Protocol):
         ...
 
 
-class OptionalFacts(Protocol):
-    """Optional members of a class of options, beside `AgentOptions`; read them by the functions below."""
-
-    SORTS: ClassVar[bool]  # True if `update` draws guided and own steps separately; replay then counts guided steps
-
-
-def draws_sorts(options: Any) -> bool:
-    """Return whether agents of these options draw guided and own steps separately (`guided_share`)."""
-    return getattr(options, "SORTS", False)
+AGENTS: dict[str, Any] = {kind.NAME: kind for kind in (ddqn.Config, sac.Config)}

@@ -218,10 +218,7 @@ def count_guided(
 ) -> Int[Array, "capacity 1"]:
     """Count guided steps beside the rows of a ring buffer: of all steps made up to each row, that row included.
 
-    Args:
-        counts: the counts of the rows so far, 0 at first.
-        step: rows written so far, see `RingBuffer`.
-        guided: which of the steps being added the guide chose.
+    `counts`: 0 at first; `step`: see `RingBuffer`; `guided`: which of the steps being added the guide chose.
     """
     before = counts[jnp.mod(step - 1, counts.shape[0]), 0]
     added = before + jnp.cumsum(guided.astype(counts.dtype))
@@ -233,15 +230,11 @@ def draw_sorts(
 ) -> Int[Array, " batch"]:
     """Draw numbers of rows of one sort each, every row of a sort as likely.
 
-    A row is found by its rank among those of its sort, by bisection. Once rows are written over, the oldest is left
-    out: the count before it, which told its sort, is gone.
+    A row is found by its rank among those of its sort, by bisection in the `counts` of `count_guided`. Once rows are
+    written over, the oldest is left out: the count before it, which told its sort, is gone.
 
-    Args:
-        key: random key of the draw.
-        counts: guided steps up to each row, see `count_guided`.
-        filled: rows written so far, also those written over since.
-        guided: which of the numbers are to be of guided steps, the others of own ones; of a sort without rows the
-            numbers are of the other.
+    `filled`: rows written so far, also those written over since. `guided`: which of the numbers are to be of guided
+    steps, the others of own ones; of a sort without rows the numbers are of the other.
     """
     capacity = counts.shape[0]
     lost = jnp.maximum(filled - capacity, 0)
@@ -273,16 +266,9 @@ def n_step_return(
 ) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
     """Return the discounted rewards of up to n steps of one episode (Sutton and Barto, 2018, Eq. 7.1).
 
-    The sum stops with the episode's last step, or with the last step that is known.
-
-    Args:
-        rewards, discounts, ended: values of consecutive steps; `discounts` is 0 at termination, else 1.
-        known: which of them have been made already; the first is.
-        discount: discount factor.
-
-    Returns:
-        The sum; the factor of the value of the last step's next observation, short of one `discount`, as
-        `Transition.discount` has it; the last step's index.
+    The sum stops with the episode's last step, or with the last step that is `known`; `discounts` is 0 at termination,
+    else 1. Returns the sum; the factor of the value of the last step's next observation, short of one `discount`, as
+    `Transition.discount` has it; the last step's index.
     """
     before_end = jnp.cumprod(jnp.concatenate([jnp.ones(1), 1.0 - ended[:-1]]))
     counts = before_end * known

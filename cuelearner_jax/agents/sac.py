@@ -40,7 +40,6 @@ class Config:
 
     NAME: ClassVar[str] = "sac"
     ABOUT: ClassVar[str] = "soft actor-critic in a box, with any number of critics"
-    ACTOR: ClassVar[bool] = True
     SORTS: ClassVar[bool] = True
 
     actor_layers: Layers = (256, 256)

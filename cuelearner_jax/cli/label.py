@@ -37,7 +37,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.reading import KIND
+from cuelearner_jax.guides.base import Reading
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
 from cuelearner_jax.policies import NearAims, policy_of, uniform_in
@@ -155,7 +155,7 @@ def _suggested(task: Task, preset: Preset, source: PolicySource | None, ahead: N
         sizes=_part(GuideSizes, sizes),
         scalars=_part(GuideScalars, scalars),
         out=Path("labels") / task.name,
-        guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
+        guidance=asking_kind(preset_kinds(task, preset)) if named is None else Reading.name,
         bound_deg=bound,
         labels=max(preset.labels) if named is None else by_reading.USUAL if by_evidence else Label.labels,
         questions=UNIFORM if named is not None else _usual_questions(task),
@@ -191,12 +191,12 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
             f"--bound-deg is {options.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
     guidance = merged.guide_in(env, guidances.kind_name(options.guidance))
-    if guidance.kind.by_evidence:
+    if guidance.by_evidence:
         _check_evidence(options)
-    if guidance.kind.sees_base:
+    if guidance.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
-        asking = [kind.name for kind in guidances.kinds() if kind.asks]
+        asking = [kind.name for kind in guidances.guides().values() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
     controls.check(guidance.form, space)
     if options.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):
@@ -205,7 +205,7 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
     if options.again is not None:
         plan = Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted, one_cue=options.one_cue)
         return _second(plan, options)
-    family = _family(options, env) if guidance.kind.by_evidence else ()
+    family = _family(options, env) if guidance.by_evidence else ()
     base = _base(task, options, source, env)
     return Plan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
 

@@ -215,7 +215,9 @@ def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -
         f"presets (--preset{default})": presets,
         "changed worlds (--scenario)": scenarios,
         "robots (--robot)": {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {},
-        "guidance (--guidance; your own as package.module:NAME)": {one.name: one.about for one in guidances.kinds()},
+        "guidance (--guidance; your own as package.module:NAME)": {
+            n: one.about for n, one in guidances.guides().items()
+        },
         "policies (--policy)": {name: one.about for name, one in POLICIES.items()} if policies else {},
     }
     # A line that is not indented would be taken for the end of the one above: the groups stand apart.

@@ -78,9 +78,9 @@ def source_of(ahead: Namespace) -> PolicySource:
     named, option = ahead.words[0] if ahead.words else None, _task_option(ahead)
     task, own = None if option is None else registry.resolve(option), None
     code = None if ahead.base is None else code_of(ahead.base)
-    for name, parts in PARTS.items():
+    for name, table in PARTS.items():
         if (part := getattr(ahead, name)) is not None:
-            parts.resolve(part)
+            plugins.resolve(table, part, name)
     if named is not None:
         folder = shipped.folder_of(named)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)

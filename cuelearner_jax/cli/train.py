@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+from cuelearner_jax import plugins
 from cuelearner_jax.cli.options import (
     Flag,
     Kinds,
@@ -107,8 +108,8 @@ def task_and_options(
     name, preset = preset_of(task, ahead.preset, QUICKSTART)
     request = train.suggested(task, preset)
     config = request.config
-    for part, known in PARTS.items():
-        chosen = None if (word := getattr(ahead, part)) is None else known.resolve(word)
+    for part, table in PARTS.items():
+        chosen = None if (word := getattr(ahead, part)) is None else plugins.resolve(table, word, part)
         if chosen is not None and chosen is not type(getattr(config, part)):
             config = replace(config, **{part: chosen()})
     used = [guidances.resolve(word) for word in ahead.guidance or request.grid.guidance]

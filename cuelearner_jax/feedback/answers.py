@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,24 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_jax.config import Scalars, TeacherFaults
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, format_value
-from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.spaces import UNSAID, Space
 from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
+
+
+class AnswerForm(NamedTuple):
+    """A form of answer. Label files hold its name; every guide with the same form can use them."""
+
+    name: str
+    width: Callable[[Space], int]  # entries of an answer
+    meaning: Callable[[Space], str]  # meaning of its entries, in a few words
+    # (key, env, teacher, state, obs, action, scalars) -> (answer (answer,), answered): of a simulated teacher about an
+    # action in a situation, with the faults of `scalars`
+    answer: Callable[..., tuple[Array, Array]]
+    values: Callable[[Space], tuple[float, ...]] | None = None  # allowed values of an entry; None: any finite number
+    is_action: bool = False  # True if an answer is itself an action
+    by_eps: bool = False  # True if an answer means a change by eps, which label files then record
+    # (space, action, answer, eps) -> the action that the answer asks for; None: an answer names none
+    correct: Callable[[Space, Array, Array, Array], Array] | None = None
 
 
 def check_teacher(teacher: Any, faults: TeacherFaults) -> None:

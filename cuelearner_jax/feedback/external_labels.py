@@ -7,7 +7,7 @@ import numpy as np
 
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.types import Label
 
@@ -15,16 +15,9 @@ ACTION_ERROR = 1e-3  # largest error of an entry of an action
 
 
 def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, named: str) -> None:
-    """Check that a file's labels fit an environment and a form of answers.
+    """Check that a file's labels, called `named` in messages, fit an environment and a form of answers, as `check`.
 
-    Args:
-        file: the labels.
-        spaces: the environment's spaces; None: observations of any size, the file's own space of actions.
-        form: form of the answers; None: unknown, then answers are only checked to be finite.
-        named: name of the file in messages.
-
-    Raises:
-        UserError: as `check`, or the file does not say how strong its answers are.
+    `spaces`: None for observations of any size and the file's own space of actions.
     """
     if form is not None and form.by_eps and file.eps is None:
         raise UserError(f"{named} does not name the strength (eps) of its {form.name} answers: write the file again")
@@ -32,17 +25,9 @@ def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, 
 
 
 def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "the labels") -> None:
-    """Check that labels fit an environment and a form of answers.
+    """Raise UserError unless labels (labels, ...) fit an environment's spaces and a form of answers.
 
-    Args:
-        labels: rows (labels, ...) of arrays.
-        spaces: the environment's spaces.
-        form: form of the answers; None: unknown, then answers are only checked to be finite.
-        named: name of the labels in messages.
-
-    Raises:
-        UserError: a wrong shape, a number that is not finite, an action outside the space, or an answer that is not
-            allowed.
+    `form`: None if it is unknown; answers are then only checked to be finite.
     """
     rows = {"observations": labels.obs, "actions": labels.action, "answers": labels.answer}
     width = labels.answer.shape[-1] if form is None else form.width(spaces.actions)

@@ -1,4 +1,4 @@
-"""The base class of guides, pure functions over an explicit model; and `Kind`, what the registry knows of a guide.
+"""Guides: pure functions over an explicit model. The base class of every kind, and the kinds that fit no model.
 
 What a teacher *said* (its answer, kept in labels) and what a network *predicts* of it (the target) are two things.
 """
@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -18,99 +18,64 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
-from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refinement, bound_scalars, refine
+from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
+from cuelearner_jax.guides.fitting import Example, GuideModel, examples, fit_least_squares, guide_model
+from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-# pattern of names of kinds, also in files: neither a path nor a reference to code
-NAME = re.compile(r"[a-z][a-z0-9_-]*")
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of guidance, before sizes and an environment are known."""
-
-    name: str  # name in options, folders and columns
-    about: str  # description in a few words
-    guide: type[Guide]
-    form: AnswerForm | None = None  # form of the answers that it asks for; None: it never asks
-    needs: tuple[str, ...] = ()  # optional members of an environment that it needs
-    title: str = ""  # title in figures, if other than the name
-    colour: str | None = None  # colour in figures
-    config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
-    sees_base: bool = False  # True if it needs a finished policy's actions; it then serves adaptation only
-    by_cues: bool = False  # True if its model measures along cues, whatever its answers say
-    # True if `reading` reads its answers; it then has no model and serves adaptation only
-    by_evidence: bool = False
-
-    def __post_init__(self) -> None:
-        if not NAME.fullmatch(self.name):
-            raise ValueError(f"a guidance is called {self.name!r}: give lower-case letters, digits, - and _")
-
-    @property
-    def asks(self) -> bool:
-        """Whether its guides ask a teacher."""
-        return self.form is not None
-
-    @property
-    def needs_cues(self) -> bool:
-        """Whether its guides need a space whose actions have cues."""
-        return self.by_cues or (self.form is not None and self.form.by_eps)
-
-    @property
-    def adapts_only(self) -> bool:
-        """Whether its guides correct finished policies only."""
-        return self.sees_base or self.by_evidence
-
-    def make(self, sizes: GuideSizes, spaces: Spaces, options: Any = None) -> Guide:
-        """Return the guide for an environment's spaces; `options`: a `config` (None: its defaults)."""
-        return self.guide(self, sizes, spaces, self.config() if options is None and self.config else options)
+NAME = re.compile(r"[a-z][a-z0-9_-]*")  # names of kinds, also in files: neither a path nor a reference to code
+Observations = Float[Array, "n obs"]
+Actions = Float[Array, "n action"]
+Rows = Bool[Array, " n"]  # which rows
 
 
 @dataclass(frozen=True)
 class Guide:
     """One kind of guidance for one lane: pure functions over an explicit model, chosen in Python before tracing.
 
-    A kind writes `act`, and `target` and `predict` where these differ. By default a network of situation and action,
-    or an ensemble of such, is fitted from scratch to all labels by least squares (paper, Eq. 3), and questions are
-    about what it would do (DAgger). Guides with equal settings are equal: a program is compiled once for them.
+    A kind is a subclass with a `name`. It writes `act`, and `target` and `predict` where these differ. By default a
+    network of situation and action, or an ensemble of such, is fitted from scratch to all labels by least squares
+    (paper, Eq. 3), and questions are about what it would do (DAgger). Guides with equal settings are equal: a program
+    is compiled once for them.
     """
 
-    kind: Kind
+    name: ClassVar[str]  # in options, folders and columns
+    about: ClassVar[str]  # description in a few words
+    form: ClassVar[AnswerForm | None] = None  # form of the answers that it asks for; None: it never asks
+    needs: ClassVar[tuple[str, ...]] = ()  # optional members of an environment that it needs
+    config: ClassVar[type | None] = None  # a dataclass (`config.part`) of options of its own; None: it has none
+    title: ClassVar[str] = ""  # title in figures, if other than the name
+    colour: ClassVar[str | None] = None  # colour in figures
+    moves: ClassVar[bool] = True  # False if it never changes an action
+    sees_base: ClassVar[bool] = False  # True if it needs a finished policy's actions; it then serves adaptation only
+    by_cues: ClassVar[bool] = False  # True if its model measures along cues, whatever its answers say
+    by_evidence: ClassVar[bool] = False  # True if `reading` reads its answers; it then serves adaptation only
+    # From the above: whether it asks a teacher, needs a space with cues, corrects finished policies only
+    asks: ClassVar[bool]
+    needs_cues: ClassVar[bool]
+    adapts_only: ClassVar[bool]
+
     sizes: GuideSizes
     spaces: Spaces
-    options: Any = None  # a `Kind.config`
+    options: Any = None  # a `config`; None: its defaults
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if not NAME.fullmatch(name := vars(cls).get("name", "inherited")):
+            raise ValueError(f"a guidance is called {name!r}: give lower-case letters, digits, - and _")
+        cls.asks = cls.form is not None
+        cls.needs_cues = cls.by_cues or (cls.form is not None and cls.form.by_eps)
+        cls.adapts_only = cls.sees_base or cls.by_evidence
 
     def __post_init__(self) -> None:
         """Raise UserError for a kind that needs cues, in a space without cues."""
-        if self.kind.needs_cues and not self.spaces.actions.cues:
-            told = "measures" if self.kind.by_cues else "asks"
+        if self.needs_cues and not self.spaces.actions.cues:
             raise UserError(
-                f"guidance {self.name!r} {told} which way to change an action, but the {self.spaces.actions.name} have "
-                "no order: give them one (`Choices(count, order)`), or guidance demonstration or scalar"
+                f"guidance {self.name!r} changes actions along cues, but the {self.spaces.actions.name} have no order: "
+                "give them one (`Choices(count, order)`), or guidance demonstration or scalar"
             )
-
-    @property
-    def name(self) -> str:
-        """Name of the guide's kind."""
-        return self.kind.name
-
-    @property
-    def form(self) -> AnswerForm | None:
-        """Form of the answers that the guide asks for; None: it never asks."""
-        return self.kind.form
-
-    @property
-    def asks(self) -> bool:
-        """Whether the guide asks a teacher."""
-        return self.kind.asks
-
-    @property
-    def moves(self) -> bool:
-        """Whether the guide ever changes an action."""
-        return True
+        if self.options is None and self.config is not None:
+            object.__setattr__(self, "options", self.config())
 
     @property
     def has_members(self) -> bool:
@@ -126,20 +91,12 @@ class Guide:
         """Return what the network is to predict for one label; here the answer."""
         return label.answer
 
-    def predict(
-        self, env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
-    ) -> Float[Array, "n outputs"]:
+    def predict(self, env: Any, params: Params, obs: Observations, actions: Actions) -> Float[Array, "n outputs"]:
         """Return the predictions that are fitted to the targets."""
         return self.network.predict(env, params, obs, actions)
 
     def act(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
-        scalars: GuideScalars,
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the actions to execute in place of a batch of actions.
 
@@ -151,22 +108,22 @@ class Guide:
         """Return an unfitted model."""
         return GuidanceModel(self.network.init(key), jnp.array(False))
 
-    def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
+    def examples(self, labels: Label, scalars: GuideScalars) -> Example:
         """Return labels (slots, ...) with their targets."""
         space = self.spaces.actions if self.form is not None and self.form.by_eps else None
-        return lessons(labels, self.target, scalars, space)
+        return examples(labels, self.target, scalars, space)
 
-    def redrawn(self, key: PRNGKeyArray, batch: Lesson) -> Lesson:
-        """Return the batch to train on in place of a batch (n, ...) of lessons."""
+    def augmented(self, key: PRNGKeyArray, batch: Example) -> Example:
+        """Return the batch to train on in place of a batch (n, ...) of examples."""
         return batch
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
         """Return the model of labels (slots, ...); fitting from scratch ignores `former`, the previous model."""
-        rows, predict = self.lessons(labels, scalars), partial(self.predict, env)
+        rows, predict = self.examples(labels, scalars), partial(self.predict, env)
         return fit_least_squares(
-            key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes, redrawn=self.redrawn
+            key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes, augment=self.augmented
         )
 
     def question(
@@ -185,14 +142,12 @@ class Guide:
         refines = jax.random.bernoulli(key, scalars.refined_fraction)
         return self.act(model, env, obs[None], base[None], refines[None], scalars).actions[0]
 
-    def disagreement(
-        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
-    ) -> Float[Array, " n"]:
+    def disagreement(self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions) -> Float[Array, " n"]:
         """Return the variance of an ensemble's members, summed over their outputs."""
         return self.network.disagreement(env, model.params, obs, actions)
 
     def refine_labelled_actions(
-        self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
+        self, model: GuidanceModel, env: Any, labels: Label, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return what `act` makes of the actions that labels (n, ...) are about."""
         return self.act(model, env, labels.obs, labels.action, active, scalars)
@@ -202,9 +157,9 @@ class Guide:
         bound: Float[Array, ""],
         model: GuidanceModel,
         env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
+        obs: Observations,
+        actions: Actions,
+        active: Rows,
         scalars: GuideScalars,
     ) -> Refinement:
         """Return `act`, limited to within `bound` of the given actions for every kind."""
@@ -214,20 +169,85 @@ class Guide:
 
     def refined(
         self,
-        residual: Callable[[Float[Array, "n action"]], Float[Array, "n action"]],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
+        residual: Callable[[Actions], Actions],
+        actions: Actions,
+        active: Rows,
         scalars: GuideScalars,
         k_max: Int[Array, ""] | int | None = None,
     ) -> Refinement:
         """Return `refine` within the limits of the scalars; `k_max`: another largest number of passes."""
         space = self.spaces.actions
-        return refine(
-            residual,
-            actions,
-            active,
-            space=space,
-            tau=space.from_unit(scalars.tau_deg),
-            tau_max=space.from_unit(scalars.tau_max_deg),
-            k_max=scalars.k_max if k_max is None else k_max,
-        )
+        limits = {"tau": space.from_unit(scalars.tau_deg), "tau_max": space.from_unit(scalars.tau_max_deg)}
+        most = scalars.k_max if k_max is None else k_max
+        return refine(residual, actions, active, space=space, **limits, k_max=most)
+
+
+def replaced(chosen: Actions, actions: Actions, rows: Rows) -> Refinement:
+    """Return the chosen actions in place of others in some rows, as one pass."""
+    return Refinement(jnp.where(rows[:, None], chosen, actions), rows.astype(jnp.int32))
+
+
+class NoGuide(Guide):
+    """No guidance, the baseline of every other kind: a guide with an empty model, as other kinds without questions."""
+
+    name, about, title, colour, moves = "none", "the agent alone", "no guidance", "#4d4d4d", False
+
+    def init(self, key: PRNGKeyArray) -> GuidanceModel:
+        """Return an empty model."""
+        return GuidanceModel({}, jnp.array(False))
+
+    def fit(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
+        """Return the former model."""
+        return former
+
+    def act(
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
+    ) -> Refinement:
+        """Return every action unchanged."""
+        return no_refinement(actions)
+
+
+class HeuristicGuide(NoGuide):
+    """The environment's heuristic as a guide."""
+
+    name, about, title, colour, moves = "heuristic", "the task's obvious action", "", "#D55E00", True
+    needs = ("heuristic",)
+
+    def act(
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
+    ) -> Refinement:
+        """Return the heuristic's action in active rows."""
+        return replaced(jax.vmap(env.heuristic)(obs), actions, active)
+
+
+class AnyAim(NoGuide):
+    """A guide that follows the nearest aim: what `intent` is before its first label."""
+
+    name, about, title, colour, moves = "any_aim", "any of the task's aims, without a label", "", "#999933", True
+    needs = ("aims",)
+
+    def act(
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
+    ) -> Refinement:
+        """Return the nearest of the aims that may be followed, in active rows; without any aim, the given action."""
+
+        def one(obs: Array, action: Array) -> tuple[Array, Array]:
+            aims = env.aims(obs)
+            possible = aims.possible if aims.open is None else aims.possible & aims.open
+            off = self.spaces.actions.distance(action[None], aims.actions)
+            return aims.actions[jnp.argmin(jnp.where(possible, off, jnp.inf))], possible.any()
+
+        goals, has_aim = jax.vmap(one)(obs, actions)
+        return replaced(goals, actions, active & has_aim)
+
+
+class Reading(NoGuide):
+    """Answers as intervals for the right action, which say what changed in the world.
+
+    No network is fitted and no action refined: `cuelearner_jax.reading` reads the answers, outside compiled programs.
+    """
+
+    name, about = "reading", "relative feedback for adaptation: what changed in the world, with an interval"
+    title, colour, form, by_evidence = "", "#B15928", RELATIVE, True

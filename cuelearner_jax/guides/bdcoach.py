@@ -23,7 +23,6 @@ cue, as no answer is. A cue of which nothing was said teaches H nothing, and H t
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Annotated, Any
 
 import jax
@@ -33,12 +32,10 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import POSITIVE, part
-from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.dcoach import Coached, DeepCoach
-from cuelearner_jax.guides.fitting import Lesson, optimizer, squared_errors
-from cuelearner_jax.guides.model import for_each
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.guides.dcoach import Coached, Correct, DeepCoach
+from cuelearner_jax.guides.fitting import Example, optimizer, squared_errors
+from cuelearner_jax.types import Label, Params
 
 
 @part
@@ -61,96 +58,76 @@ class BatchCoached(Coached):
 class BatchCoach(DeepCoach):
     """A guide that acts as a cloned policy does, and learns from a model of its teacher."""
 
-    options: Config  # pyright: ignore[reportIncompatibleVariableOverride]
+    name, about, title = "bdcoach", "a policy moved by a model of its teacher", "BD-COACH"
+    colour, config = "#CC6677", Config
 
-    def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """Return a policy without corrections, and an untrained human model."""
+    def begin(self, key: PRNGKeyArray) -> BatchCoached:
+        """Return one member's policy without corrections, and its untrained human model."""
+        policy, human = (self.member.network.init(one) for one in jax.random.split(key))
+        states = (optimizer(GuideScalars()).init(params) for params in (policy, human))
+        return BatchCoached(policy, next(states), jnp.zeros((), jnp.int32), human, next(states))
 
-        def begin(key: PRNGKeyArray) -> BatchCoached:
-            policy, human = (self.member.network.init(one) for one in jax.random.split(key))
-            states = (optimizer(GuideScalars()).init(params) for params in (policy, human))
-            return BatchCoached(policy, next(states), jnp.zeros((), jnp.int32), human, next(states))
-
-        return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
-
-    def human_loss(self, env: Any, human: Params, rows: Lesson, scalars: GuideScalars) -> Array:
+    def human_loss(self, env: Any, human: Params, rows: Example, scalars: GuideScalars) -> Array:
         """Return the loss of the human model: its predictions about the asked actions against the answers."""
         eps = self.spaces.actions.from_unit(scalars.eps_deg)
-        answered = rows.replace(target=(rows.target - rows.action) / eps)
-        return jnp.mean(squared_errors(answered, self.member.network.predict(env, human, rows.obs, rows.action)))
+        answers = rows.replace(target=(rows.target - rows.action) / eps)
+        return jnp.mean(squared_errors(answers, self.member.network.predict(env, human, rows.obs, rows.action)))
 
-    def policy_targets(self, env: Any, human: Params, rows: Lesson, acted: Array, scalars: GuideScalars) -> Lesson:
+    def policy_targets(self, env: Any, human: Params, rows: Example, acted: Array, scalars: GuideScalars) -> Example:
         """Return rows whose targets are the human model's corrections of the policy's own actions, in all cues."""
         space = self.spaces.actions
-        eps, does = space.from_unit(scalars.eps_deg), space.retract(acted)
-        toward = space.retract(does + eps * self.member.network.predict(env, human, rows.obs, does))
-        target = jax.lax.stop_gradient(space.clip(toward, does, eps))
+        eps, own = space.from_unit(scalars.eps_deg), space.retract(acted)
+        toward = space.retract(own + eps * self.member.network.predict(env, human, rows.obs, own))
+        target = jax.lax.stop_gradient(space.clip(toward, own, eps))
         return rows.replace(target=target, said=None if rows.said is None else jnp.ones_like(rows.said))
 
-    def fit(
-        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
-    ) -> GuidanceModel:
-        """Return the former policy and human model, updated by each new label in order."""
-        rows, answered = self.lessons(labels, scalars), Guide.lessons(self, labels, scalars)
-        order = jnp.argsort(~rows.valid, stable=True)
-        count, adam = rows.valid.sum(), optimizer(scalars)
+    def correction(
+        self, env: Any, labels: Label, rows: Example, order: Int[Array, " slots"], scalars: GuideScalars
+    ) -> Correct:
+        """Return the update of both models by one label, then by minibatches of all labels up to it."""
+        answers, adam = Guide.examples(self, labels, scalars), optimizer(scalars)
 
-        def batch_of(key: PRNGKeyArray, number: Int[Array, ""]) -> tuple[Lesson, Lesson]:
+        def batch_of(key: PRNGKeyArray, number: Int[Array, ""]) -> tuple[Example, Example]:
             """Return minibatches of the first labels up to `number`, which comes first: for policy and human model."""
             numbers = jax.random.randint(key, (self.sizes.fit_batch_size,), 0, number + 1).at[0].set(number)
-            return jax.tree.map(lambda leaf: leaf[order[numbers]], (rows, answered))
+            return jax.tree.map(lambda leaf: leaf[order[numbers]], (rows, answers))
 
-        def taught(coached: BatchCoached, batch: Lesson) -> BatchCoached:
+        def teach_human(coached: BatchCoached, batch: Example) -> BatchCoached:
             gradient = jax.grad(lambda human: self.human_loss(env, human, batch, scalars))(coached.human)
             updates, state = adam.update(gradient, coached.human_optimizer, coached.human)
             return coached.replace(human=optax.apply_updates(coached.human, updates), human_optimizer=state)
 
-        def moved(key: PRNGKeyArray, coached: BatchCoached, batch: Lesson, own: Array) -> BatchCoached:
+        def move(key: PRNGKeyArray, coached: BatchCoached, batch: Example, own: Array) -> BatchCoached:
             """Return the policy after one step; `own`: rows that keep their label's target."""
-            seen = self.redrawn(key, batch)
+            seen = self.augmented(key, batch)
 
             def loss(policy: Params) -> Array:
                 acted = self.member.predict(env, policy, seen.obs, seen.action)
                 targets = self.policy_targets(env, coached.human, seen, acted, scalars)
-                keep = lambda one, other: jnp.where(own[:, None], one, other)  # noqa: E731
-                target, said = keep(seen.target, targets.target), seen.said
-                said = None if said is None else keep(said, targets.said)
-                return jnp.mean(squared_errors(seen.replace(target=target, said=said), acted))
+                pick = lambda one, other: jnp.where(own[:, None], one, other)  # noqa: E731
+                said = None if seen.said is None else pick(seen.said, targets.said)
+                both = seen.replace(target=pick(seen.target, targets.target), said=said)
+                return jnp.mean(squared_errors(both, acted))
 
             updates, state = adam.update(jax.grad(loss)(coached.policy), coached.optimizer, coached.policy)
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
 
-        def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: BatchCoached) -> BatchCoached:
-            """Return the model after label `number` of the valid ones, and after the buffer up to it."""
+        def correct(key: PRNGKeyArray, number: Int[Array, ""], coached: BatchCoached) -> BatchCoached:
             keys = jax.random.split(jax.random.fold_in(key, number), 3)
-            batch, told = batch_of(keys[0], number)
+            batch, answered = batch_of(keys[0], number)
             first = jnp.arange(self.sizes.fit_batch_size) == 0
-            coached = moved(keys[1], taught(coached, told), batch, first)
+            coached = move(keys[1], teach_human(coached, answered), batch, first)
 
             def turn(coached: BatchCoached, key: PRNGKeyArray) -> tuple[BatchCoached, None]:
                 k_human, k_batch, k_see = jax.random.split(key, 3)
 
                 def one(coached: BatchCoached, key: PRNGKeyArray) -> tuple[BatchCoached, None]:
-                    return taught(coached, batch_of(key, number)[1]), None
+                    return teach_human(coached, batch_of(key, number)[1]), None
 
                 coached, _ = jax.lax.scan(one, coached, jax.random.split(k_human, self.options.human_steps))
-                return moved(k_see, coached, batch_of(k_batch, number)[0], jnp.zeros_like(first)), None
+                return move(k_see, coached, batch_of(k_batch, number)[0], jnp.zeros_like(first)), None
 
             coached, _ = jax.lax.scan(turn, coached, jax.random.split(keys[2], self.options.batch_steps))
             return coached.replace(learned=number + 1)
 
-        def learned(key: PRNGKeyArray, coached: BatchCoached) -> BatchCoached:
-            return jax.lax.fori_loop(coached.learned, count, partial(corrected, key), coached)
-
-        return GuidanceModel(for_each(self.sizes.ensemble, learned, key, former.params), former.fitted | (count > 0))
-
-
-KIND = Kind(
-    "bdcoach",
-    "a policy moved by a model of its teacher",
-    BatchCoach,
-    form=RELATIVE,
-    title="BD-COACH",
-    colour="#CC6677",
-    config=Config,
-)
+        return correct

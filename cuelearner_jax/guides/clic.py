@@ -38,9 +38,8 @@ from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import POSITIVE, SHARE, Bounds, part
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
-from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.fitting import fit_model
-from cuelearner_jax.guides.model import GuideModel, guide_model
+from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
+from cuelearner_jax.guides.fitting import GuideModel, fit_model, guide_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Box, is_answered, says_something
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -143,7 +142,9 @@ def _size(vector: Float[Array, " cues"]) -> Float[Array, ""]:
 class Clic(Guide):
     """A guide that executes the action of least energy."""
 
-    options: Any
+    name, title = "clic", "CLIC"
+    about = "an energy over actions, low in the sets that corrections leave possible"
+    form, colour, config = RELATIVE, "#117733", Config
 
     @cached_property
     def network(self) -> GuideModel:
@@ -213,14 +214,14 @@ class Clic(Guide):
     ) -> GuidanceModel:
         """Return the energy model of labels (slots, ...), fitted from scratch."""
 
-        def redrawn(key: PRNGKeyArray, batch: Contrast) -> Contrast:
+        def augment(key: PRNGKeyArray, batch: Contrast) -> Contrast:
             return batch.replace(draw=jax.random.randint(key, batch.draw.shape, 0, 2**30))
 
         def losses(params: Params, rows: Contrast) -> Array:
             return self.losses(env, scalars, params, rows)
 
         rows, sizes = self.contrasts(labels), self.sizes
-        return fit_model(key, rows, scalars, init=self.network.init, losses=losses, sizes=sizes, redrawn=redrawn)
+        return fit_model(key, rows, scalars, init=self.network.init, losses=losses, sizes=sizes, augment=augment)
 
     def minimise_energy(
         self,
@@ -252,13 +253,7 @@ class Clic(Guide):
         return found
 
     def act(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
-        scalars: GuideScalars,
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the action of least energy within tau_max of a, in active rows of a fitted model."""
         guided = active & model.fitted
@@ -268,11 +263,15 @@ class Clic(Guide):
             return self.minimise_energy(env, model.params, seen, base, scalars)
 
         chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
-        return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
+        return replaced(chosen, actions, guided)
 
 
 class ClicShown(Clic):
     """A guide that learns from demonstrated actions, by a set around each demonstration."""
+
+    name, title = "clic_shown", "CLIC, demonstrations"
+    about = "an energy over actions, low around what the teacher shows"
+    form, colour, config, by_cues = DEMONSTRATION, "#44AA99", ShownConfig, True
 
     def target_action(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
         """Return the demonstrated action."""
@@ -291,24 +290,3 @@ class ClicShown(Clic):
         away = jax.vmap(lambda action: _size(space.log(row.answer, action) / eps))(actions)
         radius = self.options.radius * _size(space.log(row.answer, row.action) / eps)
         return SHARPNESS * log_nearer(radius, away, SOFTNESS / 2)
-
-
-KIND = Kind(
-    "clic",
-    "an energy over actions, low in the sets that corrections leave possible",
-    Clic,
-    form=RELATIVE,
-    title="CLIC",
-    colour="#117733",
-    config=Config,
-)
-SHOWN = Kind(
-    "clic_shown",
-    "an energy over actions, low around what the teacher shows",
-    ClicShown,
-    form=DEMONSTRATION,
-    title="CLIC, demonstrations",
-    colour="#44AA99",
-    config=ShownConfig,
-    by_cues=True,
-)

@@ -20,6 +20,7 @@ ensemble are corrected separately, and differ by their initial parameters and th
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Annotated, Any
 
@@ -27,15 +28,14 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import POSITIVE, part
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Kind
+from cuelearner_jax.guides.base import Actions, Observations, Rows
 from cuelearner_jax.guides.demonstration import Demonstration
-from cuelearner_jax.guides.fitting import Lesson, optimizer, squared_errors
-from cuelearner_jax.guides.model import for_each
+from cuelearner_jax.guides.fitting import Example, for_each, optimizer, squared_errors
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -58,24 +58,28 @@ class Coached(struct.PyTreeNode):
     learned: Int[Array, ""]  # labels that were used already; later ones are new
 
 
+Correct = Callable[[PRNGKeyArray, Int[Array, ""], Any], Any]  # (key, number of a label, coached) -> coached
+
+
 class DeepCoach(Demonstration):
     """A guide that acts as a cloned policy does, and is updated by each correction."""
 
-    options: Config
+    name, about, title = "dcoach", "a policy moved by each correction", "deep COACH"
+    form, colour, config = RELATIVE, "#56B4E9", Config
 
     @cached_property
     def member(self) -> DeepCoach:
         """Return the guide of one member of the ensemble."""
         return dataclasses.replace(self, sizes=dataclasses.replace(self.sizes, ensemble=1))
 
+    def begin(self, key: PRNGKeyArray) -> Coached:
+        """Return one member's policy without corrections."""
+        params = self.member.network.init(key)
+        return Coached(params, optimizer(GuideScalars()).init(params), jnp.zeros((), jnp.int32))
+
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
         """Return a policy without corrections."""
-
-        def begin(key: PRNGKeyArray) -> Coached:
-            params = self.member.network.init(key)
-            return Coached(params, optimizer(GuideScalars()).init(params), jnp.zeros((), jnp.int32))
-
-        return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
+        return GuidanceModel(for_each(self.sizes.ensemble, self.begin, key), jnp.array(False))
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """Return the action changed by h * eps along each cue."""
@@ -85,22 +89,31 @@ class DeepCoach(Demonstration):
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """Return the former policy, corrected by the new labels in order."""
-        rows = self.lessons(labels, scalars)
-        order = jnp.argsort(~rows.valid, stable=True)
-        count = rows.valid.sum()
+        """Return the former model, corrected by the new labels in order."""
+        rows = self.examples(labels, scalars)
+        order, count = jnp.argsort(~rows.valid, stable=True), rows.valid.sum()
+        correct = self.correction(env, labels, rows, order, scalars)
 
-        def loss(params: Params, batch: Lesson) -> Array:
+        def learn(key: PRNGKeyArray, coached: Coached) -> Coached:
+            return jax.lax.fori_loop(coached.learned, count, partial(correct, key), coached)
+
+        return GuidanceModel(for_each(self.sizes.ensemble, learn, key, former.params), former.fitted | (count > 0))
+
+    def correction(
+        self, env: Any, labels: Label, rows: Example, order: Int[Array, " slots"], scalars: GuideScalars
+    ) -> Correct:
+        """Return the update by one label, then by a replay of the newest labels; `order`: valid labels first."""
+
+        def loss(params: Params, batch: Example) -> Array:
             return jnp.mean(squared_errors(batch, self.member.predict(env, params, batch.obs, batch.action)))
 
         def step(coached: Coached, numbers: Int[Array, " batch"], key: PRNGKeyArray) -> Coached:
-            batch = self.redrawn(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
+            batch = self.augmented(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
             gradient = jax.grad(loss)(coached.policy, batch)
             updates, state = optimizer(scalars).update(gradient, coached.optimizer, coached.policy)
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
 
-        def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
-            """Return the policy after label `number` of the valid ones, and after a replay of the newest labels."""
+        def correct(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
             oldest = jnp.maximum(number + 1 - self.options.correction_replay, 0)
 
             def replay(coached: Coached, key: PRNGKeyArray) -> tuple[Coached, None]:
@@ -113,36 +126,14 @@ class DeepCoach(Demonstration):
             coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, self.options.replay_steps))
             return coached.replace(learned=number + 1)
 
-        def taught(key: PRNGKeyArray, coached: Coached) -> Coached:
-            return jax.lax.fori_loop(coached.learned, count, partial(corrected, key), coached)
-
-        return GuidanceModel(for_each(self.sizes.ensemble, taught, key, former.params), former.fitted | (count > 0))
+        return correct
 
     def act(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
-        scalars: GuideScalars,
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the cloned policy's action in place of a."""
         return super().act(model.replace(params=model.params.policy), env, obs, actions, active, scalars)
 
-    def disagreement(
-        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
-    ) -> Float[Array, " n"]:
+    def disagreement(self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions) -> Float[Array, " n"]:
         """Return the variance of the members' vectors, summed over their entries."""
         return super().disagreement(model.replace(params=model.params.policy), env, obs, actions)
-
-
-KIND = Kind(
-    "dcoach",
-    "a policy moved by each correction",
-    DeepCoach,
-    form=RELATIVE,
-    title="deep COACH",
-    colour="#56B4E9",
-    config=Config,
-)

@@ -17,12 +17,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION
-from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.fitting import Lesson
+from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows
+from cuelearner_jax.guides.fitting import Example
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Params
 
@@ -30,20 +30,21 @@ from cuelearner_jax.types import GuidanceModel, Params
 class Demonstration(Guide):
     """A policy that is fitted to the demonstrated actions, and acts in the agent's place."""
 
+    name, about = "demonstration", "a policy cloned from what the teacher shows"
+    form, colour = DEMONSTRATION, "#009E73"
+
     @property
     def looks_again(self) -> bool:
         """Whether the policy's action depends on the action that the situation is seen from."""
         return self.sizes.frame == "action"
 
-    def predict(
-        self, env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
-    ) -> Float[Array, "n action"]:
+    def predict(self, env: Any, params: Params, obs: Observations, actions: Actions) -> Actions:
         """Return the policy's action, seen from `actions`."""
         if not self.looks_again:
             return self.network.predict(env, params, obs, jnp.zeros_like(actions))
         return actions + self.network.predict(env, params, obs, actions)
 
-    def redrawn(self, key: PRNGKeyArray, batch: Lesson) -> Lesson:
+    def augmented(self, key: PRNGKeyArray, batch: Example) -> Example:
         """Return a batch seen half from uniform directions, half from the actions asked about."""
         if not self.looks_again:
             return batch
@@ -53,28 +54,15 @@ class Demonstration(Guide):
         return batch.replace(action=jnp.where(half, anywhere, batch.action))
 
     def act(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
-        scalars: GuideScalars,
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the policy's action in place of a, in active rows of a fitted model, within the bound around a."""
 
-        def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+        def phi(current: Actions) -> Actions:
             return self.predict(env, model.params, obs, current) - current
 
         return self.refined(phi, actions, active & model.fitted, scalars, k_max=None if self.looks_again else 1)
 
-    def disagreement(
-        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
-    ) -> Float[Array, " n"]:
+    def disagreement(self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions) -> Float[Array, " n"]:
         """Return the variance of the members' vectors, summed over their entries."""
         return super().disagreement(model, env, obs, actions if self.looks_again else jnp.zeros_like(actions))
-
-
-KIND = Kind(
-    "demonstration", "a policy cloned from what the teacher shows", Demonstration, form=DEMONSTRATION, colour="#009E73"
-)

@@ -1,10 +1,15 @@
-"""Fit a model to labels of any form, by least squares (paper, Eq. 3) or another loss."""
+"""Networks of guides, and their fit to labels of any form: by least squares (paper, Eq. 3) or another loss.
+
+The model of a guide is one network, or an ensemble whose members' mean predicts and whose variance is disagreement.
+Members differ by their random initial parameters and by the batches that they are fitted to, as in Lakshminarayanan,
+Pritzel, Blundell, "Simple and scalable predictive uncertainty estimation using deep ensembles", NeurIPS 2017. Their
+parameters have a leading axis of members; of one member there is no such axis, and nothing is different from a network.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +18,88 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
+from cuelearner_jax.agents import networks
 from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.guides.model import fitted_members
+from cuelearner_jax.environment import Spaces
 from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
+
+Init = Callable[[PRNGKeyArray], Params]
+Predict = Callable[[Any, Params, Array, Array], Array]  # (env, params, obs (n, ...), actions (n, ...)) -> (n, outputs)
+Augment = Callable[[PRNGKeyArray, Any], Any]  # (key, batch (n, ...) of rows) -> what to train on in its place
 
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
 
 
-class Lesson(struct.PyTreeNode):
+class GuideModel(NamedTuple):
+    """A network of observation and action, or an ensemble of such, as pure functions."""
+
+    init: Init
+    predict: Predict  # the members' mean; of parameters with any number of members
+    disagreement: Predict  # the variance of several members, summed over outputs (n,)
+
+
+def ensemble(members: int, init: Init, predict: Predict) -> GuideModel:
+    """Return the model of so many members, from one member's parameters and outputs."""
+    each = jax.vmap(predict, in_axes=(None, 0, None, None))
+
+    def mean(env: Any, params: Params, obs: Array, actions: Array) -> Array:
+        return each(env, params, obs, actions).mean(0)
+
+    def disagreement(env: Any, params: Params, obs: Array, actions: Array) -> Float[Array, " n"]:
+        return jnp.sum(each(env, params, obs, actions).var(0), -1)
+
+    return GuideModel(lambda key: for_each(members, init, key), predict if members == 1 else mean, disagreement)
+
+
+def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, beside: int = 0) -> GuideModel:
+    """Return the networks of these sizes. Raises UserError for a frame in which the environment cannot be seen.
+
+    Args:
+        sizes: sizes of the networks.
+        spaces: the environment's.
+        outputs: number of outputs, such as the value of an action; None: a vector to be added to the
+            action, whichever frame it is seen in.
+        beside: numbers that they see beside observation and action: actions then have so many entries more, at the end.
+    """
+    size = spaces.actions.size
+    network = networks.residual_network(sizes.feedback_layers, size if outputs is None else outputs)
+    own, turned = networks.widths(sizes.frame, spaces)
+
+    def init(key: PRNGKeyArray) -> Params:
+        return network.init(key, jnp.zeros(own), jnp.zeros(turned + beside))
+
+    def predict(
+        env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "m action"]
+    ) -> Float[Array, "m outputs"]:
+        """Return predictions for m situations with an action each, or for one situation with m actions."""
+        bare, known = jnp.split(actions, [size], -1)
+        of_obs, of_action = networks.network_inputs(sizes.frame, env, obs, bare)
+        of_action = jnp.concatenate([of_action, known], -1) if beside else of_action
+        return networks.as_function(network)(params, of_obs, of_action)
+
+    model = ensemble(sizes.ensemble, init, predict)
+    if outputs is not None or sizes.frame == "raw":
+        return model
+
+    def residual(env: Any, params: Params, obs: Array, actions: Array) -> Array:
+        """Return the outputs, which are turns from the action, as vectors to add to it."""
+        return spaces.actions.outward(model.predict(env, params, obs, actions), actions[..., :size])
+
+    return model._replace(predict=residual)
+
+
+def for_each(members: int, function: Callable[..., Any], key: PRNGKeyArray, *parameters: Any) -> Any:
+    """Return a function's result (a tree) for every member, each from its own random key and parameters.
+
+    A single member uses the common `key` directly, and its parameters have no leading axis of members.
+    """
+    if members == 1:
+        return function(key, *parameters)
+    return jax.vmap(function)(jax.random.split(key, members), *parameters)
+
+
+class Example(struct.PyTreeNode):
     """A label's target: what a network is to predict of it."""
 
     obs: Float[Array, " obs"]
@@ -32,26 +110,23 @@ class Lesson(struct.PyTreeNode):
     space: Space | None = struct.field(pytree_node=False, default=None)  # the space of these cues
 
 
-def lessons(
-    labels: Label,
-    target: Callable[[Label, GuideScalars], Array],
-    scalars: GuideScalars,
-    space: Space | None = None,
-) -> Lesson:
+def examples(
+    labels: Label, target: Callable[[Label, GuideScalars], Array], scalars: GuideScalars, space: Space | None = None
+) -> Example:
     """Return labels (slots, ...) with their targets; `space`: of answers that may leave cues out.
 
     A label that names no cue is not valid.
     """
     targets = jax.vmap(lambda label: target(label, scalars))(labels)
     # Rounded here: fused with later operations, the targets' last bits would depend on the compiler.
-    rows = Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
+    rows = Example(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
     if space is None or len(space.cues) == 1:
         return rows
-    told = is_answered(labels.answer)
-    return rows.replace(valid=labels.valid & told.any(-1), said=told, space=space)
+    said = is_answered(labels.answer)
+    return rows.replace(valid=labels.valid & said.any(-1), said=said, space=space)
 
 
-def squared_errors(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
+def squared_errors(rows: Example, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
     """Return the squared errors of predictions, L = |f - y|^2 (paper, Eq. 3).
 
     Where labels may leave cues out, L is the sum over the cues of which something was said of (d log (f - y))^2, the
@@ -60,13 +135,9 @@ def squared_errors(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[
     off = predicted - rows.target
     if rows.said is None:
         return jnp.sum(jnp.square(off), -1)
-    return jnp.sum(jnp.square(along_cues(rows, off)), -1, where=rows.said)
-
-
-def along_cues(rows: Lesson, vectors: Float[Array, "n action"]) -> Float[Array, "n cues"]:
-    """Return the change along each cue that vectors make when added to the actions of lessons."""
-    assert rows.space is not None  # `lessons` gives it with `said`
-    return jax.vmap(rows.space.along)(rows.action[..., : rows.space.size], vectors)
+    assert rows.space is not None  # `examples` gives it with `said`
+    along = jax.vmap(rows.space.along)(rows.action[..., : rows.space.size], off)
+    return jnp.sum(jnp.square(along), -1, where=rows.said)
 
 
 def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
@@ -74,73 +145,9 @@ def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate))
 
 
-Redrawn = Callable[[PRNGKeyArray, Any], Any]  # (key, batch of rows) -> what to train on in its place
-
-
 def keep_batch(key: PRNGKeyArray, batch: Any) -> Any:
     """Return the batch itself."""
     return batch
-
-
-def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.Array]:
-    """Return a sampler of indices among the true rows of `valid`, with replacement."""
-    order = jnp.argsort(~valid, stable=True)
-    count = jnp.maximum(valid.sum(), 1)
-    return lambda key, size: order[jax.random.randint(key, (size,), 0, count)]
-
-
-def fit_least_squares(
-    key: PRNGKeyArray,
-    rows: Lesson,
-    scalars: GuideScalars,
-    *,
-    init: Callable[[PRNGKeyArray], Params],
-    apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
-    sizes: GuideSizes,
-    redrawn: Redrawn = keep_batch,
-) -> GuidanceModel:
-    """Fit by least squares (paper, Eq. 3), as `fit_model`.
-
-    Lessons are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
-    answer in the mirror image is mostly not the mirror image of its answer.
-
-    Args:
-        key, rows, scalars, init, sizes, redrawn: as `fit_model` has them.
-        apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
-    """
-
-    def errors(params: Params, rows: Lesson) -> Float[Array, " n"]:
-        return squared_errors(rows, apply(params, rows.obs, rows.action))
-
-    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, redrawn=redrawn)
-
-
-def fit_model(
-    key: PRNGKeyArray,
-    rows: Any,
-    scalars: GuideScalars,
-    *,
-    init: Callable[[PRNGKeyArray], Params],
-    losses: Callable[[Params, Any], Float[Array, " n"]],
-    sizes: GuideSizes,
-    redrawn: Redrawn = keep_batch,
-) -> GuidanceModel:
-    """Fit a model from scratch, and keep the parameters with the least validation loss.
-
-    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five nothing validates: the
-    last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
-
-    Args:
-        rows: a record of what is learned from (slots, ...), such as lessons, of which the `valid` ones count.
-        init: parameters from a key; with `sizes.ensemble` those of `ensemble`, whose members are fitted each by itself.
-        losses: (params, rows (n, ...)) -> the loss of each.
-        redrawn: (key, batch (n, ...) of rows) -> what to train on in its place; validation rows stay.
-
-    Returns:
-        The model; its `fitted` is False if there was no valid label to train on.
-    """
-    fit = partial(_fit_network, rows=rows, scalars=scalars, losses=losses, redrawn=redrawn, sizes=sizes)
-    return fitted_members(sizes.ensemble, fit, key, init)
 
 
 def held_out(count: int) -> Bool[np.ndarray, " count"]:
@@ -148,21 +155,74 @@ def held_out(count: int) -> Bool[np.ndarray, " count"]:
     return np.arange(count) % VALIDATION_STRIDE == VALIDATION_STRIDE - 1
 
 
-def _fit_network(
+def fit_least_squares(
     key: PRNGKeyArray,
-    init: Callable[[PRNGKeyArray], Params],
+    rows: Example,
+    scalars: GuideScalars,
     *,
+    init: Init,
+    apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
+    sizes: GuideSizes,
+    augment: Augment = keep_batch,
+) -> GuidanceModel:
+    """Fit by least squares (paper, Eq. 3), as `fit_model`.
+
+    Examples are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
+    answer in the mirror image is mostly not the mirror image of its answer.
+
+    `apply`: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
+    """
+
+    def errors(params: Params, rows: Example) -> Float[Array, " n"]:
+        return squared_errors(rows, apply(params, rows.obs, rows.action))
+
+    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, augment=augment)
+
+
+def fit_model(
+    key: PRNGKeyArray,
     rows: Any,
     scalars: GuideScalars,
+    *,
+    init: Init,
     losses: Callable[[Params, Any], Float[Array, " n"]],
-    redrawn: Redrawn,
     sizes: GuideSizes,
+    augment: Augment = keep_batch,
+) -> GuidanceModel:
+    """Fit a model from scratch, and keep the parameters with the least validation loss.
+
+    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five labels nothing
+    validates: the last parameters are kept. A fit that diverged before anything validated gives parameters that are
+    NaN. Without a valid label to train on, the model's `fitted` is False.
+
+    `rows` are what is learned from (slots, ...), such as examples, of which the `valid` ones count; `init` gives the
+    parameters of `sizes.ensemble` members, which are fitted each by itself; `losses` gives the loss of each row.
+    """
+
+    def fit(key: PRNGKeyArray, init: Init) -> GuidanceModel:
+        return _fit_member(key, rows, scalars, init, losses, sizes, augment)
+
+    if sizes.ensemble == 1:
+        return fit(key, init)
+    # A member is fitted as an ensemble of one, whose mean is its own prediction.
+    first = lambda key: jax.tree.map(lambda leaf: leaf[:1], init(key))  # noqa: E731
+    each = jax.vmap(lambda key: fit(key, first))(jax.random.split(key, sizes.ensemble))
+    return GuidanceModel(jax.tree.map(lambda leaf: leaf[:, 0], each.params), each.fitted.all())
+
+
+def _fit_member(
+    key: PRNGKeyArray,
+    rows: Any,
+    scalars: GuideScalars,
+    init: Init,
+    losses: Callable[[Params, Any], Float[Array, " n"]],
+    sizes: GuideSizes,
+    augment: Augment,
 ) -> GuidanceModel:
     held = held_out(rows.valid.shape[0])
-    validation = rows.valid & held
-    training = rows.valid & ~held
-    draw = _subset(training)
-    key_init, key_steps = jax.random.split(key)
+    validation, training = rows.valid & held, rows.valid & ~held
+    order, count = jnp.argsort(~training, stable=True), jnp.maximum(training.sum(), 1)
+    k_init, k_steps = jax.random.split(key)
     adam = optimizer(scalars)
 
     def loss(params: Params, batch: Any) -> jax.Array:
@@ -170,24 +230,23 @@ def _fit_network(
 
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
-        key_draw, key_redraw = jax.random.split(key)
-        batch = redrawn(key_redraw, jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows))
+        k_draw, k_augment = jax.random.split(key)
+        # One draw for every leaf: the compiler merges them
+        draw = lambda: order[jax.random.randint(k_draw, (sizes.fit_batch_size,), 0, count)]  # noqa: E731
+        batch = augment(k_augment, jax.tree.map(lambda leaf: leaf[draw()], rows))
         updates, opt_state = adam.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 
-    def validate(params: Params) -> jax.Array:
-        return jnp.sum(losses(params, rows), where=validation)
-
     def stretch(carry: tuple, keys: Key[Array, " steps"]) -> tuple[tuple, None]:
-        running, best, best_loss = carry
+        running, best, best_score = carry
         running, _ = jax.lax.scan(step, running, keys)
-        score = validate(running[0])
-        better = (score < best_loss) | ~validation.any()
+        score = jnp.sum(losses(running[0], rows), where=validation)
+        better = (score < best_score) | ~validation.any()
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), running[0], best)
-        return (running, best, jnp.where(better, score, best_loss)), None
+        return (running, best, jnp.where(better, score, best_score)), None
 
-    params = init(key_init)
-    keys = jax.random.split(key_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
+    params = init(k_init)
+    keys = jax.random.split(k_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
     start = ((params, adam.init(params)), params, jnp.inf)
     (_, best, score), _ = jax.lax.scan(stretch, start, keys)
     diverged = ~jnp.isfinite(score) & validation.any()

@@ -27,9 +27,8 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import Bounds, Layers, part
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.fitting import fit_model
-from cuelearner_jax.guides.model import GuideModel, ensemble
+from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows
+from cuelearner_jax.guides.fitting import GuideModel, ensemble, fit_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -120,6 +119,8 @@ def choose_aim(
 class Intent(Guide):
     """A guide that weights the task's aims by the answers, and moves toward the likeliest."""
 
+    name, about, needs = "intent", "relative feedback about the task's aims", ("aims",)
+    form, colour, config = RELATIVE, "#CC79A7", Config
     options: Config
 
     @cached_property
@@ -155,13 +156,7 @@ class Intent(Guide):
         return fit_model(key, rows, scalars, init=self.network.init, losses=surprise, sizes=self.sizes)
 
     def act(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
-        scalars: GuideScalars,
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Move each action by at most eps a pass toward the likeliest aim, in active rows with a sure, fitted model."""
         space, aims = self.spaces.actions, jax.vmap(env.aims)(obs)
@@ -169,7 +164,7 @@ class Intent(Guide):
         find = partial(choose_aim, space, doubt=self.options.aim_doubt)
         goals, sure = jax.vmap(find)(share, aims.actions, actions)
 
-        def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+        def phi(current: Actions) -> Actions:
             return space.approach(current, goals, space.from_unit(scalars.eps_deg)) - current
 
         return self.refined(phi, actions, active & sure & model.fitted, scalars)
@@ -179,20 +174,7 @@ class Intent(Guide):
         share = self.network.predict(env, model.params, aims.features, aims.possible)
         return share if aims.open is None else share.at[:, :-1].multiply(aims.open)
 
-    def disagreement(
-        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
-    ) -> Float[Array, " n"]:
+    def disagreement(self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions) -> Float[Array, " n"]:
         """Return the variance of the members' probabilities, summed over aims; it does not depend on the action."""
         aims = jax.vmap(env.aims)(obs)
         return self.network.disagreement(env, model.params, aims.features, aims.possible)
-
-
-KIND = Kind(
-    "intent",
-    "relative feedback about the task's aims",
-    Intent,
-    form=RELATIVE,
-    needs=("aims",),
-    colour="#CC79A7",
-    config=Config,
-)

@@ -1,7 +1,7 @@
-"""The registry of kinds of guidance: those of the package, of installed packages, and of the user's own code.
+"""The table of kinds of guidance: those of the package, of installed packages, and of the user's own code.
 
-A kind of one's own is a `Kind`: pass it to `register`, offer it under the entry-point group `cuelearner.guidances`, or
-name it as `package.module:NAME` wherever the name of a kind is asked for.
+A kind of one's own is a class that inherits `Guide`: add it to `guides()`, offer it under the entry-point group
+`cuelearner.guidances`, or name it as `package.module:CLASS` wherever the name of a kind is asked for.
 """
 
 from __future__ import annotations
@@ -10,72 +10,46 @@ from functools import cache
 from importlib import metadata
 from typing import Any
 
+from cuelearner_jax import plugins
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, offers, spaces_of
-from cuelearner_jax.errors import UserError, suggestion
-from cuelearner_jax.guides import (
-    baselines,
-    bdcoach,
-    clic,
-    dcoach,
-    demonstration,
-    intent,
-    reading,
-    relative,
-    scalar,
-)
-from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.plugins import load
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides.base import AnyAim, Guide, HeuristicGuide, NoGuide, Reading
+from cuelearner_jax.guides.bdcoach import BatchCoach
+from cuelearner_jax.guides.clic import Clic, ClicShown
+from cuelearner_jax.guides.dcoach import DeepCoach
+from cuelearner_jax.guides.demonstration import Demonstration
+from cuelearner_jax.guides.intent import Intent
+from cuelearner_jax.guides.relative import Relative
+from cuelearner_jax.guides.scalar import Scalar
 
 ENTRY_POINTS = "cuelearner.guidances"
-
-_TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, reading.KIND)
-_PEERS = (bdcoach.KIND, clic.KIND, clic.SHOWN)
-_BUILT_IN = (
-    baselines.NONE,
-    relative.KIND,
-    intent.KIND,
-    baselines.HEURISTIC,
-    baselines.ANY_AIM,
-    *_TAUGHT,
-    *_PEERS,
+BUILT_IN: tuple[type[Guide], ...] = (
+    *(NoGuide, Relative, Intent, HeuristicGuide, AnyAim, Demonstration, Scalar),
+    *(DeepCoach, Reading, BatchCoach, Clic, ClicShown),
 )
-_KINDS: dict[str, Kind] = {kind.name: kind for kind in _BUILT_IN}
 
 
-def register(kind: Kind) -> Kind:
-    """Register a kind under its name. Raises UserError if another kind has the name."""
-    if _KINDS.setdefault(kind.name, kind) != kind:
-        raise UserError(f"another guidance is already called {kind.name!r}: give yours another name")
-    return kind
+@cache
+def guides() -> dict[str, type[Guide]]:
+    """Return the kinds by their names."""
+    table: dict[str, type[Guide]] = {kind.name: kind for kind in BUILT_IN}
+    for point in metadata.entry_points(group=ENTRY_POINTS):
+        plugins.add(table, plugins.load_part(point.value, "guidance"), "guidance")
+    return table
 
 
-def kinds() -> tuple[Kind, ...]:
-    """Return the registered kinds, those of installed packages included."""
-    _register_installed()
-    return tuple(_KINDS.values())
-
-
-def find_or_none(name: str) -> Kind | None:
-    """Return the kind of that name, or None, for results whose kind is not known here."""
-    _register_installed()
-    return _KINDS.get(name)
-
-
-def find(name: str) -> Kind:
+def find(name: str) -> type[Guide]:
     """Return the kind of that name without loading code. Raises UserError if no kind has the name."""
-    _register_installed()
-    if name not in _KINDS:
-        raise UserError(f"unknown guidance {name!r}{suggestion(name, _KINDS)} (name your own as package.module:NAME)")
-    return _KINDS[name]
+    return plugins.find(guides(), name, "guidance")
 
 
-def resolve(text: str) -> Kind:
-    """Return the kind that a user or caller names: by its name, or as `package.module:NAME`, whose code is loaded.
+def resolve(text: str) -> type[Guide]:
+    """Return the kind that a user or caller names: by its name, or as `package.module:CLASS`, whose code is loaded.
 
     Never pass text from a file. Raises UserError if there is no such kind.
     """
-    return register(load(text, Kind, "a kind of guidance")) if ":" in text else find(text)
+    return plugins.resolve(guides(), text, "guidance")
 
 
 def kind_name(text: str) -> str:
@@ -85,35 +59,29 @@ def kind_name(text: str) -> str:
 
 def possible(env: Any, taught: bool) -> tuple[str, ...]:
     """Return the names of the kinds that an agent can be trained with; `taught`: whether the world has a teacher."""
-    trained = (kind for kind in kinds() if not kind.adapts_only and (taught or not kind.asks))
     cues = actions_of(env).cues
-    said = (kind for kind in trained if cues or not kind.needs_cues)
-    return tuple(kind.name for kind in said if all(offers(env, need) for need in kind.needs))
+    return tuple(
+        name
+        for name, kind in guides().items()
+        if not kind.adapts_only
+        and (taught or not kind.asks)
+        and (cues or not kind.needs_cues)
+        and all(offers(env, need) for need in kind.needs)
+    )
 
 
 def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
-    """Return a kind's guide for an environment (shapes in place of arrays will do).
+    """Return a kind's guide for an environment, of which only the spaces are used (shapes in place of arrays will do).
 
-    Args:
-        name: name of the kind.
-        sizes: sizes of its model.
-        env: the environment, of which only the spaces are used.
-        options: the kind's own, a `Kind.config`; None: its defaults.
+    `options`: the kind's own, a `Guide.config` (None: its defaults).
 
-    Raises:
-        UserError: no such kind, or the environment lacks what it needs.
+    Raises UserError for no such kind, or if the environment lacks what it needs.
     """
     kind = find(name)
     for need in kind.needs:
         if not offers(env, need):
             raise UserError(
-                f"guidance {kind.name!r} needs an environment with `{need}`, which this task does not "
-                "have: choose another guidance"
+                f"guidance {name!r} needs an environment with `{need}`, which this task does not have: "
+                "choose another guidance"
             )
-    return kind.make(sizes, spaces_of(env), options)
-
-
-@cache
-def _register_installed() -> None:
-    for point in metadata.entry_points(group=ENTRY_POINTS):
-        register(load(point.value, Kind, "a kind of guidance"))
+    return kind(sizes, spaces_of(env), options)

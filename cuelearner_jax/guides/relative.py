@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.fitting import Lesson
+from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.guides.fitting import Example
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label
 
@@ -28,14 +28,17 @@ from cuelearner_jax.types import GuidanceModel, Label
 class Relative(Guide):
     """A guide that corrects actions until a pass no longer moves them."""
 
+    name, about = "relative", "a model of the teacher's relative feedback"
+    form, colour = RELATIVE, "#0072B2"
+
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """Return eps * h of Eq. 3 as a vector: the action changed by h * eps along each cue, less the action."""
         space = self.spaces.actions
         return space.toward(label.action, label.answer, space.from_unit(scalars.eps_deg)) - label.action
 
-    def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
+    def examples(self, labels: Label, scalars: GuideScalars) -> Example:
         """Return labels (slots, ...) with their targets in units of eps."""
-        rows = super().lessons(labels, scalars)
+        rows = super().examples(labels, scalars)
         return rows.replace(target=rows.target / self.spaces.actions.from_unit(scalars.eps_deg))
 
     def act(
@@ -54,6 +57,3 @@ class Relative(Guide):
             return eps * self.predict(env, model.params, obs, current)
 
         return self.refined(phi, actions, active & model.fitted, scalars)
-
-
-KIND = Kind("relative", "a model of the teacher's relative feedback", Relative, form=RELATIVE, colour="#0072B2")

@@ -19,18 +19,16 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.agents.choice import best_of
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import POSITIVE, SHARE, part
 from cuelearner_jax.feedback.answers import SCALAR
-from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.model import GuideModel, guide_model
+from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
+from cuelearner_jax.guides.fitting import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel
-
-LEAST = 0.01  # least value before a logarithm: the model's values may be 0 or less
 
 
 @part
@@ -46,6 +44,8 @@ class Config:
 class Scalar(Guide):
     """A guide that executes the action of largest predicted value."""
 
+    name, about = "scalar", "a model of which actions the teacher calls good"
+    form, colour, config = SCALAR, "#E69F00", Config
     options: Config
 
     @cached_property
@@ -54,19 +54,13 @@ class Scalar(Guide):
         return guide_model(self.sizes, self.spaces, outputs=1)
 
     def act(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
-        scalars: GuideScalars,
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the best of all actions in active rows of a fitted model."""
         guided = active & model.fitted
         value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
         chosen = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
-        return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
+        return replaced(chosen, actions, guided)
 
     def question(
         self,
@@ -81,13 +75,3 @@ class Scalar(Guide):
         k_explore, k_refined = jax.random.split(key)
         explores = jax.random.bernoulli(k_explore, self.options.explored_fraction)
         return jnp.where(explores, base, super().question(k_refined, model, env, obs, base, scalars))
-
-
-KIND = Kind(
-    "scalar",
-    "a model of which actions the teacher calls good",
-    Scalar,
-    form=SCALAR,
-    colour="#E69F00",
-    config=Config,
-)

@@ -16,7 +16,7 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
-from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher, keys_of, lived
 from cuelearner_jax.storage import label_files
@@ -26,7 +26,7 @@ from cuelearner_jax.task import Task
 
 def form_of(file: LabelFile) -> AnswerForm | None:
     """Return the form of a label file's answers; None where no known kind of guidance has this form."""
-    forms = {kind.form.name: kind.form for kind in guidances.kinds() if kind.form is not None}
+    forms = {kind.form.name: kind.form for kind in guidances.guides().values() if kind.form is not None}
     return forms.get(file.answers)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.spaces import DIRECTIONS, UNSAID, Cue, Space
 
 # What the page calls the two turns, from the point of view of somebody walking along the arrow.

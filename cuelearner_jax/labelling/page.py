@@ -38,7 +38,7 @@ class Page:
         """
         self.session, self._pages, self._finish = session, pages, finish
         self.form, self.space = session.plan.form, session.questions.space
-        self._by_evidence = session.plan.guidance.kind.by_evidence
+        self._by_evidence = session.plan.guidance.by_evidence
         self._one_cue = session.plan.one_cue
         films = session.films, session.questions.pictures.simulates
         self.controls = controls.controls(self.form, self.space, self._one_cue, *films)

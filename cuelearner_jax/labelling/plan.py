@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax.config import to_json
-from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.reading.families import Family

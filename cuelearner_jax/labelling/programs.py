@@ -16,7 +16,7 @@ from cuelearner_jax import asking
 from cuelearner_jax.asking import GuideState
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.types import EnvState, Label, Teacher

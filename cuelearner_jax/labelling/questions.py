@@ -41,7 +41,7 @@ class Questions:
         self.keys = keys_of(plan.seed)
         slots = asking.label_slots(plan.labels, plan.config.sizes)
         self.blank = asking.start(plan.guidance, self.env, slots, plan.labels, self.keys.model, self.keys.start)
-        kind = EvidenceLearner if plan.guidance.kind.by_evidence else Learner
+        kind = EvidenceLearner if plan.guidance.by_evidence else Learner
         self.learner = kind(plan, self.env, self.blank, self.keys.session)
 
     def start(self, key: PRNGKeyArray) -> GuideState:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.labelling import controls, pointing
 from cuelearner_jax.labelling.arrows import HAIR, arrow, ends, line
 from cuelearner_jax.labelling.controls import Control

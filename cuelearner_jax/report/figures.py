@@ -115,7 +115,7 @@ def save_figure(figure: Figure, stem: Path) -> None:
 
 def colour_of(guidance: str) -> str:
     """Return the colour of a kind of guidance; an unknown kind gets a fixed one of the other colours."""
-    kind = registry.find_or_none(guidance)
+    kind = registry.guides().get(guidance)
     return kind.colour if kind and kind.colour else OTHER_COLOURS[sum(guidance.encode()) % len(OTHER_COLOURS)]
 
 

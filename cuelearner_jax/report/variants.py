@@ -46,7 +46,7 @@ class Variant(NamedTuple):
 
 def guidance_name(guidance: str) -> str:
     """Return the name of a kind of guidance in figures, known here or not."""
-    kind = registry.find_or_none(guidance)
+    kind = registry.guides().get(guidance)
     return one_line(kind.title if kind and kind.title else guidance)
 
 

@@ -16,7 +16,7 @@ from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.policies import Common, lanes_in, layers
 from cuelearner_jax.runs.grid import world_of
 from cuelearner_jax.storage import formats, label_files, policy_folders, results

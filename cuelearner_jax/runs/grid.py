@@ -16,7 +16,7 @@ from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage import formats, label_files
 from cuelearner_jax.storage.folders import CONFIG
@@ -34,7 +34,7 @@ class Grid:
     seeds: tuple[int, ...]
     labels: tuple[int, ...]
 
-    def lanes(self, guidance: Guide | Kind) -> tuple[np.ndarray, np.ndarray]:
+    def lanes(self, guidance: Guide | type[Guide]) -> tuple[np.ndarray, np.ndarray]:
         """Return (seeds, budgets) of the lanes of one kind, each (lanes,)."""
         budgets = self.labels if guidance.asks else (0,)
         pairs = [(seed, budget) for budget in budgets for seed in self.seeds]

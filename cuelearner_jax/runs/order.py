@@ -126,7 +126,7 @@ def read_labels(
     made = [guidances.find(kind) for kind in grid.guidance]
     asking = [guidance for guidance in made if guidance.form is not None]
     if not asking:
-        fitting = [kind.name for kind in guidances.kinds() if kind.form and kind.form.name == file.answers]
+        fitting = [kind.name for kind in guidances.guides().values() if kind.form and kind.form.name == file.answers]
         raise UserError(f"--labels-from needs a guidance that uses labels: add --guidance {' or '.join(fitting)}")
     for guidance in asking:
         assert guidance.form is not None

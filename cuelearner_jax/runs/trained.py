@@ -179,7 +179,7 @@ class PolicySource:
             return
         chosen = (guidance,) if isinstance(guidance, str) else guidance
         kinds = self.adapted.kinds if self.adapted else chosen or (self.grid.guidance if self.grid else ())
-        weighs_aims = any("aims" in kind.needs for name in kinds if (kind := guidances.find_or_none(name)))
+        weighs_aims = any("aims" in kind.needs for name in kinds if (kind := guidances.guides().get(name)))
         if weighs_aims and (width := spaces_of(known).aims) != (now := spaces_of(after).aims):
             raise UserError(
                 f"the {what} uses aims of {width} features, this world's have {now}: keep the options that set the aims"
@@ -195,7 +195,7 @@ class PolicySource:
         for name in kinds or self.grid.guidance:
             if name not in self.grid.guidance:
                 raise UserError(f"{self.folder} has no guidance {name!r}: choose among {', '.join(self.grid.guidance)}")
-            if guidances.find_or_none(name) is None:
+            if name not in guidances.guides():
                 raise UserError(
                     f"{self.folder} has lanes of a guidance outside the package, {name!r}: name its code by "
                     "--guidance package.module:NAME, if you trust that code"

@@ -1,4 +1,4 @@
-"""The box: actions whose entries lie between two bounds, each entry a cue of its own."""
+"""The box: actions whose entries lie between two bounds, each entry a cue of its own; cues from a person's words."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces.space import Cue, Space, Vectors, numbers
+from cuelearner_jax.errors import UserError, format_value
+from cuelearner_jax.spaces.space import Cue, Space, Vectors
 
 SHARE = "shares"
 WORDS = ("more", "less")
@@ -38,14 +38,12 @@ class Box(Space):
 
     def __post_init__(self) -> None:
         """Raise UserError for bounds or cues that do not fit together."""
-        low, high = numbers("low", self.low), numbers("high", self.high)
-        if len(low) != len(high) or any(b <= a for a, b in zip(low, high, strict=True)):
-            raise UserError(f"low is {low} and high is {high}: give as many of both, each high above its low")
+        low, high = (tuple(map(float, np.asarray(bound, np.float32))) for bound in (self.low, self.high))
+        if len(low) != len(high) or not low or not all(0 < b - a < np.inf for a, b in zip(low, high, strict=True)):
+            raise UserError(f"low is {low} and high is {high}: give as many of both, finite, each high above its low")
         cues = tuple(self.cues) or plain_cues([f"entry {number}" for number in range(1, len(low) + 1)])
-        if len(cues) != len(low):
-            raise UserError(f"{len(cues)} cues for {len(low)} entries: give one cue an entry")
-        if wrong := [cue.name for cue in cues if cue.unit != SHARE]:
-            raise UserError(f"the cue {wrong[0]!r} of a box has the unit {cues[0].unit!r}: give {SHARE!r}")
+        if len(cues) != len(low) or any(cue.unit != SHARE for cue in cues):
+            raise UserError(f"{len(cues)} cues for {len(low)} entries: give one cue an entry, of the unit {SHARE!r}")
         for name, value in (("low", low), ("high", high), ("cues", cues)):
             object.__setattr__(self, name, value)
 
@@ -135,3 +133,53 @@ def plain_cues(names: Sequence[str]) -> tuple[Cue, ...]:
     """Return a cue for each entry of an action: its name, "more" and "less", and two keys while there are any."""
     pairs = zip_longest(names, KEYS[: len(names)], fillvalue="")
     return tuple(Cue(name, WORDS, tuple(keys), SHARE) for name, keys in pairs)
+
+
+LONGEST = 40  # characters of a word
+ARROWS = {"left": "ArrowLeft", "right": "ArrowRight", "up": "ArrowUp", "down": "ArrowDown"}
+HELD = {"left": "a", "right": "d"}  # letter keys that stand for these arrows too
+
+
+def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple[Cue, ...]:
+    """Return cues by their words, each with its own keys. Raises UserError for words that are no such pairs.
+
+    Keys are arrows for left, right, up and down, or else a letter of the word that is free. A cue for which no keys
+    are left has none.
+
+    Args:
+        words: "left,right;up,down", or pairs of words; the first of a pair asks for more of an entry, the second for
+            less.
+        names: names of the cues (default: "left or right" and so on).
+        unit: unit of a change.
+    """
+    try:
+        pairs = [
+            part.split(",") if isinstance(part, str) else part
+            for part in (words.split(";") if isinstance(words, str) else words)
+        ]
+        pairs = [tuple(" ".join(word.split()) for word in pair) for pair in pairs]
+    except (TypeError, AttributeError):
+        pairs = []
+    sound = (len({*pair}) == len(pair) == 2 and all(0 < len(word) <= LONGEST for word in pair) for pair in pairs)
+    if not pairs or not all(sound):
+        raise UserError(
+            f'cues is {format_value(words)}: give two words for each entry of an action, as "left,right;up,down"'
+        )
+    if names and len(names) != len(pairs):
+        raise UserError(
+            f"cues are {len(pairs)} pairs of words for {len(names)} entries of an action: give one an entry"
+        )
+    taken = {HELD[word] for pair in pairs for word in pair if word in HELD}
+    cues = []
+    for number, pair in enumerate(pairs):
+        keys = []
+        for word, spare in zip(pair, KEYS[number % len(KEYS)], strict=True):
+            key = ARROWS.get(word.lower())
+            if key is None or key in taken:
+                letters = (letter for letter in word.lower() if letter.isascii() and letter.isalpha())
+                key = next((one for one in (*letters, spare, *"".join(KEYS), *"ws") if one not in taken), "")
+            taken.add(key)
+            keys.append(key)
+        name = names[number] if names else " or ".join(pair)
+        cues.append(Cue(name, (pair[0], pair[1]), tuple(keys) if all(keys) else (), unit))
+    return tuple(cues)

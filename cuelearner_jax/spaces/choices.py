@@ -33,10 +33,8 @@ class Choices(Space):
 
     def __post_init__(self) -> None:
         """Raise UserError for too few choices, or an order in another unit."""
-        if self.count < 2:
-            raise UserError(f"count is {self.count}: give at least two choices")
-        if self.order is not None and self.order.unit != STEPS:
-            raise UserError(f"the order of choices has the unit {self.order.unit!r}: give {STEPS!r}")
+        if self.count < 2 or (self.order is not None and self.order.unit != STEPS):
+            raise UserError(f"{self} makes no sense: give at least two choices, and an order of the unit {STEPS!r}")
 
     @property
     def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -14,8 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.errors import UserError
-
 Vectors = Float[Array, "... action"] | Float[np.ndarray, "... action"]  # accepted arrays; results are JAX's arrays
 Amount = Float[Array, "..."] | Float[np.ndarray, "..."] | float
 Answers = Float[Array, "... cues"] | Float[np.ndarray, "... cues"]
@@ -50,7 +48,6 @@ class Space:
     grain: float = 0.0  # the smallest change along a cue, in `unit`; 0: there is no smallest
 
     def __init_subclass__(cls) -> None:
-        """Register a space of your own for `spaces.from_json`, by its name."""
         super().__init_subclass__()
         if "name" in vars(cls):
             KNOWN[cls.name] = cls
@@ -137,10 +134,6 @@ class Space:
         apart = jnp.abs(self.log(action, other))
         return apart[..., 0] if len(self.cues) == 1 else jnp.max(apart, -1, initial=0.0)
 
-    def sense(self, action: Vectors, goal: Vectors) -> Float[Array, "... cues"]:
-        """Return h of each cue: +1 where `goal` lies at more, -1 at less, 0 where the two are equal."""
-        return jnp.sign(self.log(action, goal))
-
     def toward(self, action: Vectors, h: Float[Array, "... cues"], step: Amount) -> Float[Array, "... action"]:
         """Change an action by h steps along each cue; a cue of which nothing was said (`UNSAID`) stays."""
         h = h if len(self.cues) == 1 else jnp.where(h == UNSAID, 0.0, h)  # with one cue, an unsaid cue is no answer
@@ -181,14 +174,3 @@ def is_answered(answer: Answers) -> Bool[Array, "... cues"]:
 def says_something(answer: Answers) -> Bool[Array, "..."]:
     """Return which relative answers name a cue. With one cue, all do: silence is not an answer there."""
     return is_answered(answer).any(-1) | (answer.shape[-1] == 1)
-
-
-def numbers(name: str, given: Any) -> tuple[float, ...]:
-    """Return a row of finite numbers as a tuple. Raises UserError for anything else."""
-    try:
-        found = np.asarray(given, np.float32)
-    except (TypeError, ValueError):
-        found = np.empty(0)
-    if found.ndim != 1 or not found.size or not np.isfinite(found).all():
-        raise UserError(f"{name} is {given!r}: give a finite number for each entry of an action")
-    return tuple(map(float, found))

@@ -31,8 +31,7 @@ from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.reading import KIND
+from cuelearner_jax.guides.base import Guide, Reading
 from cuelearner_jax.policies import Common, lanes_in, policy_of
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
@@ -124,7 +123,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     """Number of seeds. Several base policies are each adapted with their own seed, so leave this out then."""
     first_seed: int = 0
     """First seed; the others count up from it."""
-    guidance: str = KIND.name
+    guidance: str = Reading.name
     """Kind of guidance: what is asked, and what a model makes of the answers."""
     scenario: str | None = None
     """A changed world, by its name. Options of the task (--task.…) come on top of it."""
@@ -174,7 +173,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             scalars: complete values in place of the defaults.
         """
         rules = task.scenario(scenario) if task and scenario else AS_IT_IS
-        kind = guidances.resolve(guidance or rules.guidance or KIND.name)
+        kind = guidances.resolve(guidance or rules.guidance or Reading.name)
         if kind.name != rules.guidance:
             rules = replace(rules, sizes={}, scalars={}, options={})  # these apply to the suggested kind
             if kind.by_evidence:
@@ -261,7 +260,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     def _adaptation(self, subject: Subject, guidance: Guide) -> Adaptation:
         """Return the settings that all lanes share. Raises UserError for changes that do not fit the world."""
         env, shared = subject.env, (guidance, self.sizes, self.scalars, subject.env, subject.bases)
-        if not guidance.kind.by_evidence:
+        if not guidance.by_evidence:
             return Adaptation(*shared)
         if subject.changes is None:
             return ReadingAdaptation(*shared, declared_distortions(env))
@@ -272,7 +271,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     def _labels(self, subject: Subject, guidance: Guide, grid: Grid) -> label_files.LabelFile | None:
         """Return the labels in place of questions; None: there are none. Raises UserError if they do not fit."""
         check_grid(grid, adapts=True)
-        if guidance.kind.by_evidence and (least := min(grid.labels)) < by_reading.LEAST:
+        if guidance.by_evidence and (least := min(grid.labels)) < by_reading.LEAST:
             raise UserError(f"labels is {least}: give at least {by_reading.LEAST}, since each is predicted first")
         rows, form, spaces = subject.rows, guidance.form, spaces_of(subject.env)
         assert form is not None  # a kind that asks has a form
@@ -292,7 +291,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         if self.bound_deg:
             by_model.check_bounds(space, self.bound_deg)
             return self.bound_deg
-        if guidance.kind.by_evidence:
+        if guidance.by_evidence:
             return (space.reach,)
         if file is None:
             return (by_model.usual_bound(space),)

@@ -29,7 +29,7 @@ from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Features, Quantity, WholeObservations
 from cuelearner_jax.errors import UserError, suggestion
-from cuelearner_jax.guides.relative import KIND
+from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.policies import PolicyNode
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS, Box, Choices, Space, cues_from
@@ -228,7 +228,7 @@ def task_of(
 def configured(config: LogsConfig, body: Body | None = None) -> Task:
     """Return the task of a configuration; `body` gives it other situations."""
     run = RunConfig(config, Sizes(frame=FRAME), plain_scalars(space_of(config)))
-    preset = Preset("labels about recorded situations", run, (KIND.name,), (200,))
+    preset = Preset("labels about recorded situations", run, (Relative.name,), (200,))
     return dataclasses.replace(LOGS, default=config, presets={PAPER: preset}, bodies=(body or BODY,))
 
 

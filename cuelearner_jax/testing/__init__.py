@@ -5,8 +5,7 @@ A check compiles once or twice and takes seconds; call it from a test, with a wo
 
 from cuelearner_jax.testing.environments import check_environment
 from cuelearner_jax.testing.guidances import check_guidance
-from cuelearner_jax.testing.policies import check_policy
-from cuelearner_jax.testing.spaces import check_space
+from cuelearner_jax.testing.laws import check_policy, check_space
 from cuelearner_jax.testing.tasks import check_task
 
 __all__ = ["check_environment", "check_guidance", "check_policy", "check_space", "check_task"]

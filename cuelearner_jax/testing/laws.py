@@ -1,4 +1,4 @@
-"""Tools of the checks: a law that holds or fails in one line, equal arrays, actions of a space, counted traces."""
+"""Tools of the checks, and the checks of the smallest parts: action spaces and policies."""
 
 from __future__ import annotations
 
@@ -10,16 +10,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.spaces import Space
+from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.policies import BY_LANE, SHARED
+from cuelearner_jax.spaces import Space, from_json
 
-TRACED = "what depends on traced values must be jax.numpy, with jnp.where and lax.cond in place of if"
+TRACED = (
+    "what depends on traced values must be jax.numpy, with jnp.where and lax.cond in place of if; a part is a pytree "
+    "(flax.struct.PyTreeNode), its fields are numbers, or static (pytree_node=False) and hashable"
+)
+DRAWN = 64  # actions of a check of a space
+ROWS = 9  # situations of a check of a policy
 
 
 class Laws:
-    """The laws of one subject."""
+    """The laws of one subject; `subject`: the beginning of messages, a string or an object whose class is named."""
 
     def __init__(self, subject: Any, tolerance: float) -> None:
-        """`subject`: the beginning of messages, a string or an object whose class is named."""
         self.subject = subject if isinstance(subject, str) else type(subject).__name__
         self.tolerance = tolerance
 
@@ -41,85 +47,99 @@ class Laws:
 
     def same(self, one: Any, other: Any) -> bool:
         """Return whether two trees of arrays are equal, within the tolerance. Keys are compared by their words."""
-        pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+        pairs = zip(*(map(_numbers, jax.tree.leaves(tree)) for tree in (one, other)), strict=True)
         return all(
-            np.shape(a) == np.shape(b) and np.allclose(a, b, self.tolerance, self.tolerance, equal_nan=True)
-            for a, b in ((_numbers(a), _numbers(b)) for a, b in pairs)
+            a.shape == b.shape and np.allclose(a, b, self.tolerance, self.tolerance, equal_nan=True) for a, b in pairs
         )
 
-    def actions(self, space: Space, actions: Any, called: str) -> None:
+    def actions(self, space: Space, actions: Any, subject: str) -> None:
         """Raise AssertionError unless rows (..., size) are actions of a space."""
         shape = np.shape(actions)
-        self.hold(shape[-1:] == (space.size,), f"{called} has shape {shape}: an action has {space.size} entries")
-        self.hold(np.isfinite(actions).all(), f"{called} is not finite everywhere: give an action in every situation")
-        kept = self.same(space.retract(jnp.asarray(actions)), actions)
-        self.hold(kept, f"{called} is not an action of the space: pass it through the space's `retract`")
+        self.hold(shape[-1:] == (space.size,), f"{subject} has shape {shape}: an action has {space.size} entries")
+        self.hold(np.isfinite(actions).all(), f"{subject} is not finite everywhere: give an action in every situation")
+        inside = self.same(space.retract(jnp.asarray(actions)), actions)
+        self.hold(inside, f"{subject} is not an action of the space: pass it through the space's `retract`")
 
 
-class OnceTraced:
-    """A function compiled by `jax.jit` that counts how often it was traced."""
+def counted_jit(function: Callable[..., Any]) -> tuple[Callable[..., Any], list[None]]:
+    """Return a function compiled by `jax.jit`, and a list that gets an entry at each trace."""
+    traces: list[None] = []
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        """Wrap the function; nothing is compiled yet."""
-        self.traces = 0
+    def counted(*arguments: Any) -> Any:
+        traces.append(None)
+        return function(*arguments)
 
-        def counted(*arguments: Any) -> Any:
-            self.traces += 1
-            return function(*arguments)
-
-        self._compiled = jax.jit(counted)
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Return the function's result."""
-        return self._compiled(*arguments)
+    return jax.jit(counted), traces
 
 
-def pytree(laws: Laws, subject: Any, called: str) -> None:
-    """Raise AssertionError unless an object is a pytree of numbers with comparable static fields."""
-    leaves = jax.tree_util.tree_leaves_with_path(subject)
-    laws.hold(
-        not (len(leaves) == 1 and leaves[0][1] is subject),
-        f"{called} is not a pytree: derive its class from flax.struct.PyTreeNode",
-    )
-    for path, leaf in leaves:
-        laws.hold(
-            isinstance(leaf, jax.Array | np.ndarray | np.generic | bool | int | float),
-            f"field {jax.tree_util.keystr(path).lstrip('.')} is of type {type(leaf).__name__}, which is not traced: "
-            "make it an array, or static by struct.field(pytree_node=False)",
-        )
-    with laws.attempted("hashing its static fields", "a static field must be hashable: a number, a string, a tuple"):
-        for static in _statics(jax.tree.structure(subject)):
-            hash(static)
-
-
-def _statics(tree: Any) -> Iterator[Any]:
-    """Return the static fields of all nodes of a tree that are not Python's own containers."""
-    node = tree.node_data()
-    if node is not None and node[0] not in (dict, list, tuple):
-        yield node[1]
-    for child in tree.children():
-        yield from _statics(child)
-
-
-def same_shapes(one: Any, other: Any) -> bool:
-    """Return whether two trees have the same fields, shapes and types."""
-    described = [
-        (jax.tree.structure(tree), [(np.shape(leaf), leaf.dtype) for leaf in jax.tree.leaves(tree)])
-        for tree in (one, other)
-    ]
-    return described[0] == described[1]
+def shapes_of(tree: Any) -> Any:
+    """Return a tree's structure with the shape and type of each leaf; two of them can be compared."""
+    return jax.tree.structure(tree), [(np.shape(leaf), leaf.dtype) for leaf in jax.tree.leaves(tree)]
 
 
 def change_floats(tree: Any) -> Any:
     """Return the tree with another value of every float, as a changed world has."""
-
-    def other(leaf: Any) -> Any:
-        return leaf * 1.01 if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating) else leaf
-
-    return jax.tree.map(other, tree)
+    is_float = lambda leaf: jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)  # noqa: E731
+    return jax.tree.map(lambda leaf: leaf * 1.01 if is_float(leaf) else leaf, tree)
 
 
 def _numbers(leaf: Any) -> np.ndarray:
-    if jnp.issubdtype(getattr(leaf, "dtype", np.float32), jax.dtypes.prng_key):
-        leaf = jax.random.key_data(leaf)
-    return np.asarray(leaf)
+    is_key = jnp.issubdtype(getattr(leaf, "dtype", np.float32), jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+
+
+def check_space(space: Space, tolerance: float = 1e-5) -> None:
+    """Check an action space on actions that it draws. Raises AssertionError for the first law that is broken."""
+    laws = Laws(space, tolerance)
+    with laws.attempted("reading its description", "derive a frozen dataclass; see `to_json` and `of_json`"):
+        hash(space)
+        laws.hold(from_json(space.to_json()) == space, "its description gives another space: see `to_json`, `of_json`")
+    with laws.attempted("drawing and comparing actions", "every method takes any leading axes, under jit too"):
+        one, other = (space.sample(jax.random.key(seed), (DRAWN,)) for seed in (0, 1))
+        change = jax.jit(space.log)(one, other)
+        moved, retracted = jax.jit(space.exp)(one, change), space.retract(one)
+        spread = space.spread(DRAWN)
+    laws.hold(change.shape == (DRAWN, len(space.cues)), f"`log` has shape {change.shape}: give one number a cue")
+    for function, actions in (("sample", one), ("exp", moved), ("spread", spread)):
+        laws.actions(space, actions, f"what `{function}` gives")
+    laws.hold(laws.same(retracted, one), "`retract` changes actions: it must leave them as they are")
+    if space.cues:
+        laws.hold(laws.same(moved, other), "exp(a, log(a, b)) is not b: `exp` must go where `log` says")
+        farthest = float(np.max(np.abs(space.to_unit(np.asarray(change), np))))
+        laws.hold(farthest <= space.reach * (1 + tolerance), f"`log` goes as far as {farthest:g}: beyond `reach`")
+    lost = space.retract(one.at[0].set(jnp.nan))
+    laws.hold(np.isnan(lost[0]).all(), "`retract` of NaN is not NaN: return NaN, so that a fault of user code is seen")
+
+
+def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None:
+    """Check a policy in one environment. Raises AssertionError for the first law that is broken.
+
+    Args:
+        policy: one policy, as `evaluate.evaluate_policy` takes it.
+        env: the environment that it acts in.
+        tolerance: relative and absolute, of actions.
+    """
+    laws, space = Laws(policy, tolerance), actions_of(env)
+    keys = jax.random.split(jax.random.key(0), ROWS)
+    states, obs = jax.vmap(env.reset)(keys)
+    act, traces = counted_jit(lambda policy, key, states, obs: policy.act(key, states, obs))
+    with laws.attempted("`act` under jit", f"it gets a key, states and observations (n, obs), all traced; {TRACED}"):
+        actions, again, other = (act(policy, keys[number], states, obs) for number in (0, 0, 1))
+        act(change_floats(policy), keys[0], states, obs)
+    laws.hold(len(traces) == 1, "other values of its floats are traced anew: keep them out of static fields")
+    with laws.attempted("`axes`", "give the policy with BY_LANE or SHARED in place of its fields: self.replace(...)"):
+        axes = jax.tree.leaves(policy.axes, is_leaf=lambda leaf: leaf is None)
+    broken = "`axes` holds something else than BY_LANE and SHARED: replace every field"
+    laws.hold(all(axis is SHARED or axis == BY_LANE for axis in axes), broken)
+    with laws.attempted("`act` of one observation", "n may be 1"):
+        alone = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[:1], states), obs[:1])
+    for rows, found in ((ROWS, actions), (1, alone)):
+        shape = np.shape(found)
+        laws.hold(shape == (rows, space.size), f"`act` returns shape {shape} for {rows} observations")
+        laws.actions(space, found, "an action that `act` returns")
+    laws.hold(laws.same(actions, again), "the same key gives other actions: draw all random numbers from the key")
+    if laws.same(actions, other):  # random actions differ where rows have another order
+        order = jnp.roll(jnp.arange(ROWS), 4)
+        moved = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[order], states), obs[order])
+        apart = laws.same(moved, actions[order]) and laws.same(alone, actions[:1])
+        laws.hold(apart, "the action in one situation depends on the others: rows must not look at each other")

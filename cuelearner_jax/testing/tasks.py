@@ -8,7 +8,6 @@ from typing import Any
 import jax
 
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import uniform_in
@@ -17,7 +16,7 @@ from cuelearner_jax.runs import filming
 from cuelearner_jax.runs.grid import Grid, check_grid
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.testing.environments import check_environment
-from cuelearner_jax.testing.laws import Laws, same_shapes
+from cuelearner_jax.testing.laws import Laws, shapes_of
 from cuelearner_jax.types import ValuesDirections
 
 FILMED = 3  # steps
@@ -38,84 +37,69 @@ def check_task(
         tolerance: as for `check_environment`.
     """
     laws = Laws(f"task {task.name}", tolerance)
-    laws.hold(task.about, "it says nothing of itself: fill `about`, for help pages")
     for name, preset in task.presets.items():
         with laws.attempted(f"preset {name!r}", "its values must pass cuelearner_jax.config.check"):
             check(preset.config)
             task.check_evaluations(preset.config)
             check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
-        with laws.attempted(f"the environment of preset {name!r}", "it must follow from the configuration alone"):
+        with laws.attempted(f"the environments of preset {name!r}", f"make those of training and of {[*SPLITS]}"):
             env = shape_of(task, preset.config.task)
-            worlds = {other: shape_of(task, one.apply(preset.config.task)) for other, one in task.scenarios.items()}
+            sizes = {
+                other: shape_of(task, one.apply(preset.config.task)).obs_size for other, one in task.scenarios.items()
+            }
+            splits = [
+                jax.eval_shape(lambda split=split: task.environment(preset.config.task, split))  # noqa: B023
+                for split in ("training", *SPLITS)
+            ]
         possible = registry.possible(env, taught=task.teacher is not None)
         odd = [kind for kind in preset.guidance if registry.resolve(kind).name not in possible]
         laws.hold(not odd, f"preset {name!r} compares guidance {odd[:1]}, which it cannot have: of {list(possible)}")
-        with laws.attempted(f"the splits of preset {name!r}", f"make an environment of training and of {[*SPLITS]}"):
-            first, *others = (_of_split(task, preset.config.task, split) for split in ("training", *SPLITS))
-        same = all(same_shapes(one, first) for one in others)
+        same = all(shapes_of(one) == shapes_of(splits[0]) for one in splits)  # they share one compiled program
         laws.hold(same, f"preset {name!r} has environments of other shapes for other splits: only values may differ")
-        for other, world in worlds.items():
-            size = world.obs_size
-            told = f"scenario {other!r} has observations of {size} entries, not {env.obs_size}: policies must act in it"
-            laws.hold(size == env.obs_size, told)
+        for other, size in sizes.items():
+            broken = f"scenario {other!r} has observations of {size} entries, not {env.obs_size}"
+            laws.hold(size == env.obs_size, f"{broken}: policies must act in it")
     if small is not None:
         laws.hold(isinstance(small, task.config), f"`small` is a {type(small).__name__}: give a {task.config.__name__}")
-        _check_longest(laws, task, small)
-        check_environment(task.environment(small), steps, tolerance=tolerance)
-        _check_teacher(laws, task, small)
-    if pictures is not None:
-        laws.hold(small is not None, "pictures are of the small world: give `small`")
-        _check_pictures(laws, task, small, pictures)
+        env = task.environment(small)
+        check_environment(env, steps, tolerance=tolerance)
+        _check_teacher(laws, task, small, env)
+        if pictures is not None:
+            _check_pictures(laws, task, small, pictures)
 
 
-def _of_split(task: Task, config: Any, split: str) -> Any:
-    """Return the shapes of an environment; all splits must share one compiled program."""
-    return jax.eval_shape(lambda: task.environment(config, split))
-
-
-def _check_longest(laws: Laws, task: Task, config: Any) -> None:
-    """Check that the longest episode is known where episodes have outcomes."""
-    env = task.environment(config)
-    state, _ = jax.eval_shape(env.reset, jax.random.key(0))
-    action = jax.eval_shape(lambda: actions_of(env).sample(jax.random.key(0), ()))
+def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
+    """Check the teacher's actions, and that the longest episode is known where episodes have outcomes."""
+    state, obs = jax.jit(env.reset)(jax.random.key(0))
+    action = actions_of(env).sample(jax.random.key(0), ())
     outcomes = sorted(jax.eval_shape(env.step, jax.random.key(0), state, action)[1].outcome)
-    laws.hold(
-        not outcomes or task.longest is not None,
-        f"its episodes have outcomes {outcomes}, but it does not say how long they last: fill `longest`",
-    )
-
-
-def _check_teacher(laws: Laws, task: Task, config: Any) -> None:
+    broken = f"its episodes have outcomes {outcomes}, but it does not say how long they last: fill `longest`"
+    laws.hold(not outcomes or task.longest is not None, broken)
     if task.teacher is None:
         return
-    env = task.environment(config)
 
     @jax.jit
-    def asked(env: Any, key: jax.Array) -> dict[str, jax.Array]:
-        teacher, (state, obs) = task.make_teacher(config, env), env.reset(key)
-        best = teacher.best_action(state, obs)
+    def answers(env: Any) -> dict[str, jax.Array]:
+        teacher = task.make_teacher(config, env)
+        best = {"best action": teacher.best_action(state, obs)}
         if not isinstance(teacher, ValuesDirections):
-            return {"best action": best}
-        return {"best action": best, "nearest good action": teacher.nearest_good(state, obs, best, 0.0, 1.0)}
+            return best
+        return {**best, "nearest good action": teacher.nearest_good(state, obs, best["best action"], 0.0, 1.0)}
 
     with laws.attempted("its teacher's best_action", "it gets one state and its observation, in jax.numpy"):
-        answers = asked(env, jax.random.key(0))
-    for name, action in answers.items():
-        laws.hold(action.ndim == 1, f"its teacher's {name} has shape {action.shape}: give one action")
-        laws.actions(actions_of(env), action, f"its teacher's {name}")
+        actions = answers(env)
+    for name, one in actions.items():
+        laws.hold(one.ndim == 1, f"its teacher's {name} has shape {one.shape}: give one action")
+        laws.actions(actions_of(env), one, f"its teacher's {name}")
 
 
 def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
     """Check a film, a still and a question of a few random steps."""
-    try:
-        drawn = task.pictures()
-    except UserError as error:
-        raise AssertionError(f"{laws.subject}: {error}") from error
-    env = task.environment(config, "validation")
-    policy, files = uniform_in(env), filming.files(folder, task.name, "gif")
     with laws.attempted("drawing", "see cuelearner_jax.task.Pictures for what each of its functions gets"):
-        rewards = filming.film(drawn, env, policy, 0, FILMED, files)
-        filming.question(drawn, env, policy, 0, files.question)
+        drawn, env = task.pictures(), task.environment(config, "validation")
+        files = filming.files(folder, task.name, "gif")
+        rewards = filming.film(drawn, env, uniform_in(env), 0, FILMED, files)
+        filming.question(drawn, env, uniform_in(env), 0, files.question)
     laws.hold(len(rewards) == FILMED, f"`record` returns {len(rewards)} rewards of {FILMED} steps: one a step")
     for file in files:
         laws.hold(file.is_file() and file.stat().st_size, f"{file.name} was not written: write the file that is named")

@@ -105,12 +105,6 @@ def test_units_that_fill_up_a_layer_add_exactly_nothing():
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
 
 
-def test_values_are_counted_as_they_are_taken():
-    assert search.values_per_choice(360, 0, 8) == 360
-    # 36 at first, then 4 peaks of 2 * 9 neighbours and themselves.
-    assert search.values_per_choice(360, 36, 4) == 36 + 4 * 19
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -11,7 +11,7 @@ import probes
 import pytest
 
 from cuelearner_jax import loop
-from cuelearner_jax.agents.networks import MLP, Joined, as_function, q_network
+from cuelearner_jax.agents.networks import Joined, as_function, q_network
 from cuelearner_jax.agents.replay import LaterSteps, Memory, StoredStep, Transition, buffer_for, n_step_return
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -44,11 +44,6 @@ def test_a_whole_window_sums_its_discounted_rewards_and_the_value_after_it_is_di
     assert returned(window()) == (1 + 2 / 2 + 4 / 4, 1 / 4, 2)
 
 
-def test_a_window_of_one_step_is_the_one_step_transition():
-    for discount, ended in ((1, 0), (1, 1), (0, 1)):
-        assert returned(window([7.0], [discount], [ended], [True])) == (7, discount, 0)
-
-
 def test_after_a_termination_neither_rewards_nor_a_value_count():
     assert returned(window((1, 2, 1e6), (1, 0, 1), (0, 1, 0))) == (2, 0, 1)
     assert returned(window((1, 1e6, 1e6), (0, 1, 1), (1, 0, 0))) == (1, 0, 0)
@@ -59,11 +54,6 @@ def test_after_a_truncation_the_value_counts_but_no_reward_does():
     assert returned(window((1, 2, 1e6), (1, 1, 1), (0, 1, 0))) == (2, 1 / 2, 1)
     assert returned(window((1, 1e6, 1e6), (1, 1, 1), (1, 0, 0))) == (1, 1, 0)
     assert returned(window((1, 2, 4), (1, 1, 1), (0, 0, 1))) == (3, 1 / 4, 2)
-
-
-def test_what_ends_a_later_episode_changes_nothing():
-    assert returned(window((1, 2, 1e6), (1, 1, 0), (0, 1, 1))) == (2, 1 / 2, 1)
-    assert returned(window((1, 2, 1e6), (1, 0, 0), (0, 1, 1))) == (2, 0, 1)
 
 
 def test_steps_that_have_not_been_made_yet_shorten_the_window():
@@ -210,17 +200,6 @@ def test_values_of_a_chain_that_is_truncated(weight):
     np.testing.assert_allclose(start, np.array([0, 0.5, 0, -0.5]) + 1.0 - 0.5 * weight, atol=0.12)
 
 
-def test_windows_that_reach_the_end_need_no_target_network():
-    start, end = learned(False, 1.0, polyak=0.0)
-    np.testing.assert_allclose(end, [1, 0, -1, 0], atol=0.08)
-    np.testing.assert_allclose(start, [0, 0.5, 0, -0.5], atol=0.1)
-
-
-def test_other_weights_and_rates_compiled_nothing():
-    learned(False, 0.3, polyak=0.01)
-    assert probes.compilations(program().train) == [1]
-
-
 @pytest.mark.parametrize(
     ("agent", "discount", "words"),
     [
@@ -256,17 +235,3 @@ def test_the_joined_layer_is_a_dense_layer_on_the_concatenation():
     ]
     for mine, theirs in zip(*map(jax.tree.leaves, slopes), strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-5)
-
-
-def test_many_actions_of_one_observation_have_the_values_of_each_pair():
-    network = MLP((16, 8), 1)
-    obs = jax.random.normal(jax.random.key(0), (5,))
-    actions = jax.random.normal(jax.random.key(1), (9, 2))
-    params = network.init(jax.random.key(2), obs, actions[0])
-    layers = [params["params"][f"Dense_{place}"] for place in range(3)]
-    x = np.concatenate([np.tile(obs, (9, 1)), actions], -1).astype(np.float64)
-    for place, layer in enumerate(layers):
-        x = x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"])
-        x = np.maximum(x, 0) if place < 2 else x
-    assert x.std() > 0.02
-    np.testing.assert_allclose(network.apply(params, obs, actions), x, atol=1e-5)

@@ -69,23 +69,6 @@ def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
     assert set((np.asarray(drawn.reward) - 0.5).tolist()) == numbers  # an empty row would be -0.5
 
 
-def test_draws_are_uniform():
-    buffer = ring_buffer(EXAMPLE)
-    drawn = drawn_from(buffer, filled(buffer, 8, 1, 8), 2, 8, 8000)
-    counts = np.bincount(np.asarray(drawn.obs[:, 0]).astype(int), minlength=8)
-    assert counts.min() > 850  # 1000 each, standard deviation 30
-    assert counts.max() < 1150
-
-
-def test_where_nothing_bootstraps_no_next_observation_is_stored():
-    nothing = jnp.zeros(0)
-    buffer = ring_buffer(EXAMPLE.replace(discount=nothing, ended=nothing, aftermath=nothing))
-    assert buffer.width == 6
-    drawn = drawn_from(buffer, filled(buffer, 4, 2, 4, bootstraps=False), 0, 4, 5)
-    assert drawn.aftermath.shape == (5, 0)
-    np.testing.assert_allclose(drawn.reward, drawn.action[:, 0] + 0.2, rtol=1e-5)
-
-
 @pytest.mark.parametrize("steps", [10, 16, 24])
 def test_what_follows_a_step_is_its_own_environments(steps):
     """Two environments in turn, 12 rows: row n's followers are n + 2, n + 4, ... up to the newest, across the seam."""
@@ -111,12 +94,6 @@ def test_in_lanes_the_write_stays_one_slice_update():
     program = str(jax.make_jaxpr(add)(rows, jnp.array(10), lanes))
     assert "dynamic_update_slice" in program
     assert "scatter" not in program
-
-
-def test_a_capacity_that_is_no_multiple_is_refused():
-    buffer = ring_buffer(EXAMPLE)
-    with pytest.raises(ValueError, match="no multiple"):
-        buffer.add(buffer.empty(7), jnp.array(0), numbered(0, 2))
 
 
 def counted(guided, capacity, at_once):
@@ -147,20 +124,3 @@ def test_rows_of_each_sort_are_drawn_alike_and_no_others(steps):
         assert set(np.flatnonzero(found)) == set(there)
         expected = 3000 / len(there)
         assert np.abs(found[there] - expected).max() < 5 * expected**0.5
-
-
-@pytest.mark.parametrize("sort", [True, False])
-def test_a_sort_without_rows_leaves_its_place_to_the_other(sort):
-    counts = counted(np.full(6, sort), 8, 1)[:, 0]
-    drawn = draw_sorts(jax.random.key(0), counts, jnp.array(6), jnp.arange(600) < 300)
-    assert set(np.asarray(drawn).tolist()) == set(range(6))
-
-
-def test_in_lanes_each_has_counts_of_its_own():
-    add = jax.vmap(count_guided, (0, None, 0))
-    flags = jnp.array([[True, True], [False, True]])
-    counts = add(jnp.zeros((2, 4, 1), jnp.int32), jnp.array(0), flags)
-    np.testing.assert_array_equal(add(counts, jnp.array(2), flags)[..., 0], [[1, 2, 3, 4], [0, 1, 1, 2]])
-    draw = jax.vmap(draw_sorts, (None, 0, None, None))
-    drawn = draw(jax.random.key(0), counts[..., 0], jnp.array(2), jnp.ones(50, bool))
-    assert [set(lane.tolist()) for lane in np.asarray(drawn)] == [{0, 1}, {1}]

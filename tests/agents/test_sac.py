@@ -12,7 +12,6 @@ import pytest
 from walk_task import BOX, SMALL, Walk
 
 from cuelearner_jax.agents import sac
-from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.replay import Memory, Transition, buffer_for, count_guided, stored_step
 from cuelearner_jax.config import static
 from cuelearner_jax.environment import Spaces, spaces_of
@@ -120,18 +119,6 @@ def test_each_target_draws_a_subset_of_the_critics():
         (own,) = [n for n in range(3) if np.allclose(found, each[n], rtol=1e-5, atol=1e-6)]
         seen.add(own)
     assert seen == {0, 1, 2}
-
-
-def test_the_value_is_the_smallest_of_all_critics_which_begin_apart():
-    agent = agent_of(THREE)
-    params, _ = agent.init(KEY)
-    obs, actions = jnp.array([0.3, 0.5]), BOX.sample(KEY, (50,))
-    each = [by_hand(params["critics"], n, np.tile(obs, (50, 1)), agent.in_unit(actions)) for n in range(3)]
-    found = agent.value(None, params, obs, actions)
-    np.testing.assert_allclose(found, np.min(each, 0), rtol=1e-5, atol=1e-6)
-    assert np.std(each, 0).min() > 1e-4
-    one = agent.value(None, params, obs[None].repeat(50, 0), actions)
-    np.testing.assert_allclose(one, found, rtol=1e-5, atol=1e-6)
 
 
 def test_normalised_layers_bound_a_critics_value_of_any_action():
@@ -246,8 +233,3 @@ def test_options_that_do_not_fit_are_refused():
         SMALL.make("action", SPACES)
     with pytest.raises(UserError, match=r"agent\.target_critics is 3: give at most agent\.critics \(2\)"):
         dataclasses.replace(SMALL, target_critics=3).check(probes.SIZES, True)
-
-
-def test_it_is_what_the_protocol_asks():
-    assert isinstance(agent_of(), AgentFunctions)
-    assert set(agent_of().described) == {"rule", "frame"}

@@ -6,11 +6,11 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.agents import ddqn, view
+from cuelearner_jax.agents import ddqn, networks
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Features, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides.model import guide_model
+from cuelearner_jax.guides.fitting import guide_model
 from cuelearner_jax.spaces import directions as geometry
 
 ENV = probes.Window()
@@ -26,19 +26,13 @@ class Turned(probes.Window):
         return Features(jnp.zeros(1), geometry.inward(jnp.broadcast_to(obs, action.shape), action))
 
 
-def test_raw_networks_see_what_there_is():
-    assert view.network_inputs("raw", None, OBS, CHOSEN) == (OBS, CHOSEN)
-    assert view.widths("raw", spaces_of(ENV)) == (2, 2)
-    assert view.outward("raw", spaces_of(ENV), OBS, CHOSEN) is OBS
-
-
 def test_rows_are_seen_each_from_its_own_action():
-    own, turned = view.network_inputs("action", ENV, OBS, CHOSEN)
+    own, turned = networks.network_inputs("action", ENV, OBS, CHOSEN)
     for row in range(3):
         alone = ENV.features(OBS[row], CHOSEN[row])
         np.testing.assert_allclose(own[row], alone.own, atol=1e-6)
         np.testing.assert_allclose(turned[row], alone.turned, atol=1e-6)
-    assert view.widths("action", spaces_of(ENV)) == (2, 4)
+    assert networks.widths("action", spaces_of(ENV)) == (2, 4)
 
 
 def test_a_vector_goes_outward_as_it_came_inward():

@@ -22,8 +22,7 @@ import pytest
 from PIL import Image
 
 from cuelearner_jax import loop
-from cuelearner_jax.agents.protocol import AgentFunctions
-from cuelearner_jax.agents.registry import AGENTS
+from cuelearner_jax.agents.protocol import AGENTS, AgentFunctions
 from cuelearner_jax.arbiters import ARBITERS, Arbiter, Outcome
 from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
@@ -79,10 +78,10 @@ def forget_modules():
 @contextlib.contextmanager
 def stranger():
     """A process that knows no task, part, kind or module of the examples, and forgets them again."""
-    tables = (guidances._KINDS, tasks._registered, AGENTS._found, ARBITERS._found)
+    tables = (guidances.guides(), tasks._registered, AGENTS, ARBITERS)
     before, modules = [dict(table) for table in tables], forget_modules()
     tasks._registered.clear()
-    for table, name in ((guidances._KINDS, "clone"), (AGENTS._found, "soft"), (ARBITERS._found, "late")):
+    for table, name in ((guidances.guides(), "clone"), (AGENTS, "soft"), (ARBITERS, "late")):
         table.pop(name, None)
     sys.meta_path.insert(0, AGAIN)
     try:
@@ -285,7 +284,7 @@ def test_the_parts_keep_the_laws(tmp_path):
     config = reach.ReachConfig(max_steps=8, mirrors=True)
     check_task(reach.TASK, config, pictures=tmp_path)
     env = reach.make_environment(config)
-    check_guidance(clone.KIND, env)
+    check_guidance(clone.Clone, env)
     for one in policy.policies(env).values():
         check_policy(one, env)
     check_task(brax.TASK)

@@ -63,7 +63,7 @@ def test_fitted_targets_and_the_network_that_is_fitted():
     labels = Label(obs, action, h[:, None], jnp.arange(20) < 15)
     given = single_file.Labels(obs, action, h)
     targets = single_file.feedback_targets(SINGLE, given)
-    np.testing.assert_allclose(targets, GUIDE.lessons(labels, SCALARS).target, atol=1e-5)
+    np.testing.assert_allclose(targets, GUIDE.examples(labels, SCALARS).target, atol=1e-5)
     fit = jax.jit(lambda key: GUIDE.fit(key, ENV, labels, GUIDE.init(key), SCALARS).params)
     package = fit(jax.random.key(3))
     single = jax.jit(lambda key: single_file.fit(SINGLE, key, given, 15))(jax.random.key(3))

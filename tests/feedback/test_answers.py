@@ -77,10 +77,6 @@ def test_answers_by_hand(action_deg, best, nearest):
     assert answers(action_deg, answer="nearest", nearest_share=0.8) == best  # the best one alone is good
 
 
-def test_how_near_is_good_is_said_in_degrees():
-    assert [answers(62, scalar_within_deg=within)[2] for within in (11.9, 12.1)] == [0, 1]
-
-
 FAULTS = {
     "mistaken": ({"mistake_probability": 1.0}, (-1, -50, 1), (0, 42, 0)),  # near: 4 degrees off, as much the other way
     "biased": ({"teacher_bias_deg": -40.0}, (1, 10, 0), (-1, 10, 0)),

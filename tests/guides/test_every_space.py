@@ -9,7 +9,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from cuelearner_jax.adaptation import by_model
@@ -18,8 +17,8 @@ from cuelearner_jax.environment import Quantity, Spaces, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import human_answer
 from cuelearner_jax.guides import registry
-from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons, squared_errors
-from cuelearner_jax.guides.relative import KIND as RELATIVE
+from cuelearner_jax.guides.fitting import examples, fit_least_squares, squared_errors
+from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.spaces import UNSAID, Box, Choices, Cue
 from cuelearner_jax.types import Label
 
@@ -118,15 +117,9 @@ PEERS = (("1", "all", 0.7), ("3", "one", 0.9), ("7", "all", 0.9), ("gears", "all
     [
         ("relative", "3", "one", 0.4),
         ("relative", "gears", "all", 0.1),
-        long("relative", "1", "all", 0.2),
-        long("relative", "7", "all", 0.3),
-        long("dcoach", "1", "all", 0.9),
-        long("dcoach", "7", "all", 0.9),
-        long("dcoach", "gears", "all", 0.8),
-        long("demonstration", "1", "all", 0.1),
-        long("demonstration", "7", "all", 0.1),
-        long("demonstration", "gears", "all", 0.1),
-        long("scalar", "1", "all", 0.6),
+        *(long("relative", *case) for case in (("1", "all", 0.2), ("7", "all", 0.3))),
+        *(long("dcoach", *case) for case in (("1", "all", 0.9), ("7", "all", 0.9), ("gears", "all", 0.8))),
+        *(long("demonstration", space, "all", 0.1) for space in ("1", "7", "gears")),
         *(long(kind, *case) for kind in ("bdcoach", "clic", "clic_shown") for case in PEERS),
         long("scalar", "gears", "all", 0.6),
     ],
@@ -142,8 +135,8 @@ def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
     answer = jnp.array([[1.0, UNSAID, 0.0], [UNSAID, -1.0, UNSAID]])
     labels = Label(obs, action, answer, jnp.ones(2, bool))
     scalars = scalars_of(space)
-    guide = RELATIVE.make(SIZES, Spaces(2, space))
-    rows = jax.jit(lambda labels: lessons(labels, guide.target, scalars, space))(labels)
+    guide = Relative(SIZES, Spaces(2, space))
+    rows = jax.jit(lambda labels: examples(labels, guide.target, scalars, space))(labels)
     eps = scalars.eps_deg
     np.testing.assert_allclose(rows.target, [[2 * eps, 0, 0], [0, -4 * eps, 0]], atol=1e-6)
     off = jnp.array([[0.2, 77.0, 0.0], [-5.0, 0.4, 3.0]])
@@ -156,7 +149,7 @@ def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
 
 def test_what_a_network_predicts_of_an_unsaid_cue_changes_no_fit():
     space, scalars = SPACES["3"], scalars_of(SPACES["3"], says="one")
-    rows = jax.jit(RELATIVE.make(SIZES, Spaces(2, space)).lessons)(told(space, scalars, "relative", 20), scalars)
+    rows = jax.jit(Relative(SIZES, Spaces(2, space)).examples)(told(space, scalars, "relative", 20), scalars)
     other = rows.replace(target=jnp.where(rows.said, rows.target, 99.0))
     fit = jax.jit(
         lambda rows: fit_least_squares(
@@ -175,14 +168,9 @@ def test_a_label_that_says_nothing_of_any_cue_is_none():
     space = SPACES["3"]
     labels = told(space, scalars_of(space), "relative", 10)
     silent = labels.replace(answer=jnp.full((10, 3), UNSAID))
-    guide = RELATIVE.make(SIZES, Spaces(2, space))
-    assert not jax.jit(guide.lessons)(silent, scalars_of(space)).valid.any()
+    guide = Relative(SIZES, Spaces(2, space))
+    assert not jax.jit(guide.examples)(silent, scalars_of(space)).valid.any()
     assert not bool(jax.jit(guide.fit)(KEY, None, silent, guide.init(KEY), scalars_of(space)).fitted)
-
-
-def test_lessons_of_one_cue_count_whole():
-    lesson = Lesson(jnp.zeros((1, 2)), jnp.zeros((1, 1)), jnp.zeros((1, 1)), jnp.ones(1, bool))
-    assert float(squared_errors(lesson, jnp.array([[3.0]]))[0]) == 9.0
 
 
 @pytest.mark.parametrize("kind", ["relative", "dcoach", "bdcoach", "clic", "clic_shown", "reading"])
@@ -201,16 +189,3 @@ def test_answers_too_weak_to_move_a_choice_are_refused_and_never_the_default():
     with pytest.raises(UserError, match=r"labels of 0\.3 steps say nothing.* from 1 on"):
         by_model.check_amounts(GEARS, [2.0], weak)
     assert FRUIT.reach == 1.0
-
-
-def test_directions_are_asked_of_as_before():
-    """One cue: whatever a teacher says of several, an answer is the same number from the same key."""
-    env = probes.Window()
-    scalars = dataclasses.replace(probes.SCALARS, mistake_probability=0.3, silence_probability=0.3)
-    action, best = env.reset(KEY)[1], env.best(env.reset(KEY)[1])
-    for key in jax.random.split(KEY, 8):
-        said = [
-            human_answer(key, SPACES["1"], action[:1], best[:1], dataclasses.replace(scalars, says=says))
-            for says in ("all", "worst", "one")
-        ]
-        assert len({(float(h[0]), bool(answered)) for h, answered in said}) == 1

@@ -9,7 +9,6 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides import intent, registry
 from cuelearner_jax.spaces import DIRECTIONS, directions
@@ -60,11 +59,6 @@ def test_what_is_not_open_may_be_meant_and_is_not_followed(fitted):
     meant = bundle.act(model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
     np.testing.assert_allclose(DIRECTIONS.distance(meant, second), 0.0, atol=1e-3)
     assert np.asarray(DIRECTIONS.distance(found, second)).min() > 0.5
-
-
-def test_who_reads_intent_needs_aims():
-    with pytest.raises(UserError, match="needs an environment with `aims`"):
-        registry.make("intent", SIZES, probes.Window())
 
 
 class Alone(probes.Aimed):
@@ -144,14 +138,6 @@ def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
         assert sure
 
 
-def test_an_impossible_aim_has_no_weight(fitted):
-    _, model = fitted
-    network, aims = intent.Weights(OPTIONS.aim_layers), ENV.aims(OBS[0])
-    weights = jax.nn.softmax(jnp.asarray(network.apply(model.params, aims.features, aims.possible)))
-    assert weights[3] == 0.0
-    assert weights[1] > 0.9
-
-
 def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     bundle, model = told(dataclasses.replace(SIZES, ensemble=3))
     lead = acted((bundle, model), ENV).actions
@@ -169,19 +155,3 @@ def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     assert apart[0] > 10 * bundle.disagreement(model, ENV, OBS, BASE)[0]
     np.testing.assert_allclose(apart[0], shares.var(0).sum(), rtol=1e-4)
     np.testing.assert_array_equal(apart, bundle.disagreement(outvoted, ENV, OBS, OBS))  # whatever the action
-
-
-def test_what_an_answer_says_of_aims_depends_on_its_strength():
-    """The second aim lies 10 degrees to the left: on the edge of what is right for a label of 20 degrees."""
-    asked = directions.rotate(ENV.best(OBS[0]), -jnp.deg2rad(10.0))
-    label = Label(OBS[0], asked, jnp.array([1.0]), jnp.array(True))
-
-    def of(eps_deg):
-        scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg)
-        return intent.evidence_of(ENV.aims(OBS[0]), DIRECTIONS, label, scalars).likelihood
-
-    # Logistic, of one degree: half at the edge of 10; e^-10 within that of 20; all but e^-8 beyond that of 2.
-    for strength, said in ((20.0, 0.5), (40.0, math.exp(-10)), (4.0, 1 - math.exp(-8))):
-        assert float(of(strength)[1]) == pytest.approx(said, abs=2e-4 * (said > 0.1) + 1e-6)
-    everywhere = of(20.0)[-1], of(40.0)[-1]
-    np.testing.assert_allclose(everywhere, [170 / 360, 160 / 360], atol=2e-3)  # degrees that are more to the left

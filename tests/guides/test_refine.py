@@ -10,7 +10,7 @@ import pytest
 
 from cuelearner_jax.devices import portions
 from cuelearner_jax.guides import refining
-from cuelearner_jax.guides.refining import no_refinement, refine
+from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.spaces import DIRECTIONS, directions
 
 DEG = math.pi / 180
@@ -79,15 +79,6 @@ def test_agrees_with_a_float64_loop(scale, tau_deg, tau_max_deg, k_max):
     assert np.abs(turn(expected, np.asarray(result.actions)))[clear].max() < 1e-4
 
 
-def test_the_cases_above_stop_by_tau_and_by_the_number_of_passes():
-    weights, first, all_rows = network(20, 0.2), starts(1), np.ones(ROWS, bool)
-    settled = refined_by_network(weights, first, all_rows, 0.5 * DEG, math.pi, 50)
-    limited = refined_by_network(weights, first, all_rows, 0.1 * DEG, math.pi, 4)
-    assert np.asarray(settled.passes).max() < 50
-    assert np.asarray(settled.passes).min() < np.asarray(settled.passes).max()
-    assert (np.asarray(limited.passes) == 4).mean() > 0.5
-
-
 @pytest.mark.parametrize("k_max", [4, 50])
 def test_passes_between_two_looks_change_nothing(monkeypatch, k_max):
     weights, first, some = network(20, 0.2), starts(1), np.arange(ROWS) % 3 > 0
@@ -108,18 +99,8 @@ def test_passes_between_two_looks_change_nothing(monkeypatch, k_max):
     assert k_max <= 7 or each.passes.max() > 7
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_never_leaves_the_ball(seed):
-    rng = np.random.default_rng(seed)
-    weights, first = network(seed, scale=10 ** rng.uniform(-1, 2)), starts(seed)
-    radius = rng.uniform(0, math.pi) if seed else 0.0
-    result = refined_by_network(weights, first, np.ones(ROWS, bool), 1e-3, radius, 50)
-    assert np.abs(turn(first, np.asarray(result.actions, np.float64))).max() <= radius + 1e-5
-    np.testing.assert_allclose(np.linalg.norm(result.actions, axis=-1), 1, atol=1e-6)
-
-
-@pytest.mark.parametrize("scale", [0.1, 1.0, 30.0, 1e4])
-@pytest.mark.parametrize("radius", [0.0, 1 * DEG, 30 * DEG, 90 * DEG, 179 * DEG])
+@pytest.mark.parametrize("scale", [0.1, 30.0])
+@pytest.mark.parametrize("radius", [0.0, 1 * DEG, 90 * DEG, 179 * DEG])
 def test_no_iterate_leaves_the_ball(scale, radius):
     weights, first = network(int(scale), scale), starts(2)
     farthest = 0.0
@@ -163,29 +144,20 @@ def refined_degrees(start, goal, eps, tau_max=180.0, k_max=50):
     return np.asarray(directions.to_angle(result.actions)) / DEG, result.passes.tolist()
 
 
-def test_a_perfect_model_of_feedback_by_hand():
-    # 47 -> 37 -> 27 -> 17 -> 7 -> -3, then one pass that moves nothing; 3 deg is right already.
-    degrees, passes = refined_degrees([47.0, -26.0, 3.0], goal=0.0, eps=10.0)
-    np.testing.assert_allclose(degrees, [-3.0, 4.0, 3.0], atol=1e-3)
-    assert passes == [6, 4, 1]
-
-
-def test_a_perfect_model_stops_at_the_bound():
-    degrees, passes = refined_degrees([47.0, -26.0], goal=0.0, eps=10.0, tau_max=25.0)
-    np.testing.assert_allclose(degrees, [22.0, -1.0], atol=1e-3)  # 26 deg: 10, 20, then 5 more to the bound
-    assert passes == [4, 4]
-
-
-def test_a_perfect_model_stops_after_k_max_passes():
-    degrees, passes = refined_degrees([47.0], goal=0.0, eps=10.0, k_max=2)
-    np.testing.assert_allclose(degrees, [27.0], atol=1e-3)
-    assert passes == [2]
-
-
-def test_a_perfect_model_turns_the_shorter_way_over_the_wrap():
-    degrees, passes = refined_degrees([160.0], goal=-170.0, eps=10.0)
-    np.testing.assert_allclose(degrees, [-170.0], atol=1e-3)
-    assert passes == [4]
+@pytest.mark.parametrize(
+    ("start", "goal", "limits", "end", "passes"),
+    [
+        # 47 -> 37 -> 27 -> 17 -> 7 -> -3, then one pass that moves nothing; 3 deg is right already.
+        ([47.0, -26.0, 3.0], 0.0, {}, [-3.0, 4.0, 3.0], [6, 4, 1]),
+        ([47.0, -26.0], 0.0, {"tau_max": 25.0}, [22.0, -1.0], [4, 4]),  # 26 deg: 10, 20, then 5 more to the bound
+        ([47.0], 0.0, {"k_max": 2}, [27.0], [2]),
+        ([160.0], -170.0, {}, [-170.0], [4]),  # the shorter way, over the wrap
+    ],
+)
+def test_a_perfect_model_of_feedback_by_hand(start, goal, limits, end, passes):
+    degrees, count = refined_degrees(start, goal=goal, eps=10.0, **limits)
+    np.testing.assert_allclose(degrees, end, atol=1e-3)
+    assert count == passes
 
 
 def test_a_perfect_model_ends_within_half_eps_from_anywhere():
@@ -205,27 +177,3 @@ def test_under_vmap_each_lane_has_its_own_number_of_passes():
         return refine(residual, start, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=math.pi, k_max=50)
 
     assert jax.vmap(one)(first).passes.tolist() == [[6], [1]]
-
-
-def test_one_row_a_batch_jit_and_vmap_agree():
-    weights, first = network(5, 0.3), jnp.asarray(starts(5, 5), jnp.float32)
-    active = jnp.array([True, True, False, True, True])
-
-    def refined(first, active):
-        residual = residual_of(weights, jnp.tanh, lambda x: jnp.asarray(x, jnp.float32))
-        return refine(residual, first, active, space=DIRECTIONS, tau=0.5 * DEG, tau_max=1.0, k_max=20)
-
-    alone = [refined(first[row : row + 1], active[row : row + 1]) for row in range(5)]
-    passes = [int(result.passes[0]) for result in alone]
-    assert len(set(passes)) > 2
-    lanes = jax.vmap(refined)(first[:, None], active[:, None])
-    for together in (refined(first, active), jax.jit(refined)(first, active), jax.tree.map(lambda x: x[:, 0], lanes)):
-        assert together.passes.tolist() == passes
-        np.testing.assert_allclose(together.actions, [result.actions[0] for result in alone], atol=1e-6)
-
-
-def test_untouched_made_no_pass():
-    first = jnp.asarray(starts(0, 3), jnp.float32)
-    result = no_refinement(first)
-    np.testing.assert_array_equal(result.actions, first)
-    assert result.passes.tolist() == [0, 0, 0]

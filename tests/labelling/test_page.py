@@ -18,8 +18,7 @@ from nicegui import ui
 from page_user import press, shown
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR
-from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR, AnswerForm
 from cuelearner_jax.labelling import controls, server, view
 from cuelearner_jax.labelling.server import Commands
 from cuelearner_jax.spaces import DIRECTIONS, directions

@@ -65,7 +65,7 @@ def test_a_file_describes_choices(space):
 def test_what_makes_no_choices_is_refused():
     with pytest.raises(UserError, match="at least two choices"):
         Choices(1)
-    with pytest.raises(UserError, match="has the unit 'degrees'"):
+    with pytest.raises(UserError, match="an order of the unit 'steps'"):
         Choices(3, Cue("gear", ("higher", "lower"), ("a", "b"), "degrees"))
     with pytest.raises(ValueError, match="unknown code"):
         from_json({**FRUIT.to_json(), "name": "fruit"})

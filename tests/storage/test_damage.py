@@ -165,7 +165,7 @@ def hook():
 @pytest.fixture
 def listening(hook, tmp_path, monkeypatch):
     """In a folder with the attacker's module, which would be imported."""
-    (tmp_path / "hostile.py").write_text("from cuelearner_jax.guides.baselines import NONE as KIND\n")
+    (tmp_path / "hostile.py").write_text("from cuelearner_jax.guides.base import NoGuide as KIND\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
