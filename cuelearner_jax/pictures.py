@@ -20,7 +20,6 @@ from cuelearner_jax.types import Reel, Sketch
 
 Picture = UInt8[np.ndarray, "height width 3"]
 Source = np.ndarray | bytes  # a `Picture`, or the bytes of a PNG or JPEG file
-KINDS = (".gif", ".mp4")
 SHOWN = {"PNG": "image/png", "JPEG": "image/jpeg"}  # readable file formats and their media types
 LARGEST = 1280  # longest side of a picture on the page, of a film there half of it [pixels]
 SHEET = 6  # frames of a film that its still shows
@@ -30,9 +29,8 @@ TURNED = 0x0112  # the EXIF tag that says how a camera was held
 def sketch(image: Source, words: str = "") -> Sketch:
     """Return a picture as the sketch of a situation; its frame counts in pixels.
 
-    Args:
-        image: RGB uint8 (height, width, 3), or the bytes of a PNG or JPEG file; else UserError.
-        words: about the situation, in a few words.
+    `image`: RGB uint8 (height, width, 3), or the bytes of a PNG or JPEG file; else UserError. `words`: about the
+    situation, in a few words.
     """
     uri, (width, height) = _uri(image, LARGEST)
     still = f'<image class="photo" href="{uri}" width="{width}" height="{height}"/>'
@@ -43,15 +41,13 @@ def sketch(image: Source, words: str = "") -> Sketch:
 def clip(frames: Sequence[Source], period: float, words: str = "") -> Reel:
     """Return a short film of pictures that replaces a sketch's picture while it plays.
 
-    Args:
-        frames: pictures as `sketch` takes them, all of one size; else UserError.
-        period: between two of them [s].
-        words: words for the film's end.
+    `frames`: pictures as `sketch` takes them, all of one size; else UserError. `period`: between two of them [s].
+    `words`: for the film's end.
     """
-    found = [_uri(frame, LARGEST // 2) for frame in _some(frames)]
-    if len({size for _, size in found}) > 1:
-        raise UserError(f"the frames of a clip differ in size ({found[0][1]} and others): give frames of one size")
-    return Reel(period, [], words, [uri for uri, _ in found])
+    uris, sizes = zip(*(_uri(frame, LARGEST // 2) for frame in _some(frames)), strict=True)
+    if len(set(sizes)) > 1:
+        raise UserError(f"the frames of a clip differ in size ({sizes[0]} and others): give frames of one size")
+    return Reel(period, [], words, uris)
 
 
 def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
@@ -68,10 +64,7 @@ def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
 
 def animate(frames: Sequence[Source], file: str | os.PathLike[str], fps: float = 25.0) -> None:
     """Write all frames as a film; raises UserError unless its name ends in .gif or .mp4."""
-    try:
-        check_film(file, fps)
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    check_film(file, fps)
 
     def even(rate: float) -> Iterator[Picture]:
         for number in range(max(1, round(len(frames) * rate / fps))):
@@ -130,7 +123,7 @@ def write_film(
     """Write a film of pictures that are made one by one: GIF with one exact palette, or MP4.
 
     Args:
-        file: a name that ends in .gif or .mp4; else ValueError.
+        file: a name that ends in .gif or .mp4; else UserError.
         fps: pictures a second; a GIF counts in hundredths of a second and takes the nearest rate it can have.
         pictures: makes them for the rate that it gets.
         palette: a GIF's colours, see `palette_of`.
@@ -144,9 +137,9 @@ def write_film(
 
 
 def check_film(file: str | os.PathLike[str], fps: float) -> None:
-    """Raise ValueError if such a film cannot be written."""
-    if Path(file).suffix.lower() not in KINDS or fps <= 0:
-        raise ValueError(f"cannot animate to {file} at {fps:g}: give a name in .gif or .mp4, and a positive fps")
+    """Raise UserError if such a film cannot be written."""
+    if Path(file).suffix.lower() not in (".gif", ".mp4") or fps <= 0:
+        raise UserError(f"cannot animate to {file} at {fps:g}: give a name in .gif or .mp4, and a positive fps")
 
 
 def palette_of(specimen: Picture, colours: int, exactly: Sequence[str] = ()) -> list[int]:

@@ -100,7 +100,7 @@ class Sketch(NamedTuple):
     aim: float = 0.0  # length of a thin line that goes on from the arrow [m]
     words: str = ""  # about the situation, in a few words
     # Of each cue, which way more of it points on the screen: x to the right, y down; None: nowhere. None given: by the
-    # words of the cues (`labelling.pointing`)
+    # words of the cues (`labelling.view`)
     points: tuple[tuple[float, float] | None, ...] = ()
 
 

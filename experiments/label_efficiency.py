@@ -18,10 +18,9 @@ import numpy as np
 from _efficiency import Carried, Efficiency, Known, Question, efficiency_of
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.report import escaping
 from cuelearner_jax.report.document import Study, report
 from cuelearner_jax.report.statistics import Interval
-from cuelearner_jax.report.tables import markdown_table
+from cuelearner_jax.report.tables import markdown, markdown_table
 from cuelearner_jax.report.variants import Variant
 
 
@@ -60,14 +59,14 @@ def known_cell(known: Known, form: str) -> str:
 
 def section(found: Efficiency) -> list[str]:
     """Return the section of the report: a row for each variant."""
-    level = f"The level is {found.level:.3f}: {escaping.markdown(found.origin)}."
+    level = f"The level is {found.level:.3f}: {markdown(found.origin)}."
     header = ["run", "guidance", "labels", "guide alone", "steps to the level", "ratio to unguided"]
     header += [f"mean over the curve to {found.shared:,}", "ratio to unguided"]
     return ["", "## Label efficiency", "", level, "", *markdown_table(header, [_cells(each) for each in found.carried])]
 
 
 def _cells(each: Carried) -> list[str]:
-    run, guidance = escaping.markdown(each.variant.run), escaping.markdown(each.variant.guidance)
+    run, guidance = markdown(each.variant.run), markdown(each.variant.guidance)
     cells = [run, guidance, f"{each.variant.labels:,}", _interval(each.guide), known_cell(each.steps, "{:,.0f}")]
     cells += [known_cell(each.ratio, "{:.2f}") if each.ratio else "", _interval(each.variant.mean)]
     return [*cells, _interval(each.area_ratio, "{:.2f}")]

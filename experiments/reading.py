@@ -34,7 +34,7 @@ from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.reading import Distortion, Reading, Unknown, Walk, declared_distortions, simulator_distortion
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
-from cuelearner_jax.report.statistics import drawn
+from cuelearner_jax.report.statistics import RESAMPLES
 from cuelearner_jax.runs.trained import PolicySource, several
 from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.storage.provenance import provenance
@@ -250,9 +250,11 @@ def mean_worth(rows: list[dict[str, Any]]) -> str:
     values = np.full((len(groups), max(map(len, groups))), np.nan)  # NaN: not played
     for own, group in zip(values, groups, strict=True):
         own[: len(group)] = group
-    means = np.nanmean(values[drawn(*values.shape)], (1, 2))
-    low, high = np.quantile(means[1:], (0.025, 0.975))
-    shown = f"{means[0]:.3f}" + (f" [{low:.3f}, {high:.3f}]" if values.size > 1 else "")
+    random, (bases, members) = np.random.default_rng(0), values.shape
+    base = random.integers(0, bases, (RESAMPLES, bases, 1))
+    means = np.nanmean(values[base, random.integers(0, members, (RESAMPLES, bases, members))], (1, 2))
+    low, high = np.quantile(means, (0.025, 0.975))
+    shown = f"{np.nanmean(values):.3f}" + (f" [{low:.3f}, {high:.3f}]" if values.size > 1 else "")
     return f"{shown} (least {np.nanmin(values):.3f})"
 
 

@@ -41,9 +41,8 @@ def labelled(arguments, ask):
                 session.finish()
 
             shown(session, acts, finish)
-            status, places[:] = session.status(), [asked.out]
-            told = status.answered, status.unsure, status.labels, commands.following(status.answered), commands.again
-            return server.Ending(session.finish(), *told)
+            places[:] = [asked.out]
+            return server.ended(session, commands)
 
     with mock.patch.object(label, "_served", served):
         label.run([*map(str, arguments)])

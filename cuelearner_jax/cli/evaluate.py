@@ -182,8 +182,8 @@ def _over(found: list[Measured], episodes: str) -> str:
     """Return what the means and intervals are computed over, in words."""
     kinds = {measurements.over(row) for row in found}
     told = {
-        measurements.EPISODES: f"one policy: mean and bootstrap over {episodes}",
-        measurements.SEEDS: "several seeds: interquartile mean and bootstrap over seeds",
+        "episodes": f"one policy: mean and bootstrap over {episodes}",
+        "seeds": "several seeds: interquartile mean and bootstrap over seeds",
     }
     return "; ".join(text for kind, text in told.items() if kind in kinds)
 
@@ -191,7 +191,7 @@ def _over(found: list[Measured], episodes: str) -> str:
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
     """Return a table of two policies side by side, with their difference."""
     mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
-    over = f"{episodes}, paired" if difference.over == measurements.EPISODES else "seeds (interquartile means)"
+    over = f"{episodes}, paired" if difference.over == "episodes" else "seeds (interquartile means)"
     named = " against ".join(name + (f" ({told})" if told else "") for name, told in ((title, mine), (other, its)))
     table = Table(
         *("metric", "policy", "against", "difference"),

@@ -250,7 +250,7 @@ def _second(plan: Plan, options: Label) -> Plan:
     assert found is not None  # the file was read above
     actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(found)}
     again = tuple(actions[number] for number in sorted(actions))
-    base = dataclasses.replace(plan.base, name=f"{file.session['base']} {file.session['base_digest']}".strip())
+    base = plan.base._replace(name=f"{file.session['base']} {file.session['base_digest']}".strip())
     wanted, digest = min(plan.labels, len(again)), label_files.digest(options.again)
     seed = int(file.session["seed"])
     return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
@@ -322,8 +322,7 @@ def _server() -> Any:
 
 def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, commands: Any) -> Any:
     """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
-    from cuelearner_jax.labelling.record import Record
-    from cuelearner_jax.labelling.session import Session
+    from cuelearner_jax.labelling.session import Record, Session
 
     Record(plan, options.out).close()  # refuses the file of another session before anything is compiled
     leads_there = options.out / "open.html"  # command lines, unlike this file, can be read by every user of the machine

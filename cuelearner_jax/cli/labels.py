@@ -16,7 +16,6 @@ from cuelearner_jax.cli.options import Flag, out, parse
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError, one_line
 from cuelearner_jax.labelling import comparing
-from cuelearner_jax.report.escaping import cell
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import UNDONE, UNSURE, LabelFile
@@ -173,8 +172,8 @@ def _export(options: LabelsExport) -> None:
         rows = _flat(file)
         with replacing(place, fresh=True) as target:
             writer = csv.writer(target)
-            writer.writerow(map(cell, rows))
-            writer.writerows(map(cell, row) for row in zip(*rows.values(), strict=True))
+            writer.writerow(rows)
+            writer.writerows(zip(*rows.values(), strict=True))
     out.print(f"wrote {len(file.seeds)} labels to {place}")
 
 

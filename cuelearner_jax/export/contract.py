@@ -1,9 +1,8 @@
 """Write an exported decision's folder.
 
-contract.json    inputs and outputs with units; versions; digests of the other files and of the contract itself
-decision.*       the decision
-golden.npz       observations (cases, obs), the last ones extreme, and JAX's actions for them (cases, action)
-decide.py        `runner`, which runs the decision
+`contract.json` has inputs and outputs with units, versions, and digests of all files. Beside it are the decision,
+`golden.npz` with observations (cases, obs) and JAX's actions for them (cases, action), and `decide.py`, which is
+`runner`.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import io
 import itertools
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +49,6 @@ def check_request(format: str, out: Path) -> None:
     """Raise UserError unless a decision in that format can be written to a folder."""
     if format not in FORMATS:
         raise UserError(f"unknown format {format!r}{suggestion(format, FORMATS)}")
-    _check_free(out)
-
-
-def _check_free(out: Path) -> None:
     if is_used(out):
         raise UserError(f"{out} is not empty: give another --out")
 
@@ -73,13 +69,12 @@ def write(
     Returns the contract, with "difference": the largest difference among the golden cases in this replay. Raises
     UserError for an unknown format, a folder in use, or a policy that cannot be exported.
     """
-    check_request(format, out)
-    with place_of(out, _check_free) as place:
+    with place_of(out, partial(check_request, format)) as place:
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
         base = getattr(env, "base_size", 0)  # only for a correction alone
         traced = trace_policy(policy, env.obs_size)
         file, contents, about = _artefact(format, policy, traced, env.obs_size, actions_of(env).size, base)
-        golden, cases = golden_cases(policy, drawn(), traced=traced), io.BytesIO()
+        golden, cases = golden_cases(policy, drawn(), traced), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {file: contents, runner.GOLDEN: cases.getvalue(), "decide.py": inspect.getsource(runner).encode()}
         ends = list(itertools.accumulate(quantity.size for quantity in env.observation))
@@ -113,11 +108,11 @@ def write(
 def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
     """Describe an action: its space with cues and units, and the guide's largest change."""
     action, space, radius = action_of(env), actions_of(env), policy.get("clip_radius_deg")
-    told = {"name": action.name, "size": space.size, "unit": action.unit, "about": action.about, "dtype": "float32"}
-    told["space"] = space.to_json()
+    entry = {"name": action.name, "size": space.size, "unit": action.unit, "about": action.about, "dtype": "float32"}
+    entry["space"] = space.to_json()
     if space == DIRECTIONS:
-        return {**told, "angle": ANGLE, "clip_radius_deg": radius}
-    return {**told, "clip_radius": radius, "clip_radius_unit": space.unit}
+        return {**entry, "angle": ANGLE, "clip_radius_deg": radius}
+    return {**entry, "clip_radius": radius, "clip_radius_unit": space.unit}
 
 
 def _artefact(
@@ -144,7 +139,7 @@ def _artefact(
         contents = onnx_graph.serialize(traced, obs_size, action_size, base_size)
         about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET, "input": "obs", "output": "action"}
         return "decision.onnx", contents, about | ({"base_input": onnx_graph.BASE} if base_size else {})
-    graph, stored = np.frombuffer(json.dumps(traced.graph.as_json()).encode(), np.uint8), io.BytesIO()
+    graph, stored = np.frombuffer(json.dumps(traced.graph._asdict()).encode(), np.uint8), io.BytesIO()
     arrays: dict[str, Any] = {"graph": graph, **traced.constants}
     np.savez(stored, **arrays)
     return "decision.npz", stored.getvalue(), {"needs": "numpy"}

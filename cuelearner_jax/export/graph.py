@@ -1,16 +1,15 @@
 """Trace a function of one observation into a graph of few basic operations, which NumPy and ONNX can run.
 
 JAX traces the function. Calls are inlined, whatever does not depend on the observation is computed once, and the rest
-becomes the operations of `operations.OPERATIONS`. All shapes are fixed, since the input is one observation; a batch is
+becomes the operations of `runner.OPERATIONS`. All shapes are fixed, since the input is one observation; a batch is
 processed row by row.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,14 +19,12 @@ from jax.extend import core
 
 from cuelearner_jax.tracing import written_out
 
-KINDS = {"float32": "float32", "int32": "int32", "bool": "bool", "bfloat16": "float32"}
-
 
 def kind_of(dtype: Any) -> str:
-    """Return how a graph holds numbers of a type. Raises NotImplementedError for a type that no graph holds."""
-    if str(dtype) not in KINDS:
+    """Return the name of a number type. Raises NotImplementedError for a type that no graph holds."""
+    if str(dtype) not in ("float32", "int32", "bool"):
         raise NotImplementedError(f"numbers of type {dtype}")
-    return KINDS[str(dtype)]
+    return str(dtype)
 
 
 class Value(NamedTuple):
@@ -41,17 +38,12 @@ class Value(NamedTuple):
 Known = Value | np.ndarray | jax.Array  # a run-time value, or one that is known already
 
 
-@dataclasses.dataclass
-class Graph:
+class Graph(NamedTuple):
     """Operations in executable order: [name, inputs, outputs, attributes]."""
 
     inputs: list[str]
     outputs: list[str]
     ops: list[list[Any]]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the graph for a file, or as an attribute of a loop."""
-        return dataclasses.asdict(self)
 
 
 class Traced(NamedTuple):
@@ -78,9 +70,9 @@ def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
     (result,) = builder.inlined(closed.jaxpr, closed.consts, [drawn, given])
     ops, needed = _needed(builder.ops, {builder.name(result)})
     constants = {name: array for name, array in builder.constants.items() if name in needed}
-    missing = tuple(sorted({name.removeprefix("missing:") for name in _names(ops) if name.startswith("missing:")}))
+    missing = sorted({what for name, what in builder.missing.items() if name in needed})
     graph = Graph(["obs"], [builder.name(result)], ops)
-    return Traced(graph, constants, missing, "key" in needed, {"obs": "float32", **builder.kinds})
+    return Traced(graph, constants, tuple(missing), "key" in needed, {"obs": "float32", **builder.kinds})
 
 
 def _needed(ops: list[list[Any]], wanted: set[str]) -> tuple[list[list[Any]], set[str]]:
@@ -99,14 +91,6 @@ def _needed(ops: list[list[Any]], wanted: set[str]) -> tuple[list[list[Any]], se
     return kept[::-1], wanted
 
 
-def _names(ops: list[list[Any]]) -> Iterator[str]:
-    for name, _, _, attributes in ops:
-        yield name
-        if name == "while":
-            yield from _names(attributes["test"]["ops"])
-            yield from _names(attributes["body"]["ops"])
-
-
 class Builder:
     """Collects the operations of a graph."""
 
@@ -115,6 +99,7 @@ class Builder:
         self.ops: list[list[Any]] = []
         self.constants: dict[str, np.ndarray] = {}
         self.kinds: dict[str, str] = {}
+        self.missing: dict[str, str] = {}  # what no rule supports, by the names of its outputs
         self._done_before: dict[str, Value] = {}  # results by operation and inputs
         self._named: dict[int, tuple[Any, str]] = {}  # by identity; keeping the array reserves its identity
         self._numbers = itertools.count()
@@ -125,7 +110,9 @@ class Builder:
         values.update(zip(jaxpr.invars, inputs, strict=True))
 
         def read(atom: Any) -> Known:
-            return np.asarray(atom.val, atom.aval.dtype) if _is_literal(atom) else values[atom]
+            if isinstance(atom, core.Literal):
+                return np.asarray(atom.val, atom.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+            return values[atom]
 
         for equation in jaxpr.eqns:
             given = [read(atom) for atom in equation.invars]
@@ -144,22 +131,16 @@ class Builder:
             for value in given:
                 if isinstance(value, Value):
                     kind_of(value.kind)
-            found = RULES[name](self, equation, given)
+            return RULES[name](self, equation, given)
         except NotImplementedError as error:
             return self._missing(str(error), equation, given)
-        return [
-            self.add("bfloat16", [value], value.shape, value.kind)
-            if name in ROUNDED and isinstance(value, Value) and str(var.aval.dtype) == "bfloat16"
-            else value
-            for value, var in zip(found, equation.outvars, strict=True)
-        ]
 
     def _missing(self, what: str, equation: Any, given: list[Known]) -> list[Known]:
         """Add a placeholder for what no rule supports, which may turn out not to be needed."""
-        dtypes = [str(var.aval.dtype) for var in equation.outvars]
-        outputs = [self.new(v.aval.shape, KINDS.get(d, d)) for v, d in zip(equation.outvars, dtypes, strict=True)]
-        known = [value.name for value in given if isinstance(value, Value)]
-        self.ops.append([f"missing:{what}", known, [value.name for value in outputs], {}])
+        outputs = [self.new(var.aval.shape, str(var.aval.dtype)) for var in equation.outvars]
+        names = [value.name for value in outputs]
+        self.missing.update(dict.fromkeys(names, what))
+        self.ops.append(["missing", [value.name for value in given if isinstance(value, Value)], names, {}])
         return list(outputs)
 
     def new(self, shape: tuple[int, ...], kind: str) -> Value:
@@ -229,15 +210,12 @@ class Builder:
 
 def _computed(equation: Any, given: list[Any], origin: Any) -> list[Any]:
     """Evaluate one equation with known inputs; `origin` is JAX's debug information."""
-    own = [atom for atom in equation.invars if not _is_literal(atom)]
-    first = [number for number, atom in enumerate(own) if atom not in own[:number]]
-    known = [value for atom, value in zip(equation.invars, given, strict=True) if not _is_literal(atom)]
-    alone = core.Jaxpr((), [own[number] for number in first], equation.outvars, [equation], debug_info=origin)
-    return core.jaxpr_as_fun(core.ClosedJaxpr(alone, ()))(*[known[number] for number in first])
-
-
-def _is_literal(atom: Any) -> bool:
-    return isinstance(atom, core.Literal)
+    known: dict[Any, Any] = {}
+    for atom, value in zip(equation.invars, given, strict=True):
+        if not isinstance(atom, core.Literal):
+            known.setdefault(atom, value)
+    alone = core.Jaxpr((), [*known], equation.outvars, [equation], debug_info=origin)
+    return core.jaxpr_as_fun(core.ClosedJaxpr(alone, ()))(*known.values())
 
 
 def _called(equation: Any) -> Any:
@@ -248,11 +226,3 @@ def _called(equation: Any) -> Any:
         if (found := equation.params.get(name)) is not None:
             return found if hasattr(found, "consts") else core.ClosedJaxpr(found, ())
     return None
-
-
-# Operations that compute in bfloat16 if their result has that type; the others only move or select numbers.
-ROUNDED = {
-    *("add", "sub", "mul", "div", "dot_general", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan"),
-    *("atan2", "sqrt", "rsqrt", "square", "logistic", "pow", "integer_pow", "reduce_sum", "convert_element_type"),
-    *("cumsum", "reduce_prod"),
-}

@@ -65,7 +65,7 @@ class _Writer:
         self.helper, self._kinds = helper, kinds
         self.kind = ""  # of the present operation's first input
         self.kinds = {"float32": types.FLOAT, "int32": types.INT32, "bool": types.BOOL}
-        self.bfloat16, self.counter = types.BFLOAT16, types.INT64
+        self.counter = types.INT64
         self.constants: dict[str, np.ndarray] = {}
         self.names: dict[str, str] = {}  # the graph's names of values -> this model's, where they differ
         self._made: list[Any] = []
@@ -82,8 +82,6 @@ class _Writer:
             self.kind = self._kinds[inputs[0]]
             if op == "while":
                 self._loop(given, results, **attributes)
-            elif op == "top_k":
-                self._highest(given[0], results, **attributes)
             else:
                 last = NODES[op](self, *given, **attributes)
                 self._named("Identity", [last], results[0])
@@ -119,27 +117,6 @@ class _Writer:
     def cast(self, value: str, kind: str) -> str:
         """Cast a value to another type."""
         return self.node("Cast", value, to=self.kinds[kind])
-
-    def _top(self, x: str, k: str) -> tuple[str, str]:
-        """Return the largest entries along the last axis, and their places as integers of 64 bits."""
-        names = [f"n{next(self._numbers)}" for _ in range(2)]
-        self._made.append(self.helper.make_node("TopK", [x, k], names, axis=-1))
-        return names[0], names[1]
-
-    def _highest(self, x: str, results: list[str], k: int) -> None:
-        """Find the k largest entries; -0 comes after 0, as for XLA, which ONNX takes for equal."""
-        if self.kind == "float32":
-            zero = self.node("Equal", x, self.number(0.0))
-            below = self.node("And", zero, self.node("Less", self.node("Reciprocal", x), self.number(0.0)))
-            size = self.node("Slice", self.node("Shape", x), self.whole([-1]), self.whole([1 << 30]))
-            order = self._top(self.node("Neg", self.cast(below, "float32")), size)[1]
-            x = self.node("GatherElements", x, order, axis=-1)
-            largest, places = self._top(x, self.whole([k]))
-            places = self.node("GatherElements", order, places, axis=-1)
-        else:
-            largest, places = self._top(x, self.whole([k]))
-        self._named("Identity", [largest], results[0])
-        self._named("Cast", [places], results[1], to=self.kinds["int32"])
 
     def _loop(self, given: list[str], results: list[str], carried: list[str], kinds: Any, test: Any, body: Any) -> None:
         """Convert a loop: ONNX reads the condition at the end of a pass, this graph at its beginning."""
@@ -255,7 +232,7 @@ def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[in
     return w.node("Slice", x, w.whole(start), w.whole(stop), w.whole(range(len(start))), w.whole(step))
 
 
-# By the names of `operations.OPERATIONS`: (writer, input names, attributes) -> output name.
+# By the names of `runner.OPERATIONS`: (writer, input names, attributes) -> output name.
 NODES: dict[str, Callable[..., str]] = {
     **{name.lower(): _plain(name) for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin")},
     **{name.lower(): _plain(name) for name in ("Cos", "Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul")},
@@ -266,7 +243,6 @@ NODES: dict[str, Callable[..., str]] = {
     "square": lambda w, x: w.node("Mul", x, x),
     "logistic": _logistic,
     "is_finite": _finite,
-    "bfloat16": lambda w, x: w.node("Cast", w.node("Cast", x, to=w.bfloat16), to=w.kinds["float32"]),
     "rem": _plain("Mod", fmod=1),
     "atan2": _atan2,
     "eq": _plain("Equal"),
@@ -286,12 +262,10 @@ NODES: dict[str, Callable[..., str]] = {
     "take": lambda w, x, places: w.node("Gather", x, places, axis=0),
     "matmul": _plain("MatMul"),
     "sum": _sum,
-    "prod": lambda w, x, axes: w.node("ReduceProd", x, w.whole(axes), keepdims=0),
     "largest": _extreme("ReduceMax"),
     "smallest": _extreme("ReduceMin"),
     "all": _of_bools("ReduceMin"),
     "any": _of_bools("ReduceMax"),
     "argmax": _argument("ArgMax"),
     "argmin": _argument("ArgMin"),
-    "cumsum": lambda w, x, axis: w.node("CumSum", x, w.constant(np.array(axis, np.int64))),
 }

@@ -1,46 +1,211 @@
-"""Rules that express each JAX operation by those of `operations.OPERATIONS`: one rule per primitive, by name.
+"""Rules that express each JAX operation by those of `runner.OPERATIONS`: one rule per primitive, by name.
 
-A rule returns one value from (builder, the primitive's parameters, its inputs, shape and type of the output). A rule
-of a primitive with several outputs, or with inner functions, takes the equation. Rules of numbers are in `arithmetic`.
+A rule returns one value from (builder, the equation, its inputs, shape and type of the output). A rule of a primitive
+with several outputs takes (builder, the equation, its inputs). Integers wrap and are converted as XLA does. What NumPy
+or ONNX would do otherwise is refused.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import GatherScatterMode
+from jax.lax import GatherScatterMode, RoundingMethod
 
-from cuelearner_jax.export.arithmetic import Shape, chosen, kind_in, one, output, said_by, select, several
-from cuelearner_jax.export.graph import RULES, Builder, Known, Value
+from cuelearner_jax.export.graph import RULES, Builder, Known, Rule, Value, kind_of
 
-__all__ = ["RULES"]
+SAME = ("neg", "abs", "sign", "floor", "ceil", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan")
+SAME += ("sqrt", "rsqrt", "square", "logistic", "is_finite", "add", "sub", "mul", "atan2", "eq", "ne")
+# of numbers, of booleans
+REDUCTIONS = {"reduce_sum": ("sum", ""), "reduce_max": ("largest", "any"), "reduce_min": ("smallest", "all")}
+REDUCTIONS |= {"reduce_and": ("", "all"), "reduce_or": ("", "any"), "max": ("max", "or"), "min": ("min", "and")}
 MOST_UNROLLED = 64  # passes of a scan
 
-one("concatenate")(said_by("concatenate", axis=lambda params: int(params["dimension"])))
-one("copy", "copy_p", "stop_gradient")(lambda b, params, given, shape, kind: given[0])
+Shape = tuple[int, ...]
+Single = Callable[[Builder, Any, list[Known], Shape, str], Known]
+
+
+def output(equation: Any, place: int = 0) -> tuple[Shape, str]:
+    """Return shape and kind of an equation's output."""
+    aval = equation.outvars[place].aval
+    return tuple(aval.shape), kind_of(aval.dtype)
+
+
+def one(*names: str) -> Callable[[Single], Single]:
+    """Register a rule of primitives with one output."""
+
+    def register(single: Single) -> Single:
+        def rule(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
+            return [single(builder, equation, given, *output(equation))]
+
+        RULES.update(dict.fromkeys(names, rule))
+        return single
+
+    return register
+
+
+def several(name: str) -> Callable[[Rule], Rule]:
+    """Register the rule of a primitive with several outputs."""
+    return partial(RULES.setdefault, name)
+
+
+def kind_in(value: Known) -> str:
+    """Return how a graph holds a value."""
+    return value.kind if isinstance(value, Value) else kind_of(value.dtype)
+
+
+# --- numbers, entry by entry and along axes ---
+
+one("copy", "copy_p", "stop_gradient")(lambda b, equation, given, shape, kind: given[0])
+one("select_n")(lambda b, equation, given, shape, kind: chosen(b, given[0], given[1:], shape, kind))
+
+
+@one(*SAME)
+def _same(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    return builder.add(equation.primitive.name, given, shape, kind)
+
+
+@one("and", "or", "xor", "not")
+def _logic(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    if kind != "bool":
+        raise NotImplementedError("bitwise logic of integers")
+    return builder.add(equation.primitive.name, given, shape, kind)
+
+
+@one("lt", "le", "gt", "ge", "argmax", "argmin")
+def _order(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    """Order numbers; booleans as integers, since ONNX neither orders them nor finds their largest."""
+    whole: list[Known] = [
+        value
+        if kind_in(value) != "bool"
+        else builder.add("cast", [value], value.shape, "int32", dtype="int32")
+        if isinstance(value, Value)
+        else np.asarray(value, np.int32)
+        for value in given
+    ]
+    axis = {"axis": int(equation.params["axes"][0])} if "axes" in equation.params else {}
+    return builder.add(equation.primitive.name, whole, shape, kind, **axis)
+
+
+@one(*REDUCTIONS)
+def _reduction(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    of_numbers, of_bools = REDUCTIONS[equation.primitive.name]
+    op = of_bools if kind == "bool" else of_numbers
+    if not op:
+        raise NotImplementedError("bitwise logic of integers")
+    if "axes" not in equation.params:
+        return builder.add(op, given, shape, kind)
+    axes = list(map(int, equation.params["axes"]))  # none, for ONNX, means all
+    return builder.add(op, given, shape, kind, axes=axes) if axes else given[0]
+
+
+@one("convert_element_type")
+def _cast(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    (value,) = given
+    assert isinstance(value, Value)
+    if value.kind == kind:
+        return value
+    if (value.kind, kind) != ("float32", "int32"):
+        return builder.add("cast", [value], shape, kind, dtype=kind)
+    # As XLA: NaN becomes 0, and what is out of range the nearest integer. NumPy and ONNX leave both open.
+    low, high = np.asarray(-(2**31), np.float32), np.asarray(2**31, np.float32)
+    number = builder.add("eq", [value, value], shape, "bool")
+    value = builder.add("select", [number, value, np.asarray(0, np.float32)], shape, "float32")
+    value = builder.add("max", [value, low], shape, "float32")
+    whole = builder.add("cast", [value], shape, kind, dtype=kind)
+    above = builder.add("ge", [value, high], shape, "bool")
+    return builder.add("select", [above, np.asarray(2**31 - 1, np.int32), whole], shape, kind)
+
+
+@one("integer_pow")
+def _integer_pow(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    """Multiply repeatedly: integers then wrap as those of XLA do."""
+    (power,), left, found = given, abs(equation.params["y"]), None
+    while left:
+        if left % 2:
+            found = power if found is None else builder.add("mul", [found, power], shape, kind)
+        left //= 2
+        power = builder.add("mul", [power, power], shape, kind) if left else power
+    if found is None:
+        return np.ones(shape, kind)
+    return builder.add("div", [np.ones((), kind), found], shape, kind) if equation.params["y"] < 0 else found
+
+
+@one("pow")
+def _pow(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    if any(kind_in(value) != "float32" for value in given):
+        raise NotImplementedError("powers with an integer base or exponent")
+    return builder.add("pow", given, shape, kind)
+
+
+@one("div", "rem")
+def _division(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    """Divide; not integers by 0 or -1, at which ONNX stops the process."""
+    if kind == "int32" and (isinstance(given[1], Value) or np.isin(np.asarray(given[1]), (0, -1)).any()):
+        raise NotImplementedError("a division of integers by 0, by -1, or by what depends on the observation")
+    return builder.add(equation.primitive.name, given, shape, kind)
+
+
+def select(builder: Builder, which: Known, true: Known, false: Known, shape: Shape, kind: str) -> Known:
+    """Select entries; booleans by logic, as onnxruntime cannot select them."""
+    if kind != "bool":
+        return builder.add("select", [which, true, false], shape, kind)
+    other = builder.add("and", [builder.add("not", [which], tuple(which.shape), kind), false], shape, kind)
+    return builder.add("or", [builder.add("and", [which, true], shape, kind), other], shape, kind)
+
+
+def chosen(builder: Builder, which: Known, cases: list[Known], shape: Shape, kind: str) -> Known:
+    """Select the case of a number, or of False and True."""
+    if kind_in(which) == "bool":
+        return select(builder, which, cases[1], cases[0], shape, kind)
+    found = cases[-1]
+    for number, case in reversed(list(enumerate(cases[:-1]))):
+        here = builder.add("le", [which, np.asarray(number, np.int32)], tuple(which.shape), "bool")
+        found = select(builder, here, case, found, shape, kind)
+    return found
+
+
+one("clamp")(
+    lambda b, equation, given, shape, kind: b.add(
+        "min", [b.add("max", given[1::-1], shape, kind), given[2]], shape, kind
+    )
+)
+
+
+@one("round")
+def _round(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    if equation.params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
+        raise NotImplementedError("rounding halves away from zero")
+    return builder.add("round", given, shape, kind)
+
+
+# --- shapes, places and products ---
+
 several("optimization_barrier")(lambda builder, equation, given: given)
-one("reshape", "squeeze", "expand_dims")(lambda b, params, given, shape, kind: b.reshaped(given[0], shape))
-one("transpose")(lambda b, params, given, shape, kind: b.transposed(given[0], params["permutation"]))
+one("reshape", "squeeze", "expand_dims")(lambda b, equation, given, shape, kind: b.reshaped(given[0], shape))
+one("transpose")(lambda b, equation, given, shape, kind: b.transposed(given[0], equation.params["permutation"]))
+
+
+@one("concatenate", "stack")
+def _concatenate(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    axis = int(equation.params["axis" if equation.primitive.name == "stack" else "dimension"])
+    if equation.primitive.name == "stack":
+        given = [builder.reshaped(each, (*shape[:axis], 1, *shape[axis + 1 :])) for each in given]
+    return builder.add("concatenate", given, shape, kind, axis=axis)
 
 
 @one("broadcast_in_dim")
-def _broadcast(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+def _broadcast(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     placed = [1] * len(shape)
-    for axis, place in enumerate(params["broadcast_dimensions"]):
+    for axis, place in enumerate(equation.params["broadcast_dimensions"]):
         placed[place] = given[0].shape[axis]
     spread = builder.reshaped(given[0], tuple(placed))
     return spread if tuple(placed) == shape else builder.add("broadcast", [spread], shape, kind, shape=list(shape))
-
-
-@one("stack")
-def _stack(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    axis = int(params["axis"])
-    row = (*shape[:axis], 1, *shape[axis + 1 :])
-    return builder.add("concatenate", [builder.reshaped(one, row) for one in given], shape, kind, axis=axis)
 
 
 def _cut(builder: Builder, value: Known, start: Any, stop: Any, step: Any = None) -> Known:
@@ -60,21 +225,21 @@ def _part(builder: Builder, value: Known, axis: int, first: int, last: int) -> K
 
 
 @one("slice")
-def _slice(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    return _cut(builder, given[0], params["start_indices"], params["limit_indices"], params["strides"])
+def _slice(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    ends = (equation.params[name] for name in ("start_indices", "limit_indices", "strides"))
+    return _cut(builder, given[0], *ends)
 
 
 @several("split")
 def _split(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     ends = np.cumsum([0, *equation.params["sizes"]]).tolist()
-    axis = equation.params["axis"]
-    return [_part(builder, given[0], axis, *pair) for pair in itertools.pairwise(ends)]
+    return [_part(builder, given[0], equation.params["axis"], *pair) for pair in itertools.pairwise(ends)]
 
 
 @one("pad")
-def _pad(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+def _pad(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     value, filling = given
-    settings = [tuple(map(int, each)) for each in params["padding_config"]]
+    settings = [tuple(map(int, each)) for each in equation.params["padding_config"]]
     if any(inner for _, _, inner in settings):
         raise NotImplementedError("padding between entries")
     kept = [(max(-low, 0), size - max(-high, 0)) for (low, high, _), size in zip(settings, value.shape, strict=True)]
@@ -89,8 +254,8 @@ def _taken(builder: Builder, value: Known, places: Known, shape: Shape, kind: st
 
 
 @one("rev")
-def _rev(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    places = np.flip(np.arange(math.prod(shape), dtype=np.int32).reshape(shape), params["dimensions"])
+def _rev(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    places = np.flip(np.arange(math.prod(shape), dtype=np.int32).reshape(shape), equation.params["dimensions"])
     return _taken(builder, given[0], places.copy(), shape, kind)
 
 
@@ -100,15 +265,7 @@ def _strides(shape: Shape) -> list[int]:
 
 def _offsets(sizes: Shape, strides: list[int]) -> np.ndarray:
     """Return the offset of every entry of a block of these sizes from the first entry."""
-    numbers = np.zeros(sizes, np.int32)
-    for axis, (size, stride) in enumerate(zip(sizes, strides, strict=True)):
-        numbers += _along(axis, len(sizes), np.arange(size, dtype=np.int32) * stride)
-    return numbers
-
-
-def _along(axis: int, axes: int, row: np.ndarray) -> np.ndarray:
-    """Return a row laid along one of several axes."""
-    return row.reshape([-1 if a == axis else 1 for a in range(axes)])
+    return np.asarray(np.tensordot(np.array(strides, np.int32), np.indices(sizes, np.int32), 1), np.int32)
 
 
 def _clipped(builder: Builder, start: Known, most: int, stride: int) -> Known:
@@ -130,7 +287,7 @@ def _summed(builder: Builder, parts: list[Known], shape: Shape) -> Known:
 
 
 @one("dynamic_slice")
-def _dynamic_slice(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+def _dynamic_slice(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     value, *starts = given
     strides = _strides(tuple(value.shape))
     parts = [
@@ -141,11 +298,11 @@ def _dynamic_slice(builder: Builder, params: Any, given: list[Known], shape: Sha
 
 
 @one("gather")
-def _gather(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+def _gather(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     """Gather blocks of the operand, one for each row of indices (XLA's Gather)."""
     value, indices = given
-    named, sizes = params["dimension_numbers"], params["slice_sizes"]
-    fills = params["mode"] == GatherScatterMode.FILL_OR_DROP
+    named, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    fills = equation.params["mode"] == GatherScatterMode.FILL_OR_DROP
     strides, rows = _strides(tuple(value.shape)), tuple(indices.shape[:-1])
     gone = {*named.collapsed_slice_dims, *named.operand_batching_dims}
     inner = [axis for axis in range(len(value.shape)) if axis not in gone]
@@ -164,23 +321,24 @@ def _gather(builder: Builder, params: Any, given: list[Known], shape: Shape, kin
             missed = out if missed is None else builder.add("or", [missed, out], first.shape, "bool")
     for axis, place in zip(named.operand_batching_dims, named.start_indices_batching_dims, strict=True):
         numbers = np.arange(value.shape[axis], dtype=np.int32) * np.int32(strides[axis])
-        parts.append(_along(place, len(rows) + len(block), numbers))
+        parts.append(numbers.reshape([-1 if a == place else 1 for a in range(len(rows) + len(block))]))
     whole = (*rows, *block)
     found: Known = _taken(builder, value, _summed(builder, parts, whole), whole, kind)
     if missed is not None:
-        default = {"float32": np.nan, "int32": np.iinfo(np.int32).min, "bool": True}[kind]
-        filling = np.asarray(default if params["fill_value"] is None else params["fill_value"], kind)
-        found = select(builder, missed, filling, found, whole, kind)
+        filling = equation.params["fill_value"]
+        if filling is None:
+            filling = {"float32": np.nan, "int32": np.iinfo(np.int32).min, "bool": True}[kind]
+        found = select(builder, missed, np.asarray(filling, kind), found, whole, kind)
     blocks, others = iter(range(len(rows), len(whole))), iter(range(len(rows)))
     order = (next(blocks) if axis in named.offset_dims else next(others) for axis in range(len(shape)))
     return builder.transposed(found, tuple(order))
 
 
 @one("dot_general")
-def _dot_general(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+def _dot_general(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     """Express the product as (batch, left, summed) by (batch, summed, right)."""
     left, right = given
-    (left_summed, right_summed), (left_batch, right_batch) = params["dimension_numbers"]
+    (left_summed, right_summed), (left_batch, right_batch) = equation.params["dimension_numbers"]
     left_free = [a for a in range(len(left.shape)) if a not in (*left_summed, *left_batch)]
     right_free = [a for a in range(len(right.shape)) if a not in (*right_summed, *right_batch)]
     if not kind_in(left) == kind_in(right) == kind or kind == "bool":
@@ -191,24 +349,6 @@ def _dot_general(builder: Builder, params: Any, given: list[Known], shape: Shape
     left = builder.reshaped(builder.transposed(left, (*left_batch, *left_free, *left_summed)), (*batch, m, k))
     right = builder.reshaped(builder.transposed(right, (*right_batch, *right_summed, *right_free)), (*batch, k, n))
     return builder.reshaped(builder.add("matmul", [left, right], (*batch, m, n), kind), shape)
-
-
-@one("cumsum")
-def _cumsum(builder: Builder, params: Any, given: list[Known], shape: Shape, kind: str) -> Known:
-    if params["reverse"]:
-        raise NotImplementedError("a cumulative sum from the end")
-    return builder.add("cumsum", given, shape, kind, axis=int(params["axis"]))
-
-
-@several("top_k")
-def _top_k(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
-    axes, axis = len(given[0].shape), equation.params.get("axis", -1)
-    if kind_in(given[0]) == "bool" or axis not in (-1, axes - 1):
-        raise NotImplementedError("the largest of booleans, or along another axis than the last")
-    found = [builder.new(*output(equation, place)) for place in (0, 1)]
-    names = [value.name for value in found]
-    builder.ops.append(["top_k", [builder.name(given[0])], names, {"k": equation.params["k"]}])
-    return list(found)
 
 
 @several("while")
@@ -223,11 +363,11 @@ def _while(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     attributes = {
         "carried": [value.name for value in carried],
         "kinds": [[value.kind, list(value.shape)] for value in carried],
-        "test": test.as_json(),
-        "body": body.as_json(),
+        "test": test._asdict(),
+        "body": body._asdict(),
     }
     names = [value.name for value in results]
-    builder.ops.append(["while", [builder.name(value) for value in start], names, attributes])
+    builder.ops.append(["while", list(map(builder.name, start)), names, attributes])
     return list(results)
 
 
@@ -237,7 +377,10 @@ def _scan(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     named = equation.params
     if named["length"] > MOST_UNROLLED:
         raise NotImplementedError(f"a scan of {named['length']} passes")
-    fixed, carried = _parts(named)
+    if "ft_in" in named:  # since JAX 0.11
+        fixed, carried, _ = map(len, named["ft_in"].unpack())
+    else:
+        fixed, carried = named["num_consts"], named["num_carry"]
     consts, carry, over = given[:fixed], given[fixed:][:carried], given[fixed + carried :]
     rows: list[list[Known]] = []
     order = range(named["length"])
@@ -253,14 +396,6 @@ def _scan(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
         parts = [builder.reshaped(value, (1, *value.shape)) for value in each]
         stacked.append(parts[0] if len(parts) == 1 else builder.add("concatenate", parts, shape, kind, axis=0))
     return [*carry, *stacked]
-
-
-def _parts(named: Any) -> tuple[int, int]:
-    """Return the numbers of constant and carried operands of a scan."""
-    if "ft_in" in named:  # since JAX 0.11
-        consts, carry, _ = named["ft_in"].unpack()
-        return len(consts), len(carry)
-    return named["num_consts"], named["num_carry"]
 
 
 @several("cond")

@@ -211,30 +211,23 @@ RUNNERS = {"numpy": _of_numpy, "onnx": _of_onnx, "stablehlo": _of_stablehlo}
 def compile_ops(ops: list[list[Any]]) -> Run:
     """Return a graph's operations as one function, which adds their results to the values it is given.
 
-    `ops`: each [name, inputs, outputs, attributes]; see `OPERATIONS`, `SETTLED`, `_loop` and `_highest`.
+    `ops`: each [name, inputs, outputs, attributes]; see `OPERATIONS`, `SETTLED` and `_loop`.
     """
-    steps: list[Run] = []
+    steps: list[tuple[Callable[..., Any], list[str], str | None]] = []
     for name, inputs, outputs, attributes in ops:
         if name == "while":
-            steps.append(_loop(inputs, outputs, **attributes))
-        elif name == "top_k":
-            steps.append(_highest(inputs[0], *outputs, **attributes))
+            steps.append((_loop(inputs, outputs, **attributes), [], None))
         else:
-            function = SETTLED[name](**attributes) if name in SETTLED else OPERATIONS[name]
-            steps.append(_step(function, inputs, outputs[0]))
+            steps.append((SETTLED[name](**attributes) if name in SETTLED else OPERATIONS[name], inputs, outputs[0]))
 
     def run(values: Values) -> None:
-        for step in steps:
-            step(values)
+        for function, inputs, output in steps:
+            if output is None:
+                function(values)
+            else:
+                values[output] = function(*[values[name] for name in inputs])
 
     return run
-
-
-def _step(function: Callable[..., Any], inputs: list[str], output: str) -> Run:
-    def step(values: Values) -> None:
-        values[output] = function(*[values[name] for name in inputs])
-
-    return step
 
 
 def _loop(inputs: list[str], outputs: list[str], carried: list[str], kinds: Any, test: Any, body: Any) -> Run:
@@ -252,32 +245,6 @@ def _loop(inputs: list[str], outputs: list[str], carried: list[str], kinds: Any,
         values.update(zip(outputs, [values[name] for name in carried], strict=True))
 
     return run
-
-
-def _highest(given: str, largest: str, places: str, k: int) -> Run:
-    """Compute the k largest entries along the last axis, ties by position, and their positions."""
-
-    def run(values: Values) -> None:
-        x = values[given]
-        order = np.argsort(~_ordinal(x), axis=-1, kind="stable")[..., :k].astype(np.int32)
-        values[largest], values[places] = np.take_along_axis(x, order, -1), order
-
-    return run
-
-
-def _ordinal(x: np.ndarray) -> np.ndarray:
-    """Return integers in the order that XLA sorts numbers in: -0 before 0, and NaN last."""
-    if x.dtype.kind == "i":
-        return x
-    bits = np.ascontiguousarray(x).view(np.int32)
-    return np.where(np.isnan(x), LAST, bits ^ ((bits >> 31) & LAST))
-
-
-def _rounded(x: np.ndarray) -> np.ndarray:
-    """Round to the nearest bfloat16, ties to even; the result stays in single precision."""
-    bits = np.atleast_1d(x).view(np.uint32)
-    up = ((bits >> np.uint32(16)) & np.uint32(1)) + np.uint32(0x7FFF)
-    return ((bits + up) & np.uint32(0xFFFF0000)).view(np.float32).reshape(x.shape)
 
 
 def _argument(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -298,7 +265,6 @@ def _quotient(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 ONE = np.float32(1)
-LAST = np.int32(2**31 - 1)
 
 # For float32, int32 or bool arrays of fixed shapes. Elementwise ones take equal or broadcastable shapes.
 OPERATIONS: dict[str, Callable[..., Any]] = {
@@ -308,7 +274,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     **{"sub": np.subtract, "mul": np.multiply, "rem": np.fmod, "pow": np.power, "max": np.maximum, "min": np.minimum},
     **{"and": np.logical_and, "or": np.logical_or, "xor": np.logical_xor, "not": np.logical_not},
     **{"eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater},
-    **{"ge": np.greater_equal, "select": np.where, "bfloat16": _rounded, "div": _quotient},
+    **{"ge": np.greater_equal, "select": np.where, "div": _quotient},
     "rsqrt": lambda x: ONE / np.sqrt(x),
     "logistic": lambda x: ONE / (ONE + np.exp(-x)),
 }
@@ -323,8 +289,7 @@ SETTLED: dict[str, Callable[..., Callable[..., Any]]] = {
     "concatenate": lambda axis: lambda *parts: np.concatenate(parts, axis),
     "slice": _slices,
     "pad": lambda low, high: lambda x, value: np.pad(x, list(zip(low, high, strict=True)), constant_values=value),
-    **{"sum": _reduction(np.add), "prod": _reduction(np.multiply), "largest": _reduction(np.maximum)},
+    **{"sum": _reduction(np.add), "largest": _reduction(np.maximum)},
     **{"smallest": _reduction(np.minimum), "all": _reduction(np.logical_and), "any": _reduction(np.logical_or)},
     **{"argmax": _argument(np.argmax), "argmin": _argument(np.argmin)},
-    "cumsum": lambda axis: lambda x: np.cumsum(x, axis, dtype=x.dtype),
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,12 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.config import Scalars
-from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher, keys_of, lived
+from cuelearner_jax.labelling.learner import Agreement, agreement, as_teacher
+from cuelearner_jax.labelling.plan import keys_of, replay
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.task import Task
@@ -68,18 +68,14 @@ def with_teacher(
     env = task.environment(config)
     teacher = task.make_teacher(config, env)
     items = {row["item"]: (np.asarray(row["obs"], np.float32), np.asarray(row["action"], np.float32)) for row in rows}
-    situations = list(lived(env, keys_of(file.session["seed"]), [items[number] for number in range(len(items))]))
+    situations = list(replay(env, keys_of(file.session["seed"]), [items[number] for number in range(len(items))]))
     if len(situations) <= len(items):
         raise UserError(
-            "replaying the file's situations gives other observations: use the version of "
-            "cuelearner that wrote the file"
+            "replaying the file's situations gives other observations: use the version of cuelearner that wrote the "
+            "file"
         )
-    told = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
-
-    @jax.jit
-    def one(env: Environment, teacher: Any, state: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
-        return as_teacher(form, env, told, teacher, state, obs, action)
-
+    scalars = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
+    one = jax.jit(lambda env, teacher, *question: as_teacher(form, env, scalars, teacher, *question))
     asked = [(*situations[item], jnp.asarray(items[item][1])) for item in file.people.item]
     theirs = np.stack([np.asarray(one(env, teacher, *question)) for question in asked])
     return agreement(form, env, np.asarray(file.labels.answer), theirs)
@@ -92,23 +88,20 @@ def between(one: LabelFile, other: LabelFile, env: Any) -> Agreement:
     """
     form = form_of(one)
     if form is None or (one.answers, one.space, one.eps) != (other.answers, other.space, other.eps):
-        raise UserError(f"the files hold {_called(one)} and {_called(other)} answers: give two of one form")
-    mine, theirs = dict(_questions(one)), dict(_questions(other))
-    both = [question for question in mine if question in theirs]
-    width = form.width(one.space)
-    pairs = np.array([(mine[question], theirs[question]) for question in both], np.float32).reshape(-1, 2, width)
-    return agreement(form, env, pairs[:, 0], pairs[:, 1])
+        kinds = [
+            f"{file.answers}" + ("" if file.eps is None else f" ({file.eps:g} {file.space.unit})")
+            for file in (one, other)
+        ]
+        raise UserError(f"the files hold {' and '.join(kinds)} answers: give two of one form")
+    mine, theirs = (dict(zip(_questions(file), np.asarray(file.labels.answer), strict=True)) for file in (one, other))
+    pairs = [(mine[question], theirs[question]) for question in mine if question in theirs]
+    both = np.array(pairs, np.float32).reshape(-1, 2, form.width(one.space))
+    return agreement(form, env, both[:, 0], both[:, 1])
 
 
-def _called(file: LabelFile) -> str:
-    return file.answers if file.eps is None else f"{file.answers} ({file.eps:g} {file.space.unit})"
-
-
-def _questions(file: LabelFile) -> Iterator[tuple[bytes, np.ndarray]]:
-    """Yield each label's question, as the bytes of its observation and action, and its answer."""
-    columns = (file.labels.obs, file.labels.action, file.labels.answer)
-    for *asked, answer in zip(*(np.asarray(column) for column in columns), strict=True):
-        yield b"".join(part.tobytes() for part in asked), answer
+def _questions(file: LabelFile) -> list[bytes]:
+    """Return each label's question, as the bytes of its observation and action."""
+    return [row.tobytes() for row in np.concatenate([file.labels.obs, file.labels.action], -1)]
 
 
 def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
@@ -120,33 +113,28 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     Raises UserError if the files differ in task, world, form or strength, or if one file holds several seeds' labels.
     """
     files = list(files)
-    first = files[0]
+    first, everyone = files[0], all(file.people is not None for file in files)
+    known: set[Any] = set()
+    fresh: list[bool] = []
     for file in files:
         if len(np.unique(file.seeds)) > 1:
             raise UserError(
                 "a file holds the labels of several seeds, which must stay separate: merge files of one seed each"
             )
         for name in ("task", "answers", "space", "eps"):
-            if getattr(file, name) != getattr(first, name):
-                raise UserError(
-                    f"the files differ in {name} ({getattr(first, name)}, {getattr(file, name)}): "
-                    f"merge only files that agree in it"
-                )
-    if len({(file.labels.obs.shape[1], file.labels.action.shape[1]) for file in files}) > 1:
-        raise UserError("the files' observations differ in size: merge files of one world")
-    by_people = all(file.people is not None for file in files)
-    there: set[Any] = set()
-    kept: Any = []
-    for file in files:
-        keys = [(question, answer.tobytes()) for question, answer in _questions(file)]
-        if by_people and file.people is not None:
+            if (other := getattr(file, name)) != (own := getattr(first, name)):
+                raise UserError(f"the files differ in {name} ({own}, {other}): merge only files that agree in it")
+        if file.labels.obs.shape[1] != first.labels.obs.shape[1]:
+            raise UserError("the files' observations differ in size: merge files of one world")
+        keys: list[Any] = list(zip(_questions(file), map(bytes, np.asarray(file.labels.answer)), strict=True))
+        if everyone and file.people is not None:
             keys = list(zip(keys, file.people.who.tolist(), file.people.when.tolist(), strict=True))
-        kept += [key not in there for key in keys]
-        there.update(keys)
-    kept = np.array(kept, bool)
+        fresh += [key not in known for key in keys]
+        known.update(keys)
+    kept = np.array(fresh, bool)
     labels = jax.tree.map(lambda *leaves: np.concatenate(leaves)[kept], *(file.labels for file in files))
     people = None
-    if by_people:
+    if everyone:
         columns = [np.concatenate(each)[kept] for each in zip(*(file.people or () for file in files), strict=True)]
         people = label_files.People(np.arange(len(labels.valid)), *columns[1:])
     seeds = np.zeros(len(labels.valid), np.int64)

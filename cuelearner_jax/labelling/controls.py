@@ -19,7 +19,7 @@ SHOWN = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # how the page write
 SHOWN |= {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
 
 
-def shown(key: str) -> str:
+def key_words(key: str) -> str:
     """Return a key as the page writes it."""
     return SHOWN.get(key, key.upper() if len(key) == 1 else key)
 
@@ -42,7 +42,7 @@ class Control(NamedTuple):
     @property
     def shown(self) -> str:
         """The first key, as the page writes it."""
-        return shown(self.keys[0]) if self.keys else ""
+        return key_words(self.keys[0]) if self.keys else ""
 
 
 UNSURE = Control("unsure", "don't know", ("ArrowDown", "s", "S"))
@@ -74,21 +74,21 @@ def _keys_of(space: Space, cue: Cue) -> tuple[tuple[str, ...], ...]:
 
 def _of_cue(number: int, space: Space, one_cue: bool) -> tuple[Control, ...]:
     """Return the controls about one of several cues: parts of an answer or, with `one_cue`, whole answers."""
-    cue, count = space.cues[number], len(space.cues)
-    more, less = _keys_of(space, cue)
-    if one_cue:
-        alone = np.where(np.arange(count) == number, 1.0, UNSAID)
-        said = tuple(map(float, alone)), tuple(map(float, np.where(alone == 1.0, -1.0, UNSAID)))
-        return (
-            Control(f"only-{number}-more", cue.words[0], more, said[0], "left", number),
-            Control(f"only-{number}-less", cue.words[1], less, said[1], "right", number),
-        )
-    return (
-        Control(f"pick-{number}-more", cue.words[0], more, (1.0,), "left", number),
-        Control(f"pick-{number}-right", "already right", (), (0.0,), "asked", number),
-        Control(f"pick-{number}-less", cue.words[1], less, (-1.0,), "right", number),
-        Control(f"pick-{number}-unsaid", "not said", (), (UNSAID,), "", number),
+    cue, others = space.cues[number], [UNSAID] * len(space.cues)
+    sides = zip(("more", "less"), (1.0, -1.0), ("left", "right"), cue.words, _keys_of(space, cue), strict=True)
+    more, less = (
+        Control(f"pick-{number}-{way}", words, keys, (h,), colour, number) for way, h, colour, words, keys in sides
     )
+    if one_cue:
+        return tuple(
+            one._replace(
+                name=one.name.replace("pick", "only"),
+                answer=(*others[:number], *(one.answer or ()), *others[number + 1 :]),
+            )
+            for one in (more, less)
+        )
+    right = Control(f"pick-{number}-right", "already right", (), (0.0,), "asked", number)
+    return more, right, less, Control(f"pick-{number}-unsaid", "not said", (), (UNSAID,), "", number)
 
 
 def answers(form: AnswerForm, space: Space, one_cue: bool = False) -> tuple[Control, ...]:
@@ -123,14 +123,11 @@ def controls(
 
     `films`: whether the task films a situation. `simulated`: whether it can film the outcome of any action.
     """
-    own = answers(form, space, one_cue)
-    filmed = (*[FILM] * films, *[CORRECTED] * (films and simulated))
-    taken = {key for control in own for key in control.keys}
-    others = (
-        control._replace(keys=tuple(key for key in control.keys if key not in taken))
-        for control in (UNSURE, UNDO, *filmed, HELP)
-    )
-    return {control.name: control for control in (*own, *others)}
+    found = {control.name: control for control in answers(form, space, one_cue)}
+    taken = {key for control in found.values() for key in control.keys}
+    for control in (UNSURE, UNDO, *[FILM] * films, *[CORRECTED] * (films and simulated), HELP):
+        found[control.name] = control._replace(keys=tuple(key for key in control.keys if key not in taken))
+    return found
 
 
 def check(form: AnswerForm, space: Space) -> None:
@@ -144,7 +141,7 @@ def check(form: AnswerForm, space: Space) -> None:
         raise UserError(f"the space {space.name} has no cues to ask about: give --guidance scalar")
     keys = [key for control in answers(form, space) for key in control.keys]
     if twice := [key for key in keys if keys.count(key) > 1]:
-        raise UserError(f"the key {shown(twice[0])!r} stands for two answers: give the space's cues different keys")
+        raise UserError(f"the key {key_words(twice[0])!r} stands for two answers: give the space's cues different keys")
 
 
 def question(form: AnswerForm, space: Space) -> str:
@@ -161,37 +158,32 @@ def question(form: AnswerForm, space: Space) -> str:
 
 def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list[str]:
     """Return the lines of the page's help about these controls."""
-    lines, picks = [], False
+    known, lines = list(known), []
     for one in known:
         name = f"{space.cues[one.cue].name}: " if one.cue is not None else ""
-        lines += [f"{name}{one.words}: {', '.join(dict.fromkeys(map(shown, one.keys)))}"] if one.keys else []
-        picks = picks or one.picks
+        lines += [f"{name}{one.words}: {', '.join(dict.fromkeys(map(key_words, one.keys)))}"] if one.keys else []
     if form.by_eps and space == DIRECTIONS:
         lines.append(
             "Left and right are meant for somebody who walks along the arrow: left turns it counterclockwise. "
             "Two arrows in the picture show both turns, each in the colour of its button and with its key."
         )
-    if picks:
-        lines.append(
-            "Say which way each cue should change, then send. An answer that says nothing of any "
-            "cue counts as: don't know."
-        )
+    if any(one.picks for one in known):
+        lines.append("Say which way each cue should change, then send. An answer about no cue counts as: don't know.")
     elif form.by_eps and len(space.cues) > 1:
         lines.append("Say what comes to mind first: one press is the answer. Nothing is said of the other cues.")
     return [
         *lines,
-        "Each answer is saved before the next question shows. Where you cannot tell, say so: not "
-        "knowing costs nothing.",
+        "Each answer is saved before the next question shows. Where you cannot tell, say so: that costs nothing.",
         "A key pressed while no question is ready is ignored, and the page says so.",
     ]
 
 
 def answer_of(
-    space: Space, pressed: Control | None, angle_deg: float | None, said: Mapping[int, float]
+    space: Space, pressed: Control | None, angle_deg: float | None, parts: Mapping[int, float]
 ) -> np.ndarray | None:
     """Return the answer in the form's encoding, (width,); None for "don't know".
 
-    Without a `pressed` control the answer is the direction pointed at [deg]. `said` maps a cue's index to the part of
+    Without a `pressed` control the answer is the direction pointed at [deg]. `parts` maps a cue's index to the part of
     the answer chosen for it.
     """
     if pressed is None:
@@ -201,8 +193,8 @@ def answer_of(
         return None
     if pressed.name not in (REST_RIGHT.name, REST_UNSAID.name):  # these two complete the parts chosen so far
         return np.asarray(pressed.answer, np.float32)
-    found = np.array([said.get(number, *pressed.answer) for number in range(len(space.cues))], np.float32)
-    return None if (found == UNSAID).all() else found
+    answer = np.array([parts.get(number, *pressed.answer) for number in range(len(space.cues))], np.float32)
+    return None if (answer == UNSAID).all() else answer
 
 
 def outcomes(form: AnswerForm, space: Space, action: np.ndarray, eps: float) -> dict[str, np.ndarray]:

@@ -36,14 +36,12 @@ class Page:
             finish: called by the button that ends the session; None: no such button.
             again: the command that opens the session once more.
         """
-        self.session, self._pages, self._finish = session, pages, finish
-        self.form, self.space = session.plan.form, session.questions.space
-        self._by_evidence = session.plan.guidance.by_evidence
-        self._one_cue = session.plan.one_cue
+        self.session, self._finish, self._pages = session, finish, pages
+        self.form, self.space, self._one_cue = session.plan.form, session.questions.space, session.plan.one_cue
         films = session.films, session.questions.pictures.simulates
         self.controls = controls.controls(self.form, self.space, self._one_cue, *films)
-        self._said: dict[int, float] = {}  # parts of the answer chosen so far, by the cue's index
-        self._said_of = session.number
+        self._parts: dict[int, float] = {}  # parts of the answer chosen so far, by the cue's index
+        self._parts_of = session.number
         self._drawn: Item | None = None  # the item on the screen
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
@@ -59,9 +57,9 @@ class Page:
                 self._note = ui.label().classes("note")
                 self._scene = ui.html("", sanitize=False).classes("stage")
             with ui.column().classes("answering w-full gap-2"):
-                self._answers()
+                self._build_answers()
             with ui.element("aside").classes("side"):
-                self._side()
+                self._build_side()
         with ui.dialog() as self._help, ui.card().classes("gap-1"):
             ui.label("Help").classes("big")
             for line in controls.help_lines(self.form, self.space, self.controls.values()):
@@ -76,21 +74,18 @@ class Page:
 
     # --- building ------------------------------------------------------------------------------------------
 
-    def _button(self, control: Control, **look: str) -> ui.button:
+    def _button(self, control: Control, props: str = "") -> ui.button:
         """Make a button whose event names the control and the item on the screen."""
-        with ui.button(color=None).props(look.get("props", "")) as button:
+        with ui.button(color=None).props(props).classes(control.colour).mark(control.name) as button:
             ui.html(f"{control.words}<span class=key>{control.shown}</span>", sanitize=False)
-        button.classes(control.colour).mark(control.name)
-        button.on(
-            "click",
-            lambda event, name=control.name: self._heard(event, name),
-            js_handler=f"event => cue.send({json.dumps(control.name)}, {{clicks: event.detail}})",
-        )
+        send = f"event => cue.send({json.dumps(control.name)}, {{clicks: event.detail}})"
+        button.on("click", lambda event, name=control.name: self._heard(event, name), js_handler=send)
         return button
 
-    def _answers(self) -> None:
+    def _build_answers(self) -> None:
         own = controls.answers(self.form, self.space, self._one_cue)
-        self._pressable, self._picks = [], {}
+        self._pressable: list[ui.button] = []
+        self._picks: dict[Control, ui.button] = {}
         for number, cue in enumerate(self.space.cues):
             if about := [control for control in own if control.cue == number]:
                 # a row per cue, beside the picture, which has the height and most of the width
@@ -106,28 +101,25 @@ class Page:
         ui.label("").classes("dropped").props("aria-live=polite")
         ui.label("").classes("film-words")
 
-    def _side(self) -> None:
+    def _build_side(self) -> None:
         self._count = ui.label().classes("big")
         self._bar = ui.linear_progress(value=0.0, show_value=False).props("rounded size=10px")
-        self._pace = ui.label()
-        self._left = ui.label()
+        self._pace, self._left = ui.label(), ui.label()
         ui.separator()
-        self._model = ui.label()
-        self._quality = ui.label().classes("told")
+        self._model, self._quality = ui.label(), ui.label().classes("told")
         ui.separator()
         self._words = ui.label()
         with ui.element("div").classes("hide-small"):
             turned = [one for one in self.controls.values() if one.colour in ("left", "right") and one.cue is None]
+            by_evidence = self.session.plan.guidance.by_evidence
             swatches = {"asked": "the action in question", **{one.colour: one.words for one in turned}}
-            refined = "the corrected policy" if self._by_evidence else "the model's correction"
-            for name, about in {**swatches, "refined": refined}.items():
+            swatches["refined"] = "the corrected policy" if by_evidence else "the model's correction"
+            for name, about in swatches.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
             ui.label(self.session.questions.pictures.legend).classes("text-caption")
-        self._tools: dict[str, ui.button] = {}
         with ui.element("div").classes("tools"):
-            for name in ("undo", "film", "film-refined", "help"):
-                if name in self.controls:
-                    self._tools[name] = self._button(self.controls[name], props="flat dense")
+            names = [name for name in ("undo", "film", "film-refined", "help") if name in self.controls]
+            self._tools = {name: self._button(self.controls[name], "flat dense") for name in names}
         self._saved = ui.label().classes("text-caption")
         self._trouble = ui.label().classes("trouble")
         if self._finish is not None:
@@ -137,39 +129,40 @@ class Page:
 
     async def _heard(self, event: GenericEventArguments, name: str | None = None) -> None:
         """Handle a control's event; without an item from the browser, it is about the current question."""
-        told = event.args if isinstance(event.args, dict) and "name" in event.args else {"name": name}
-        item = told.get("item")
-        await self._act(str(told["name"]), self.session.number if item is None else int(item), told)
+        given = event.args if isinstance(event.args, dict) and "name" in event.args else {"name": name}
+        item = given.get("item")
+        await self._act(str(given["name"]), self.session.number if item is None else int(item), given)
 
-    async def _act(self, name: str, number: int, told: dict[str, Any]) -> None:
+    async def _act(self, name: str, number: int, given: dict[str, Any]) -> None:
+        """Act on a control pressed, or a direction pointed at, while an item was on the screen."""
+        pressed, angle = self.controls.get(name), given.get("angle")
         if name == "help":
             self._help.value = not self._help.value
             return
         if name.startswith("film"):
-            await self._show_film(name, number)
+            await self._show_film(name.removeprefix("film-"), number)
             return
-        pressed, angle = self.controls.get(name), told.get("angle")
         if pressed is None and not (name == "point" and self.form.is_action and angle is not None):
             return
         taken, why = False, LATE
         if self._help.value:  # the browser may not know yet that the window opened
             why = "a window lies over the question: close it first"
         elif pressed is not None and pressed.picks and pressed.answer and number == self.session.number:
-            self._said_about(number)[pressed.cue or 0] = pressed.answer[0]  # stored until the answer is sent
+            self._parts_about(number)[pressed.cue or 0] = pressed.answer[0]  # stored until the answer is sent
             self._mark()
             return
         elif pressed is None or not pressed.picks:
             try:
                 if name == "undo":
                     taken = await run.io_bound(self.session.undo, number)
+                    why = "there is nothing to take back" if number == self.session.number else LATE
                 else:
-                    said = self._said if self._said_of == number else {}
-                    answer = controls.answer_of(self.space, pressed, angle, said)
-                    taken = await run.io_bound(self.session.answer, number, answer, told.get("seconds"))
+                    parts = self._parts if self._parts_of == number else {}
+                    answer = controls.answer_of(self.space, pressed, angle, parts)
+                    taken = await run.io_bound(self.session.answer, number, answer, given.get("seconds"))
             except UserError as error:
                 why = str(error)
         if not taken:
-            why = "there is nothing to take back" if name == "undo" and number == self.session.number else why
             self._script(f"cue.refused({json.dumps(why)})")
         for page in list(self._pages):
             page.refresh()
@@ -187,21 +180,20 @@ class Page:
             with self._client:
                 ui.notify(str(error), type="negative", timeout=0, close_button="close")
 
-    async def _show_film(self, name: str, number: int) -> None:
-        item, of = self.session.item, name.removeprefix("film-")
+    async def _show_film(self, of: str, number: int) -> None:
+        """Play a film of an outcome of an item's action; of the action itself by default."""
+        item, questions = self.session.item, self.session.questions
         if item is None or item.number != number:
             return
-        made = self.session.questions
-        shown = item.refined if of == "refined" else made.outcomes(item).get(of, item.action)
-        if shown is None:  # there is no correction yet
-            return
-        reel = await run.io_bound(made.film, item, shown)
-        if reel is not None:
+        shown = item.refined if of == "refined" else questions.outcomes(item).get(of, item.action)
+        if shown is not None and (reel := await run.io_bound(questions.film, item, shown)) is not None:
             self._script(f"cue.play({view.film(item, reel)})")
 
     def goto(self, address: str) -> None:
         """Make the browser open another page of this server."""
         self._script(f"location.replace({json.dumps(address)})")
+
+    # --- showing -----------------------------------------------------------------------------------------------
 
     def refresh(self) -> None:
         """Show the session's current state."""
@@ -211,7 +203,7 @@ class Page:
             self._drawn = item
             self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
             self._note.text = "" if item is None else view.note(item, *how)
-        self._said_about(self.session.number)
+        self._parts_about(self.session.number)
         self._mark()
         if "film-refined" in self._tools:
             self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
@@ -222,37 +214,36 @@ class Page:
             self._words.text = item.sketch.words if item.sketch else ""
         for button in self._pressable:
             button.set_enabled(item is not None)
-        self._tell(self.session.status())
+        self._show_progress(self.session.status())
 
-    def _said_about(self, number: int) -> dict[int, float]:
+    def _parts_about(self, number: int) -> dict[int, float]:
         """Return the parts chosen for a question; empty for a new question."""
-        if self._said_of != number:
-            self._said, self._said_of = {}, number
-        return self._said
+        if self._parts_of != number:
+            self._parts, self._parts_of = {}, number
+        return self._parts
 
     def _mark(self) -> None:
         """Highlight the parts chosen so far, where there are several cues."""
-        picked = {one.name for one in self._picks if one.answer == (self._said.get(one.cue, UNSAID),)}
+        picked = {one.name for one in self._picks if one.answer == (self._parts.get(one.cue or 0, UNSAID),)}
         for control, button in self._picks.items():
             button.classes(**{"add" if control.name in picked else "remove": "picked"})
         if self._picks:
             self._script(f"cue.mark({json.dumps(sorted(picked))})")
 
-    def _tell(self, status: Status) -> None:
+    def _show_progress(self, status: Status) -> None:
         unsure = f", {status.unsure} not known" if status.unsure else ""
         self._count.text = f"{status.answered} of {status.labels}{unsure}"
         self._bar.value = status.answered / status.labels
         self._pace.text = f"{status.per_minute:.0f} labels a minute" if status.per_minute else "no labels yet"
-        left = status.minutes_left
+        left, newest = status.minutes_left, status.newest
         self._left.text = "" if left is None else "nearly done" if left < 1 else f"{left:.0f} minutes left"
-        newest = status.newest
-        what, doing = ("estimate", "reading") if self._by_evidence else ("model", "fitting")
+        by_evidence = self.session.plan.guidance.by_evidence
+        what, doing = ("estimate", "reading") if by_evidence else ("model", "fitting")
         fitted = f"{what} {newest.number}, of {newest.labels} labels" if newest.number else f"no {what} yet"
-        self._model.text = f"{fitted}; {doing} the next" if status.fitting else fitted
-        if newest.problem:
-            self._model.text = f"{fitted}; {newest.problem}"
-        apart = f"agreement with held-out labels: {newest.quality}" if newest.quality else ""
-        self._quality.text = "\n".join(newest.told) or apart
+        now = newest.problem or (f"{doing} the next" if status.fitting else "")
+        self._model.text = f"{fitted}; {now}" if now else fitted
+        agreed = f"agreement with held-out labels: {newest.quality}" if newest.quality else ""
+        self._quality.text = "\n".join(newest.lines) or agreed
         place = "/".join(self.session.record.path.parts[-2:])
         self._saved.text = f"{place}: {status.answered + status.unsure} answers saved"
         self._trouble.text = status.trouble

@@ -1,27 +1,33 @@
-"""What a labelling session is configured to ask."""
+"""What a labelling session is configured to ask, and the replay of its situations."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
+from cuelearner_jax import asking
 from cuelearner_jax.config import to_json
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Task
+from cuelearner_jax.types import EnvState
 
 APART = ("env", "teacher")  # fields of policies that describe the world; the label file records them separately
+SAME = 1e-5  # largest difference of a replayed observation from the recorded one
 
 
-@dataclass(frozen=True)
-class Base:
+class Base(NamedTuple):
     """The policy whose actions the questions are about."""
 
     policy: Policy
@@ -76,7 +82,6 @@ class Plan:
 
     def session(self, env: Any) -> dict[str, Any]:
         """Return the settings that must be equal for answers to share a file, beyond task and form."""
-        layout = [{"name": part.name, "size": part.size, "unit": part.unit} for part in env.observation]
         return {
             "seed": self.seed,
             "guidance": self.guidance.name,
@@ -85,5 +90,46 @@ class Plan:
             "bound": self.bound_deg,
             **({"robot": self.robot} if self.robot else {}),
             **({"again_of": self.again_of} if self.again else {}),
-            "observation": layout,
+            "observation": [{"name": part.name, "size": part.size, "unit": part.unit} for part in env.observation],
         }
+
+
+class Keys(NamedTuple):
+    """Random keys of a session."""
+
+    session: PRNGKeyArray  # for questions and fits
+    model: PRNGKeyArray
+    start: PRNGKeyArray  # for the first situation
+
+
+def keys_of(seed: int) -> Keys:
+    """Derive a session's random keys from its seed."""
+    return Keys(*jax.random.split(jax.random.key(seed), 3))
+
+
+@jax.jit
+def begin(env: Environment, key: PRNGKeyArray) -> tuple[EnvState, jax.Array]:
+    """Return the first situation of an episode: (state, observation)."""
+    return env.reset(key)
+
+
+@jax.jit
+def advance(env: Environment, key: PRNGKeyArray, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
+    """Return the situation after an action: (state, observation)."""
+    after, step = env.step(key, state, action)
+    return after, step.obs
+
+
+def replay(env: Environment, keys: Keys, rows: Iterable[Any]) -> Iterator[tuple[EnvState, jax.Array]]:
+    """Replay recorded items; yield the situation (state, observation) before each item, and after the last.
+
+    `rows` holds the items' observations and actions. The replay ends early, before the first item whose observation
+    differs from the recorded one (a program of another version).
+    """
+    state, obs = begin(env, keys.start)
+    for number, (recorded, action) in enumerate(rows):
+        if recorded.shape != obs.shape or not np.allclose(np.asarray(obs), recorded, atol=SAME):
+            return
+        yield state, obs
+        state, obs = advance(env, asking.question_keys(keys.session, number).env, state, jnp.asarray(action))
+    yield state, obs

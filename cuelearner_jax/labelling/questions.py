@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax import asking, user_code
 from cuelearner_jax.asking import GuideState
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.labelling import controls
-from cuelearner_jax.labelling.evidence import EvidenceLearner
-from cuelearner_jax.labelling.learner import Learner
-from cuelearner_jax.labelling.plan import Plan
-from cuelearner_jax.labelling.programs import advance, begin, keys_of
+from cuelearner_jax.labelling.learner import EvidenceLearner, Learner
+from cuelearner_jax.labelling.plan import Plan, advance, keys_of
 from cuelearner_jax.policies import policy_name
-from cuelearner_jax.types import Reel, Sketch
+from cuelearner_jax.types import EnvState, Reel, Sketch
 
 
 class Item(NamedTuple):
@@ -40,20 +38,18 @@ class Questions:
         self.plan, self.env, self.pictures, self.space = plan, env, plan.task.pictures(), actions_of(env)
         self.keys = keys_of(plan.seed)
         slots = asking.label_slots(plan.labels, plan.config.sizes)
-        self.blank = asking.start(plan.guidance, self.env, slots, plan.labels, self.keys.model, self.keys.start)
+        self._blank = asking.start(plan.guidance, env, slots, plan.labels, self.keys.model, self.keys.start)
         kind = EvidenceLearner if plan.guidance.by_evidence else Learner
-        self.learner = kind(plan, self.env, self.blank, self.keys.session)
+        self.learner = kind(plan, env, self._blank, self.keys.session)
 
-    def start(self, key: PRNGKeyArray) -> GuideState:
-        """Return the first situation of an episode."""
-        state, obs = begin(self.env, key)
-        return self.blank.replace(env=state, obs=obs)
+    def guide_in(self, state: EnvState, obs: jax.Array) -> GuideState:
+        """Return a guide without labels in a situation."""
+        return self._blank.replace(env=state, obs=obs)
 
     def after(self, item: Item) -> GuideState:
-        """Return the situation that follows an item's action."""
+        """Return the guide in the situation that follows an item's action."""
         key = asking.question_keys(self.keys.session, item.number).env
-        state, obs = advance(self.env, key, item.guide.env, jnp.asarray(item.action))
-        return item.guide.replace(env=state, obs=obs)
+        return self.guide_in(*advance(self.env, key, item.guide.env, jnp.asarray(item.action)))
 
     def ask(self, number: int, guide: GuideState) -> Item:
         """Choose the action to ask about in a situation. Raises UserError for a policy without valid actions."""
@@ -78,8 +74,8 @@ class Questions:
 
     def refine(self, item: Item) -> Item:
         """Add the newest model's action."""
-        newest = self.learner.newest
-        return item._replace(refined=self.learner.refined(item.guide.obs, item.action) if newest.number else None)
+        fitted = self.learner.newest.number
+        return item._replace(refined=self.learner.refined(item.guide.obs, item.action) if fitted else None)
 
     def outcomes(self, item: Item) -> dict[str, np.ndarray]:
         """Return each answer's outcome for an item's action, see `controls.outcomes`."""

@@ -1,4 +1,4 @@
-"""Serve a session's page on this machine until the session is finished or stopped."""
+"""Serve a session's page on this machine, to those who know its address, until the session is finished or stopped."""
 
 from __future__ import annotations
 
@@ -8,27 +8,30 @@ import html
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import uvicorn
 from fastapi import FastAPI
-from fastapi.responses import HTMLResponse
+from fastapi.requests import HTTPConnection
+from fastapi.responses import HTMLResponse, PlainTextResponse
 from nicegui import run, ui
 from starlette.background import BackgroundTask
+from starlette.websockets import WebSocketClose
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.labelling.gate import Gate
 from cuelearner_jax.labelling.page import Page
 from cuelearner_jax.labelling.session import Session
 
 HOST = "127.0.0.1"
+FINISHED = "/finished"  # address of the last page
 SHOWN_WITHIN = 10.0  # time for all browsers to load the last page before the server stops [s]
 RECONNECT = 60.0  # time for which the page of a broken connection is kept [s]
-
-
-ADDRESS = "/finished"  # of the last page
+HEADERS = (
+    (b"referrer-policy", b"no-referrer"),  # the address contains the token
+    (b"x-frame-options", b"DENY"),
+    (b"x-content-type-options", b"nosniff"),
+)
 
 
 class Commands(NamedTuple):
@@ -41,24 +44,15 @@ class Commands(NamedTuple):
 class Ending(NamedTuple):
     """Result of a finished session."""
 
-    file: Path
-    labels: int
-    unsure: int
-    wanted: int
+    line: str  # what was saved, and where
     following: str  # the command that uses the labels
     again: str  # the command that continues the session
 
     @property
-    def line(self) -> str:
-        """Return one line that says what was saved, and where."""
-        also = f", and {self.unsure} questions without an answer" if self.unsure else ""
-        return f"{self.labels} of {self.wanted} labels are saved{also}, in {self.file}"
-
-
-def last_page(told: Ending) -> str:
-    """Return the last page as HTML, which needs no server once shown."""
-    line, following, again = (html.escape(text) for text in (told.line, told.following, told.again))
-    return f"""<!doctype html><html lang="en"><head><meta charset="utf-8"><title>finished</title>
+    def page(self) -> str:
+        """The last page as HTML, which needs no server once shown."""
+        line, following, again = map(html.escape, self)
+        return f"""<!doctype html><html lang="en"><head><meta charset="utf-8"><title>finished</title>
 <meta name="viewport" content="width=device-width"><style>:root {{ color-scheme: light dark; }}
 body {{ font: 1.1rem/1.6 system-ui, sans-serif; max-width: 46rem; margin: 3rem auto; padding: 0 1rem; }}
 pre {{ background: #80808022; padding: 0.8rem; white-space: pre-wrap; overflow-wrap: anywhere; }}</style></head><body>
@@ -68,17 +62,64 @@ pre {{ background: #80808022; padding: 0.8rem; white-space: pre-wrap; overflow-w
 <p>The command in the terminal has ended by itself. You may close this tab.</p></body></html>"""
 
 
+def ended(session: Session, commands: Commands) -> Ending:
+    """Finish a session. Raises UserError if its labels cannot be saved; the session then continues."""
+    file, status = session.finish().resolve(), session.status()
+    also = f", and {status.unsure} questions without an answer" if status.unsure else ""
+    line = f"{status.answered} of {status.labels} labels are saved{also}, in {file}"
+    return Ending(line, commands.following(status.answered), commands.again)
+
+
 def bind(port: int) -> socket.socket:
     """Return a socket bound to this machine only (port 0: any free port). Raises UserError if the port is taken."""
-    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        found.bind((HOST, port))
-        found.listen()  # from now on a browser waits for the page, where it would have been refused
+        bound.bind((HOST, port))
+        bound.listen()  # from now on a browser waits for the page, where it would have been refused
     except OSError as error:
-        found.close()
+        bound.close()
         raise UserError(f"port {port} of {HOST} is not available ({error.strerror}): give another --port") from error
-    return found
+    return bound
+
+
+def guarded(app: Any, port: int, token: str) -> Any:
+    """Return an ASGI application that passes on connections to `127.0.0.1:port` that present the token.
+
+    A page of another site can make a browser send requests to 127.0.0.1, and a domain name of that site can resolve to
+    127.0.0.1 (DNS rebinding). So the host and origin headers are checked, and a secret token is required: first in the
+    page's address, afterwards in a cookie.
+    """
+    cookie = f"cuelearner-{port}"  # browsers share cookies among ports
+    hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+
+    def refusal(asked: HTTPConnection) -> str:
+        if [host.lower() for host in asked.headers.getlist("host")] not in [[host] for host in hosts]:
+            return f"this page answers to {HOST} alone: open the address that the command printed"
+        if not {origin.lower() for origin in asked.headers.getlist("origin")} <= {f"http://{host}" for host in hosts}:
+            return "this page answers no other site"
+        presented = [*asked.query_params.getlist("token"), asked.cookies.get(cookie, "")]
+        if not any(secrets.compare_digest(each.encode(), token.encode()) for each in presented):
+            return "the token is missing or wrong: open the address that the command printed when it started last"
+        return ""
+
+    async def gate(scope: Any, receive: Any, send: Any) -> None:
+        async def send_private(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message = {**message, "headers": [*message.get("headers", []), *HEADERS, *entry]}
+            await send(message)
+
+        if scope["type"] not in ("http", "websocket"):
+            await app(scope, receive, send)
+        elif why := refusal(asked := HTTPConnection(scope)):
+            refused = PlainTextResponse(f"{why}\n", 403) if scope["type"] == "http" else WebSocketClose(1008, why)
+            await refused(scope, receive, send)
+        else:
+            carried = f"{cookie}={token}; HttpOnly; SameSite=Strict; Path=/".encode()
+            entry = [(b"set-cookie", carried)] if "token" in asked.query_params else []
+            await app(scope, receive, send_private)
+
+    return gate
 
 
 class _Server(uvicorn.Server):
@@ -86,11 +127,7 @@ class _Server(uvicorn.Server):
 
     ends: threading.Event
     after_startup: Callable[[], None]
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Install no signal handlers."""
-        yield
+    capture_signals: Any = contextlib.nullcontext
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, then call `after_startup` in a thread of its own: what it opens may need an event loop too."""
@@ -102,82 +139,80 @@ class _Server(uvicorn.Server):
         return await super().on_tick(counter) or self.ends.is_set()
 
 
-class _Last:
-    """Ends the session: saves its labels, sends every browser to the last page, stops the server once sent."""
+class Site:
+    """The pages of a session, and its end: a last page in every browser, after which the server stops."""
 
     session: Session
 
-    def __init__(self, pages: set[Page], stopping: threading.Event, commands: Commands) -> None:
-        self.told: Ending | None = None
-        self._pages, self._stopping, self._commands = pages, stopping, commands
-        self._waited_for = 0
+    def __init__(self, commands: Commands, stopping: threading.Event) -> None:
+        """Begin without a session; `stopping` is set once every browser shows the last page."""
+        self.commands, self.stopping = commands, stopping
+        self.pages: set[Page] = set()
+        self.ending: Ending | None = None
+        self._waiting = 0  # browsers that do not show the last page yet
+
+    def show(self) -> None:
+        """Build a page in NiceGUI's current client."""
+        Page(self.session, self.pages, self.finish, self.commands.again)
 
     async def finish(self) -> None:
         """Finish the session. Raises UserError if its labels cannot be saved; the session then continues."""
-        file = await run.io_bound(self.session.finish)
-        if file is None or self.told is not None:  # the program ends, or another page was first
+        ending = await run.io_bound(ended, self.session, self.commands)
+        if ending is None or self.ending is not None:  # the program ends, or another page was first
             return
-        status = self.session.status()
-        counts, following = (status.answered, status.unsure, status.labels), self._commands.following(status.answered)
-        self.told = Ending(file.resolve(), *counts, following, self._commands.again)
-        asyncio.get_running_loop().call_later(SHOWN_WITHIN, self._stopping.set)
-        self._waited_for = len(self._pages)
-        for page in list(self._pages):
-            page.goto(ADDRESS)
+        self.ending, self._waiting = ending, len(self.pages)
+        asyncio.get_running_loop().call_later(SHOWN_WITHIN, self.stopping.set)
+        for page in list(self.pages):
+            page.goto(FINISHED)
 
-    def route(self, app: FastAPI) -> None:
-        """Add the last page."""
+    def last_page(self, _: Any) -> HTMLResponse:
+        """Answer a browser's request of the last page."""
+        if self.ending is None:
+            return HTMLResponse("nothing is finished yet", 404)
+        return HTMLResponse(self.ending.page, background=BackgroundTask(self._shown))
 
-        @app.get(ADDRESS)
-        def show() -> HTMLResponse:
-            if self.told is None:
-                return HTMLResponse("nothing is finished yet", 404)
-            return HTMLResponse(last_page(self.told), background=BackgroundTask(self._sent))
-
-    def _sent(self) -> None:
-        self._waited_for -= 1
-        if self._waited_for <= 0:
-            self._stopping.set()
+    def _shown(self) -> None:
+        self._waiting -= 1
+        if self._waiting <= 0:
+            self.stopping.set()
 
 
 def serve(
     make: Callable[[], Session],
     title: str,
-    taken: socket.socket,
+    listening: socket.socket,
     stopping: threading.Event,
     tell: Callable[[str], None],
     commands: Commands,
 ) -> Ending | None:
-    """Serve a session's page on a socket of `bind` until the session ends; close the session.
+    """Serve a session's page until the session ends; close the session.
 
     Args:
         make: opens the session. It is called once the server has started: NiceGUI then lists every object that Python's
             garbage collector knows, also tuples that a session's threads are just building, which CPython refuses to
             finish (see the documentation of `gc.get_referrers`).
         title: of the page.
-        taken: the socket to listen on.
+        listening: a socket of `bind`.
         stopping: set it to stop the server.
         tell: called with the page's address, which contains a secret token.
         commands: what the last page shows for copying.
 
     Returns how a person finished the session; None if `stopping` was set before. Raises what `make` raises.
     """
-    token, port = secrets.token_urlsafe(18), taken.getsockname()[1]
-    pages: set[Page] = set()
-    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-    last = _Last(pages, stopping, commands)
-    last.route(app)
+    token, port = secrets.token_urlsafe(18), listening.getsockname()[1]
+    app, site = FastAPI(docs_url=None, redoc_url=None, openapi_url=None), Site(commands, stopping)
+    app.add_route(FINISHED, site.last_page)
     with contextlib.ExitStack() as end:
 
         def opened() -> None:
-            last.session = end.enter_context(make())
+            site.session = end.enter_context(make())
             tell(f"http://{HOST}:{port}/?token={token}")
 
         look = {"title": title, "dark": None, "reconnect_timeout": RECONNECT, "show_welcome_message": False}
-        ui.run_with(app, root=lambda: Page(last.session, pages, last.finish, commands.again) and None, **look)
+        ui.run_with(app, root=site.show, **look)
         # uvloop would take over the signal wake-up that the thread of `signals` waits for.
         how = {"log_level": "warning", "ws": "wsproto", "loop": "asyncio", "timeout_graceful_shutdown": 1}
-        server = _Server(uvicorn.Config(Gate(app, port, token), **how))
+        server = _Server(uvicorn.Config(guarded(app, port, token), **how))
         server.ends, server.after_startup = stopping, opened
-        server.run(sockets=[taken])
-        return last.told
+        server.run(sockets=[listening])
+        return site.ending

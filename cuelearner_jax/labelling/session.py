@@ -1,7 +1,8 @@
 """A labelling session without its page: ask, save answers, take answers back, fit a model in the background.
 
-An answer is on disk before the next question is shown. Threads prepare questions and fit models, so that nobody who
-answers has to wait. A session that is reopened replays the recorded actions and continues where its file ends.
+An answer is on disk before the next question is shown, and nothing on disk is ever changed. Threads prepare questions
+and fit models, so that nobody who answers has to wait. A session that is reopened replays the recorded actions and
+continues where its file ends.
 """
 
 from __future__ import annotations
@@ -10,22 +11,95 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling.learner import Fitted
-from cuelearner_jax.labelling.plan import Plan
-from cuelearner_jax.labelling.programs import lived
+from cuelearner_jax.labelling.plan import Plan, begin, replay
 from cuelearner_jax.labelling.questions import Item, Questions
-from cuelearner_jax.labelling.record import Record, Said
+from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import ANSWERED, UNDONE, UNSURE
+from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import Label
 
 KEPT = 20  # number of past questions whose pictures are kept; undo redraws earlier ones
+RECENT = 50  # number of answers from which the pace is computed
+
+
+class Response(NamedTuple):
+    """The recorded response to an item."""
+
+    said: str  # one of `label_files.SAID`
+    obs: np.ndarray
+    action: np.ndarray
+    answer: np.ndarray | None
+    seconds: float
+
+
+class Record:
+    """The newest response to each item, as in the label file."""
+
+    def __init__(self, plan: Plan, folder: Path) -> None:
+        """Open or continue the folder's label file. Raises UserError if it holds labels of another session."""
+        shape = shape_of(plan.task, plan.config.task)
+        space = actions_of(shape)
+        about = plan.world, plan.form.name, space, plan.eps, plan.form.meaning(space), plan.session(shape)
+        self._plan, self._writer = plan, label_files.LabelWriter(folder, *about, written_by=provenance())
+        self.path, self.trouble = self._writer.path, ""
+        self.rows: dict[int, Response] = {}
+        for row in label_files.history(self.path):
+            obs, action = (np.asarray(row[name], np.float32) for name in ("obs", "action"))
+            answer = None if row.get("answer") is None else np.asarray(row["answer"], np.float32)
+            self.rows[row.get("item", -1)] = Response(row["said"], obs, action, answer, row["seconds"])
+        if set(self.rows) != set(range(len(self.rows))):
+            raise UserError(f"{self.path} was not written by the labelling page: give another --out")
+
+    def save(self, number: int, response: Response) -> None:
+        """Write a response to the disk, then use it. Raises UserError if the disk takes no more."""
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        person = {"seconds": round(response.seconds, 3), "who": self._plan.who, "when": now}
+        try:
+            self._writer.append(seed=self._plan.seed, item=number, **{**response._asdict(), **person})
+        except OSError as error:
+            self.trouble = f"this answer is not saved ({error.strerror or error}): make room, then answer again"
+            raise UserError(self.trouble) from error
+        self.trouble = ""
+        self.rows[number] = response
+
+    def in_order(self) -> list[Response]:
+        """Return the responses by the numbers of their items; may be called from any thread."""
+        rows = self.rows.copy()
+        return [rows[number] for number in sorted(rows)]
+
+    def count(self, said: str) -> int:
+        """Return the number of items with this response."""
+        return sum(row.said == said for row in list(self.rows.values()))
+
+    def per_minute(self) -> float | None:
+        """Return the answers a minute over the last questions; None without any."""
+        recent = [row for row in self.in_order() if row.said != UNDONE][-RECENT:]
+        seconds, answered = sum(row.seconds for row in recent), sum(row.said == ANSWERED for row in recent)
+        return 60 * answered / seconds if answered and seconds > 0 else None
+
+    def finish(self) -> Path:
+        """Write the answers as Parquet and return that file. Raises UserError without an answer or on a full disk."""
+        if not self.count(ANSWERED):
+            raise UserError("there is no answer to save yet: answer a question, or stop with Ctrl-C")
+        try:
+            return label_files.finish(self.path.parent)
+        except OSError as error:
+            raise UserError(f"not finished ({error.strerror or error}): make room, then finish again") from error
+
+    def close(self) -> None:
+        """Close the file."""
+        self._writer.close()
 
 
 class Status(NamedTuple):
@@ -60,6 +134,7 @@ class Session:
         if check is not None:
             check(env)
         self.plan, self.record, self.questions = plan, Record(plan, folder), Questions(plan, env)
+        self._learner = self.questions.learner
         # answers are handled one at a time; whoever waits for an item holds no other lock
         self._acting, self._lock = threading.Lock(), threading.RLock()
         self._ahead = ThreadPoolExecutor(1, thread_name_prefix="ahead")  # the only thread that makes items
@@ -69,46 +144,38 @@ class Session:
         self.number = self._furthest = 0  # the current question, and the last one that was shown
         self._replay(tell)
         tell("preparing questions")
-        self._ensure(self.number)
-        self._ensure(self.number + 1)
+        self._prepare(self.number)
+        self._prepare(self.number + 1)
         # whether the task films situations
         self.films = self.questions.film(self._items[self.number], self._items[self.number].action) is not None
-        self._next: Future[None] = self._ahead.submit(self._ensure, self.number + 1)
+        self._next: Future[None] = self._ahead.submit(self._prepare, self.number + 1)
         self._since = time.monotonic()
 
     def _replay(self, tell: Callable[[str], None]) -> None:
         """Replay the file's items, fit a model to its answers, and make the question that comes next."""
-        made, rows = self.questions, self.record.in_order()
-        count = len(rows)
-        if set(self.record.rows) != set(range(count)):
-            raise UserError(
-                f"{self.record.path} lacks items, so the labelling page did not write it: give another --out"
-            )
-        if count:
+        questions, rows = self.questions, self.record.in_order()
+        if count := len(rows):
             tell(f"replaying {count} earlier questions")
-        replayed = lived(made.env, made.keys, [(row.obs, row.action) for row in rows])
-        found = [made.blank.replace(env=state, obs=obs) for state, obs in replayed]
-        if len(found) <= count:
+        situations = list(replay(questions.env, questions.keys, [(row.obs, row.action) for row in rows]))
+        if len(situations) <= count:
             tell("replaying the earlier situations gives other observations with this version: a new episode begins")
-            found = [made.start(jax.random.fold_in(made.keys.start, count))]
+            situations = [begin(questions.env, jax.random.fold_in(questions.keys.start, count))]
         else:
-            self._items = {
-                n: Item(n, guide, row.action) for n, (guide, row) in enumerate(zip(found, rows, strict=False))
-            }
+            pairs = enumerate(zip(situations, rows, strict=False))
+            self._items = {n: Item(n, questions.guide_in(*at), row.action) for n, (at, row) in pairs}
         self.number = min((number for number in self._items if rows[number].said == UNDONE), default=count)
         self._furthest = count
-        made.learner.fit(self._labels())
-        self._items[count] = made.ask(count, found[-1])
+        self._learner.fit(self._labels())
+        self._items[count] = questions.ask(count, questions.guide_in(*situations[-1]))
 
     # --- question ----------------------------------------------------------------------------------------------------
 
-    def _ensure(self, number: int) -> None:
+    def _prepare(self, number: int) -> None:
         """Make an item ready to be shown; the item before it exists already."""
         item = self._items.get(number)
-        made = self.questions
         if item is None:
-            item = made.ask(number, made.after(self._items[number - 1]))
-        self._items[number] = made.draw(item)
+            item = self.questions.ask(number, self.questions.after(self._items[number - 1]))
+        self._items[number] = self.questions.draw(item)
 
     def _show(self, number: int) -> None:
         """Move to an item that is ready, and start preparing the next one."""
@@ -117,19 +184,19 @@ class Session:
             self._furthest = max(self._furthest, number)
             if passed := self._items.get(number - KEPT):
                 self._items[passed.number] = passed._replace(sketch=None, trails=None)
-            self._next = self._ahead.submit(self._ensure, number + 1)
+            self._next = self._ahead.submit(self._prepare, number + 1)
 
     def _renew(self) -> None:
         """Update items for the newest model: remake prepared questions, refine the shown ones again."""
-        coming, seen, made = self._items.get(self._furthest + 1), self._items.get(self.number), self.questions
-        anew = coming and made.refine(made.ask(coming.number, coming.guide)._replace(sketch=coming.sketch))
-        again = seen and made.refine(seen)
+        coming, shown, questions = self._items.get(self._furthest + 1), self._items.get(self.number), self.questions
+        anew = coming and questions.refine(questions.ask(coming.number, coming.guide)._replace(sketch=coming.sketch))
+        again = shown and questions.refine(shown)
         with self._lock:
             if anew and self._furthest < anew.number:
                 self._items[anew.number] = anew
             if again:
                 self._items[again.number] = again
-        self._tell_all()
+        self._notify()
 
     @property
     def item(self) -> Item | None:
@@ -169,22 +236,20 @@ class Session:
         return True
 
     def _save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
-        self.record.save(item.number, Said(said, np.asarray(item.guide.obs), item.action, answer, seconds))
+        self.record.save(item.number, Response(said, np.asarray(item.guide.obs), item.action, answer, seconds))
 
     def _labels(self) -> Label:
         """Return the answers in the order of their items, as a padded `Label`."""
         rows = [(row.obs, row.action, row.answer) for row in self.record.in_order() if row.answer is not None]
-        return self.questions.learner.padded(rows)
+        return self._learner.padded(rows)
 
     def _fit_if_due(self) -> None:
-        if self.questions.learner.fit_later(self._labels, self.record.count(ANSWERED), self._fitted):
-            self._tell_all()
+        if self._learner.fit_later(self._labels, self.record.count(ANSWERED), self._use_fit):
+            self._notify()
 
-    def _fitted(self) -> None:
+    def _use_fit(self) -> None:
         self._ahead.submit(self._renew)
         self._fit_if_due()
-
-    # --- undo --------------------------------------------------------------------------------------------------------
 
     def undo(self, number: int) -> bool:
         """Take back the answer before this question and ask it again.
@@ -197,7 +262,7 @@ class Session:
                 if number != self.number or before is None:
                     return False
                 self._save(before, UNDONE, None, time.monotonic() - self._since)
-            self._ahead.submit(self._ensure, number - 1).result()
+            self._ahead.submit(self._prepare, number - 1).result()
             self._show(number - 1)
             return True
 
@@ -214,10 +279,10 @@ class Session:
 
     def status(self) -> Status:
         """Return the session's progress."""
-        learner, answered, pace = self.questions.learner, self.record.count(ANSWERED), self.record.per_minute()
-        left = (self.plan.labels - answered) / pace if pace else None
+        answered, pace = self.record.count(ANSWERED), self.record.per_minute()
         counts = answered, self.record.count(UNSURE), self.plan.labels
-        return Status(*counts, pace, left, learner.running, learner.newest, self.record.trouble)
+        left = (self.plan.labels - answered) / pace if pace else None
+        return Status(*counts, pace, left, self._learner.running, self._learner.newest, self.record.trouble)
 
     def listen(self, heard: Callable[[], object]) -> Callable[[], None]:
         """Register a function that is called, from any thread, when a fit begins or a new model is in use.
@@ -227,13 +292,13 @@ class Session:
         self._listeners.append(heard)
         return lambda: self._listeners.remove(heard)
 
-    def _tell_all(self) -> None:
+    def _notify(self) -> None:
         for heard in list(self._listeners):
             heard()
 
     def close(self) -> None:
         """Close the file and stop the threads, after any running fit."""
-        self.questions.learner.close()
+        self._learner.close()
         self._ahead.shutdown(wait=True, cancel_futures=True)
         self.record.close()
 

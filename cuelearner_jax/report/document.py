@@ -1,8 +1,7 @@
-"""Write the folder of `cuelearner report`: figures and tables from recorded results.
+"""Write the folder of `cuelearner report`: figures and tables of recorded results. Equal results give equal bytes.
 
-`report.md` has the figures, the table, what is missing, and the provenance. Beside it are `summary.csv` (the table),
-`curves.csv` (the curves' values) and `curves.png/.svg`; for several label budgets also `label_efficiency.png/.svg`. A
-study may add tables and a section (`experiments/label_efficiency.py`). Equal results always give equal bytes.
+`report.md` has the figures, the table, what is missing, and the provenance. Beside it are `summary.csv`, `curves.csv`
+and the figures. A study may add tables and a section (`experiments/label_efficiency.py`).
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import pyarrow as pa
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import extent, tables
-from cuelearner_jax.report.escaping import code, markdown
 from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, save_figure
+from cuelearner_jax.report.tables import code, markdown
 from cuelearner_jax.report.variants import PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
 
@@ -65,9 +64,7 @@ def report(
         overwrite: replaces an existing report.
         command: command line that makes this report, recorded in it.
 
-    Raises:
-        UserError: `out` exists, or the results are missing, damaged, of several tasks, without the metric or the split,
-            contain a seed twice, or have failed lanes only.
+    Raises UserError if `out` exists, or if the results cannot be reported (`read_groups`, `variants_of`).
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)

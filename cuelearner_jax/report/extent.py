@@ -20,9 +20,11 @@ from cuelearner_jax.storage.folders import CONFIG
 
 def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[str]:
     """Return one line for everything planned that the table lacks, or whose plan is unknown."""
-    found = table.group_by("folder").aggregate([("step", "max")])
-    last = dict(zip(*(found[name].to_pylist() for name in ("folder", "step_max")), strict=True))
-    configurations = {folder: _configuration(Path(folder)) for folder in last}
+    ends = table.group_by("folder").aggregate([("step", "max")])
+    last = dict(zip(*(ends[name].to_pylist() for name in ("folder", "step_max")), strict=True))
+    # the config.json of each folder with results; a run's lies above the folders of its kinds of guidance
+    places = {folder: (Path(folder) / CONFIG, Path(folder).parent / CONFIG) for folder in last}
+    configurations = {folder: next((file for file in files if file.exists()), None) for folder, files in places.items()}
     files = {file for folder in folders for file in Path(folder).rglob(CONFIG)} | set(configurations.values())
     plans: dict[Path, dict[str, Any]] = {}
     lines = []
@@ -67,15 +69,10 @@ def _absent(run: Path, grid: dict[str, Any], table: pa.Table) -> list[str]:
     return lines
 
 
-def _configuration(folder: Path) -> Path | None:
-    """Return the config.json of a folder with results; a run's lies above the folders of its kinds of guidance."""
-    files = [folder / CONFIG, folder.parent / CONFIG]
-    return next((file for file in files if file.exists()), None)
-
-
 def shown(groups: Sequence[Group], variants: Sequence[Variant], metric: str, split: str) -> list[str]:
     """Return one line for everything in the results that the figures do not show."""
-    lines, gaps = [], []
+    lines: list[str] = []
+    gaps: list[str] = []
     for group in groups:
         own = [variant for variant in variants if variant.run == group.name]
         left = {(variant.guidance, variant.labels): len(variant.seeds) for variant in own}

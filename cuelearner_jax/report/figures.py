@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from cuelearner_jax.errors import one_line
 from cuelearner_jax.guides import registry
-from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval
 from cuelearner_jax.report.variants import Variant, guidance_name
 

@@ -19,18 +19,15 @@ from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.studies.evaluate import Measured
 
-EPISODES = "episodes"  # what a single policy's interval is computed over
-SEEDS = "seeds"
-
 
 def is_single(row: Measured) -> bool:
     """Whether a row measures one policy, whose interval is over episodes instead of seeds."""
     return len(row.seeds) == 1 or row.is_shared
 
 
-def over(row: Measured) -> str:
-    """Return what a row's intervals are computed over: "episodes" or "seeds"."""
-    return EPISODES if is_single(row) else SEEDS
+def over(*rows: Measured) -> str:
+    """Return what the intervals of rows, or of their difference, are computed over: "episodes" or "seeds"."""
+    return "episodes" if all(map(is_single, rows)) else "seeds"
 
 
 def spread(row: Measured, metric: str) -> Interval | None:
@@ -62,28 +59,21 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
     Two single policies are paired by episode, and rows of equal seeds by seed. A single policy is subtracted from each
     seed of several. Rows of different seeds are resampled independently.
 
-    Raises:
-        UserError: a row has no counterpart.
+    Raises UserError for a row without a counterpart.
     """
-    return [_difference(row, _counterpart(row, others)) for row in rows]
-
-
-def _counterpart(row: Measured, others: Sequence[Measured]) -> Measured:
-    alike = others if len(others) == 1 else [other for other in others if variant(other) == variant(row)]
-    if len(alike) == 1:
-        return alike[0]
-    known, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
-    raise UserError(f"--compare has {len(others)} variants ({known}), but not {wanted}: give a policy of one variant")
-
-
-def _difference(row: Measured, other: Measured) -> Difference:
-    finite = [
-        name
-        for name, values in row.metrics.items()
-        if name in other.metrics and np.isfinite(values).all() and np.isfinite(other.metrics[name]).all()
-    ]
-    over = EPISODES if is_single(row) and is_single(other) else SEEDS
-    return Difference(row, other, over, {name: _less(row, other, name) for name in finite})
+    found = []
+    for row in rows:
+        alike = others if len(others) == 1 else [other for other in others if variant(other) == variant(row)]
+        if len(alike) != 1:
+            known, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
+            raise UserError(
+                f"--compare has {len(others)} variants ({known}), but not {wanted}: give a policy of one variant"
+            )
+        both = row, alike[0]
+        shared = [name for name in row.metrics if name in both[1].metrics]
+        finite = [name for name in shared if all(np.isfinite(one.metrics[name]).all() for one in both)]
+        found.append(Difference(*both, over(*both), {name: _less(*both, name) for name in finite}))
+    return found
 
 
 def _less(row: Measured, other: Measured, name: str) -> Interval:
@@ -97,9 +87,9 @@ def _less(row: Measured, other: Measured, name: str) -> Interval:
     return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(drawn, [0.025, 0.975]))
 
 
-def _plain(found: Sequence[Any] | np.ndarray | None) -> list[float | None] | None:
+def _plain(values: Sequence[Any] | np.ndarray | None) -> list[float | None] | None:
     """Return numbers for JSON, those that are not finite as None."""
-    return None if found is None else [float(value) if math.isfinite(value) else None for value in found]
+    return None if values is None else [float(value) if math.isfinite(value) else None for value in values]
 
 
 def _row(row: Measured) -> dict[str, Any]:
@@ -141,13 +131,13 @@ def write(
         "rows": [_row(row) for row in rows],
     }
     if compared is not None:
-        name, found = compared
-        told = [
+        name, pairs = compared
+        entries = [
             {"of": variant(one.row), "less": _row(one.other), "over": one.over}
             | {"difference": {metric: _plain(value) for metric, value in one.metrics.items()}}
-            for one in found
+            for one in pairs
         ]
-        contents["compared"] = {"with": name, "differences": told}
+        contents["compared"] = {"with": name, "differences": entries}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         file.write(json.dumps(contents, indent=1) + "\n")

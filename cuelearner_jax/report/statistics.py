@@ -44,16 +44,9 @@ class Curve(NamedTuple):
 
 
 def interquartile_mean(values: ArrayLike, axis: int = 0) -> Float[np.ndarray, "*rest"]:
-    """Return the 25% trimmed mean: the mean without the lowest and the highest quarter of the values.
+    """Return the 25% trimmed mean over the seeds on `axis`: of n values, floor(n / 4) are dropped at each end.
 
-    The definition is that of `scipy.stats.trim_mean(values, 0.25)`: of n values, floor(n / 4) are dropped at each end.
     So up to 3 values give the plain mean, 4 to 7 values drop one at each end, and 8 to 11 drop two.
-
-    Args:
-        values: array of any shape; `axis` is the seeds.
-
-    Returns:
-        Array of that shape without `axis`.
     """
     return np.asarray(scipy.stats.trim_mean(np.asarray(values, dtype=float), 0.25, axis=axis))
 
@@ -89,34 +82,16 @@ def interval(values: Float[np.ndarray, "seeds *steps"], resamples: int = RESAMPL
     return Interval(estimate, np.asarray(bounds.low), np.asarray(bounds.high))
 
 
-def drawn(
-    groups: int, members: int, resamples: int = RESAMPLES, seed: int = 0
-) -> tuple[Int[np.ndarray, "draws groups 1"], Int[np.ndarray, "draws groups members"]]:
-    """Return indices of a bootstrap over groups and over each group's members, such as agents with several label seeds.
-
-    The first draw is the original data. Index an array (groups, members, ...) with both results.
-    """
-    random = np.random.default_rng(seed)
-    outer = random.integers(0, groups, (resamples, groups))
-    inner = random.integers(0, members, (resamples, groups, members))
-    outer = np.concatenate([np.arange(groups)[None], outer])
-    own = np.broadcast_to(np.arange(members), (1, groups, members))
-    return outer[..., None], np.concatenate([own, inner])
-
-
 def curve(steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]) -> Curve:
     """Return the interval at each evaluation, see `interval`."""
     return Curve(np.asarray(steps), *interval(values))
 
 
 def stretches_apart(curve_a: Curve, curve_b: Curve) -> list[tuple[int, int]]:
-    """Return the stretches of steps where the interval of `curve_a` lies wholly above that of `curve_b`.
+    """Return where the interval of `curve_a` lies wholly above that of `curve_b`, among the steps that both have.
 
-    Each evaluation is compared by itself. Among many evaluations a few may differ by chance, so a long stretch is
-    stronger evidence than a short one.
-
-    Returns:
-        (first step, last step) of each unbroken stretch of the steps that both curves have; empty if there is none.
+    Each unbroken stretch is (first step, last step). Each evaluation is compared by itself, so a short stretch may be
+    chance.
     """
     steps, a, b = np.intersect1d(curve_a.steps, curve_b.steps, return_indices=True)
     above = curve_a.lower[a] > curve_b.upper[b]  # False where a bound is NaN
@@ -127,10 +102,7 @@ def stretches_apart(curve_a: Curve, curve_b: Curve) -> list[tuple[int, int]]:
 def mean_over_curve(
     steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]
 ) -> Float[np.ndarray, "seeds"]:
-    """Return the mean of each seed's curve over its steps: the area by the trapezoidal rule over the span.
-
-    The mean of a curve with one evaluation is its value.
-    """
+    """Return the mean of each seed's curve over its steps: the area by the trapezoidal rule over the span."""
     span = float(steps[-1] - steps[0])
     area = np.trapezoid(values, np.asarray(steps, dtype=float), axis=-1)
     return area / span if span > 0 else np.asarray(values, dtype=float)[..., 0]
@@ -149,8 +121,7 @@ def resampled(
 ) -> Float[np.ndarray, "resamples *steps"]:
     """Return interquartile means over seeds drawn with replacement, whole curves at a time, as in `interval`.
 
-    This serves statistics of several variants, which are drawn independently, each with its own `seed`. A single seed
-    is drawn repeatedly, so it gives no spread.
+    Several variants are drawn independently, each with its own `seed`. A single seed of a variant gives no spread.
     """
     values = np.asarray(values, dtype=float)
     drawn = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))

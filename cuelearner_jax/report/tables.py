@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import csv
+import html
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from cuelearner_jax.report import escaping
+from cuelearner_jax.errors import one_line
 from cuelearner_jax.report.statistics import steps_to_reach, stretches_apart
 from cuelearner_jax.report.variants import Variant
 
 Row = dict[str, str | int | float]  # of a table
+
+
+def markdown(text: object) -> str:
+    """Escape text for a line or a table cell in Markdown, where tags and bars are active."""
+    return re.sub(r"([\\`|\[\]])", r"\\\1", html.escape(one_line(str(text)), quote=False))
+
+
+def code(text: object) -> str:
+    """Format text as code in Markdown."""
+    return f"`{one_line(str(text)).replace('`', chr(39))}`"
 
 
 def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
@@ -71,16 +83,13 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows({name: escaping.cell(value) for name, value in row.items()} for row in rows)
+        writer.writerows(rows)
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
     """Return the lines of a Markdown table; cells are Markdown already."""
-    return [
-        f"| {' | '.join(header)} |",
-        "|" + "---|" * len(header),
-        *(f"| {' | '.join(map(str, row))} |" for row in rows),
-    ]
+    head, *body = (f"| {' | '.join(map(str, row))} |" for row in (header, *rows))
+    return [head, "|" + "---|" * len(header), *body]
 
 
 def summary_lines(rows: Sequence[Row]) -> list[str]:
@@ -93,9 +102,8 @@ def summary_lines(rows: Sequence[Row]) -> list[str]:
 def _summary_cells(row: Row) -> list[object]:
     reached, failed = row["reaches_unguided_final"], int(row["failed"])
     seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
-    cells: list[object] = [escaping.markdown(row[name]) for name in ("run", "guidance") if name in row]
-    cells += [f"{row['labels']:,}", seeds]
-    cells.append(f"{row['last_step']:,}")
+    cells: list[object] = [markdown(row[name]) for name in ("run", "guidance") if name in row]
+    cells += [f"{row['labels']:,}", seeds, f"{row['last_step']:,}"]
     for key in ("final", "mean"):
         bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""
         cells.append(f"{row[key]:.3f}{bounds}")

@@ -68,20 +68,16 @@ class Group(NamedTuple):
 def read_groups(folders: Sequence[PathLike], metric: str, split: str, by_run: bool) -> list[Group]:
     """Read the results of folders, together or (`by_run`) each folder by itself under its name.
 
-    Raises:
-        UserError: results are missing, damaged, of several tasks, without the metric or the split, or have failed lanes
-            only; or two folders that are to be reported separately have one name.
+    Raises UserError if results are missing, damaged, of several tasks, without the metric or the split, or have failed
+    lanes only; or if two folders that are to be reported separately have one name.
     """
     named = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
     if by_run and len(named) < len(folders):
         raise UserError("--by-run: several folders have the same name: give them different names")
     groups = []
     for name, own in named.items():
-        guides, column = results.read_guides(own), f"guide_{metric}"
-        if guides is not None and column in guides.column_names:
-            guides = guides.filter((pc.field("split") == split) & pc.field(column).is_valid())
-        else:
-            guides = None
+        guides = results.read_guides(own)
+        guides = None if guides is None else guides.filter(pc.field("split") == split)
         groups.append(Group(name, *_select(results.read(own), metric, split), guides))
     tasks = sorted({group.table["task"][0].as_py() for group in groups})
     if len(tasks) > 1:
@@ -97,9 +93,8 @@ def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Tabl
     if split not in splits:
         raise UserError(f"no {split} rows in the results: there are {', '.join(splits)} rows")
     rows = table.filter(pc.field("split") == split)
-    marked = results.failures(rows)
-    lanes = zip(*(rows[name].to_pylist() for name in results.LANE), strict=True) if marked else ()
-    of_failed = np.array([lane in marked for lane in lanes] or [False] * rows.num_rows, bool)
+    marked, lanes = results.failures(rows), zip(*(rows[name].to_pylist() for name in results.LANE), strict=True)
+    of_failed = np.array([lane in marked for lane in lanes], bool)
     rows, failed = rows.filter(pa.array(~of_failed)), rows.filter(pa.array(of_failed))
     if failed.num_rows and not rows.num_rows:
         raise UserError(f"nothing to report, {failures.summary(failed)}: train again with other settings")
@@ -112,8 +107,7 @@ def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Tabl
 def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
     """Return the variants in the legend's order: for each group unguided first, then by guidance and label budget.
 
-    Raises:
-        UserError: a seed occurs twice, or the seeds of a variant have no step in common.
+    Raises UserError if a seed occurs twice, or the seeds of a variant have no step in common.
     """
     found = []
     for group in groups:

@@ -109,7 +109,7 @@ def asked_for(monkeypatch, *arguments):
 
     def served(server, plan, asked, port, stopping, commands):
         found.extend([asked, plan, commands])
-        return server.Ending(asked.out, 40, 0, 50, commands.following(40), commands.again)
+        return server.Ending("40 of 50 labels are saved", commands.following(40), commands.again)
 
     monkeypatch.setattr(label, "_served", served)
     assert main(["label", *arguments]) == 0

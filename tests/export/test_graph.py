@@ -9,10 +9,9 @@ import onnxruntime
 import pytest
 from jax import lax
 
-from cuelearner_jax.export import onnx_graph, rules, runner
-from cuelearner_jax.export.graph import trace
+from cuelearner_jax.export import decisions, onnx_graph, runner
 
-assert rules.RULES  # importing `rules` registers them
+trace = decisions.trace
 SIZE = 12
 TABLE = np.arange(60.0, dtype=np.float32).reshape(3, 4, 5)
 MATRICES = np.random.default_rng(1).normal(size=(4, 3, 2)).astype(np.float32)
@@ -50,14 +49,13 @@ FUNCTIONS = {
     "loop": looped,
     "scan": scanned,
     "layer": lambda o: jax.nn.relu(o + ALONG[:, 0]) @ ALONG,
-    "rough": lambda o: (o.astype(jnp.bfloat16) * jnp.bfloat16(1.7) + jnp.bfloat16(0.3)).astype(jnp.float32),
     "known": lambda o: o + jax.random.normal(jax.random.key(3), (SIZE,)),
 }
 
 
 def decided(traced, drawn, size):
     """The actions of a graph in NumPy, and in ONNX."""
-    graph = json.loads(json.dumps(traced.graph.as_json()))
+    graph = json.loads(json.dumps(traced.graph._asdict()))
     run, found = runner.compile_ops(graph["ops"]), []
     for obs in drawn:
         values = {**traced.constants, "obs": obs}
@@ -85,23 +83,8 @@ def test_numpy_and_onnx_say_what_jax_says(name):
 
 
 NUMBERS = [0, -0.0, 1, -1, 0.5, -0.5, 1.5, 2.5, -2.5, 3, 7, -7, 0.3, -0.9999, 1e-10, -1e-10, 1e-30, 2.4e-38, 20, -20]
-NUMBERS += [
-    100,
-    -100,
-    1e4,
-    46341,
-    65537,
-    1e10,
-    -1e10,
-    3e38,
-    -3e38,
-    2147483520,
-    2.0**31,
-    -(2.0**31),
-    -2147483904,
-    2.0**32,
-]
-NUMBERS = np.array([*NUMBERS, np.inf, -np.inf, np.nan], np.float32)
+NUMBERS += [100, -100, 1e4, 46341, 65537, 1e10, -1e10, 3e38, -3e38, 2147483520, 2.0**31, -(2.0**31), -2147483904]
+NUMBERS = np.array([*NUMBERS, 2.0**32, np.inf, -np.inf, np.nan], np.float32)
 ROWS = np.random.default_rng(4).integers(len(NUMBERS), size=(200, 5))
 KINDS = {"float32": lambda x: x, "int32": lambda x: x.astype(jnp.int32), "bool": lambda x: x > 0.7}
 COMPARED = {name: getattr(lax, name) for name in ("eq", "ne", "lt", "le", "gt", "ge")}
@@ -113,8 +96,7 @@ SINGLE = {
         **{name: getattr(lax, name) for name in ("sin", "cos", "tan", "tanh", "atan", "sqrt", "rsqrt", "square")},
         **{name: getattr(lax, name) for name in ("logistic", "is_finite")},
         **{f"integer_pow {y}": lambda x, y=y: lax.integer_pow(x, y) for y in (-2, 0, 1, 2, 3, 5)},
-        **{name: lambda x, to=name: x.astype(to) for name in ("int32", "bool", "bfloat16")},
-        "bfloat16 to int32": lambda x: x.astype(jnp.bfloat16).astype(jnp.int32),
+        **{name: lambda x, to=name: x.astype(to) for name in ("int32", "bool")},
         "round": jnp.round,
         "log of sigmoid": lambda x: jnp.log(jax.nn.sigmoid(x)),
         "clip": lambda x: jnp.clip(x, -1, 2),
@@ -122,10 +104,10 @@ SINGLE = {
     "int32": {
         **{name: getattr(lax, name) for name in ("neg", "abs", "sign", "square")},
         **{f"integer_pow {y}": lambda x, y=y: lax.integer_pow(x, y) for y in (0, 1, 2, 3, 7)},
-        **{f"div {y}": lambda x, y=y: lax.div(x, y) for y in (-3, -1, 0, 2)},
-        **{f"rem {y}": lambda x, y=y: lax.rem(x, y) for y in (-3, -1, 0, 2)},
+        **{f"div {y}": lambda x, y=y: lax.div(x, y) for y in (-3, 2)},
+        **{f"rem {y}": lambda x, y=y: lax.rem(x, y) for y in (-3, 2)},
         **{f"floor_divide {y}": lambda x, y=y: x // y for y in (-3, 2)},
-        **{name: lambda x, to=name: x.astype(to) for name in ("float32", "bool", "bfloat16")},
+        **{name: lambda x, to=name: x.astype(to) for name in ("float32", "bool")},
         "clip": lambda x: jnp.clip(x, -5, 2**31 - 2),
     },
     "bool": {"not": lax.bitwise_not, **{name: lambda x, to=name: x.astype(to) for name in ("float32", "int32")}},
@@ -136,8 +118,7 @@ PAIRED = {
         "pow": lambda x, y: lax.pow(jnp.where(jnp.isinf(x), 2.0, x), y),  # of -inf, NumPy's is not IEEE's
         "mod": jnp.mod,
     },
-    "int32": {name: getattr(lax, name) for name in ("add", "sub", "mul", "div", "rem", "max", "min")}
-    | {"mod": jnp.mod},
+    "int32": {name: getattr(lax, name) for name in ("add", "sub", "mul", "max", "min")},
     "bool": {f"bitwise {n}": getattr(lax, f"bitwise_{n}") for n in ("and", "or", "xor")}
     | {"max": lax.max, "min": lax.min},
 }
@@ -153,15 +134,10 @@ OF_ROWS = {  # of five numbers, and the first of them as an index
     "padded": lambda x: jnp.pad(x, 1),
     "barrier": lambda x: jnp.stack(lax.optimization_barrier((x, x[::-1]))),
 }
-SMALL = {"sum": jnp.sum, "cumsum": jnp.cumsum, "product": lambda x: x[:4].reshape(2, 2) @ x[1:].reshape(2, 2)}
+SMALL = {"sum": jnp.sum, "product": lambda x: x[:4].reshape(2, 2) @ x[1:].reshape(2, 2)}
 REDUCED = {
-    "float32": {
-        **OF_ROWS,
-        "top_k": lambda x: jnp.concatenate([(found := lax.top_k(x, 3))[0], found[1].astype(jnp.float32)]),
-        **{name: lambda x, of=of: of(jnp.round(jnp.clip(x, -9, 9))) for name, of in SMALL.items()},  # exact
-        "prod": lambda x: jnp.prod(jnp.where(jnp.abs(x) > 1e-3, jnp.clip(x, -9, 9), 1)),
-    },
-    "int32": {**OF_ROWS, **SMALL, "top_k": lambda x: jnp.concatenate(lax.top_k(x, 3))},
+    "float32": {**OF_ROWS, **{name: lambda x, of=of: of(jnp.round(jnp.clip(x, -9, 9))) for name, of in SMALL.items()}},
+    "int32": {**OF_ROWS, **SMALL},
     "bool": OF_ROWS | {"sum": jnp.sum},
 }
 
@@ -188,17 +164,15 @@ def test_every_primitive_does_with_extreme_numbers_what_xla_does(kind):
         assert not wrong.any(), (sorted(set(names[wrong])), actions[0][wrong][:5], wanted[wrong][:5])
 
 
+DIVISION = "a division of integers by 0, by -1, or by what depends on the observation"
 REFUSED = {
     "bitwise and": (lax.bitwise_and, "bitwise logic of integers"),
     "all bits": (lambda x, y: lax.reduce_and(x, (0,)), "bitwise logic of integers"),
-    "prod": (lambda x, y: jnp.prod(x), "a product of integers along an axis"),
+    "division": (lax.div, DIVISION),
+    "remainder": (lambda x, y: lax.rem(x, -1), DIVISION),
     "pow": (lambda x, y: lax.pow(jnp.float32(2) + 0.0 * x, y), "powers with an integer base or exponent"),
-    "top_k": (lambda x, y: lax.top_k(x > y, 1)[0], "the largest of booleans, or along another axis than the last"),
     "product": (lambda x, y: (x > 0) @ (y > 0), "products of booleans or of different types"),
-    **{
-        name: (lambda x, y, to=name: (x.astype(to) + 1).astype(jnp.float32), f"numbers of type {name}")
-        for name in ("uint8", "float16")
-    },
+    "bfloat16": (lambda x, y: (x.astype(jnp.bfloat16) + 1).astype(jnp.float32), "numbers of type bfloat16"),
     "uint8 table": (lambda x, y: jnp.arange(9, dtype=jnp.uint8)[x].astype(jnp.float32), "numbers of type uint8"),
 }
 
@@ -211,8 +185,8 @@ def test_what_a_graph_would_do_otherwise_is_refused(name):
 
 
 def test_what_no_rule_says_is_named_and_only_if_it_is_needed():
-    traced = trace(lambda key, obs: jnp.sort(obs) + lax.cumsum(obs, reverse=True), SIZE)
-    assert traced.missing == ("a cumulative sum from the end", "sort")
+    traced = trace(lambda key, obs: jnp.sort(obs) + jnp.cumsum(obs), SIZE)
+    assert traced.missing == ("cumsum", "sort")
     traced = trace(lambda key, obs: obs + 0 * jnp.sort(obs).shape[0], SIZE)
     assert traced.missing == ()
 

@@ -25,8 +25,8 @@ LINE = re.compile(r"action: turn: (\S+) \[(\S+), (\S+)\] degrees")
 
 def estimate(status):
     """Mean, lower and upper end of what the page tells."""
-    found = LINE.match(status.newest.told[0])
-    assert found, status.newest.told
+    found = LINE.match(status.newest.lines[0])
+    assert found, status.newest.lines
     return [float(number) for number in found.groups()]
 
 
@@ -40,7 +40,7 @@ def test_the_estimate_narrows_the_page_shows_it_and_the_policy_follows(opened):
         await user.should_see("the corrected policy")
 
     session = opened(**SETTINGS)
-    assert session.status().newest.told == ()
+    assert session.status().newest.lines == ()
     ends = []
     for number in (1, 2):
         give(session, 10, EPS_DEG)
@@ -68,9 +68,9 @@ def test_an_answer_taken_back_is_forgotten_and_a_policy_that_is_right_is_told_to
     assert status.newest.labels == 20
     answers = [answer for _, _, answer in session.questions.learner._rows]
     np.testing.assert_array_equal(answers, np.asarray(session._labels().answer)[:20])
-    assert status.newest.told == ("The answers ask for no change.",)
+    assert status.newest.lines == ("The answers ask for no change.",)
     item = session.item
     session.close()
     again = opened(**{**SETTINGS, "base": right})  # a restart goes on
     np.testing.assert_allclose(again.item.guide.obs, item.guide.obs, atol=1e-6)
-    assert (again.number, again.status().newest.labels, again.status().newest.told) == (20, 20, status.newest.told)
+    assert (again.number, again.status().newest.labels, again.status().newest.lines) == (20, 20, status.newest.lines)

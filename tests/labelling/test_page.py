@@ -133,36 +133,35 @@ def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
 def test_every_page_ends_where_it_says_what_was_saved(opened, tmp_path):
     session, stopping = opened(), threading.Event()
     commands = Commands("cuelearner label mine", lambda labels: f"cuelearner train <{labels}>")
-    pages = set()
-    last = server._Last(pages, stopping, commands)
-    last.session = session
+    site = server.Site(commands, stopping)
+    site.session = session
     app = FastAPI()
-    last.route(app)
+    app.add_route(server.FINISHED, site.last_page)
 
     async def seen(kind, address):
         async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://page") as client:
             return await client.request(kind, address)
 
     async def acts(user, its_pages):
-        pages.update(its_pages)
+        site.pages.update(its_pages)
         (page,) = its_pages
         with pytest.raises(UserError, match="no answer to save yet"):
-            await last.finish()
+            await site.finish()
         for number in range(2):
             await press(user, "+1", lambda number=number: session.number == number + 1)
-        assert (await seen("GET", server.ADDRESS)).status_code == 404
+        assert (await seen("GET", server.FINISHED)).status_code == 404
         with told_browser(user) as told_it:
             await page._end()
-        assert told_it == [f'location.replace("{server.ADDRESS}")']
+        assert told_it == [f'location.replace("{server.FINISHED}")']
         assert not stopping.is_set()  # until a browser has shown it
-        text = (await seen("GET", server.ADDRESS)).text
+        text = (await seen("GET", server.FINISHED)).text
         place = str(tmp_path / "labels" / label_files.PARQUET)
         for words in (f"2 of 20 labels are saved, in {place}", "cuelearner train &lt;2&gt;", "cuelearner label mine"):
             assert words in text
         assert stopping.is_set()
 
-    shown(session, acts, last.finish)
-    assert last.told.labels == len(label_files.read(tmp_path / "labels").people.item) == 2
+    shown(session, acts, site.finish)
+    assert len(label_files.read(tmp_path / "labels").people.item) == 2
 
 
 WAYS = ("left", "right")

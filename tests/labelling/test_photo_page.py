@@ -1,6 +1,5 @@
 """The page on a folder of pictures: arrows of cues, one cue a press, what is refused, and a script that answers."""
 
-import asyncio
 import re
 
 import numpy as np
@@ -9,16 +8,12 @@ import recorded_situations as recorded
 from page_answers import labelled
 
 pytest.importorskip("nicegui")
-from page_user import press, shown
 
 from cuelearner_jax.cli import label
-from cuelearner_jax.cli.options import look_ahead
-from cuelearner_jax.cli.sources import recorded_or_task, with_cues
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.labelling import controls, pointing, view
+from cuelearner_jax.labelling import controls, view
 from cuelearner_jax.labelling.questions import Item
-from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.spaces import UNSAID, Box, cues_from
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import fetch_layout
@@ -76,8 +71,8 @@ def test_cues_are_arrows_where_their_words_point_with_keys_and_words():
     assert {name[:5] for name in arrows(drawn(box(CUES), one_cue=True))} == {"only-"}
     assert arrows(drawn(box("higher,lower"))) == {"+1": (90, "H", "higher"), "-1": (-90, "L", "lower")}
     assert arrows(drawn(box("right,left")))["+1"][0] == 0  # more may be to the right
-    assert pointing.by_words(cues_from("left,up")[0]) is None
-    assert pointing.by_words(cues_from("more to the left,less")[0]) == (-1.0, 0.0)
+    assert view.by_words(cues_from("left,up")[0]) is None
+    assert view.by_words(cues_from("more to the left,less")[0]) == (-1.0, 0.0)
 
 
 def test_arrows_stay_in_the_picture_and_two_that_point_alike_lie_apart():
@@ -130,40 +125,19 @@ def test_one_press_about_one_cue_says_nothing_of_the_others():
 
 @pytest.mark.long
 def test_one_cue_a_press_on_a_folder_of_pictures(folder, tmp_path):
-    arguments = [str(folder), "--cues", CUES, *BOUNDS]
-    task = recorded_or_task(look_ahead(arguments))
-    config = task.presets["paper"].config
-    asked = label.Label(
-        task=task.plain(),
-        sizes=label._part(label.GuideSizes, label.by_model.SIZES),
-        scalars=label._part(label.GuideScalars, config.scalars),
-        out=tmp_path / "labels",
-        guidance="relative",
-        labels=10,
-        questions="proposed",
-        one_cue=True,
-    )
-    plan = label.make_plan(task, config, asked)
-    with Session(plan, tmp_path / "labels") as session:
+    seen = []
 
-        async def acts(user, pages):
-            (page,) = pages
-            await user.should_see("sideways")
-            assert "film" not in page.controls  # plain pictures have none
-            assert 'class="photo" href="data:image/png;base64,' in page._scene.content
-            first = np.asarray(session.item.guide.obs)
-            row = np.flatnonzero((recorded.arrays()[0] == first).all(-1))
-            np.testing.assert_allclose(session.item.action, recorded.arrays()[1][row[0]], atol=1e-6)
-            await press(user, "only-2-more", lambda: session.number == 1)
-            await press(user, "rest", lambda: session.number == 2)
-            await press(user, "unsure", lambda: session.number == 3)
-            await press(user, "undo", lambda: session.number == 2)
-            await press(user, "only-0-less", lambda: session.number == 3)
-            await asyncio.sleep(0.05)
-            await user.should_see("3 of 10")
+    def ask(obs, action, page):
+        seen.append((np.asarray(obs), action, page._scene.content, "film" in page.controls))
+        return [np.array([UNSAID, UNSAID, 1.0]), np.zeros(3), np.array([-1.0, UNSAID, UNSAID])][len(seen) - 1]
 
-        shown(session, acts)
-    file = label_files.read(tmp_path / "labels")
+    command = [folder, "--cues", CUES, *BOUNDS, *SMALL, "--guidance", "relative", "--one-cue", "--labels", "3"]
+    file = label_files.read(labelled([*command, "--out", tmp_path / "labels"], ask))
+    for obs, action, svg, films in seen:
+        row = np.flatnonzero((recorded.arrays()[0] == obs).all(-1))
+        np.testing.assert_allclose(action, recorded.arrays()[1][row[0]], atol=1e-6)
+        assert 'class="photo" href="data:image/png;base64,' in svg
+        assert not films  # plain pictures have none
     np.testing.assert_array_equal(file.labels.answer, [[UNSAID, UNSAID, 1.0], [0.0, 0.0, 0.0], [-1.0, UNSAID, UNSAID]])
     assert [cue.words for cue in file.space.cues] == [("left", "right"), ("up", "down"), ("open", "close")]
     assert file.session["base"] == "proposed"
@@ -210,23 +184,3 @@ def test_the_page_shows_what_gymnasium_renders_and_films_where_an_action_leads(t
     photos = [re.search(r'class="photo" href="([^"]+)"', svg)[1] for svg in seen]
     assert len(set(photos)) == len(photos)  # a picture of each step
     assert arrows(seen[0]) == {"+1": (0, "→", "right"), "-1": (180, "←", "left")}
-
-
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
-        (["--cues", "left,right;up,down"], "2 pairs of words for 3 entries"),
-        (["--cues", "left;right"], "two words for each entry"),
-        ([*BOUNDS[:4]], "low is given alone"),
-        (["--task.low", "a", "b"], "--task.low: invalid float value: 'a'"),
-    ],
-)
-def test_what_does_not_fit_a_folder_is_told_in_one_line(folder, given, told):
-    with pytest.raises(UserError, match=re.escape(told)):
-        recorded_or_task(look_ahead([str(folder), *given]))
-
-
-def test_a_task_with_cues_of_its_own_takes_no_others():
-    task = recorded_or_task(look_ahead(["navigation"]))
-    with pytest.raises(UserError, match="navigation has its own: leave it out"):
-        with_cues(task, task.plain(), "left,right")

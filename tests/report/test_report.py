@@ -179,14 +179,14 @@ def test_seeds_budgets_and_pieces_of_the_plan_without_results_are_named(runs, tm
 
 
 def test_names_are_only_names_in_markdown_csv_and_figures(tmp_path):
-    name = "=cmd()|<script>alert(1)</script>`\n| relative | 9,000 | 8 |"
+    name = "mine|<script>alert(1)</script>`\n| relative | 9,000 | 8 |"
     write(tmp_path / "runs" / "a", name, -0.5, 100, steps=STEPS[:-1], task=name, command=name, versions=name)
     text = report(tmp_path / "runs", tmp_path / "out", command="cuelearner report 'a`b'").read_text()
     assert "\n| relative" not in text
-    (row,) = [line for line in text.splitlines() if line.startswith("| =cmd")]
+    (row,) = [line for line in text.splitlines() if line.startswith("| mine")]
     assert len(re.findall(r"(?<!\\)\|", row)) == 11
     assert "<script" not in row
-    assert list(summary(tmp_path / "out")) == [(f"'{name}", 100)]
+    assert list(summary(tmp_path / "out")) == [(name, 100)]
     for path in (tmp_path / "out").glob("*.svg"):
         ElementTree.parse(path)
 
@@ -238,19 +238,15 @@ def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path)
     assert crosses == 3 + 1  # one for each lane that a curve lacks, and the legend's
 
 
-def test_nothing_but_failed_lanes_is_refused(tmp_path):
-    lose(tmp_path / "a", "none", by=0)
-    with pytest.raises(UserError, match=r"3 of 3 lanes failed, no longer finite \(none: seeds 0 \(by step 0\)"):
-        report(tmp_path / "a", tmp_path / "report")
-    assert not (tmp_path / "report").exists()
-
-
 def test_errors_are_clear_and_leave_no_folder(runs, tmp_path):
     out = tmp_path / "report"
     with pytest.raises(UserError, match="there are reward"):
         report(runs, out, "success")
     with pytest.raises(UserError, match="there are validation rows"):
         report(runs, out, split="training")
+    lose(runs / "lost", "none", by=0)
+    with pytest.raises(UserError, match=r"3 of 3 lanes failed, no longer finite \(none: seeds 0 \(by step 0\)"):
+        report(runs / "lost", out)
     write(runs / "again", "relative", 0.3, 100, seeds=[5])
     with pytest.raises(UserError, match=r"seed 5 of relative guidance with 100 labels occurs twice, in .*again and"):
         report(runs, out)
