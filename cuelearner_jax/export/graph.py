@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from cuelearner_jax.tracing import written_out
+from cuelearner_jax.devices import written_out
 
 KINDS = {"float32": "float32", "int32": "int32", "bool": "bool", "bfloat16": "float32"}
 

@@ -29,8 +29,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.config import GuideScalars
-from cuelearner_jax.config.parts import POSITIVE, part
+from cuelearner_jax.config import POSITIVE, GuideScalars, part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.demonstration import Demonstration
