@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from functools import partial
 from itertools import compress
 from pathlib import Path
@@ -27,6 +28,9 @@ NUMERICS = {
     "enable_x64": False,
     "debug_nans": False,
 }
+
+
+_written_out = ContextVar("written out", default=False)
 
 
 @contextmanager
@@ -57,6 +61,24 @@ class Portions(NamedTuple):
     agents: int  # agents evaluated side by side
     states: int  # situations in one call of a teacher
     passes: int  # of refinement between two looks whether all actions are done
+
+
+@contextmanager
+def written_out() -> Iterator[None]:
+    """Trace without loops over data: for exporters, whose formats have none."""
+    token = _written_out.set(True)
+    try:
+        yield
+    finally:
+        _written_out.reset(token)
+
+
+def goes_through() -> bool:
+    """Return whether a minimum over few data for many places is best taken datum by datum.
+
+    On a CPU: all places are then worked on side by side in vector registers, which XLA's reductions leave unused.
+    """
+    return jax.default_backend() == "cpu" and not _written_out.get()
 
 
 def release_programs(share: float = 0.5, process: Path = Path("/proc/self"), system: Path = Path("/proc/sys")) -> bool:
@@ -122,23 +144,16 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
         full = [leaf.size > 0 for leaf in leaves]
 
         def share(*entered: jax.Array) -> Any:
-            entering = iter(entered)
-            return function(
-                *jax.tree.unflatten(
-                    structure,
-                    [
-                        next(entering) if there else empty(leaf, spec)
-                        for leaf, spec, there in zip(leaves, specs, full, strict=True)
-                    ],
-                )
-            )
+            rest = iter(entered)
+            own = [next(rest) if there else empty(*one) for there, *one in zip(full, leaves, specs, strict=True)]
+            return function(*jax.tree.unflatten(structure, own))
 
         def empty(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
-            rows = leaf.shape[0] // (mesh.size if spec == BY_LANE else 1)
+            rows = len(leaf) // (mesh.size if spec == BY_LANE else 1)
             return jnp.zeros((rows, *leaf.shape[1:]), leaf.dtype)
 
-        taken = tuple(compress(specs, full))
-        mapped = jax.shard_map(share, mesh=mesh, in_specs=taken, out_specs=gives, check_vma=False)
+        entering = tuple(compress(specs, full))
+        mapped = jax.shard_map(share, mesh=mesh, in_specs=entering, out_specs=gives, check_vma=False)
         return mapped(*compress(leaves, full))
 
     return whole
@@ -187,7 +202,7 @@ def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Calla
 
 
 def _lanes(blocks: Any) -> int:
-    return jax.tree.leaves(blocks)[0].shape[0]
+    return len(jax.tree.leaves(blocks)[0])
 
 
 def _lane(blocks: Any, index: Any) -> Any:

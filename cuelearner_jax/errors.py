@@ -2,31 +2,21 @@
 
 import difflib
 import errno
+import re
 import reprlib
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from typing import Any
 
-# Refusals of the file system that no check beforehand can rule out.
-FILE_SYSTEM = (
-    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),
-    *(errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.EBUSY, errno.ENOTEMPTY, errno.EEXIST),
-)
 MOST_LISTED = 20  # numbers that a message names
 
 
 def one_line(text: str) -> str:
     """Return the text with every unprintable character escaped, for instance a newline as `\\n`."""
-    return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
-        for character in text
-    )
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in text)
 
 
 class UserError(Exception):
-    """Bad input. The message is one clear line that says what is wrong and what to do.
-
-    The command line prints the message alone, without a traceback, and exits with status 2.
-    """
+    """Bad input: one line that says what is wrong and what to do, for exit status 2 without a traceback."""
 
     def __init__(self, message: object = "") -> None:
         """Store the message on one line, without escape sequences that a path or a name in it may hold."""
@@ -38,24 +28,9 @@ class UserCodeError(UserError):
 
 
 class NotFinite(Exception):
-    """A result stopped being finite. The message is one line that says which result, and what was kept.
+    """A result stopped being finite: one line that says which result, and what was saved."""
 
-    The command line prints the message and exits with `status`.
-    """
-
-    status = 1
-
-
-def mentions(error: BaseException | None, numbers: Collection[int | None], *words: str) -> bool:
-    """Return whether an exception, or one of its causes, has one of these error numbers or contains one of these words.
-
-    TensorStore reports the system's errors in words only.
-    """
-    while error is not None:
-        if (isinstance(error, OSError) and error.errno in numbers) or any(text in str(error) for text in words):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+    status = 1  # exit status of the command
 
 
 def machine_message(error: BaseException, resumes: bool) -> str | None:
@@ -63,13 +38,21 @@ def machine_message(error: BaseException, resumes: bool) -> str | None:
 
     `resumes`: whether the command can resume from what it saved.
     """
-    words = ("No space left on device", "Disk quota exceeded", "File too large")
-    if mentions(error, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), *words):
+    causes = [error]
+    while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
+        causes.append(cause)
+    numbers, words = {getattr(one, "errno", None) for one in causes}, " ".join(map(str, causes))
+    full = re.search("No space left on device|Disk quota exceeded|File too large", words)  # TensorStore has words only
+    if full or numbers & {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
         again = "go on with the same command and --resume" if resumes else "give the same command again"
         return f"the disk is full: free some, then {again}"
-    if isinstance(error, OSError) and error.filename is not None and error.errno in FILE_SYSTEM:
+    if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}; what was saved before is safe"
-    if mentions(error, (errno.ENOMEM,), "RESOURCE_EXHAUSTED", "Out of memory") or isinstance(error, MemoryError):
+    if (
+        isinstance(error, MemoryError)
+        or errno.ENOMEM in numbers
+        or re.search("RESOURCE_EXHAUSTED|Out of memory", words)
+    ):
         why = (str(error).splitlines() or [""])[0][:200]
         return f"not enough memory ({why}): lower the sizes that were given, or the number of seeds at once"
     return None
@@ -103,8 +86,7 @@ def format_numbers(numbers: Iterable[float]) -> str:
 
 def suggestion(word: str, known: Iterable[str]) -> str:
     """Return the end of a message about an unknown word: the probably intended word, or all known words."""
-    known = list(known)
-    return near(word, known) or f": choose one of {', '.join(known)}"
+    return near(word, known := list(known)) or f": choose one of {', '.join(known)}"
 
 
 def near(word: str, known: Iterable[str]) -> str:

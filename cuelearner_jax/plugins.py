@@ -16,15 +16,10 @@ T = TypeVar("T")
 
 
 def load(reference: str, kind: type[T], called: str) -> T:
-    """Return the object that a reference names; modules of the current folder can be named too.
+    """Return the object that `package.module:NAME` leads to; modules of the current folder can be named too.
 
-    Args:
-        reference: `package.module:NAME`.
-        kind: class that the object must be an instance of.
-        called: name of such an object in messages, for instance "a task".
-
-    Raises:
-        UserError: no such module or name, the module does not import, or the object is something else.
+    `kind`: class of the object. `called`: such an object in messages, as "a task". Raises UserError if there is none,
+    UserCodeError if the module fails to import.
     """
     if not REFERENCE.fullmatch(reference):
         raise UserError(f"{reference!r} does not name {called}: give package.module:NAME, for instance my_code:MINE")
@@ -37,19 +32,17 @@ def load(reference: str, kind: type[T], called: str) -> T:
     except (Exception, SystemExit) as error:  # whatever the module's own code raises
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing and f"{module_name}.".startswith(f"{missing}."):
-            raise UserError(
-                f"no module {missing!r} for {reference}: run in the folder that holds it, or install it"
-            ) from error
+            where = "run in the folder that holds it, or install it"
+            raise UserError(f"no module {missing!r} for {reference}: {where}") from error
         why = (str(error).strip().splitlines() or [""])[0][:200]
         raise UserCodeError(f"{module_name} fails to import ({type(error).__name__}: {why}): mend it first") from error
     if not hasattr(module, name):
-        there = [other for other, value in vars(module).items() if isinstance(value, kind)]
-        raise UserError(f"{module_name} has no {name!r}{suggestion(name, there) if there else f', nor {called}'}")
-    found = getattr(module, name)
-    if not isinstance(found, kind):
+        fitting = [other for other, value in vars(module).items() if isinstance(value, kind)]
+        raise UserError(f"{module_name} has no {name!r}{suggestion(name, fitting) if fitting else f', nor {called}'}")
+    if not isinstance(value := getattr(module, name), kind):
         wanted = f"{called} is a {kind.__module__}.{kind.__name__}"
-        raise UserError(f"{reference} is of type {type(found).__name__}: {wanted}")
-    return found
+        raise UserError(f"{reference} is of type {type(value).__name__}: {wanted}")
+    return value
 
 
 # The parts that a user may bring, by their sort: the function that the class of such a part must have

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from cuelearner_jax import config as configuration
@@ -62,10 +63,7 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
         return self.agent.make(self.sizes.frame, spaces_of(env))
 
     def guide_in(self, env: Any, kind: str) -> Guide:
-        """Return the guide of a kind for an environment.
-
-        Raises UserError as `guides.registry.make`, and for sizes that do not suit the guide's answers or the space.
-        """
+        """Return the guide of a kind for an environment. Raises UserError for options that do not suit either."""
         guide, space = guidances.make(kind, self.sizes, env, self.options_of(kind)), spaces_of(env).actions
         if self.sizes.ask_from == "middle" and not isinstance(space, Box):
             raise UserError(f"sizes.ask_from is middle, but only a box has one, not {space.name}: leave it out")
@@ -77,9 +75,7 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
         return guide
 
     def options_of(self, kind: str) -> Any:
-        """Return the options of a kind of guidance; None: its defaults.
-
-        Plain values are the options of a kind from outside that is not known here.
+        """Return the options of a kind of guidance: None for its defaults, plain values for an unknown kind's.
 
         Raises UserError for options of another kind.
         """
@@ -112,13 +108,15 @@ def check(config: RunConfig) -> None:
     config.agent.check(sizes, config.bootstraps)
     if config.scalars.discount >= 1:
         raise UserError(f"scalars.discount is {config.scalars.discount}: give a number below 1")
-    check_multiple(config.agent.replay_capacity, sizes.num_envs, "agent.replay_capacity", "sizes.num_envs")
-    check_multiple(schedule.eval_every, sizes.num_envs, "schedule.eval_every", "sizes.num_envs")
-    check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
-    check_multiple(schedule.checkpoint_every, schedule.eval_every, "schedule.checkpoint_every", "schedule.eval_every")
-    check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
-    unit = sizes.labels_per_round
-    check_multiple(schedule.guide_eval_every, unit, "schedule.guide_eval_every", "sizes.labels_per_round")
+    for name, unit in (
+        ("agent.replay_capacity", "sizes.num_envs"),
+        ("schedule.eval_every", "sizes.num_envs"),
+        ("schedule.total_steps", "schedule.eval_every"),
+        ("schedule.checkpoint_every", "schedule.eval_every"),
+        ("schedule.eval_steps", "schedule.eval_envs"),
+        ("schedule.guide_eval_every", "sizes.labels_per_round"),
+    ):
+        check_multiple(attrgetter(name)(config), attrgetter(unit)(config), name, unit)
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:

@@ -27,9 +27,9 @@ class Interrupted(Exception):
 
 
 class _Work(threading.Event):
-    """Work that the first signal asks to stop; it keeps the signal's number."""
+    """Work that the first signal asks to stop."""
 
-    number: int = signal.SIGINT
+    number: int = signal.SIGINT  # of that signal
     name: str = ""
 
 
@@ -41,10 +41,8 @@ _listening = threading.Event()  # set in a process of the command's own
 def interruptible(what: str = "this stretch of steps") -> Iterator[threading.Event]:
     """Yield an event that the first signal sets. A second Ctrl-C stops at once and loses unsaved work.
 
-    An `Interrupted` that is raised inside ends the command with the status of that signal.
-
-    Args:
-        what: the work that is finished first, in words.
+    An `Interrupted` that is raised inside ends the command with the status of that signal. `what`: the work that is
+    finished first, in words.
     """
     work = _Work()
     work.name = what
@@ -71,28 +69,25 @@ def listen() -> None:
     """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    heard = _install(lambda number, frame: None, ignored=NUMBERS)
+    known = _install(lambda number, frame: None, ignored=NUMBERS)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     _listening.set()
 
     def hear() -> None:
         while number := os.read(reading, 1)[0]:
-            if number in heard:
-                _hear(number, None)
+            if number in known:
+                _hear(number)
 
     threading.Thread(target=hear, name="signals", daemon=True).start()
 
 
 def _install(handler: Any, ignored: tuple[int, ...]) -> dict[int, Any]:
     """Handle the signals, without those of `ignored` that this process ignores; return the former handlers."""
-    before: dict[int, Any] = {number: signal.getsignal(number) or signal.SIG_DFL for number in NUMBERS}
-    before = {number: was for number, was in before.items() if was != signal.SIG_IGN or number not in ignored}
-    for number in before:
-        signal.signal(number, handler)
-    return before
+    spared = [number for number in ignored if signal.getsignal(number) == signal.SIG_IGN]
+    return {number: signal.signal(number, handler) or signal.SIG_DFL for number in NUMBERS if number not in spared}
 
 
-def _hear(number: int, frame: Any) -> None:
+def _hear(number: int, frame: Any = None) -> None:
     work = _works[-1] if _works else None
     if work is not None and not work.is_set():
         work.number = number
@@ -103,6 +98,5 @@ def _hear(number: int, frame: Any) -> None:
         if not _listening.is_set():
             raise KeyboardInterrupt
         with contextlib.suppress(OSError):  # bypasses Python's streams, whose locks another thread may hold
-            shown = SHOW_CURSOR if os.isatty(2) else b""
-            os.write(2, shown + b"stopped at once; what was saved before is safe\n")
+            os.write(2, SHOW_CURSOR * os.isatty(2) + b"stopped at once; what was saved before is safe\n")
         os._exit(128 + number)

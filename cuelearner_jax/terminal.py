@@ -21,24 +21,19 @@ __all__ = ["Interrupted", "abandon", "console", "interruptible", "progress_bars"
 class _StandardError:
     """The current `sys.stderr`. Work goes on if its reader is gone: a closed pipe or terminal."""
 
+    def __getattr__(self, name: str) -> Any:
+        return getattr(getattr(sys.stderr, "rich_proxied_file", sys.stderr), name)  # a progress bar wraps the stream
+
     def write(self, text: str) -> int:
-        stream = _stderr()
         try:
-            stream.write(text)
-            stream.flush()
+            self.__getattr__("write")(text)
+            self.__getattr__("flush")()
         except OSError:  # else Python would try again to write the rest when it ends, and fail
-            abandon(stream)
+            abandon(self)
         return len(text)
 
     def flush(self) -> None:
         """Do nothing: text is flushed when it is written."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(_stderr(), name)
-
-
-def _stderr() -> Any:
-    return getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # a progress bar wraps the stream
 
 
 def abandon(stream: Any) -> None:
@@ -55,21 +50,13 @@ console = Console(file=cast(IO[str], _StandardError()), **PLAIN)
 
 
 @contextmanager
-def progress_bars(shown: bool = True, counted: bool = True) -> Iterator[Progress]:
-    """Show progress on standard error: bars on a terminal, lines elsewhere, nothing unless `shown`.
-
-    `counted`: bars also show how much of how much is done.
-    """
+def progress_bars(shown: bool = True) -> Iterator[Progress]:
+    """Show progress on standard error: bars on a terminal, lines elsewhere, nothing unless `shown`."""
     if shown and not console.is_terminal:
         yield ProgressLines()
         return
-    columns = (
-        TextColumn("{task.description:<12}", markup=False),
-        BarColumn(),
-        *([MofNCompleteColumn()] if counted else []),
-        TextColumn("{task.fields[note]}", markup=False),
-        TimeRemainingColumn(),
-    )
+    name, note = (TextColumn(text, markup=False) for text in ("{task.description:<12}", "{task.fields[note]}"))
+    columns = name, BarColumn(), MofNCompleteColumn(), note, TimeRemainingColumn()
     with Progress(*columns, console=console, disable=not shown) as bars:
         yield bars
 
@@ -91,10 +78,10 @@ class ProgressLines(Progress):
             return
         self._next = time.monotonic() + EVERY
         task = self._tasks[task_id]
-        done = [f"{task.completed:,.0f} of {task.total:,.0f}"] if task.total else []
-        note = [task.fields["note"]] if task.fields.get("note") else []
+        amount = f"{task.completed:,.0f} of {task.total:,.0f}" if task.total else ""
         left = f", about {task.time_remaining:.0f} s left" if task.time_remaining else ""
-        console.print(f"{', '.join([task.description, *done, *note])}; after {task.elapsed or 0:.0f} s{left}")
+        parts = ", ".join(filter(None, [task.description, amount, task.fields.get("note")]))
+        console.print(f"{parts}; after {task.elapsed or 0:.0f} s{left}")
 
 
 def watched_by(bars: Progress) -> Callable[[str], Callable[[int, int], None]]:

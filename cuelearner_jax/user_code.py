@@ -1,8 +1,7 @@
 """Errors of the user's own policies, teachers and environments: exceptions, and invalid actions.
 
-An exception of the user's code keeps its own traceback. A function that is called back on the host leaves its exception
-here and returns NaN, because exceptions that leave a compiled program are long and unclear. Code that reads a program's
-results on the host asks here first.
+A function that is called back on the host leaves its exception here and returns NaN, because JAX logs an exception that
+leaves a compiled program, and loses its traceback. Code that reads a program's results on the host asks here first.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ def is_waiting() -> bool:
 def tell() -> None:
     """Raise the first exception that a function on the host left, if there is one, and forget all of them."""
     if _left:
-        first = _left[0]
+        first, *_ = _left
         _left.clear()
         raise first
 
@@ -48,53 +47,45 @@ def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
     def wrapped(*arguments: P.args, **named: P.kwargs) -> T:
         try:
             with fixed_numerics():
-                found = function(*arguments, **named)
-            tell()
-            return found
-        except Exception:
-            tell()
-            raise
+                return function(*arguments, **named)
         finally:
-            _left.clear()
+            tell()
 
     return wrapped
 
 
 def acts_in(name: str, policy: Any, env: Any) -> None:
     """Raise UserError for a policy that cannot act in a world, without acting."""
-    _tried(name, "act", env, policy.act)
+    _trace(name, "act", env, policy.act)
 
 
 def answers_in(name: str, teacher: Any, env: Any) -> None:
     """Raise UserError for a teacher that cannot answer in a world, without asking."""
-    _tried(name, "answer", env, lambda key, states, obs: jax.vmap(teacher.best_action)(states, obs))
+    _trace(name, "answer", env, lambda key, states, obs: jax.vmap(teacher.best_action)(states, obs))
 
 
-def _tried(name: str, verb: str, env: Any, function: Any) -> None:
+def _trace(name: str, verb: str, env: Any, function: Any) -> None:
     """Trace a function of a key, states (1, ...) and observations (1, obs) of a world."""
-    own = jax.random.key(0)
-    states, obs = jax.eval_shape(lambda: jax.vmap(env.reset)(own[None]))
+    key = jax.random.key(0)
+    states, obs = jax.eval_shape(lambda: jax.vmap(env.reset)(key[None]))
     try:
-        jax.eval_shape(function, own, states, obs)
+        jax.eval_shape(function, key, states, obs)
     except UserError as error:
         if name in str(error):
             raise
         raise type(error)(f"{name}: {error}") from error.__cause__
     except Exception as error:
-        raise UserCodeError(
-            f"{name} cannot {verb} in this world, whose observations have {obs.shape[-1]} entries: "
-            f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        ) from error
+        where = f"in this world, whose observations have {obs.shape[-1]} entries"
+        why = " ".join(str(error).split())[:200]
+        raise UserCodeError(f"{name} cannot {verb} {where}: {type(error).__name__}: {why}") from error
 
 
 def check_actions(actions: Any, whose: str) -> None:
-    """Raise UserError unless all of a program's actions are finite.
+    """Raise UserError unless all of a program's actions are finite; `actions` may also be whether they are.
 
-    Args:
-        actions: on the host, of any shape; or whether all of them are finite.
-        whose: for the message, for instance "policy my_policy".
+    `whose`: for the message, for instance "policy my_policy".
     """
     tell()
-    found = np.asarray(actions)
-    if not (found if found.dtype == bool else np.isfinite(found)).all():
+    actions = np.asarray(actions)
+    if not (actions if actions.dtype == bool else np.isfinite(actions)).all():
         raise UserError(f"{whose} gave actions that are not finite, or zero: give a direction in every situation")

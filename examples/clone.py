@@ -15,8 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.config import GuideScalars, Scalars
-from cuelearner_jax.config.parts import Bounds, part
+from cuelearner_jax.config import Bounds, GuideScalars, Scalars, part
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import Refinement

@@ -11,7 +11,7 @@ METHOD, TASKS = "cuelearner_jax", "cuelearner_envs"
 
 # Bottom row first: a module imports from rows below its own and, within its row, from its own package.
 ROWS = [
-    ["errors", "signals", "tracing", "devices"],
+    ["errors", "signals", "devices"],
     ["user_code"],
     ["types", "spaces", "plugins"],
     ["environment", "pictures"],
@@ -41,7 +41,7 @@ ROWS = [
     ["cli"],
 ]
 ROW = {room: number for number, row in enumerate(ROWS) for room in row}
-FOR_TASKS = {"errors", "types", "spaces", "environment", "pictures", "tracing"}  # what a task may know of the method
+FOR_TASKS = {"errors", "types", "spaces", "environment", "pictures", "devices"}  # what a task may know of the method
 # Of guidance; "heuristic" names a member and a policy too.
 KINDS = {"relative", "intent", "demonstration", "scalar", "dcoach", "bdcoach", "clic"}
 

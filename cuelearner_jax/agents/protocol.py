@@ -1,4 +1,4 @@
-"""The agent protocol: pure functions of one lane, made from options (`config.parts`), for any space and environment.
+"""The agent protocol: pure functions of one lane, made from options (`config.part`), for any space and environment.
 
 The options are a class with a `NAME`, a line `ABOUT` it, and `make`. Add your own to `AGENTS`, or name it as
 package.module:NAME. An agent made from equal options for equal spaces is equal, so that a program compiled for one

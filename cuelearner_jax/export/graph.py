@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from cuelearner_jax.tracing import written_out
+from cuelearner_jax.devices import written_out
 
 
 def kind_of(dtype: Any) -> str:

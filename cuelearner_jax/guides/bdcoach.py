@@ -30,8 +30,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from cuelearner_jax.config import GuideScalars
-from cuelearner_jax.config.parts import POSITIVE, part
+from cuelearner_jax.config import POSITIVE, GuideScalars, part
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.dcoach import Coached, Correct, DeepCoach
 from cuelearner_jax.guides.fitting import Example, optimizer, squared_errors

@@ -35,8 +35,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.agents.choice import each_in_portions
-from cuelearner_jax.config import GuideScalars
-from cuelearner_jax.config.parts import POSITIVE, SHARE, Bounds, part
+from cuelearner_jax.config import POSITIVE, SHARE, Bounds, GuideScalars, part
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
 from cuelearner_jax.guides.fitting import GuideModel, fit_model, guide_model

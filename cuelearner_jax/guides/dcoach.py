@@ -30,8 +30,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.config import GuideScalars
-from cuelearner_jax.config.parts import POSITIVE, part
+from cuelearner_jax.config import POSITIVE, GuideScalars, part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Actions, Observations, Rows
 from cuelearner_jax.guides.demonstration import Demonstration

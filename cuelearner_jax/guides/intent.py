@@ -23,8 +23,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.config import GuideScalars
-from cuelearner_jax.config.parts import Bounds, Layers, part
+from cuelearner_jax.config import Bounds, GuideScalars, Layers, part
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows

@@ -22,8 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.agents.choice import best_of
-from cuelearner_jax.config import GuideScalars
-from cuelearner_jax.config.parts import POSITIVE, SHARE, part
+from cuelearner_jax.config import POSITIVE, SHARE, GuideScalars, part
 from cuelearner_jax.feedback.answers import SCALAR
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
 from cuelearner_jax.guides.fitting import GuideModel, guide_model

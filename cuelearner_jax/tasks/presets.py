@@ -13,7 +13,7 @@ from typing import Any
 
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.config import plain
-from cuelearner_jax.run_config import PARTS, RunConfig, kind_from_json, part_from_json
+from cuelearner_jax.run_config import RunConfig, kind_from_json, part_from_json
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.task import QUICKSTART, Preset, Scenario
 
@@ -43,7 +43,7 @@ def read(name: str, config: Any, space: Space = DIRECTIONS) -> dict[str, Any]:
 def _group(start: RunConfig, name: str, values: dict[str, Any]) -> Any:
     if name == "kinds":
         return {kind: kind_from_json(kind, own) for kind, own in values.items()}
-    return part_from_json(PARTS[name], values) if "name" in values else _changed(getattr(start, name), values)
+    return part_from_json(name, values) if "name" in values else _changed(getattr(start, name), values)
 
 
 def _changed(start: Any, values: dict[str, Any]) -> Any:

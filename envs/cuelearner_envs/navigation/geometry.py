@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.navigation.world import World
-from cuelearner_jax.tracing import goes_through
+from cuelearner_jax.devices import goes_through
 
 
 def in_frame(boxes: Float[Array, "boxes 5"], point: Float[Array, "2"]) -> Float[Array, "boxes 2"]:

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.navigation.geometry import free_paths
 from cuelearner_envs.navigation.lidar import MAX_RANGE
+from cuelearner_jax.devices import goes_through
 from cuelearner_jax.spaces.directions import rotate
-from cuelearner_jax.tracing import goes_through
 
 EVERY = 2  # of the beams: second legs look at every second point, 0.17 m apart at 5 m
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of a way's free length, where stations lie
