@@ -112,6 +112,4 @@ def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 1
     # Orbax's threads may complain beside it.
-    assert (
-        "error: the disk is full: free some, then go on with the same command and --resume" in done.stderr.splitlines()
-    )
+    assert "error: the disk is full: free some, then go on with the same command and --resume" in done.stderr
