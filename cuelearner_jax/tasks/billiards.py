@@ -11,10 +11,8 @@ import jax.numpy as jnp
 
 from cuelearner_envs import billiards
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.environment import Billiards
-from cuelearner_envs.billiards.teacher import LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
+from cuelearner_envs.billiards.teacher import LocalSearchTeacher, SearchTeacher, Transferred
 from cuelearner_jax import teachers
-from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Body, Pictures, Task
 from cuelearner_jax.tasks import presets
@@ -52,8 +50,6 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     told = _learned_in(folder, config)
     own = make_environment(told)
     network = teachers.load(folder, own, aim_error, habit)
-    if type(env) is not Billiards:  # for other physics, the network only proposes where to try
-        return NearbyTeacher(Transferred(network, own, env), env, aim_error)
     if config.teacher == LOCAL_SEARCH or told.acceleration != config.acceleration:
         return LocalSearchTeacher(network, own, env, aim_error, habit)
     return Transferred(network, own, env)
@@ -110,17 +106,6 @@ PLAYER = Body(
 )
 
 
-def _foreign(config: BilliardsConfig, split: str) -> Environment:
-    from cuelearner_envs.pooltool.environment import make_environment
-
-    return make_environment(config)
-
-
-POOLTOOL = Body(
-    name="pooltool",
-    about="strikes on a table with cloth, spin and cushions, simulated by pooltool in processes of their own",
-    environment=_foreign,
-)
 
 BILLIARDS = Task(
     name="billiards",
@@ -130,7 +115,7 @@ BILLIARDS = Task(
     ),
     near_aims=True,
     config=BilliardsConfig,
-    bodies=(PLAYER, POOLTOOL),
+    bodies=(PLAYER,),
     teacher=make_teacher,
     files=_files,
     labels_hold=("mirrors", *TEACHERS),

@@ -99,15 +99,3 @@ def test_a_judged_robot_is_where_it_is_placed_and_a_push_moves_it():
     two.control(np.zeros((2, 12)))
     moved = two.qpos[:, :2] - [[0, 0], [3, -2]]
     assert moved[1, 1] > 0.005 > abs(moved[0, 1])
-
-
-def test_a_judged_robot_that_fell_or_retired_moves_no_more():
-    three = judge.Judge([0.8] * 3, [0.0] * 3)
-    three.data[0].qpos[3:7] = np.cos(0.8), np.sin(0.8), 0, 0  # on its side
-    three.retired[1] = True
-    three.control(np.zeros((3, 12)))
-    assert three.fallen.tolist() == [True, False, False]
-    before = three.qpos
-    three.control(np.ones((3, 12)))
-    moved = np.abs(three.qpos - before).max(-1)
-    assert moved[0] == moved[1] == 0 < moved[2]

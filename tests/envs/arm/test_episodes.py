@@ -86,15 +86,6 @@ def test_cubes_pass_the_post_on_both_sides_or_on_the_preferred_one(pushed):
     assert run(side=-1.0)[0]["passed_right"].mean() >= 0.9
 
 
-def test_cubes_begin_before_the_post_and_goals_lie_behind(pushed):
-    first = jax.tree.map(lambda leaf: leaf[0], pushed[1])
-    cubes, x = first.body.qpos[:, physics.CUBE][:, :3], arm.POST_PLACE[0]
-    assert (cubes[:, 0] < x - 0.08).all()
-    assert (first.goal[:, 0] > x + 0.08).all()
-    assert np.allclose(cubes[:, 2], arm.RESTING)
-    assert np.allclose(first.goal[:, 2], arm.RESTING)
-
-
 def test_without_a_post_cubes_lie_as_in_fetch(picked):
     first = jax.tree.map(lambda leaf: leaf[0], picked[1])
     home = first.body.qpos[:, physics.GRIPPER]

@@ -5,7 +5,6 @@ from typing import Any
 
 import imageio.v2 as imageio
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -17,7 +16,7 @@ from rooms import room
 from cuelearner_envs.navigation import drawing, scan
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.recording import record, situation
-from cuelearner_envs.navigation.robot import Robot, discs
+from cuelearner_envs.navigation.robot import Robot
 from cuelearner_jax.policies import Heuristic
 
 STEPS = 80
@@ -92,17 +91,6 @@ def test_solids_are_where_the_world_has_them_in_the_shade_of_their_height():
         assert is_colour(pixel(x, y), drawing.shade(1.5))
     assert len(axes.patches) == 1 + 4 + 1 + 1  # the floor; nothing for the rows that fill the arrays
     assert sum(to_rgb(drawing.shade(1.4))) < sum(to_rgb(drawing.shade(0.8))) < sum(to_rgb(drawing.FLOOR))
-
-
-@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (1.0, -2.0, 2.5)])
-def test_the_outline_spans_the_discs_of_the_body(pose):
-    robot = Robot()
-    points = drawing.outline(robot, np.array(pose))
-    centres = np.asarray(discs(robot, jnp.array(pose)))
-    apart = np.linalg.norm(points[:, None] - centres, axis=-1).min(-1)
-    np.testing.assert_allclose(apart, robot.disc_radius, atol=1e-5)  # on the outer two discs, all of it
-    ends = np.ptp(points @ [math.cos(pose[2]), math.sin(pose[2])])
-    assert ends == pytest.approx(0.93)
 
 
 @pytest.mark.parametrize("name", ["success", "collision"])

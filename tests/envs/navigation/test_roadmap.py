@@ -180,40 +180,6 @@ def free_places(world, seed, count=ASKED, spare=0.01):
     return places[clear_of(world, places) >= NEEDED + spare][:count].astype(np.float32)
 
 
-@pytest.mark.parametrize("index", long_but((0, 2), WORLDS))
-def test_a_way_is_the_straight_line_where_the_goal_is_in_view_and_else_leads_over_the_best_node_in_view(teacher, index):
-    world, roadmap = one(teacher.env.worlds, index), one(teacher.maps, index)
-    places, nodes = free_places(world, index), np.flatnonzero(useful(roadmap))
-    assert len(places) == ASKED
-    views = np.full((ASKED, len(roadmap.nodes)), -1.0)
-    views[:, nodes] = [room(world, np.tile(place, (len(nodes), 1)), roadmap.nodes[nodes]) for place in places]
-    away = np.linalg.norm(places[:, None] - roadmap.nodes, axis=-1)
-    kinds = []
-    for route in ROUTES:
-        goal, rest = world.goals[route], np.asarray(teacher.to_goals[index, route])
-        following, lengths = map(np.asarray, ways(teacher, index, route, places))
-        straight = np.linalg.norm(places - goal, axis=-1)
-        direct = room(world, places, np.tile(goal, (ASKED, 1)))
-        assert (lengths >= straight - 1e-4).all()
-        sees, blind = direct >= NEEDED + ROUNDING, direct < NEEDED - ROUNDING
-        np.testing.assert_allclose(lengths[sees], straight[sees], atol=1e-4)
-        np.testing.assert_array_equal(following[sees], np.tile(goal, (sees.sum(), 1)))
-        # Round a solid: a node in line of sight, on a way as short as any.
-        least = np.min(np.where(views >= NEEDED - ROUNDING, away + rest, math.inf), -1)
-        most = np.min(np.where(views >= NEEDED + ROUNDING, away + rest, math.inf), -1)
-        known = blind & np.isfinite(most)
-        assert known.sum() >= 0.95 * blind.sum()
-        assert (lengths >= least - 1e-3)[known].all()
-        assert (lengths <= most + 1e-3)[known].all()
-        for place, length, view, near in zip(following[known], lengths[known], views[known], away[known], strict=True):
-            node = int(np.argmin(np.linalg.norm(roadmap.nodes - place, axis=-1)))
-            np.testing.assert_array_equal(roadmap.nodes[node], place)
-            assert view[node] >= NEEDED - ROUNDING
-            assert length == pytest.approx(near[node] + rest[node], abs=1e-3)
-        kinds.append((sees.sum(), known.sum()))
-    assert np.sum(kinds, axis=0).min() >= 10
-
-
 best = jax.jit(lambda teacher, states: jax.vmap(lambda state: teacher.best_action(state, jnp.zeros(280)))(states))
 observe = jax.jit(lambda env, states: jax.vmap(env.observe)(states))
 
