@@ -79,8 +79,7 @@ def _files(config: BilliardsConfig) -> dict[str, str]:
 
 def _pictures() -> Pictures:
     from cuelearner_envs.billiards import drawing  # takes seconds to load
-    from cuelearner_envs.billiards.recording import record
-    from cuelearner_envs.billiards.sketch import reel, sketch, trails
+    from cuelearner_envs.billiards.sketch import record, reel, sketch, trails
 
     return Pictures(
         record=record,

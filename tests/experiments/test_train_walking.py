@@ -118,7 +118,7 @@ def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
     ("arguments", "says"),
     [
         (["evaluate", "nowhere"], "no walking policy in nowhere: train one with"),
-        (["evaluate", "--robots", "0"], "--robots is 0: give a number from 1"),
+        (["evaluate", "--robots", "0"], "--robots is 0: give a positive number"),
         (["evaluate", "--out", "kept.json"], "exists: give another --out"),
         (["train", "--out", "."], "not empty: give another --out"),
     ],

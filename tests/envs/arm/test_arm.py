@@ -13,8 +13,7 @@ from cuelearner_envs.anymal.model import rotation
 from cuelearner_envs.arm import drawing, physics, recording
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm.config import ArmConfig
-from cuelearner_envs.arm.environment import Camera
-from cuelearner_envs.arm.places import HOME
+from cuelearner_envs.arm.environment import HOME, Camera
 from cuelearner_envs.arm.scripts import act
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.reading import declared_distortions

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cuelearner_envs.billiards.aims import aims_of, contact_for
-from cuelearner_envs.billiards.impacts import normal_impulse, tangential_impulse
+from cuelearner_envs.billiards.contacts import normal_impulse, tangential_impulse
 from cuelearner_envs.billiards.table import Table
 from cuelearner_jax.spaces import directions
 

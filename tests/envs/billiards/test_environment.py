@@ -18,7 +18,7 @@ from billiards_scenes import (
 
 from cuelearner_envs.billiards import simulate
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.recording import record
+from cuelearner_envs.billiards.sketch import record
 from cuelearner_envs.billiards.table import rack
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.spaces import directions
