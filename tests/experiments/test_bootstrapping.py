@@ -79,7 +79,7 @@ def test_labels_for_an_equal_mean_are_what_the_recorded_runs_give():
         [str(data / "frame"), "--by-run", "--metric", "success", "--level", "0.9", "--within", "1", "--out", "nowhere"]
     )
     groups = read_groups(asked.folders, asked.metric, "validation", by_run=True)
-    found = efficiency_of(variants_of(groups, asked.metric), asked.question).tables()["equal_area"]
+    found = efficiency_of(variants_of(groups, asked.metric), asked.question).tables["equal_area"]
     mine = {(row["reference_labels"], row["guidance"]): row for row in found if row["reference"] == "relative"}
     with (data / "report/equal_area.csv").open(newline="") as file:
         recorded = [row for row in csv.DictReader(file) if row["run"] == "frame"]

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from cuelearner_envs.arm import model as arm
 
 Picture = UInt8[np.ndarray, "height width 3"]
-Face = Float[np.ndarray, "corners 3"]
+Face = Float[np.ndarray, "_ 3"]
 Colour = Sequence[int]
 SIZE = (480, 360)  # width and height [pixels]
 FINER = 2  # the picture is drawn this many times larger and averaged down
