@@ -7,7 +7,7 @@ from pathlib import Path
 import label_efficiency
 import pytest
 from _efficiency import efficiency_of
-from _pieces import pieces_below, report_command, scaled, sweep_command
+from _pieces import report_command, scaled, sweep_command
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.guides import registry
@@ -39,14 +39,6 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, monkeypatch,
         assert main(sweep_command(experiment.task, piece, tmp_path, resume=False)) == 0, piece.path
         assert orders[-1].grid.labels == piece.labels or not piece.labels
         assert orders[-1].out == tmp_path / piece.path
-
-
-def test_names_choose_pieces_and_folders_of_them(experiment, capsys):
-    names = [piece.path for piece in pieces_below(experiment.pieces, [f"{experiment.pieces[0].world}/frame"])]
-    assert len(names) > 5
-    assert all("/frame/" in name for name in names)
-    with pytest.raises(ValueError, match="no piece 'nothing': see --list"):
-        pieces_below(experiment.pieces, ["nothing"])
 
 
 def test_a_report_is_asked_what_its_runs_can_answer(experiment, tmp_path):

@@ -17,11 +17,9 @@ from _teacher_program import TeacherConfig, Trainer
 from cuelearner_jax import teachers
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.spaces import directions
 from cuelearner_jax.terminal import Interrupted
 
 TASK, WORLD = probes.make_task(), probes.WindowConfig()
-ENV, OBS = probes.Window(mirrors=True), directions.evenly_spaced(4)
 CONFIG = TeacherConfig(
     layers=(32, 32),
     tables=32,

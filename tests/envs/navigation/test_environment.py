@@ -59,15 +59,6 @@ def test_the_observation_is_nearness_then_the_goals_direction_and_distance_then_
     np.testing.assert_allclose(seen[PREVIOUS], np.ravel(previous), atol=1e-7)
 
 
-def test_previous_actions_move_up_by_one_each_step():
-    state, given = walker((0.0, 0.0, 0.0)), [AHEAD, LEFT, BACK, jnp.array([0.6, -0.8])]
-    for count, action in enumerate(given, start=1):
-        state, result = step(HALL, state, action)
-        latest = [*given[:count][::-1], *[jnp.zeros(2)] * 3][:3]
-        np.testing.assert_array_equal(result.obs[PREVIOUS], jnp.concatenate(latest))
-        np.testing.assert_array_equal(result.final_obs, result.obs)
-
-
 AHEAD_OF_IT, SEEN_GOAL, SEEN_PREVIOUS = 180, slice(360, 362), slice(362, 368)
 TURNED = walker((0.3, -0.2, 0.4), previous=((1.0, 0.0), (0.0, 1.0), (0.6, 0.8)))
 

@@ -11,7 +11,7 @@ import rooms
 
 from cuelearner_envs.navigation.aims import RADII, SCALE, WAYS, aims_of
 from cuelearner_envs.navigation.config import NavigationConfig
-from cuelearner_envs.navigation.lidar import BEAMS, scan
+from cuelearner_envs.navigation.lidar import scan
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.config import GuideSizes, to_json
@@ -92,16 +92,6 @@ def test_what_is_seen_of_a_wall_stops_a_second_leg_and_what_is_not_seen_does_not
     beside = [-6, 6]  # 30 degrees either way, past the screen
     np.testing.assert_allclose(one[0][beside], 0.0, atol=1e-3)
     assert one[1][beside].max() < seen_too[1][beside].min()
-
-
-def test_unless_it_is_asked_for_aims_are_what_they_were():
-    rng = np.random.default_rng(2)
-    obs = seen(rng.uniform(0.5, 9.0, BEAMS), (3.0, 1.0))
-    plain, more = told_less(obs), told(obs)
-    assert plain.features.shape == (WAYS, PLAINLY)
-    np.testing.assert_array_equal(plain.features, more.features[:, :PLAINLY])
-    np.testing.assert_array_equal(plain.open, more.open)
-    np.testing.assert_array_equal(plain.actions, more.actions)
 
 
 def world(**changes):
