@@ -30,13 +30,9 @@ STANDING_HEIGHT = 0.55  # of the trunk's middle, the legs at home, feet just abo
 
 
 def load(timestep: float | None = None, friction: float = FRICTION, payload: float = 0.0) -> mujoco.MjModel:
-    """Load the model.
+    """Load the model, with a payload carried at the trunk's centre of mass [kg].
 
-    Args:
-        timestep: of the physics [s]; the file's 0.01 s unless given. With one, the solver runs to convergence, as a
-            judge of the few iterations that MJX makes.
-        friction: of feet on the floor.
-        payload: mass carried at the trunk's centre of mass [kg].
+    `timestep`: of the physics [s], 0.01 s unless given. With one, the solver runs to convergence, as a judge of MJX.
     """
     model = mujoco.MjModel.from_xml_path(str(FILE))
     if timestep is not None:

@@ -83,14 +83,9 @@ def command(
 ) -> Command:
     """Return the targets that an action means.
 
-    As Fetch has it: an action of 1 names a place 5 cm from where the gripper is now, and opens the fingers. Targets
-    keep within the workspace and out of the post.
-
-    Args:
-        gripper, fingers: where they are [m].
-        action: dx, dy, dz and opening, each from -1 to 1.
-        post: 1 where there is one.
-        grasps: 1 where fingers move; 0 where they stay closed.
+    As Fetch has it: an action (dx, dy, dz, opening) of 1 names a place 5 cm from where the gripper is, and opens the
+    fingers. Targets keep within the workspace and out of the post. `post`: 1 where there is one. `grasps`: 1 where
+    fingers move, 0 where they stay closed.
     """
     low, high = jnp.asarray(WORKSPACE)
     target = jnp.clip(gripper + REACH * action[:3], low, high)

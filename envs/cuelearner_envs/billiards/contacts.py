@@ -108,11 +108,7 @@ def next_on_edge(
     for jaw_x, jaw_y in (*jaws(table, exit_x, exit_y), *jaws(table, x, y)):
         time = time_to_circle(x - jaw_x, y - jaw_y, ux, uy, reach)
         sooner = time < best
-        best, best_x, best_y = (
-            jnp.where(sooner, time, best),
-            jnp.where(sooner, jaw_x, best_x),
-            jnp.where(sooner, jaw_y, best_y),
-        )
+        best, best_x, best_y = (jnp.where(sooner, *both) for both in ((time, best), (jaw_x, best_x), (jaw_y, best_y)))
 
     pocket = jnp.minimum(
         time_to_line(half_x + table.pocket_margin - out_x, speed_x),

@@ -114,17 +114,13 @@ def look_ahead(
 ) -> tuple[Float[Array, " ways"], Float[Array, " ways"], Float[Array, " ways"]]:
     """Return the remaining length to the goal after the best two legs, of which the first goes along each way.
 
-    Args:
-        points: what beams hit, in the body's frame; those that hit nothing lie far away [m].
-        ways: unit vectors all round in order, so that neighbours lie side by side.
-        free: how far a disc of the radius can walk along each [m].
-        goal: in the body's frame [m].
-        radius: of the disc [m].
+    Lengths are metres in the body's frame. `points` are what beams hit, `ways` unit vectors all round in order, so that
+    neighbours lie side by side; `free` is how far a disc of the radius can walk along each.
 
     Returns:
-        the straight distance that is left after both legs [m]; the detour, both legs and what is left less the straight
-        distance from here [m]; the length of the first leg [m]. Where there is no room for a first leg: the straight
-        distance from here, infinity, 0.
+        the straight distance that is left after both legs; the detour, both legs and what is left less the straight
+        distance from here; the length of the first leg. Without room for a first leg: the straight distance from here,
+        infinity, 0.
     """
     legs = _stations(ways, free, goal)
     second_legs = lambda leg: _second_legs(points, ways, leg, goal, radius)  # noqa: E731

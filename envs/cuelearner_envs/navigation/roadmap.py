@@ -74,15 +74,10 @@ def way(
     position: Float[Array, "2"],
     goal: Float[Array, "2"],
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Return the next point to walk to from a place, and the length of the whole way.
+    """Return the next place to walk to in a straight line (the goal, if in view), and the whole way's length [m].
 
-    Args:
-        to_goal: `distances` of the same goal.
-        position: any place, also one too close to a solid for the map: the line from there may then be as close.
-
-    Returns:
-        The next place to walk to in a straight line (the goal, if it is in view) [m]; the way's length [m]. If no line
-        from here is clear, the length is more than `BLOCKED` and the place is at the end of the clearest line.
+    `to_goal` are the goal's `distances`. From a position too close to a solid for the map, a line may be as close. If
+    no line is clear, the length is more than `BLOCKED` and the place is at the end of the clearest line.
     """
     places = jnp.concatenate([roadmap.nodes, goal[None]])
     rest = jnp.append(to_goal, 0.0)

@@ -75,16 +75,9 @@ def closed(world: World, side: Float[Array, ""] | float) -> World:
     """The world with a thin barrier from each obstacle to the outer wall above it (side +1) or below it (-1)."""
     middles, there = obstacles(world)
     wall = side * world.extent[1] / 2
-    barrier = jnp.stack(
-        [
-            middles[:, 0],
-            (middles[:, 1] + wall) / 2,
-            jnp.zeros(len(middles)),
-            jnp.full(len(middles), BARRIER),
-            jnp.abs(wall - middles[:, 1]) / 2,
-        ],
-        axis=-1,
-    )
+    x, y = middles[:, 0], middles[:, 1]
+    zero, thin = jnp.zeros(len(middles)), jnp.full(len(middles), BARRIER)
+    barrier = jnp.stack([x, (y + wall) / 2, zero, thin, jnp.abs(wall - y) / 2], axis=-1)
     unused = jnp.array([FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01])
     barriers = jnp.where(there[:, None], barrier, unused[None])
     heights = jnp.full(len(middles), world.box_heights[0])

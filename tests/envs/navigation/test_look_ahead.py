@@ -26,7 +26,6 @@ POSE = jnp.zeros(3)
 RADIUS = RADII[2]
 
 told = jax.jit(lambda obs: aims_of(obs, True))
-told_less = jax.jit(aims_of)
 
 
 def seen(ranges, goal):
