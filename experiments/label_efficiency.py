@@ -13,6 +13,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from _efficiency import Efficiency, Question, efficiency_of
@@ -20,7 +21,7 @@ from _efficiency import Efficiency, Question, efficiency_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import escaping
 from cuelearner_jax.report.document import Study, report
-from cuelearner_jax.report.tables import Row, markdown_table
+from cuelearner_jax.report.tables import markdown_table
 from cuelearner_jax.report.variants import Variant
 
 
@@ -42,7 +43,7 @@ def parsed(arguments: Sequence[str]) -> argparse.Namespace:
     return asked
 
 
-def cell(row: Row, name: str, form: str) -> str:
+def cell(row: dict[str, Any], name: str, form: str) -> str:
     """Return a quantity with its interval: `0.62 [0.54, 0.71]`, `above 1.40 [1.30, no bound]`, or nothing."""
     value, low, high = row[name], row.get(f"{name}_above", ""), row.get(f"{name}_below", "")
     if value == "" == low:

@@ -114,7 +114,7 @@ def _solids(scene: Scene) -> Iterator[tuple[Face, Colour]]:
     gripper, opened = np.asarray(scene.gripper, float), [float(one) for one in scene.fingers]
     radius, rise = arm.FINGER_RADIUS, 0.03 - arm.TIP / 2
     half = (arm.FINGER_HALF_WIDTH, radius, 0.03 + arm.TIP / 2)
-    boxes = [
+    boxes: list[tuple[np.ndarray, Sequence[float], np.ndarray | None, Colour]] = [
         (np.add(gripper, [0.0, radius + opened[0], rise]), half, None, STEEL),
         (np.add(gripper, [0.0, -radius - opened[1], rise]), half, None, STEEL),
         (np.add(gripper, [0.0, 0.0, 0.075]), (0.014, 0.02 + max(opened), 0.01), None, PALM),

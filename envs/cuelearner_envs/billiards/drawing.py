@@ -113,12 +113,12 @@ def _balls(axes: Axes, table: Table, positions: Any, pocketed: Any, *, ghosts: b
     style = {"ha": "center", "va": "center_baseline", "color": "white", "fontweight": "bold", "zorder": 6}
     artists: list[Artist] = []
     for ball, tray in enumerate(_tray(table)):
-        centre = tuple(tray if pocketed[ball] else positions[ball])
-        disc = Circle(centre, float(table.ball_radius), facecolor=ball_colour(ball), edgecolor="#1a1a1a", linewidth=0.6)
+        x, y = tray if pocketed[ball] else positions[ball]
+        disc = Circle((x, y), float(table.ball_radius), facecolor=ball_colour(ball), edgecolor="#1a1a1a", linewidth=0.6)
         disc.set(zorder=3 if ghosts else 5, alpha=0.35 if ghosts else None, visible=not (ghosts and pocketed[ball]))
         artists.append(axes.add_patch(disc))
         if ball and not ghosts:
-            artists.append(axes.text(*centre, str(ball), fontsize=size, **style))
+            artists.append(axes.text(x, y, str(ball), fontsize=size, **style))
     return artists
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,23 +39,23 @@ def ball_colour(ball: int) -> str:
     return CUE if ball == 0 else TARGETS[(ball - 1) % len(TARGETS)]
 
 
-def solids(table: Table) -> Iterator[tuple[np.ndarray, tuple[float, float], float, str]]:
+def solids(table: Table) -> Iterator[tuple[np.ndarray, np.ndarray, float, str]]:
     """Yield what does not move, from below to above: rounded rectangles.
 
     Each is its lower left corner, width and height, and the radius of its corners [m], and a colour.
     """
     half, gap, rail = np.array([table.width, table.height], float) / 2, float(corner_gap(table)), rail_width(table)
-    yield -half - rail, tuple(2 * (half + rail)), 0.6 * rail, RAIL
+    yield -half - rail, 2 * (half + rail), 0.6 * rail, RAIL
     for place in np.asarray(pockets(table), float):
         # A disc through the jaws; at a corner drawn a little inwards, so that the rail round it may be narrow. The
         # cloth covers what lies on the table: a ball falls where the cloth ends.
         inwards = 0.25 * gap if abs(place[0]) > half[0] / 2 else 0.0
         radius = math.hypot(gap - inwards, inwards) if inwards else float(table.hole_width)
-        yield place - np.sign(place) * inwards - radius, (2 * radius,) * 2, radius, HOLE
-    yield -half, tuple(2 * half), 0.0, CLOTH
+        yield place - np.sign(place) * inwards - radius, np.full(2, 2 * radius), radius, HOLE
+    yield -half, 2 * half, 0.0, CLOTH
     pad = float(table.cushion_radius)
     for start, end in np.asarray(cushions(table), float):
-        yield np.minimum(start, end) - pad, tuple(np.abs(end - start) + 2 * pad), pad, CUSHION
+        yield np.minimum(start, end) - pad, np.abs(end - start) + 2 * pad, pad, CUSHION
 
 
 def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tuple[list[Trajectory], list[float]]:
@@ -93,7 +94,7 @@ def sketch(env: Billiards, state: Balls) -> Sketch:
     )
 
 
-def _places(positions: np.ndarray, gone: np.ndarray) -> dict[str, tuple[float, float, float] | None]:
+def _places(positions: np.ndarray, gone: np.ndarray) -> dict[str, Any]:
     """Return where each ball is on the screen; None: nowhere."""
     return {
         f"ball-{number}": None if gone[number] else (float(x), -float(y), 0.0)

@@ -183,7 +183,8 @@ def make_teacher(env: Navigation, side: Float[Array, ""] | None = None) -> RoadM
         return jax.tree.map(lambda *two: jnp.stack(two), *(mapped(key, closed(world, above)) for above in (1.0, -1.0)))
 
     keys = _keys(env)
-    return RoadMapTeacher(env, *jax.lax.map(each, (keys, env.worlds), batch_size=min(len(keys), 16)), side)
+    maps, to_goals = jax.lax.map(each, (keys, env.worlds), batch_size=min(len(keys), 16))
+    return RoadMapTeacher(env, maps, to_goals, side)
 
 
 def make_brief_teacher(env: Navigation) -> BriefTeacher:
