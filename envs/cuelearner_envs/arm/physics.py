@@ -124,5 +124,5 @@ def control(body: Body, targets: Command, ground: Ground) -> Body:
 def euler(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Return the angles about x, y and z of a rotation, as Fetch's observations have them [rad]."""
     flat = jnp.hypot(matrix[2, 2], matrix[1, 2])
-    x, z = -jnp.arctan2(matrix[1, 2], matrix[2, 2]), -jnp.arctan2(matrix[0, 1], matrix[0, 0])
-    return jnp.stack([x, jnp.arctan2(matrix[0, 2], flat), z])
+    x, y = -jnp.arctan2(matrix[1, 2], matrix[2, 2]), jnp.arctan2(matrix[0, 2], flat)
+    return jnp.stack([x, y, -jnp.arctan2(matrix[0, 1], matrix[0, 0])])
