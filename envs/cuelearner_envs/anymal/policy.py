@@ -55,8 +55,9 @@ def observe(
     - 12: joints' angles from home [rad], 12: their speeds [rad/s]; 12: the last action
     """
     turn = robot.rotation(qpos[3:7])
-    bent = qpos[7:] - jnp.asarray(robot.HOME, jnp.float32)
-    return jnp.concatenate([robot.in_body(turn, qvel[:3]), qvel[3:6], -turn[2], command, bent, qvel[6:], last_action])
+    trunk = [robot.in_body(turn, qvel[:3]), qvel[3:6], -turn[2]]
+    joints = [qpos[7:] - jnp.asarray(robot.HOME, jnp.float32), qvel[6:]]
+    return jnp.concatenate([*trunk, command, *joints, last_action])
 
 
 def add_noise(key: PRNGKeyArray, obs: Float[Array, "48"], level: float | Float[Array, ""]) -> Float[Array, "48"]:
