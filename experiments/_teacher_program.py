@@ -36,7 +36,7 @@ class TeacherConfig:
     """Hidden layers."""
     tables: Annotated[int, Bounds(1)] = 4096
     """Environments that play in parallel."""
-    tries: Annotated[int, Bounds(4)] = 8
+    tries: Annotated[int, Bounds(4, 1 << 16)] = 8
     """Directions tried in each state: the best, promising ones near their peaks, two uniform ones."""
     search: Annotated[int, Bounds(1)] = 360
     """Directions over which it looks for promising ones (turned at random each time)."""
