@@ -105,7 +105,6 @@ PLAYER = Body(
 )
 
 
-
 BILLIARDS = Task(
     name="billiards",
     about="pocket the target balls with one shot a step",
