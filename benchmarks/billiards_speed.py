@@ -10,13 +10,13 @@ interleaved, so that other work on the machine meets all alike; figures are medi
 import argparse
 import json
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _measuring import timed
 from pymunk_table import USUAL_STEP, PymunkTable, scenes
 
 from cuelearner_envs.billiards import Table, simulate, simulate_many
@@ -29,13 +29,6 @@ def mixed_scenes(table: Table, count: int, seed: int) -> tuple[np.ndarray, np.nd
     jitter = float(table.rack_jitter) * np.random.default_rng(seed + 1).uniform(-0.5, 0.5, places.shape)
     places[::2] = (np.asarray(rack(table)) + jitter)[::2]
     return places, angles
-
-
-def timed(play: Callable[[], object]) -> float:
-    """Seconds that one call takes."""
-    began = time.perf_counter()
-    jax.block_until_ready(play())
-    return time.perf_counter() - began
 
 
 def main() -> None:
@@ -72,11 +65,11 @@ def main() -> None:
         "simulate_many": (len(angles), lambda: blocks(table, *scene)),
         "simulate_many, tilted": (len(angles), lambda: blocks(tilted, *scene)),
     }
-    first = {name: timed(play) for name, (_, play) in contenders.items()}
+    first = {name: timed(play)[0] for name, (_, play) in contenders.items()}
     times = {name: [] for name in contenders}
     for _ in range(arguments.rounds):
         for name, (_, play) in contenders.items():
-            times[name].append(timed(play))
+            times[name].append(timed(play)[0])
 
     rate = {name: shots / float(np.median(times[name])) for name, (shots, _) in contenders.items()}
     peers = max(rate["pymunk, no threads"], rate["pymunk, 2 threads"]), rate["pymunk, stepping alone"]

@@ -1,7 +1,6 @@
 """The labelling page in a real browser, with real keys: nothing lost or doubled, how fast, and what it looks like.
 
     python benchmarks/labelling_page.py paced --task navigation --out paced.json        500 labels, 5 a second
-    python benchmarks/labelling_page.py blind --task billiards --preset quickstart --labels 200
     python benchmarks/labelling_page.py kills --task billiards --preset quickstart --out kills.json
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart
     python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --more="--task.table regulation"
@@ -181,31 +180,6 @@ def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
     }
 
 
-def blind(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, Any]:
-    """Press at a pace whatever the page shows: each is in the file once, or told as not taken."""
-    (task,) = asked.task
-    folder = asked.keep or work / "labels"
-    with served(asked, task, folder, "--labels", str(2 * asked.labels)) as (_, address):
-        page = entered(browser, address)
-        start = time.perf_counter()
-        for number in range(asked.labels):
-            time.sleep(max(0.0, start + number / asked.rate - time.perf_counter()))
-            page.keyboard.press(["ArrowLeft", "ArrowUp", "ArrowRight"][number % 3])
-        seconds = time.perf_counter() - start
-        page.wait_for_function("() => cue.ready()")
-        told = page.evaluate("cue.dropped")
-    found = label_files.found_in(folder)
-    assert found is not None
-    items = [row["item"] for row in label_files.history(found)]
-    saved = {"saved": len(items), "doubled": len(items) - len(set(items)), "told_as_not_taken": told}
-    return {
-        "presses": asked.labels,
-        "seconds": round(seconds, 1),
-        **saved,
-        "unexplained": asked.labels - len(items) - told,
-    }
-
-
 def kills(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, Any]:
     """The command killed at random moments while keys are pressed, and opened again on the same file."""
     rng, pressed, found = random.Random(1), {}, []
@@ -277,7 +251,7 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
 def main() -> None:
     """Run one of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("paced", "blind", "kills", "pictures"))
+    parser.add_argument("what", choices=("paced", "kills", "pictures"))
     parser.add_argument("--task", nargs="+", default=["navigation"])
     parser.add_argument("--preset", default="", help="(default: paper, of a folder or an environment its own)")
     parser.add_argument("--situations", type=int, default=200, help="of the task pictures: how many are written")
@@ -298,9 +272,7 @@ def main() -> None:
             asked.photos = Path(work) / "situations"
             asked.seen, _ = _photos.write(asked.photos, asked.situations)
         browser = driver.chromium.launch(executable_path=asked.browser, args=["--no-sandbox"])
-        found = {"paced": paced, "blind": blind, "kills": kills, "pictures": pictures}[asked.what](
-            asked, browser, Path(work)
-        )
+        found = {"paced": paced, "kills": kills, "pictures": pictures}[asked.what](asked, browser, Path(work))
         browser.close()
     print(json.dumps(found, indent=1))
     if asked.out:

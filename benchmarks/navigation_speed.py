@@ -66,7 +66,7 @@ def ours(env: Navigation, see: Callable[[Any], Any]) -> System:
     return System(env, reset, step)
 
 
-def jaxnav(automatic_reset: bool = True, **options: Any) -> System:
+def jaxnav(**options: Any) -> System:
     """JaxNav with one agent."""
     with contextlib.redirect_stdout(None), warnings.catch_warnings():
         # It tells of environments not installed, and that its own defaults for the goal's distance are clipped.
@@ -83,29 +83,22 @@ def jaxnav(automatic_reset: bool = True, **options: Any) -> System:
     def step(_: None, key: jax.Array, state: Any) -> Any:
         k_action, k_step = jax.random.split(key)
         action = {AGENT: jax.random.uniform(k_action, (2,), minval=space.low, maxval=space.high)}
-        obs, state, _, done, _ = (nav.step if automatic_reset else nav.step_env)(k_step, state, action)
+        obs, state, _, done, _ = nav.step(k_step, state, action)
         return state, obs[AGENT], done["__all__"]
 
     return System(None, reset, step)
 
 
-def contenders(parts: bool) -> dict[str, System]:
-    """Return the contenders; with `parts` also variants that show where the time goes."""
+def contenders() -> dict[str, System]:
+    """Return the contenders."""
     env = make_environment(NavigationConfig(style="clutter", worlds=256))
     hall = {"map_params": {"map_size": (22, 22), "fill": 0.3}, "lidar_max_range": 10.0}
-    raced = {
+    return {
         PEER: jaxnav(),
         "JaxNav, 20 m": jaxnav(**hall),
         "ours": ours(env, lambda step: step.obs),
         "ours, final_obs too": ours(env, lambda step: (step.obs, step.final_obs)),
     }
-    if parts:
-        raced |= {
-            "JaxNav, no reset": jaxnav(automatic_reset=False),
-            "JaxNav, 2 beams": jaxnav(lidar_num_beams=2),
-            "ours, no lidar": ours(env, lambda step: step.reward),
-        }
-    return raced
 
 
 class Race:
@@ -175,7 +168,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8, help="of each environment in one call of the compiled loop")
     parser.add_argument("--repeats", type=int, default=7, help="interleaved rounds")
     parser.add_argument("--seconds", type=float, default=1.0, help="least duration of a timed stretch")
-    parser.add_argument("--parts", action="store_true", help="also without reset, without lidar")
     parser.add_argument("--write", action="store_true", help=f"write {RESULTS.name}")
     asked = parser.parse_args()
     try:
@@ -183,7 +175,7 @@ def main() -> None:
     except metadata.PackageNotFoundError:
         parser.error("JaxMARL is not installed: `python -m uv pip install --no-deps jaxmarl==0.2.0`")
 
-    systems = contenders(asked.parts)
+    systems = contenders()
     rows = [row for n in asked.envs for row in measure(systems, n, asked.steps, asked.repeats, asked.seconds)]
     print(f"{os.cpu_count()} cores, JAX {jax.__version__} on {jax.devices()[0].device_kind}, JaxMARL {version}")
     print(f"{'envs':>6}  {'system':<20}{'steps/s':>10}{'slowest':>10}{'fastest':>10}{'x JaxNav':>10}{'ends/1000':>11}")

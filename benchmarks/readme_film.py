@@ -126,16 +126,7 @@ def picture_of(page: Page) -> Image.Image:
 
 def labelled(folder: Path, browser: str, labels: int) -> tuple[list[str], list[Shot]]:
     """Runs `cuelearner label` to its end; returns its arguments and pictures of the page."""
-    command = [
-        TASK,
-        POLICY,
-        "--guidance",
-        "reading",
-        "--labels",
-        str(labels),
-        "--out",
-        str(folder),
-    ]
+    command = [TASK, POLICY, "--guidance", "reading", "--labels", str(labels), "--out", str(folder)]
     shots: list[Shot] = []
     answering: list[threading.Thread] = []
 
@@ -150,13 +141,6 @@ def labelled(folder: Path, browser: str, labels: int) -> tuple[list[str], list[S
         label.run(command)
     answering[0].join()
     return ["label", *command], shots
-
-
-def film_frames(folder: Path) -> list[Image.Image]:
-    """The frames of the one film in a folder."""
-    (file,) = folder.glob("*.gif")
-    with Image.open(file) as film:
-        return [frame.convert("RGB") for frame in ImageSequence.Iterator(film)]
 
 
 def canvas(words: str, colour: tuple[int, int, int] = INK) -> Image.Image:
@@ -215,14 +199,11 @@ def composed(before: list[Image.Image], shots: list[Shot], after: list[Image.Ima
 
 
 def save(frames: list[Any], file: Path, colours: int = 144) -> None:
-    """Writes an animated GIF of one palette for all frames."""
-    pictures, durations = zip(*frames, strict=True)
-    chosen = range(0, len(pictures), max(1, len(pictures) // 8))
-    sample = Image.new("RGB", (WIDTH, HEIGHT * len(chosen)))
-    for number, index in enumerate(chosen):
-        sample.paste(pictures[index], (0, HEIGHT * number))
-    palette = sample.quantize(colours)
-    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    """Write an animated GIF of one palette for all frames."""
+    shown, durations = zip(*frames, strict=True)
+    sample = np.concatenate([np.asarray(picture) for picture in shown[:: max(1, len(shown) // 8)]])
+    palette = Image.fromarray(sample).quantize(colours)
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in shown]
     indexed[0].save(file, save_all=True, append_images=indexed[1:], duration=list(durations), loop=0, optimize=True)
 
 
@@ -232,7 +213,9 @@ def rendered(commands: list[list[str]], folder: Path, *more: str) -> list[Image.
     commands.append(command)
     if main(command):
         raise SystemExit("cuelearner render failed")
-    return film_frames(folder)
+    (file,) = folder.glob("*.gif")
+    with Image.open(file) as reel:
+        return [frame.convert("RGB") for frame in ImageSequence.Iterator(reel)]
 
 
 def film(asked: argparse.Namespace, work: Path) -> None:

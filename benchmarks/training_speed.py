@@ -33,21 +33,18 @@ BATCH, ENVS, DIRECTIONS = 256, 8, 2
 def measure(config: RunConfig, env: CartPole, seeds: int, steps: int, rounds: int) -> dict[str, float]:
     """Medians over rounds of one number of seeds."""
     operations = step_operations(config, spaces_of(env)).total
-    timed, shares, rates, peaks = Timed(config, env, "none", seeds), [], [], []
-    for round_ in range(rounds + 1):
+    timed, found = Timed(config, env, "none", seeds), []
+    for _ in range(rounds + 1):
         peak = matmul_rate()
         rate = steps * seeds / timed.train(steps // ENVS)
-        if round_:  # the first one compiles
-            peak = max(peak, matmul_rate())
-            shares.append(rate * operations / peak)
-            rates.append(rate)
-            peaks.append(peak)
+        found.append((rate, max(peak, matmul_rate())))
+    rates, peaks = np.array(found[1:]).T  # the first one compiles
     return {
         "seeds": seeds,
         "steps_a_second": float(np.median(rates)),
         "gflop_a_step": operations / 1e9,
         "matmul_gflops": float(np.median(peaks)) / 1e9,
-        "share": float(np.median(shares)),
+        "share": float(np.median(rates * operations / peaks)),
     }
 
 
@@ -59,9 +56,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--lanes-per-block", type=int, default=0, help="0: the default of the machine")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
-    arguments = parser.parse_args()
-
-    env = CartPole()
+    asked = parser.parse_args()
     agent = ddqn.Config(
         directions=DIRECTIONS,
         target_directions=DIRECTIONS,
@@ -70,17 +65,17 @@ def main() -> None:
         optimizer="adam",
         learning_rate=2.5e-4,
     )
-    sizes = Sizes(num_envs=ENVS, lanes_per_block=arguments.lanes_per_block)
+    sizes = Sizes(num_envs=ENVS, lanes_per_block=asked.lanes_per_block)
     config = learning(RunConfig(None, sizes, Scalars(discount=0.99), agent=agent))
-    rows = [measure(config, env, seeds, arguments.steps, arguments.rounds) for seeds in arguments.seeds]
+    rows = [measure(config, CartPole(), seeds, asked.steps, asked.rounds) for seeds in asked.seeds]
     print("seeds  steps/s (all)  GFLOP a step  matmul GFLOP/s  share of it")
     for row in rows:
         print(
             f"{row['seeds']:5d}  {row['steps_a_second']:13.1f}  {row['gflop_a_step']:12.3f}  "
             f"{row['matmul_gflops']:14.0f}  {row['share']:11.1%}"
         )
-    if arguments.out:
-        arguments.out.write_text(json.dumps({"device": jax.devices()[0].device_kind, "rows": rows}, indent=1) + "\n")
+    if asked.out:
+        asked.out.write_text(json.dumps({"device": jax.devices()[0].device_kind, "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

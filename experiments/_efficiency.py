@@ -4,6 +4,8 @@ Intervals are 95% percentile bootstraps over seeds: the seeds of every variant a
 of those of others, 2,000 times; what is computed of the interquartile means of the real seeds is computed of each
 draw's. A level is held fixed. A curve that ends below the level is right-censored (`Bounds`): its steps are "more than
 the last", which ratios and intervals carry on as a bound, never as a number.
+
+Samples lead with the estimate of the real seeds; the draws follow.
 """
 
 from __future__ import annotations
@@ -14,15 +16,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import _efficiency_statistics as bounds
 import numpy as np
-from _efficiency_statistics import Bounds
+import scipy.optimize
+from jaxtyping import Float, Int
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.statistics import Interval
 from cuelearner_jax.report.tables import Row, named, unguided_of
 from cuelearner_jax.report.variants import Variant
+
+Samples = Float[np.ndarray, "samples"]
 
 
 @dataclass(frozen=True)
@@ -43,24 +46,20 @@ class Question:
             raise UserError(f"--within is {self.within}: give a share of steps above 0, at most 1")
 
 
-class Known(NamedTuple):
-    """An estimate with its interval; the interval's ends are NaN for a variant with one seed."""
+class Efficiency(NamedTuple):
+    """Result of a study of label efficiency; tables by file name."""
 
-    bounds: Bounds  # of the estimate, each ()
-    lower: float
-    upper: float
-
-    def columns(self, name: str) -> Row:
-        """Return the table columns; `name` is empty where only `name_above` or `name_below` is known."""
-        low, high = float(self.bounds.lower), float(self.bounds.upper)
-        row = interval_columns(name, Interval(*map(np.array, (low if low == high else np.nan, self.lower, self.upper))))
-        exact = low == high or np.isnan(low)
-        return row | {f"{name}_above": "" if exact else low, f"{name}_below": "" if exact else high}
+    level: float
+    origin: str  # of the level, in words
+    shared: int  # step to which areas are taken
+    tables: dict[str, list[Row]]
 
 
-def interval_columns(name: str, found: Interval) -> Row:
-    """Return the interval's table columns, empty without a number."""
-    return {name + end: _number(value) for end, value in zip(("", "_lower", "_upper"), found, strict=True)}
+class Bounds(NamedTuple):
+    """Bounds of a quantity; they are equal where it is known exactly."""
+
+    lower: Samples
+    upper: Samples
 
 
 class Drawn:
@@ -68,131 +67,103 @@ class Drawn:
 
     def __init__(self, variant: Variant, sign: float, shared: int) -> None:
         """Draw nothing yet; the area is taken to the step `shared`."""
-        self.variant, self.sign = variant, sign
-        self.steps, self.values = variant.curve.steps, sign * variant.values
-        self.last = float(self.steps[-1])
+        self.variant, self.steps, self.values = variant, variant.curve.steps, sign * variant.values
         until = max(1, int(np.searchsorted(self.steps, shared, side="right")))
         self.seed_areas = statistics.mean_over_curve(self.steps[:until], variant.values[:, :until])
         # Its own stream, whatever other variants there are.
         self.stream = zlib.crc32(f"{variant.run}/{variant.guidance}/{variant.labels}".encode())
-        self.alone = len(variant.seeds) == 1
 
     @cached_property
-    def curve(self) -> np.ndarray:
-        """The interquartile mean, (steps,)."""
-        return statistics.interquartile_mean(self.values)
+    def curves(self) -> Float[np.ndarray, "samples steps"]:
+        """The interquartile mean of the seeds' curves."""
+        return self._samples(self.values)
 
     @cached_property
-    def curves(self) -> np.ndarray:
-        """Return the curve of each draw, (resamples, steps)."""
-        return statistics.resampled(self.values, seed=self.stream)
+    def areas(self) -> Samples:
+        """The interquartile mean of the seeds' means over the curve; the draws are those of `curves`."""
+        return self._samples(self.seed_areas)
 
-    @cached_property
-    def areas(self) -> tuple[np.ndarray, np.ndarray]:
-        """The interquartile mean of the seeds' means over the curve, (), and of each draw's, (resamples,)."""
-        drawn = statistics.resampled(self.seed_areas, seed=self.stream)  # the same seeds as of `curves`
-        return statistics.interquartile_mean(self.seed_areas), drawn
+    def _samples(self, values: np.ndarray) -> np.ndarray:
+        own = statistics.interquartile_mean(values)
+        return np.concatenate([np.asarray(own)[None], statistics.resampled(values, seed=self.stream)])
 
-    def steps_to(self, level: float) -> tuple[Bounds, Bounds]:
-        """Steps to a (signed) level: of the interquartile mean, each (), and of each draw's, each (resamples,)."""
-        one = bounds.step_at_level(self.steps, self.curve, level)
-        many = bounds.step_at_level(self.steps, self.curves, level)
-        return bounds.censored(one, self.last), bounds.censored(many, self.last)
+    def steps_to(self, level: float) -> Bounds:
+        """Steps to a (signed) level."""
+        return censored(step_at_level(self.steps, self.curves, level), float(self.steps[-1]))
 
 
-def known(one: Bounds, many: Bounds, *drawn: Drawn) -> Known:
-    """An estimate with the interval of its draws, which has no ends where one of the variants has a single seed."""
-    if any(each.alone for each in drawn):
-        return Known(one, np.nan, np.nan)
-    return Known(one, *bounds.percentiles(many))
+def step_at_level(
+    steps: Float[np.ndarray, "steps"] | Int[np.ndarray, "steps"],
+    curves: Float[np.ndarray, "samples steps"],
+    level: Samples | float,
+) -> Samples:
+    """Return the step at which each curve first reaches its level, by linear interpolation; infinity if never.
+
+    A curve that begins at its level or above gives the first step, so it may have reached it earlier.
+    """
+    steps, level = np.asarray(steps, float), np.broadcast_to(np.asarray(level, float), curves.shape[:-1])
+    reached = curves >= level[..., None]
+    place = reached.argmax(axis=-1)  # 0 where it begins there, and where it never gets there
+    before = np.maximum(place - 1, 0)
+    low, high = (np.take_along_axis(curves, at[..., None], axis=-1)[..., 0] for at in (before, place))
+    share = np.divide(level - low, high - low, out=np.zeros(level.shape), where=high > low)
+    found = steps[before] + share * (steps[place] - steps[before])
+    return np.where(reached.any(axis=-1), found, np.inf)
 
 
-def exactly(values: np.ndarray | float) -> Bounds:
-    """Values that are known."""
-    return Bounds(np.asarray(values, dtype=float), np.asarray(values, dtype=float))
+def censored(found: Samples, last: float) -> Bounds:
+    """Steps to a level of which those that are infinite are only known to be more than `last`."""
+    return Bounds(np.where(np.isinf(found), last, found), found)
 
 
-class Carried(NamedTuple):
-    """Label efficiency of one variant."""
+def ratio_bounds(above: Bounds, below: Bounds) -> Bounds:
+    """Return the bounds of the ratio of two non-negative quantities; 0 to infinity for 0 over 0."""
 
-    variant: Variant
-    against: Variant | None  # the unguided agents that it is compared with; None: it is unguided, or there are none
-    guide: Interval | None  # metric of the guide alone
-    steps: Known  # to the level
-    reached: float  # share of draws whose interquartile mean reaches the level
-    ratio: Known | None  # of those steps to the unguided agents'
-    area_difference: Interval | None  # of the mean over the curve to the unguided agents', in units of the metric
-    area_ratio: Interval | None
+    def divided(numerator: Samples, denominator: Samples, otherwise: float) -> Samples:
+        unknown = ((numerator == 0) & (denominator == 0)) | (np.isinf(numerator) & np.isinf(denominator))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(unknown, otherwise, numerator / denominator)
 
-    def row(self) -> Row:
-        """Return the row of `efficiency.csv`."""
-        row: Row = {**named(self.variant), "seeds": len(self.variant.seeds)}
-        row |= {"against": self.against.name if self.against else ""}
-        row |= interval_columns("guide", self.guide or NOTHING)
-        row |= self.steps.columns("steps_to_level") | {"reached": self.reached}
-        row |= self.ratio.columns("steps_ratio") if self.ratio else UNKNOWN.columns("steps_ratio")
-        row |= interval_columns("mean", self.variant.mean)
-        row |= interval_columns("mean_difference", self.area_difference or NOTHING)
-        return _numbers(row | interval_columns("mean_ratio", self.area_ratio or NOTHING))
+    return Bounds(divided(above.lower, below.upper, 0.0), divided(above.upper, below.lower, np.inf))
 
 
-NOTHING = Interval(*(np.array(np.nan),) * 3)
-UNKNOWN = Known(exactly(np.nan), np.nan, np.nan)
+def labels_for(
+    budgets: Int[np.ndarray, "budgets"], areas: Float[np.ndarray, "samples budgets"], wanted: Samples
+) -> Bounds:
+    """Labels at which areas under the curve, nondecreasing in the budget, first reach what is wanted.
+
+    Areas lie on straight lines over the logarithm of the labels between two budgets; beyond the budgets all that is
+    known is that more than the largest are needed, or no more than the smallest.
+    """
+    first = areas[:, 0] >= wanted
+    exact = np.where(first, float(budgets[0]), np.exp(step_at_level(np.log(budgets), areas, wanted)))
+    return Bounds(np.where(first, 0.0, censored(exact, float(budgets[-1])).lower), exact)
 
 
-class LabelsToLevel(NamedTuple):
-    """The smallest budget of a kind whose curve reaches the level within a share of the unguided agents' steps."""
+def columns(name: str, samples: Bounds, *drawn: Drawn) -> Row:
+    """Return the table columns of an estimate with its interval; without one for a variant with a single seed.
 
-    run: str
-    guidance: str
-    budgets: tuple[int, ...]
-    labels: Known
-    reached: float  # share of draws in which some budget does
-
-
-class EqualArea(NamedTuple):
-    """Labels of one kind that give the area under the curve of another kind's labels."""
-
-    run: str
-    reference: str
-    reference_labels: int
-    area: float  # in units of the metric
-    guidance: str
-    labels: Known
-    ratio: Known  # of those labels to the reference's
+    The column `name` is empty where only `name_above` or `name_below` is known. The interval is wide enough for all
+    that the draws' bounds allow. Its ends are values of draws, never between two, so that infinity ("never") keeps its
+    meaning.
+    """
+    low, high = float(samples.lower[0]), float(samples.upper[0])
+    ends = (np.nan, np.nan)
+    if all(len(each.variant.seeds) > 1 for each in drawn):
+        last = len(samples.lower) - 2
+        ends = np.sort(samples.lower[1:])[int(0.025 * last)], np.sort(samples.upper[1:])[int(np.ceil(0.975 * last))]
+    row = interval_columns(name, (low if low == high else np.nan, *ends))
+    exact = low == high or np.isnan(low)
+    return row | {f"{name}_above": "" if exact else low, f"{name}_below": "" if exact else high}
 
 
-@dataclass(frozen=True)
-class Efficiency:
-    """Result of a study of label efficiency."""
+def interval_columns(name: str, found: Sequence[float | np.ndarray]) -> Row:
+    """Return an interval's table columns, empty without a number."""
+    ends = zip(("", "_lower", "_upper"), map(float, found), strict=True)
+    return {name + end: "" if np.isnan(value) else value for end, value in ends}
 
-    question: Question
-    level: float
-    origin: str  # of the level, in words
-    shared: int  # step to which areas are taken
-    carried: tuple[Carried, ...]
-    labels_to_level: tuple[LabelsToLevel, ...]
-    equal_area: tuple[EqualArea, ...]
 
-    def tables(self) -> dict[str, list[Row]]:
-        """Tables by file name."""
-        found = {"efficiency": [each.row() for each in self.carried]}
-        if self.labels_to_level:
-            found["labels_to_level"] = [
-                _run(each.run)
-                | {"guidance": each.guidance, "level": self.level, "within": self.question.within}
-                | _numbers(each.labels.columns("labels") | {"reached": each.reached})
-                for each in self.labels_to_level
-            ]
-        if self.equal_area:
-            found["equal_area"] = [
-                _run(each.run)
-                | {"reference": each.reference, "reference_labels": each.reference_labels, "mean": each.area}
-                | {"guidance": each.guidance}
-                | _numbers(each.labels.columns("labels") | each.ratio.columns("labels_ratio"))
-                for each in self.equal_area
-            ]
-        return found
+NOTHING = (np.nan,) * 3
 
 
 def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_better: bool = False) -> Efficiency:
@@ -214,28 +185,32 @@ def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_bett
         raise UserError(f"--reference {question.reference}: no results with its labels; there are {there}")
     level, origin = _level(variants, question, shared)
     drawn = {id(variant): Drawn(variant, sign, shared) for variant in variants}
+    rows, to_level, equal = [], [], []
     for variant in variants:
-        if variant.guidance == "none" and sign * level <= drawn[id(variant)].curve[0]:
+        own, unguided = drawn[id(variant)], unguided_of(variant, variants)
+        if variant.guidance == "none" and sign * level <= own.curves[0, 0]:
             raise UserError(
                 f"the level {level:.3g} is no better than what {variant.name} begins with "
                 f"({variant.curve.estimate[0]:.3g}): give another --level or a later --level-at"
             )
-    carried, to_level, equal = [], [], []
-    for variant in variants:
-        unguided = unguided_of(variant, variants)
         against = drawn[id(unguided)] if unguided is not None and unguided is not variant else None
-        carried.append(_carried(drawn[id(variant)], against, sign * level))
+        rows.append(_row(own, against, sign * level))
     for run in dict.fromkeys(variant.run for variant in variants):
         asking: dict[str, list[Drawn]] = {}
         for variant in variants:
             if variant.run == run and variant.labels:
                 asking.setdefault(variant.guidance, []).append(drawn[id(variant)])
-        for own in asking.values():
-            unguided = unguided_of(own[0].variant, variants)
-            if unguided is not None:
-                to_level.append(_labels_to_level(own, drawn[id(unguided)], sign * level, question.within))
-        equal += _equal_area(asking, question.reference, sign)
-    return Efficiency(question, level, origin, shared, tuple(carried), tuple(to_level), tuple(equal))
+        for kind, own in asking.items():
+            if (unguided := unguided_of(own[0].variant, variants)) is not None:
+                row = {**_run(run), "guidance": kind, "level": level, "within": question.within}
+                to_level.append(row | _labels_to_level(own, drawn[id(unguided)], sign * level, question.within))
+        equal += _equal_area(run, asking, question.reference, sign)
+    tables = {"efficiency": rows, "labels_to_level": to_level, "equal_area": equal}
+    return Efficiency(level, origin, shared, {name: table for name, table in tables.items() if table})
+
+
+def _run(name: str) -> Row:
+    return {"run": name} if name else {}
 
 
 def _level(variants: Sequence[Variant], question: Question, shared: int) -> tuple[float, str]:
@@ -253,77 +228,59 @@ def _level(variants: Sequence[Variant], question: Question, shared: int) -> tupl
     return level, f"that of {unguided.name} at step {at:,}"
 
 
-def _carried(own: Drawn, unguided: Drawn | None, level: float) -> Carried:
-    one, many = own.steps_to(level)
-    guide = None if own.variant.guide is None else statistics.interval(own.variant.guide)
-    steps, reached = known(one, many, own), float(np.isfinite(many.upper).mean())
+def _row(own: Drawn, unguided: Drawn | None, level: float) -> Row:
+    """Return a variant's row of `efficiency.csv`; ratios and differences are to the unguided agents'."""
+    variant, steps = own.variant, own.steps_to(level)
+    row: Row = {**named(variant), "seeds": len(variant.seeds), "against": unguided.variant.name if unguided else ""}
+    row |= interval_columns("guide", NOTHING if variant.guide is None else statistics.interval(variant.guide))
+    row |= columns("steps_to_level", steps, own) | {"reached": float(np.isfinite(steps.upper[1:]).mean())}
+    mean = interval_columns("mean", variant.mean)
     if unguided is None:
-        return Carried(own.variant, None, guide, steps, reached, None, None, None)
-    below, belows = unguided.steps_to(level)
-    ratio = known(bounds.ratio_bounds(one, below), bounds.ratio_bounds(many, belows), own, unguided)
-    (area, areas), (other, others) = own.areas, unguided.areas
-    difference = known(exactly(area - other), exactly(areas - others), own, unguided)
-    more = Interval(difference.bounds.lower, np.array(difference.lower), np.array(difference.upper))
-    pairs = ((area, other), (areas, others))
-    one, many = (bounds.ratio_bounds(exactly(above), exactly(under)) for above, under in pairs)
-    times = known(one, many, own, unguided)
-    share = Interval(np.where(other == 0, np.nan, one.lower), np.array(times.lower), np.array(times.upper))
-    return Carried(own.variant, unguided.variant, guide, steps, reached, ratio, more, share)
+        nothing = interval_columns("steps_ratio", NOTHING) | {"steps_ratio_above": "", "steps_ratio_below": ""}
+        return (
+            row
+            | nothing
+            | mean
+            | interval_columns("mean_difference", NOTHING)
+            | interval_columns("mean_ratio", NOTHING)
+        )
+    row |= columns("steps_ratio", ratio_bounds(steps, unguided.steps_to(level)), own, unguided) | mean
+    difference = own.areas - unguided.areas
+    pairs = {
+        "mean_difference": Bounds(difference, difference),
+        "mean_ratio": ratio_bounds(*(Bounds(each.areas, each.areas) for each in (own, unguided))),
+    }
+    for name, samples in pairs.items():
+        known = columns(name, samples, own, unguided)
+        row |= {column: known[column] for column in (name, f"{name}_lower", f"{name}_upper")}
+    return row | ({"mean_ratio": ""} if unguided.areas[0] == 0 else {})
 
 
-def _labels_to_level(own: Sequence[Drawn], unguided: Drawn, level: float, within: float) -> LabelsToLevel:
-    """See `LabelsToLevel`; a budget counts only where it is known to reach the level in time."""
+def _labels_to_level(own: Sequence[Drawn], unguided: Drawn, level: float, within: float) -> Row:
+    """The smallest budget of a kind whose curve is known to reach the level within a share of the unguided steps."""
     budgets = np.array([each.variant.labels for each in own], float)
-    smallest = []
-    for which in (0, 1):  # the seeds there are, then the draws
-        limit = within * np.atleast_1d(unguided.steps_to(level)[which].lower)
-        in_time = np.stack([np.atleast_1d(each.steps_to(level)[which].upper) <= limit for each in own])
-        smallest.append(np.where(in_time.any(axis=0), budgets[in_time.argmax(axis=0)], np.inf))
-    one, many = (bounds.censored(found, budgets[-1]) for found in smallest)
-    labels = known(Bounds(one.lower[0], one.upper[0]), many, unguided, *own)
-    variant = own[0].variant
-    reached = float(np.isfinite(many.upper).mean())
-    return LabelsToLevel(variant.run, variant.guidance, tuple(int(budget) for budget in budgets), labels, reached)
+    limit = within * unguided.steps_to(level).lower
+    in_time = np.stack([each.steps_to(level).upper <= limit for each in own])
+    smallest = np.where(in_time.any(axis=0), budgets[in_time.argmax(axis=0)], np.inf)
+    row = columns("labels", censored(smallest, budgets[-1]), unguided, *own)
+    return row | {"reached": float(np.isfinite(smallest[1:]).mean())}
 
 
-def _equal_area(asking: dict[str, list[Drawn]], reference: str | None, sign: float) -> list[EqualArea]:
-    """Every kind against every other (or the reference) of one run, at each budget of the other's."""
+def _equal_area(run: str, asking: dict[str, list[Drawn]], reference: str | None, sign: float) -> list[Row]:
+    """Labels of one kind that give the area under the curve of another's (or the reference's), at each budget."""
     budgets = {kind: np.array([each.variant.labels for each in own]) for kind, own in asking.items()}
-    fitted = {}
+    fitted = {}  # each sample's nondecreasing least-squares fit (pool adjacent violators)
     for kind, own in asking.items():
-        one = np.array([[each.areas[0] for each in own]])
-        many = np.stack([each.areas[1] for each in own], axis=1)
-        fitted[kind] = bounds.isotonic(sign * one), bounds.isotonic(sign * many)
-    found = []
-    for base, own in asking.items():
-        if reference not in (None, base):
-            continue
+        samples = sign * np.stack([each.areas for each in own], axis=1)
+        fitted[kind] = np.stack([scipy.optimize.isotonic_regression(row).x for row in samples])
+    rows = []
+    for base in asking if reference is None else [kind for kind in asking if kind == reference]:
         for place, labels in enumerate(budgets[base].tolist()):
-            for kind, others in asking.items():
-                if kind == base:
-                    continue
-                one, many = (
-                    bounds.labels_for(budgets[kind], fitted[kind][which], fitted[base][which][:, place])
-                    for which in (0, 1)
-                )
-                one = Bounds(one.lower[0], one.upper[0])
-                needed = known(one, many, *own, *others)
-                ratio = known(Bounds(*(b / labels for b in one)), Bounds(*(b / labels for b in many)), *own, *others)
-                area = float(sign * fitted[base][0][0, place])
-                found.append(EqualArea(own[0].variant.run, base, labels, area, kind, needed, ratio))
-    return found
-
-
-def _run(name: str) -> Row:
-    return {"run": name} if name else {}
-
-
-def _number(value: str | int | float | np.ndarray) -> str | int | float:
-    """A plain number, or nothing where there is none."""
-    if isinstance(value, str | int):
-        return value
-    return "" if np.isnan(value) else float(value)
-
-
-def _numbers(row: Row) -> Row:
-    return {name: _number(value) for name, value in row.items()}
+            for kind in (kind for kind in asking if kind != base):
+                needed = labels_for(budgets[kind], fitted[kind], fitted[base][:, place])
+                both = (*asking[base], *asking[kind])
+                row = {**_run(run), "reference": base, "reference_labels": labels}
+                row |= {"mean": float(sign * fitted[base][0, place]), "guidance": kind}
+                row |= columns("labels", needed, *both)
+                rows.append(row | columns("labels_ratio", Bounds(*(bound / labels for bound in needed)), *both))
+    return rows

@@ -76,15 +76,18 @@ def option(name: str, value: object) -> list[str]:
     return [f"--{name}", *(str(each) for each in (value if isinstance(value, tuple) else (value,)))]
 
 
+def words_of(options: Options) -> list[str]:
+    """Return options as they are typed."""
+    return [word for name, value in options.items() for word in option(name, value)]
+
+
 def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]:
     """Return the command line of a piece."""
     own: dict[str, object] = {**piece.options, "guidance": piece.kinds, "seeds": piece.seeds}
     own |= {"first-seed": FIRST_SEED, **({"labels": piece.labels} if piece.labels else {})}
-    words = ["sweep", task]
-    for name, value in own.items():
-        words += option(name, value)
     folder = out / piece.path
-    return [*words, "--out", str(folder), *(["--resume"] if resume and (folder / "config.json").exists() else [])]
+    going_on = ["--resume"] if resume and (folder / "config.json").exists() else []
+    return ["sweep", task, *words_of(own), "--out", str(folder), *going_on]
 
 
 def folder_at(out: Path, scale: str) -> Path:

@@ -8,10 +8,9 @@ tried in one state.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +19,10 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.agents.networks import all_finite
-from cuelearner_jax.config import LARGEST
+from cuelearner_jax.config import Bounds, Layers
 from cuelearner_jax.environment import random_symmetries
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import directions as geometry
-from cuelearner_jax.teachers import LearnedTeacher, expected_reward, init_params
+from cuelearner_jax.teachers import expected_reward, init_params
 from cuelearner_jax.types import Params
 
 SHARPNESS = 0.05  # values that differ by this are told apart when promising directions are drawn
@@ -34,53 +32,30 @@ SHARPNESS = 0.05  # values that differ by this are told apart when promising dir
 class TeacherConfig:
     """Settings of a teacher's training."""
 
-    layers: tuple[int, ...] = (512, 512, 512, 512)
+    layers: Layers = (512, 512, 512, 512)
     """Hidden layers."""
-    tables: int = 4096
+    tables: Annotated[int, Bounds(1)] = 4096
     """Environments that play in parallel."""
-    tries: int = 8
-    """Directions tried in each state: the best, promising ones near their peaks, uniform ones."""
-    search: int = 360
+    tries: Annotated[int, Bounds(4, 1 << 16)] = 8
+    """Directions tried in each state: the best, promising ones near their peaks, two uniform ones."""
+    search: Annotated[int, Bounds(1)] = 360
     """Directions over which it looks for promising ones (turned at random each time)."""
-    directions: int = 3600
+    directions: Annotated[int, Bounds(1)] = 3600
     """Directions among which the finished teacher takes its best."""
-    memory: int = 64
+    memory: Annotated[int, Bounds(1)] = 64
     """Rounds of play kept for training."""
-    updates: int = 8
+    updates: Annotated[int, Bounds(1)] = 8
     """Gradient steps a round."""
-    batch_size: int = 8192
+    batch_size: Annotated[int, Bounds(1)] = 8192
     """Tries in a gradient step."""
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, Bounds(0, math.inf, above=True)] = 1e-3
     """Adam's peak step size (cosine decay over the run)."""
-    rounds: int = 8000
+    rounds: Annotated[int, Bounds(1)] = 8000
     """Rounds of play."""
-    explore_probability: float = 0.05
+    explore_probability: Annotated[float, Bounds(0, 1)] = 0.05
     """Share of shots played in a uniform direction."""
-    spread_deg: float = 2.0
+    spread_deg: Annotated[float, Bounds(0, 180)] = 2.0
     """Largest standard deviation of the directions tried round a promising one [deg]."""
-
-
-def check_config(config: TeacherConfig) -> None:
-    """Raise UserError for values that cannot work."""
-    for name in ("tables", "search", "directions", "memory", "updates", "batch_size", "rounds"):
-        if not 1 <= getattr(config, name) <= LARGEST:
-            raise UserError(f"--teacher.{name} is {getattr(config, name)}: give a positive number of at most {LARGEST}")
-    if config.rounds * config.updates > LARGEST:
-        raise UserError(
-            f"teacher.rounds times teacher.updates is {config.rounds * config.updates}: give at most {LARGEST}"
-        )
-    if not 4 <= config.tries <= LARGEST:
-        raise UserError(
-            f"teacher.tries is {config.tries}: give at least 4 (the best, a promising one, two uniform ones)"
-        )
-    if not config.layers or min(config.layers) < 1 or max(config.layers) > LARGEST:
-        raise UserError("teacher.layers: give at least one layer of positive width")
-    if not 0 < config.learning_rate < math.inf:
-        raise UserError(f"teacher.learning_rate is {config.learning_rate}: give a positive, finite number")
-    if not 0 <= config.explore_probability <= 1:
-        raise UserError(f"teacher.explore_probability is {config.explore_probability}: give a number from 0 to 1")
-    if not 0 <= config.spread_deg <= 180:
-        raise UserError(f"teacher.spread_deg is {config.spread_deg}: give a number from 0 to 180")
 
 
 class TeacherState(struct.PyTreeNode):
@@ -98,30 +73,8 @@ class TeacherState(struct.PyTreeNode):
     round: jax.Array
 
 
-class TeacherProgram(NamedTuple):
-    """The jitted functions of a teacher's training."""
-
-    init: Callable[[Any, PRNGKeyArray], TeacherState]  # (env, key) -> state
-    # (env, state, rounds) -> state, metrics
-    train: Callable[[Any, TeacherState, int], tuple[TeacherState, dict[str, jax.Array]]]
-
-
-def make_program(config: TeacherConfig) -> TeacherProgram:
-    """The training of a teacher; see the module's docstring."""
-    training = Trainer(config)
-    return TeacherProgram(
-        jax.jit(training.init),
-        jax.jit(training.train, static_argnames="rounds", donate_argnames="state"),
-    )
-
-
-def finished(config: TeacherConfig, env: Any, state: TeacherState) -> LearnedTeacher:
-    """The teacher that a training has led to: it aims perfectly and has no habit."""
-    return LearnedTeacher(env, state.average, 0.0, 0.0, config.layers, config.directions)
-
-
 class Trainer(NamedTuple):
-    """Pure functions of a training."""
+    """Pure functions of a training: a hashable value, so that `init` and `train` are jitted once for each config."""
 
     config: TeacherConfig
 
@@ -134,10 +87,7 @@ class Trainer(NamedTuple):
         )
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
-    def value(self, env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
-        """Return the expected reward of actions in one state."""
-        return expected_reward(self.config.layers, env, params, obs, actions)
-
+    @partial(jax.jit, static_argnums=0)
     def init(self, env: Any, key: PRNGKeyArray) -> TeacherState:
         """A fresh network, every table at the start of an episode."""
         c = self.config
@@ -163,7 +113,7 @@ class Trainer(NamedTuple):
         k_turn, k_draw, k_width, k_noise, k_uniform = jax.random.split(key, 5)
         turn = jax.random.uniform(k_turn, maxval=2 * jnp.pi / c.search)
         options = geometry.rotate(geometry.evenly_spaced(c.search), turn)
-        values = self.value(env, params, obs, options)
+        values = expected_reward(c.layers, env, params, obs, options)
         best = jnp.argmax(values)
         promising = jax.random.categorical(k_draw, values / SHARPNESS, shape=(c.tries - 3,))
         width = jnp.deg2rad(c.spread_deg) * jax.random.uniform(k_width, (c.tries - 3,))
@@ -205,7 +155,7 @@ class Trainer(NamedTuple):
         obs, action = random_symmetries(k_mirror, env, c.batch_size)(obs, action)
 
         def loss(params: Params) -> jax.Array:
-            values = jax.vmap(partial(self.value, env, params))(obs, action)
+            values = jax.vmap(partial(expected_reward, c.layers, env, params))(obs, action)
             return jnp.mean(jnp.square(values - reward))
 
         error, gradient = jax.value_and_grad(loss)(state.params)
@@ -216,6 +166,7 @@ class Trainer(NamedTuple):
         average = optax.incremental_update(params, state.average, rate)
         return state.replace(params=params, average=average, opt_state=opt_state), error
 
+    @partial(jax.jit, static_argnums=(0, 3), donate_argnums=2)
     def train(self, env: Any, state: TeacherState, rounds: int) -> tuple[TeacherState, dict[str, jax.Array]]:
         """`rounds` rounds of play with their gradient steps.
 

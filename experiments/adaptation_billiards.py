@@ -9,11 +9,12 @@ in a world, in lanes of one program. At the scale `smoke` a piece takes seconds 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from _adaptation import MODEST, SMALL, UNCHANGED, Piece, Scale, Study, run
-from _pieces import option
+from _pieces import words_of
 from billiards_bootstrapping import SCALES as TRAINING
 
 BOUNDS_DEG = {UNCHANGED: 1.0, "turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3}
@@ -47,12 +48,8 @@ def pieces(world: str, bound: float) -> list[Piece]:
 PIECES = tuple(piece for world, bound in BOUNDS_DEG.items() for piece in pieces(world, bound))
 
 
-def bases() -> list[str]:
-    """Return the command-line options for training tiny base agents."""
-    own = {**TRAINING["smoke"].options, "preset": "regulation", "guidance": "none", "seeds": 2}
-    return [word for name, value in own.items() for word in option(name, value)]
-
-
+# Tiny base agents.
+BASES = words_of({**TRAINING["smoke"].options, "preset": "regulation", "guidance": "none", "seeds": 2})
 SCALES = {
     "smoke": Scale(
         "seconds a piece on a CPU, to see that everything runs",
@@ -62,7 +59,7 @@ SCALES = {
         labels={50: 5, 250: 10},
         settings=SMALL,
         tuned_steps=(40, 20),
-        train=bases(),
+        train=BASES,
     ),
     "cpu": Scale(
         "ten minutes a piece on 2 cores: smaller models, fewer episodes",
@@ -75,11 +72,7 @@ SCALES = {
     "paper": Scale("minutes a piece on an accelerator", envs=200, steps=50),
 }
 STUDY = Study("billiards", PIECES, SCALES)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run pieces; return the exit status."""
-    return run(STUDY, __doc__ or "", arguments)
+main = partial(run, STUDY, __doc__ or "")
 
 
 if __name__ == "__main__":

@@ -9,11 +9,12 @@ lanes of one program. At the scale `smoke` a piece takes seconds on a CPU, with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from _adaptation import MODEST, SMALL, UNCHANGED, Piece, Scale, Study, run
-from _pieces import option
+from _pieces import words_of
 from navigation_bootstrapping import SCALES as TRAINING
 
 FRAME: Mapping[str, Any] = {"sizes.frame": "action"}
@@ -96,12 +97,8 @@ PIECES = (
 )
 
 
-def bases() -> list[str]:
-    """Return the command-line options for training tiny base agents."""
-    own = {**TRAINING["smoke"].options, "preset": "paper", "sizes.num-envs": 10, "guidance": "none", "seeds": 2}
-    return [word for name, value in own.items() for word in option(name, value)]
-
-
+# Tiny base agents.
+BASES = words_of({**TRAINING["smoke"].options, "preset": "paper", "sizes.num-envs": 10, "guidance": "none", "seeds": 2})
 SCALES = {
     "smoke": Scale(
         "seconds a piece on a CPU, to see that everything runs",
@@ -111,7 +108,7 @@ SCALES = {
         labels={50: 5, 250: 10},
         settings=SMALL,
         tuned_steps=(40, 20),
-        train=bases(),
+        train=BASES,
     ),
     "cpu": Scale(
         "ten minutes a piece on 2 cores: smaller models, fewer episodes, bases with 36 directions",
@@ -124,11 +121,7 @@ SCALES = {
     "paper": Scale("minutes a piece on an accelerator", envs=2_000, steps=0),
 }
 STUDY = Study("navigation", PIECES, SCALES)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run pieces; return the exit status."""
-    return run(STUDY, __doc__ or "", arguments)
+main = partial(run, STUDY, __doc__ or "")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ there is a report of each table (FOLDER/TABLE/report). At the scale `smoke` a pi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 
 from _pieces import Experiment, Options, Piece, Scale, run
 
@@ -109,11 +109,7 @@ EXPERIMENT = Experiment(
         "easy": ("--level-at", "1000000", "--reference", "relative"),
     },
 )
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what is asked for; return the exit status."""
-    return run(EXPERIMENT, __doc__ or "", arguments)
+main = partial(run, EXPERIMENT, __doc__ or "")
 
 
 if __name__ == "__main__":

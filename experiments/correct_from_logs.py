@@ -74,19 +74,15 @@ def recorded(seed: int) -> np.ndarray:
     return np.random.default_rng((seed, 0)).uniform(-1, 1, (RECORDED, 3)).astype(np.float32)
 
 
-def at_random(seed: int, eps: float) -> cl.Labels:
-    """Answers about the policy's actions, moved at random by up to the bound."""
+def at_random(seed: int, eps: float, is_shuffled: bool) -> cl.Labels:
+    """Answers about the policy's actions, moved at random by up to the bound; shuffled: each that of another label."""
     random = np.random.default_rng((seed, 2))
     obs = random.permutation(recorded(seed))[:LABELS]
     moved = off(obs) + BOUND * RANGE * random.uniform(-1, 1, obs.shape)
     actions = np.clip(moved, LOW, HIGH).astype(np.float32)
-    told = jax.vmap(lambda action, best: relative_feedback(BOX, action, best, eps))
-    return cl.Labels(obs, actions, np.array(told(jnp.asarray(actions), jnp.asarray(intended_actions(obs)))))
-
-
-def shuffled(labels: cl.Labels, seed: int) -> cl.Labels:
-    """Each label with the answer of another."""
-    return labels._replace(answer=np.random.default_rng((seed, 3)).permutation(labels.answer))
+    answer = jax.vmap(lambda action, best: relative_feedback(BOX, action, best, eps))
+    answers = np.array(answer(jnp.asarray(actions), jnp.asarray(intended_actions(obs))))
+    return cl.Labels(obs, actions, np.random.default_rng((seed, 3)).permutation(answers) if is_shuffled else answers)
 
 
 def in_rounds(seed: int, guidance: str, folder: Path, control: bool):
@@ -110,8 +106,7 @@ def correct(guidance: str, questions: str, answers: str, seed: int, folder: Path
             found = in_rounds(seed, guidance, folder, answers == "shuffled")
         else:
             eps = plain_scalars(BOX).eps_deg
-            labels = at_random(seed, eps)
-            labels = shuffled(labels, seed) if answers == "shuffled" else labels
+            labels = at_random(seed, eps, answers == "shuffled")
             bound = None if guidance == "reading" else BOUND
             found = cl.correct(off, labels, low=LOW, high=HIGH, eps=eps, guidance=guidance, seed=seed, bound=bound)
     return Row(guidance, questions, answers, seed, error(off, seed), error(found, seed), found.used)

@@ -88,16 +88,7 @@ def teacher(obs: np.ndarray) -> np.ndarray:
     return np.asarray(right(obs))
 
 
-@dataclasses.dataclass(frozen=True)
-class Content:
-    """The content of a picture: answers (labels, ...), and actions after these answers (situations,)."""
-
-    form: str  # of the answers; empty: there are none
-    labels: Any
-    after: np.ndarray
-
-
-SITUATIONS, ROWS = np.linspace(-1, 1, 161, dtype=np.float32)[:, None], np.linspace(-1, 1, 121, dtype=np.float32)
+SITUATIONS = np.linspace(-1, 1, 161, dtype=np.float32)[:, None]
 
 
 def corrected(kind: str) -> tuple[Any, Any]:
@@ -112,17 +103,7 @@ def corrected(kind: str) -> tuple[Any, Any]:
     return better, jax.tree.map(lambda leaf: np.asarray(leaf[0]), better.outcome.found.labels)
 
 
-def content_of(kind: str) -> Content:
-    """Return the content of the picture of a kind."""
-    if kind == "heuristic":
-        return Content("", None, np.full(len(SITUATIONS), 0.1))
-    better, labels = corrected(kind)
-    form = registry.find(kind).form
-    assert form is not None
-    return Content(form.name, labels, np.asarray(better(SITUATIONS))[:, 0])
-
-
-def plot(what: Content, kind: str) -> Figure:
+def plot(kind: str, labels: Any, after: np.ndarray) -> Figure:
     """Draw the one picture that all kinds share; readable on white and on black."""
     found = registry.guides().get(kind)
     colour = found.colour if found else "#0072B2"
@@ -134,8 +115,9 @@ def plot(what: Content, kind: str) -> Figure:
     if kind == "intent":
         others = np.asarray(jax.vmap(Line().aims)(jnp.asarray(SITUATIONS)).actions)[:, 1:, 0]
         axes.plot(SITUATIONS, others, color=GREY, linewidth=0.7, alpha=0.7)
-    axes.plot(SITUATIONS, what.after, color=colour, linewidth=2.4, label="after", zorder=4)
-    answers(axes, what)
+    axes.plot(SITUATIONS, after, color=colour, linewidth=2.4, label="after", zorder=4)
+    if labels is not None:
+        answers(axes, registry.find(kind).form, labels)
     axes.set(xlim=(-1, 1), ylim=(-1, 1), xticks=[], yticks=[])
     axes.set_xlabel("situation", color=GREY, loc="left")
     axes.set_ylabel("action", color=GREY)
@@ -146,20 +128,18 @@ def plot(what: Content, kind: str) -> Figure:
     return figure
 
 
-def answers(axes: Any, what: Content) -> None:
+def answers(axes: Any, form: Any, labels: Any) -> None:
     """Draw each answer where its question lies."""
-    if what.labels is None:
-        return
-    keep = np.asarray(what.labels.valid, bool)
-    where, action = what.labels.obs[keep, 0], what.labels.action[keep, 0]
-    said = np.asarray(what.labels.answer)[keep]
+    keep = np.asarray(labels.valid, bool)
+    where, action = labels.obs[keep, 0], labels.action[keep, 0]
+    said = np.asarray(labels.answer)[keep]
     said = said[:, 0] if said.ndim > 1 else said
     style: dict[str, Any] = {"linestyle": "", "markersize": 5.5, "alpha": 0.9, "zorder": 3}
-    if what.form == "demonstration":
+    if form.name == "demonstration":
         axes.vlines(where, action, said, color=GREY, linewidth=0.8)
         axes.plot(where, said, marker="*", color="#009E73", **{**style, "markersize": 7})
         return
-    if what.form == "scalar":
+    if form.name == "scalar":
         axes.plot(where[said < 0.5], action[said < 0.5], marker="x", color=DOWN, **{**style, "markersize": 4})
         axes.plot(where[said > 0.5], action[said > 0.5], marker="o", color="#009E73", **style)
         return
@@ -178,10 +158,14 @@ def main() -> None:
     file = asked.out / "pictures.json"
     told = json.loads(file.read_text()) if file.exists() else {}
     for kind in asked.kinds:
-        what = content_of(kind)
-        plot(what, kind).savefig(asked.out / f"{kind}.svg", metadata={"Date": None}, transparent=True)
-        wrong = float(np.abs(what.after - np.asarray(right(SITUATIONS))[:, 0]).mean() / OFFSET)
-        count = 0 if what.labels is None else int(np.asarray(what.labels.valid).sum())
+        if kind == "heuristic":
+            labels, after = None, np.full(len(SITUATIONS), 0.1)
+        else:
+            better, labels = corrected(kind)
+            after = np.asarray(better(SITUATIONS))[:, 0]
+        plot(kind, labels, after).savefig(asked.out / f"{kind}.svg", metadata={"Date": None}, transparent=True)
+        wrong = float(np.abs(after - np.asarray(right(SITUATIONS))[:, 0]).mean() / OFFSET)
+        count = 0 if labels is None else int(np.asarray(labels.valid).sum())
         told[kind] = {"labels": count, "error_left": round(wrong, 3)}
         print(f"{kind}: {count} labels leave {100 * wrong:.0f}% of the error")
     told["made"] = {**provenance(), "command": "python experiments/feedback_pictures.py"}

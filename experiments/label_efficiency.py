@@ -13,13 +13,13 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from _efficiency import Carried, Efficiency, Known, Question, efficiency_of
+from _efficiency import Efficiency, Question, efficiency_of
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report.document import Study, report
-from cuelearner_jax.report.statistics import Interval
 from cuelearner_jax.report.tables import markdown, markdown_table
 from cuelearner_jax.report.variants import Variant
 
@@ -42,19 +42,21 @@ def parsed(arguments: Sequence[str]) -> argparse.Namespace:
     return asked
 
 
-def known_cell(known: Known, form: str) -> str:
-    """Return a quantity with its interval as a cell: `0.62 [0.54, 0.71]`, `above 1.40 [1.30, no bound]`."""
-    low, high = (float(bound) for bound in known.bounds)
-    if low == high:
-        text = form.format(low)
+def cell(row: dict[str, Any], name: str, form: str) -> str:
+    """Return a quantity with its interval: `0.62 [0.54, 0.71]`, `above 1.40 [1.30, no bound]`, or nothing."""
+    value, low, high = row[name], row.get(f"{name}_above", ""), row.get(f"{name}_below", "")
+    if value == "" == low:
+        return ""
+    if value != "":
+        text = form.format(value)
     elif np.isinf(high):
         text = f"above {form.format(low)}" if low > 0 else "not known"
     else:
         text = f"below {form.format(high)}" if low <= 0 else f"{form.format(low)} to {form.format(high)}"
-    if np.isnan(known.lower):
+    lower, upper = row[f"{name}_lower"], row[f"{name}_upper"]
+    if lower == "":
         return text
-    upper = form.format(known.upper) if np.isfinite(known.upper) else "no bound"
-    return f"{text} [{form.format(known.lower)}, {upper}]"
+    return f"{text} [{form.format(lower)}, {form.format(upper) if np.isfinite(upper) else 'no bound'}]"
 
 
 def section(found: Efficiency) -> list[str]:
@@ -62,21 +64,13 @@ def section(found: Efficiency) -> list[str]:
     level = f"The level is {found.level:.3f}: {markdown(found.origin)}."
     header = ["run", "guidance", "labels", "guide alone", "steps to the level", "ratio to unguided"]
     header += [f"mean over the curve to {found.shared:,}", "ratio to unguided"]
-    return ["", "## Label efficiency", "", level, "", *markdown_table(header, [_cells(each) for each in found.carried])]
-
-
-def _cells(each: Carried) -> list[str]:
-    run, guidance = markdown(each.variant.run), markdown(each.variant.guidance)
-    cells = [run, guidance, f"{each.variant.labels:,}", _interval(each.guide), known_cell(each.steps, "{:,.0f}")]
-    cells += [known_cell(each.ratio, "{:.2f}") if each.ratio else "", _interval(each.variant.mean)]
-    return [*cells, _interval(each.area_ratio, "{:.2f}")]
-
-
-def _interval(found: Interval | None, form: str = "{:.3f}") -> str:
-    if found is None or np.isnan(found.estimate):
-        return ""
-    estimate, lower, upper = (form.format(float(value)) for value in found)
-    return estimate if np.isnan(found.lower) else f"{estimate} [{lower}, {upper}]"
+    forms = {"guide": "{:.3f}", "steps_to_level": "{:,.0f}", "steps_ratio": "{:.2f}", "mean": "{:.3f}"}
+    forms["mean_ratio"] = "{:.2f}"
+    lines = []
+    for row in found.tables["efficiency"]:
+        names = [markdown(row.get("run", "")), markdown(row["guidance"]), f"{row['labels']:,}"]
+        lines.append([*names, *(cell(row, name, form) for name, form in forms.items())])
+    return ["", "## Label efficiency", "", level, "", *markdown_table(header, lines)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -85,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def study(variants: Sequence[Variant]) -> Study:
         found = efficiency_of(variants, asked.question, asked.lower_is_better)
-        return Study(section(found), found.tables())
+        return Study(section(found), found.tables)
 
     try:
         asked = parsed(arguments)

@@ -10,7 +10,7 @@ there is a report (FOLDER/clutter/report). At the scale `cpu` a piece takes ten 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from _pieces import Experiment, Options, Piece, Scale, run
@@ -113,11 +113,7 @@ EXPERIMENT = Experiment(
     report={"clutter": ("--level", "0.9", "--within", "1", "--reference", "relative")},
     metric=("--metric", "success"),
 )
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what is asked for; return the exit status."""
-    return run(EXPERIMENT, __doc__ or "", arguments)
+main = partial(run, EXPERIMENT, __doc__ or "")
 
 
 if __name__ == "__main__":

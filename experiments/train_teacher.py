@@ -21,7 +21,7 @@ from typing import Any, Generic, TypeVar
 import jax
 import numpy as np
 import tyro
-from _teacher_program import TeacherConfig, check_config, finished, make_program
+from _teacher_program import TeacherConfig, Trainer
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import teachers
@@ -62,18 +62,6 @@ class Asked(Generic[TaskT]):
     """Go on with an interrupted training."""
 
 
-def check(task: Task, asked: Asked) -> None:
-    """Raise UserError for values that cannot work."""
-    check_config(asked.teacher)
-    if not 0 <= asked.seed <= LARGEST:
-        raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST}")
-    if not 1 <= asked.eval_steps <= LARGEST or asked.eval_steps % min(EVAL_ENVS, asked.eval_steps):
-        raise UserError(f"--eval-steps is {asked.eval_steps}: give a positive number, beyond {EVAL_ENVS} a multiple")
-    shape = shape_of(task, asked.task)
-    if not hasattr(shape, "features"):
-        raise UserError(f"{task.name} gives a teacher no features to learn from")
-
-
 def train(task: Task, asked: Asked, command: str) -> float:
     """Train a teacher, validate and write it.
 
@@ -85,7 +73,11 @@ def train(task: Task, asked: Asked, command: str) -> float:
         Interrupted: Ctrl-C; everything is saved.
         NotFinite: the training diverged; what its newest checkpoint holds is finite.
     """
-    check(task, asked)
+    configuration.check_part(asked.teacher, "teacher")
+    if not 1 <= asked.eval_steps <= LARGEST or asked.eval_steps % min(EVAL_ENVS, asked.eval_steps):
+        raise UserError(f"--eval-steps is {asked.eval_steps}: give a positive number, beyond {EVAL_ENVS} a multiple")
+    if not hasattr(shape_of(task, asked.task), "features"):
+        raise UserError(f"{task.name} gives a teacher no features to learn from")
     out, config, world = asked.out, asked.teacher, configuration.to_json(asked.task)
     described = {"config": configuration.to_json(config), "task": {"name": task.name, **world}, "seed": asked.seed}
     env = task.environment(asked.task)
@@ -95,7 +87,8 @@ def train(task: Task, asked: Asked, command: str) -> float:
         check_folder(out, {"format": formats.FORMATS["config"], **described}, asked.resume, overwrite=False)
         prepare_folder(out, described, clean=False)
         made, history = _learn(env, config, out, asked.seed)
-        reward = validate(made, env, asked.eval_steps)
+        found = evaluate_policy(env, Taught(made), episodes(), min(EVAL_ENVS, asked.eval_steps), asked.eval_steps)
+        reward = float(np.asarray(found["reward"]))
         rows = history[:: max(1, len(history) // 50)]
         about = {
             **described,
@@ -113,42 +106,35 @@ def train(task: Task, asked: Asked, command: str) -> float:
 
 def _learn(env: Any, config: TeacherConfig, out: Path, seed: int) -> tuple[LearnedTeacher, list[list[float]]]:
     """Train all rounds from the folder's newest checkpoint on; return the teacher and `COLUMNS` per stretch."""
-    program = make_program(config)
+    trainer = Trainer(config)
     with checkpoints(out / TRAINING) as saved, interruptible() as stopping, progress_bars() as bars:
-        state = program.init(env, jax.random.key(seed))
+        state = trainer.init(env, jax.random.key(seed))
         history = np.zeros((-(-config.rounds // ROUNDS_A_STRETCH), len(COLUMNS)), np.float32)
         if saved.latest() is not None:
             whole = saved.restore(jax.eval_shape(lambda: {"state": state, "history": history}))
             state, history = whole["state"], np.array(whole["history"])
-        before, started, kept = history[:, 1].max(), time.perf_counter(), time.perf_counter()
+        before, started, saved_at = history[:, 1].max(), time.perf_counter(), time.perf_counter()
         bar = bars.add_task("teacher", total=config.rounds, note="", completed=int(state.round))
         while (done := int(state.round)) < config.rounds:
-            state, metrics = program.train(env, state, min(ROUNDS_A_STRETCH, config.rounds - done))
+            state, metrics = trainer.train(env, state, min(ROUNDS_A_STRETCH, config.rounds - done))
             if not metrics["finite"]:
-                raise NotFinite(_diverged(out, saved.latest(), int(state.round)))
+                kept = saved.latest()
+                held = "nothing was saved before" if kept is None else f"{out} holds the checkpoint of round {kept}"
+                raise NotFinite(
+                    f"the teacher is no longer finite by round {int(state.round):,}, and was not written; {held}: "
+                    "train with a smaller --teacher.learning-rate and another --out"
+                )
             reward, loss, now = float(metrics["reward"]), float(metrics["loss"]), time.perf_counter()
             history[done // ROUNDS_A_STRETCH] = int(state.round), before + now - started, reward, loss
             bars.update(bar, completed=int(state.round), note=f"reward {reward:.3f} loss {loss:.4f}")
-            if now - kept > SECONDS_BETWEEN_CHECKPOINTS or stopping.is_set() or int(state.round) >= config.rounds:
+            if now - saved_at > SECONDS_BETWEEN_CHECKPOINTS or stopping.is_set() or int(state.round) >= config.rounds:
                 saved.save(int(state.round), {"state": state, "history": history})
-                kept = time.perf_counter()
+                saved_at = time.perf_counter()
             if stopping.is_set():
                 raise Interrupted(f"stopped at round {int(state.round)}; go on with the same command and --resume")
-    return finished(config, env, state), history.tolist()
-
-
-def _diverged(out: Path, kept: int | None, done: int) -> str:
-    held = "nothing was saved before" if kept is None else f"{out} holds the checkpoint of round {kept}"
-    return (
-        f"the teacher is no longer finite by round {done:,}, and was not written; {held}: "
-        "train with a smaller --teacher.learning-rate and another --out"
-    )
-
-
-def validate(made: LearnedTeacher, env: Any, steps: int) -> float:
-    """Reward a step of a teacher's own choices on validation episodes."""
-    found = evaluate_policy(env, Taught(made), episodes(), min(EVAL_ENVS, steps), steps)
-    return float(np.asarray(found["reward"]))
+    # It aims perfectly and has no habit.
+    teacher = LearnedTeacher(env, state.average, 0.0, 0.0, config.layers, config.directions)
+    return teacher, history.tolist()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import tyro
@@ -27,6 +27,7 @@ from jaxtyping import PRNGKeyArray
 from cuelearner_jax import config as configuration
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.bridges.brax import supply_device_put_replicated
+from cuelearner_jax.config import Bounds, Layers
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.storage.folders import claimed, in_use
 from cuelearner_jax.storage.provenance import provenance
@@ -34,6 +35,7 @@ from cuelearner_jax.terminal import Interrupted, interruptible
 
 COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history
 VALUE_LAYERS = (256, 256, 256, 256)
+Tell = Callable[[str], None]
 
 
 class Walker(NamedTuple):
@@ -47,39 +49,43 @@ class Walker(NamedTuple):
     load: Callable[..., Any]  # (folder) -> the policy; the shipped one without a folder
 
 
+Positive = Bounds(0, math.inf, above=True)
+Robots = Annotated[int, Bounds(1, 1 << 20)]  # each keeps some kilobytes of physics
+
+
 @dataclass(frozen=True)
 class Training:
     """Settings of training to walk (brax's PPO)."""
 
-    steps: int = 100_000_000
+    steps: Annotated[int, Bounds(1)] = 100_000_000
     """Steps of control, over all robots."""
-    seconds: float = 0.0
+    seconds: Annotated[float, Bounds(0)] = 0.0
     """Stop at the first measurement after this time [s]; 0: only after all steps."""
-    robots: int = 4096
+    robots: Robots = 4096
     """Robots that walk in parallel."""
-    layers: tuple[int, ...] = (256, 128, 64)
+    layers: Layers = (256, 128, 64)
     """Hidden layers of the policy."""
-    unroll: int = 20
+    unroll: Annotated[int, Bounds(1)] = 20
     """Steps of control in a piece of experience."""
-    minibatches: int = 16
+    minibatches: Annotated[int, Bounds(1)] = 16
     """Parts into which a batch is split."""
-    batch_size: int = 256
+    batch_size: Annotated[int, Bounds(1)] = 256
     """Pieces of experience in a minibatch; times minibatches it must be a multiple of the robots."""
-    updates: int = 4
+    updates: Annotated[int, Bounds(1)] = 4
     """Passes over each batch."""
-    learning_rate: float = 3e-4
+    learning_rate: Annotated[float, Positive] = 3e-4
     """Adam's step size."""
-    entropy: float = 0.01
+    entropy: Annotated[float, Bounds(0)] = 0.01
     """Weight of the policy's entropy."""
-    discount: float = 0.97
+    discount: Annotated[float, Positive] = 0.97
     """Discount factor."""
-    max_grad_norm: float = 1.0
+    max_grad_norm: Annotated[float, Positive] = 1.0
     """Bound on the gradient's norm."""
-    episode: int = 1000
+    episode: Annotated[int, Bounds(1)] = 1000
     """Steps of control of an episode."""
-    measurements: int = 20
+    measurements: Annotated[int, Bounds(1)] = 20
     """Times at which the policy is measured and saved."""
-    measured_robots: int = 512
+    measured_robots: Robots = 512
     """Robots that a measurement watches for 20 s."""
 
 
@@ -108,49 +114,12 @@ class Evaluate:
     """Also write the figures to this JSON file."""
 
 
-LARGEST_ROBOTS = 1 << 20  # each keeps some kilobytes of physics
-
-
-def check(config: Training) -> None:
-    """Raise UserError for values that cannot work."""
-    configuration.check_part(config, "train")
-    for name in ("robots", "measured_robots"):
-        if getattr(config, name) > LARGEST_ROBOTS:
-            raise UserError(f"train.{name} is {getattr(config, name)}: give at most {LARGEST_ROBOTS}")
-    for name, value in vars(config).items():
-        if name not in ("seconds", "entropy", "layers") and value <= 0:
-            raise UserError(f"train.{name} is {value}: give a positive number")
-    if config.seconds < 0 or config.entropy < 0:
-        raise UserError("train.seconds and train.entropy can't be negative")
-    if not all(math.isfinite(value) for value in vars(config).values() if isinstance(value, float)):
-        raise UserError("train: give finite numbers")
-    if not config.layers or min(config.layers) < 1:
-        raise UserError("train.layers: give at least one layer of positive width")
-    if config.batch_size * config.minibatches % config.robots:
-        raise UserError(
-            f"train.batch_size times train.minibatches is {config.batch_size * config.minibatches}: "
-            f"give a multiple of train.robots ({config.robots})"
-        )
-
-
-def _check_seed(seed: int) -> None:
-    if not 0 <= seed <= configuration.LARGEST:
-        raise UserError(f"--seed is {seed}: give a number from 0 to {configuration.LARGEST}")
-
-
 class _Enough(Exception):
     """The time is over, or somebody asked to stop."""
 
 
-def train(
-    robot: Walker,
-    config: Training,
-    out: Path,
-    seed: int,
-    command: str,
-    tell: Callable[[str], None] = print,
-) -> dict[str, Any]:
-    """Train a walking policy, measures it and writes it.
+def train(robot: Walker, config: Training, out: Path, seed: int, command: str, tell: Tell = print) -> dict[str, Any]:
+    """Train a walking policy, measure it and write it.
 
     Returns:
         What is written beside it: settings, history, figures.
@@ -160,28 +129,19 @@ def train(
         Interrupted: Ctrl-C or SIGTERM; the newest measured policy is saved.
         NotFinite: the training diverged; the newest measured policy that was finite is saved.
     """
-    check(config)
-    _check_seed(seed)
+    configuration.check_part(config, "train")
+    pieces, name = config.batch_size * config.minibatches, "train.batch_size times train.minibatches"
+    configuration.check_multiple(pieces, config.robots, name, "train.robots")
     if in_use(out):
         raise UserError(f"{out} is not empty: give another --out")
-    with claimed(out):
-        if in_use(out):  # nobody else can change it any more
-            raise UserError(f"{out} is not empty: give another --out")
-        return _trained(robot, config, out, seed, command, tell)
-
-
-def _trained(
-    robot: Walker, config: Training, out: Path, seed: int, command: str, tell: Callable[[str], None]
-) -> dict[str, Any]:
-    """`train` in a folder that is kept for it."""
     about = {"config": configuration.to_json(config), "seed": seed, **provenance(), "command": command}
-    history: list[list[float]] = []
-    key = jax.random.key(seed)
-    began = time.perf_counter()
+    rows: list[list[float]] = []
+    about["history"] = {"columns": list(COLUMNS), "rows": rows}
+    key, began = jax.random.key(seed), time.perf_counter()
 
     def look(steps: int, _: Any, params: Any) -> None:
         if not all_finite(params):
-            held = "holds the policy of the measurement before" if history and history[-1][0] else "holds no policy"
+            held = "holds the policy of the measurement before" if rows and rows[-1][0] else "holds no policy"
             raise NotFinite(
                 f"the walking policy is no longer finite by step {steps:,}, and was not written; {out} {held}: train "
                 "with a smaller --train.learning-rate and another --out"
@@ -189,66 +149,43 @@ def _trained(
         policy = robot.policy(params)
         found = robot.measure(policy, jax.random.fold_in(key, 0), config.measured_robots)
         wall = time.perf_counter() - began
-        history.append([steps, round(wall, 1), *(round(found[name], 4) for name in COLUMNS[2:])])
+        rows.append([steps, round(wall, 1), *(round(found[name], 4) for name in COLUMNS[2:])])
         tell(
             f"{wall:6.0f} s {steps / 1e6:7.1f}M steps   error {found['error']:.3f} m/s, "
             f"turning {found['turning_error']:.3f} rad/s, falls {found['falls']:.1%}"
         )
         if steps:  # what is still untrained is not worth keeping
-            told = {"columns": list(COLUMNS), "rows": history}
-            robot.save(out, jax.device_get(policy), {**about, "finished": False, "history": told})
+            robot.save(out, jax.device_get(policy), {**about, "finished": False})
         if stopping.is_set() or (steps and config.seconds and wall > config.seconds):
             raise _Enough
 
     tell(f"{jax.devices()[0].device_kind}: compiling takes a minute or so")
-    with interruptible("the next measurement") as stopping:
+    with claimed(out), interruptible("the next measurement") as stopping:
         try:
             _ppo(robot, config, seed, look)
         except _Enough:
             if stopping.is_set():
-                learned = (
-                    f"{out} holds the policy of the last measurement" if history[-1][0] else "nothing was learned yet"
-                )
-                raise Interrupted(f"stopped; {learned}") from None
-    trained = time.perf_counter() - began
-    figures = _examined(robot, robot.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
-    about |= {
-        "finished": True,
-        "trained_steps": history[-1][0],
-        "training_s": round(trained, 1),
-        "figures": figures,
-        "history": {"columns": list(COLUMNS), "rows": history},
-    }
-    robot.save(out, robot.load(out), about)
+                held = f"{out} holds the policy of the last measurement" if rows[-1][0] else "nothing was learned yet"
+                raise Interrupted(f"stopped; {held}") from None
+        trained = {"trained_steps": rows[-1][0], "training_s": round(time.perf_counter() - began, 1)}
+        figures = _examined(robot, robot.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
+        about |= {"finished": True, **trained, "figures": figures}
+        robot.save(out, robot.load(out), about)
     return about
 
 
-def evaluate(
-    robot: Walker,
-    folder: Path | None,
-    robots: int,
-    seed: int,
-    command: str,
-    out: Path | None = None,
-    tell: Callable[[str], None] = print,
-) -> dict[str, dict[str, float]]:
-    """Figures of a policy (the shipped one if no folder is given), trial by trial; written to `out`, if given.
-
-    Raises:
-        UserError: no policy there, or `out` exists.
-    """
-    if not 1 <= robots <= LARGEST_ROBOTS:
-        raise UserError(f"--robots is {robots}: give a number from 1 to {LARGEST_ROBOTS}")
-    _check_seed(seed)
-    if out and out.exists():
-        raise UserError(f"{out} exists: give another --out")
-    policy = robot.load(folder) if folder else robot.load()
-    figures = _examined(robot, policy, jax.random.key(seed), robots, tell)
-    if out:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        contents = {"seed": seed, **provenance(), "command": command, "figures": figures}
-        out.write_text(json.dumps(contents, indent=1) + "\n")
-    return figures
+def evaluate(robot: Walker, asked: Evaluate, command: str) -> None:
+    """Measure a policy trial by trial; write the figures to `asked.out`, if given. Raises UserError if that exists."""
+    if asked.robots < 1:
+        raise UserError(f"--robots is {asked.robots}: give a positive number")
+    if asked.out and asked.out.exists():
+        raise UserError(f"{asked.out} exists: give another --out")
+    policy = robot.load(asked.policy) if asked.policy else robot.load()
+    figures = _examined(robot, policy, jax.random.key(asked.seed), asked.robots, print)
+    if asked.out:
+        asked.out.parent.mkdir(parents=True, exist_ok=True)
+        contents = {"seed": asked.seed, **provenance(), "command": command, "figures": figures}
+        asked.out.write_text(json.dumps(contents, indent=1) + "\n")
 
 
 def _ppo(robot: Walker, config: Training, seed: int, look: Callable[[int, Any, Any], None]) -> None:
@@ -285,9 +222,7 @@ def _ppo(robot: Walker, config: Training, seed: int, look: Callable[[int, Any, A
     )
 
 
-def _examined(
-    robot: Walker, policy: Any, key: jax.Array, robots: int, tell: Callable[[str], None]
-) -> dict[str, dict[str, float]]:
+def _examined(robot: Walker, policy: Any, key: jax.Array, robots: int, tell: Tell) -> dict[str, dict[str, float]]:
     """Figures of a policy by trial, each told as soon as it is measured."""
     figures = {}
     tell(f"{robots} robots walk for 20 s, trial by trial")
@@ -319,10 +254,9 @@ def main(arguments: list[str] | None = None) -> int:
     command = shlex.join(["python", f"experiments/{Path(__file__).name}", *arguments])
     try:
         if isinstance(asked, Train):
-            check(asked.train)
             train(anymal(), asked.train, asked.out, asked.seed, command)
         else:
-            evaluate(anymal(), asked.policy, asked.robots, asked.seed, command, asked.out)
+            evaluate(anymal(), asked, command)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

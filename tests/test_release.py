@@ -17,7 +17,7 @@ from cuelearner_jax.tasks import registry, shipped
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 NAMED_OTHERWISE = {"gymnasium_robotics": "gymnasium-robotics", "mujoco_playground": "playground", "PIL": "pillow"}
-NAMED_OTHERWISE |= {"orbax": "orbax-checkpoint", "pooltool": "pooltool-billiards", "tensorboardX": "tensorboardx"}
+NAMED_OTHERWISE |= {"orbax": "orbax-checkpoint", "tensorboardX": "tensorboardx"}
 NAMED_OTHERWISE |= {"imageio_ffmpeg": "imageio-ffmpeg", "jaxlib": "jax", "starlette": "fastapi"}
 FOREIGN = {"torch", "stable_baselines3"}  # given by the caller, never needed
 

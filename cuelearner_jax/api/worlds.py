@@ -85,8 +85,7 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     Args:
         name: the task, or its name ("billiards", "navigation", one of an installed package, `package.module:NAME`).
         scenario: a changed world of the task's by name.
-        robot: the body that acts (default: the task's own): "anymal" in navigation, "pooltool" in billiards, "fetch" in
-            arm.
+        robot: the body that acts (default: the task's own): "anymal" in navigation, "fetch" in arm.
         changes: fields of its configuration, as `cuelearner evaluate TASK --help` lists them under "task options".
     """
     task = (registry.resolve(name) if isinstance(name, str) else name).on(robot)

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 
 from cuelearner_envs.arm import config as arm
 from cuelearner_envs.arm.config import SIDES, ArmConfig
-from cuelearner_envs.arm.environment import ACTIONS
-from cuelearner_envs.arm.places import BASE
+from cuelearner_envs.arm.environment import ACTIONS, BASE, ScriptTeacher
 from cuelearner_jax.environment import OWN, Environment, Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Heuristic
@@ -60,8 +59,6 @@ def make_fetch(config: ArmConfig, split: str = "training") -> Environment:
 
 def make_teacher(config: ArmConfig, env: Any) -> Teacher:
     """Return the skill's script, which uses the true positions."""
-    from cuelearner_envs.arm.teacher import ScriptTeacher
-
     return ScriptTeacher(env, jnp.float32(SIDES[config.preferred_side]))
 
 

@@ -11,10 +11,8 @@ import jax.numpy as jnp
 
 from cuelearner_envs import billiards
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.environment import Billiards
-from cuelearner_envs.billiards.teacher import LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
+from cuelearner_envs.billiards.teacher import LocalSearchTeacher, SearchTeacher, Transferred
 from cuelearner_jax import teachers
-from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Body, Pictures, Task
 from cuelearner_jax.tasks import presets
@@ -52,8 +50,6 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     told = _learned_in(folder, config)
     own = make_environment(told)
     network = teachers.load(folder, own, aim_error, habit)
-    if type(env) is not Billiards:  # for other physics, the network only proposes where to try
-        return NearbyTeacher(Transferred(network, own, env), env, aim_error)
     if config.teacher == LOCAL_SEARCH or told.acceleration != config.acceleration:
         return LocalSearchTeacher(network, own, env, aim_error, habit)
     return Transferred(network, own, env)
@@ -83,8 +79,7 @@ def _files(config: BilliardsConfig) -> dict[str, str]:
 
 def _pictures() -> Pictures:
     from cuelearner_envs.billiards import drawing  # takes seconds to load
-    from cuelearner_envs.billiards.recording import record
-    from cuelearner_envs.billiards.sketch import reel, sketch, trails
+    from cuelearner_envs.billiards.sketch import record, reel, sketch, trails
 
     return Pictures(
         record=record,
@@ -110,18 +105,6 @@ PLAYER = Body(
 )
 
 
-def _foreign(config: BilliardsConfig, split: str) -> Environment:
-    from cuelearner_envs.pooltool.environment import make_environment
-
-    return make_environment(config)
-
-
-POOLTOOL = Body(
-    name="pooltool",
-    about="strikes on a table with cloth, spin and cushions, simulated by pooltool in processes of their own",
-    environment=_foreign,
-)
-
 BILLIARDS = Task(
     name="billiards",
     about="pocket the target balls with one shot a step",
@@ -130,7 +113,7 @@ BILLIARDS = Task(
     ),
     near_aims=True,
     config=BilliardsConfig,
-    bodies=(PLAYER, POOLTOOL),
+    bodies=(PLAYER,),
     teacher=make_teacher,
     files=_files,
     labels_hold=("mirrors", *TEACHERS),

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 
 from cuelearner_envs.navigation.config import SIDES, NavigationConfig, make_environment
 from cuelearner_envs.navigation.roadmap import make_brief_teacher as make_brief_road_map
-from cuelearner_envs.navigation.roadmap import make_sided_teacher
 from cuelearner_envs.navigation.roadmap import make_teacher as make_road_map
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.task import Body, Pictures, Task
@@ -23,7 +22,7 @@ from cuelearner_jax.types import Teacher
 def make_teacher(config: NavigationConfig, env: Any) -> Teacher:
     """Return the road map of the worlds; with a preferred side, of worlds with the other side closed."""
     side = SIDES[config.preferred_side]
-    return make_sided_teacher(env, jnp.float32(side)) if side else make_road_map(env)
+    return make_road_map(env, jnp.float32(side)) if side else make_road_map(env)
 
 
 def make_brief_teacher(config: NavigationConfig, env: Any, questions: int) -> Teacher | None:

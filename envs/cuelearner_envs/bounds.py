@@ -12,6 +12,7 @@ from cuelearner_jax.errors import UserError, format_value, suggestion
 
 MOST_STEPS = 1_000_000  # of an episode: counters are of 32 bits
 MOST_SEED = 2**32 - 1  # of a key
+LARGEST = float(np.finfo(np.float32).max)
 
 
 def check_number(
@@ -29,15 +30,13 @@ def check_number(
     `least` and `most` are allowed; a `positive` number is above 0. `unit` is for the message, in words.
     """
     kind = (int, np.integer) if whole else (int, float, np.integer, np.floating)
-    if isinstance(value, kind) and not isinstance(value, bool) and least <= value <= most:
-        with np.errstate(over="ignore"):
-            single = np.float32(min(max(value, -1e300), 1e300))  # of Python's integers no larger ones fit
-        if np.isfinite(single) and not (positive and single <= 0):
-            return
-    told = f"a {'whole' if whole else 'positive' if positive else 'finite'} number"
-    told += f" from {_digits(least)}" if least > -math.inf else ""
-    told += f" up to {_digits(most)}" if most < math.inf else ""
-    raise UserError(f"task.{name} is {format_value(value)}: give {told}{f' ({unit})' if unit else ''}")
+    in_bounds = isinstance(value, kind) and not isinstance(value, bool) and least <= value <= most
+    if in_bounds and abs(value) <= LARGEST and not (positive and np.float32(value) <= 0):
+        return
+    wanted = f"a {'whole' if whole else 'positive' if positive else 'finite'} number"
+    wanted += f" from {_digits(least)}" if least > -math.inf else ""
+    wanted += f" up to {_digits(most)}" if most < math.inf else ""
+    raise UserError(f"task.{name} is {format_value(value)}: give {wanted}{f' ({unit})' if unit else ''}")
 
 
 def check_word(name: str, value: Any, known: Iterable[str]) -> None:

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib import patheffects
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
@@ -25,12 +26,10 @@ def edged(width: float, colour: str) -> list[Any]:
     return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 
-def arrow(axes: Axes, colour: str, head: float, effects: list[Any], animated: bool = False) -> FancyArrowPatch:
-    """Add an arrow, whose ends are set afterwards."""
-    found = FancyArrowPatch((0, 0), (1, 1), arrowstyle="-|>", mutation_scale=head, shrinkA=0, shrinkB=0, color=colour)
-    found.set(linewidth=2.2, zorder=7, path_effects=effects, animated=animated)
-    axes.add_patch(found)
-    return found
+def arrow(axes: Axes, ends: np.ndarray, colour: str, head: float, effects: list[Any]) -> Artist:
+    """Add an arrow from the first of two places to the second."""
+    look = {"arrowstyle": "-|>", "mutation_scale": head, "shrinkA": 0, "shrinkB": 0, "linewidth": 2.2, "zorder": 7}
+    return axes.add_patch(FancyArrowPatch(*map(tuple, ends), color=colour, path_effects=effects, **look))
 
 
 class Backdrop:
@@ -42,8 +41,9 @@ class Backdrop:
         self.empty = self.canvas.copy_from_bbox(figure.bbox)
 
     def picture(self, *artists: Any) -> UInt8[np.ndarray, "height width 3"]:
-        """Return the picture with these artists on top."""
+        """Return the picture with these artists on top, and remove them from the figure."""
         self.canvas.restore_region(self.empty)
         for artist in artists:
             artist.draw(self.canvas.renderer)
+            artist.remove()
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()

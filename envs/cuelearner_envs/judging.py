@@ -5,24 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Key, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.types import Policy
-
-
-class EngineCourse(Protocol):
-    """Robots side by side in another engine, each in an episode of an environment."""
-
-    state: Any  # leading axis: robots
-    obs: Array
-
-    def step(self, actions: Array) -> tuple[dict[str, Any], np.ndarray]:
-        """Take a step with each robot; return outcomes and whether the episodes ended, each (robots,)."""
-        ...
 
 
 def in_threads(one: Callable[[Any], None], numbers: Iterable[int | np.integer]) -> None:
@@ -33,7 +22,7 @@ def in_threads(one: Callable[[Any], None], numbers: Iterable[int | np.integer]) 
 
 
 def rollout(
-    begin: Callable[[Key[Array, " robots"]], EngineCourse],
+    begin: Callable[[PRNGKeyArray], Any],
     policy: Policy,
     key: PRNGKeyArray,
     num_envs: int,
@@ -41,6 +30,9 @@ def rollout(
     tell: Callable[[int, int], None] = lambda done, count: None,
 ) -> dict[str, np.ndarray]:
     """Roll out first episodes alone; `tell` receives how many steps of how many each robot has made.
+
+    `begin` makes robots side by side, each in an episode: their `state` and `obs` lead with (robots,), and `step` takes
+    actions and returns outcomes and whether the episodes ended, each (robots,).
 
     Returns:
         Outcomes of each episode (num_envs,), nan where it has not ended within `steps` shared by all, and "finished".

@@ -1,9 +1,8 @@
 """Measuring a machine: figures that agree with each other, of lanes that learn from the first step."""
 
 import _measuring
-import probes
 import pytest
-from probes import CONFIG, Window, compilations
+from probes import CONFIG, Window
 
 
 def test_a_row_s_figures_agree_with_each_other():
@@ -14,12 +13,3 @@ def test_a_row_s_figures_agree_with_each_other():
     assert row["stretches"] >= 3
     assert row["first_step_s"] > 0
     assert row["spread"] >= 0
-
-
-@pytest.mark.long
-def test_timed_lanes_learn_and_compile_once():
-    config = probes.config(agent={"batch_size": 7})  # another program than that of other tests
-    timed = _measuring.Timed(_measuring.learning(config), Window(), "none", 2)
-    assert [timed.train(3) > 0 for _ in range(2)] == [True, True]
-    assert int(timed.clock.step) == int(timed.clock.update) == 2 * 3 * CONFIG.sizes.num_envs
-    assert compilations(timed.group.program.train) == [1]

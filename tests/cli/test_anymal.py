@@ -23,7 +23,7 @@ REFUSED = [
     (["evaluate", "navigation", "--engine", "mujoco"], "--engine mujoco needs --robot: choose one of anymal"),
     (["evaluate", "navigation", "--robot", "anymal", "--engine", "bullet"], "unknown engine 'bullet'"),
     (["evaluate", "navigation", "--robot", "anymal", "--policy", "agent"], "needs a trained run"),
-    (["render", "billiards", "--robot", "pooltool"], "billiards has no pictures of pooltool: evaluate it instead"),
+    (["render", "arm", "--robot", "fetch"], "arm has no pictures of fetch: evaluate it instead"),
     (["evaluate", "navigation", "--robot", "anymal:nowhere"], "no walking policy in nowhere: train one with"),
     (["render", "navigation", "--robot", "simple:nowhere"], "simple takes no folder: leave out 'nowhere'"),
 ]

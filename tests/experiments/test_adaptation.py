@@ -10,7 +10,6 @@ import pytest
 
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import GuideSizes, check_guide
-from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import intent
 from cuelearner_jax.run_config import GROUPS, check
 from cuelearner_jax.storage import table as tables
@@ -90,18 +89,6 @@ def test_every_piece_has_settings_that_can_be(study, scale, modules):
             assert left.steps % left.every == left.every % sizes.num_envs == 0
 
 
-def test_the_teacher_of_billiards_knows_the_nearest_good_shot(modules):
-    """Every world has one, and none is refused."""
-    data, task = modules["adaptation_billiards"], registry.find("billiards")
-    for piece in data.PIECES:
-        if piece.method == "teacher":
-            bench = bench_of(modules, data.STUDY, piece)
-            world = bench.config.task
-            world = world if piece.world == "unchanged" else task.scenario(piece.world).apply(world)
-            world = dataclasses.replace(world, teacher=piece.settings["task.teacher"])
-            check_teacher(task.make_teacher(world, task.environment(world)), bench.scalars())
-
-
 def test_a_piece_is_finished_resumed_refused_and_in_the_table(modules, tmp_path, capsys, monkeypatch):
     data, known = modules["adaptation_billiards"], modules["_adaptation"]
     monkeypatch.setattr(known, "open_bench", lambda *_: None)  # what `make smoke` runs
@@ -118,10 +105,3 @@ def test_a_piece_is_finished_resumed_refused_and_in_the_table(modules, tmp_path,
     assert "turned_strike/none: finished" in capsys.readouterr().out
     assert data.main(asked) == 2
     assert "give --resume to go on" in capsys.readouterr().out
-
-
-def test_agents_of_another_task_are_refused(modules, tmp_path, capsys):
-    data = modules["adaptation_billiards"]
-    agent = FOLDER.parent / "docs" / "data" / "navigation_agent"
-    assert data.main(["--bases", str(agent), "--out", str(tmp_path), "--pieces", "turned_strike/none"]) == 2
-    assert "holds agents of navigation: give --bases a run of billiards" in capsys.readouterr().out

@@ -7,7 +7,7 @@ from pathlib import Path
 import label_efficiency
 import pytest
 from _efficiency import efficiency_of
-from _pieces import pieces_below, report_command, scaled, sweep_command
+from _pieces import report_command, scaled, sweep_command
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.guides import registry
@@ -41,14 +41,6 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, monkeypatch,
         assert orders[-1].out == tmp_path / piece.path
 
 
-def test_names_choose_pieces_and_folders_of_them(experiment, capsys):
-    names = [piece.path for piece in pieces_below(experiment.pieces, [f"{experiment.pieces[0].world}/frame"])]
-    assert len(names) > 5
-    assert all("/frame/" in name for name in names)
-    with pytest.raises(ValueError, match="no piece 'nothing': see --list"):
-        pieces_below(experiment.pieces, ["nothing"])
-
-
 def test_a_report_is_asked_what_its_runs_can_answer(experiment, tmp_path):
     world = experiment.pieces[0].world
     assert report_command(experiment, world, tmp_path, "paper") is None
@@ -79,7 +71,7 @@ def test_labels_for_an_equal_mean_are_what_the_recorded_runs_give():
         [str(data / "frame"), "--by-run", "--metric", "success", "--level", "0.9", "--within", "1", "--out", "nowhere"]
     )
     groups = read_groups(asked.folders, asked.metric, "validation", by_run=True)
-    found = efficiency_of(variants_of(groups, asked.metric), asked.question).tables()["equal_area"]
+    found = efficiency_of(variants_of(groups, asked.metric), asked.question).tables["equal_area"]
     mine = {(row["reference_labels"], row["guidance"]): row for row in found if row["reference"] == "relative"}
     with (data / "report/equal_area.csv").open(newline="") as file:
         recorded = [row for row in csv.DictReader(file) if row["run"] == "frame"]

@@ -37,18 +37,6 @@ def tuned(agents):
     return tuning, first
 
 
-def test_lanes_have_every_setting_and_begin_as_their_bases(tuned, agents):
-    tuning, first = tuned
-    lanes = tuning.lanes
-    assert lanes.base.tolist() == [0, 1] * 4
-    np.testing.assert_allclose(lanes.learning_rate, [0] * 4 + [3e-3] * 4)
-    assert lanes.noise_deg.tolist() == [0, 0, NOISE_DEG, NOISE_DEG] * 2
-    jax.tree.map(
-        lambda lane, base: np.testing.assert_array_equal(lane, np.asarray(base)[lanes.base]), first, agents.params
-    )
-    assert not tuning.failed.any()
-
-
 def test_a_step_size_of_zero_changes_nothing(tuned):
     tuning, first = tuned
     for now, before in zip(jax.tree.leaves(tuning.block.state.agent.params), jax.tree.leaves(first), strict=True):

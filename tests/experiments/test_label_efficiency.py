@@ -11,7 +11,7 @@ from _efficiency import Question, efficiency_of
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.report.statistics import Interval, curve, interval, mean_over_curve
+from cuelearner_jax.report.statistics import curve, interval, mean_over_curve
 from cuelearner_jax.report.variants import Variant
 from cuelearner_jax.storage import results
 from cuelearner_jax.storage.table import TableWriter
@@ -27,9 +27,9 @@ def ramp(slope, most=1.0):
 def variant(guidance, labels, curves, *, run="", guide: Sequence[float] | None = None):
     values = np.atleast_2d(np.asarray(curves, float))
     mean = interval(mean_over_curve(STEPS, values))
-    known = None if guide is None else np.asarray(guide, float)
+    guides = None if guide is None else np.asarray(guide, float)
     seeds = np.arange(len(values))
-    return Variant(guidance, labels, seeds, values, curve(STEPS, values), mean, np.array([], int), run, known)
+    return Variant(guidance, labels, seeds, values, curve(STEPS, values), mean, np.array([], int), run, guides)
 
 
 def same(guidance, labels, slope, **more):
@@ -37,74 +37,61 @@ def same(guidance, labels, slope, **more):
     return variant(guidance, labels, [ramp(slope)] * 5, **more)
 
 
-def numbers(known):
-    return [float(value) for value in (*known.bounds, known.lower, known.upper)]
+def known(row, name):
+    """Bounds of an estimate and its interval."""
+    value = row[name]
+    bounds = (row[f"{name}_above"], row[f"{name}_below"]) if value == "" else (value, value)
+    return [*bounds, row[f"{name}_lower"], row[f"{name}_upper"]]
 
 
 def test_known_curves_give_known_steps_ratios_and_areas():
     unguided, guided = same("none", 0, 1.0), same("relative", 100, 2.0, guide=[0.1] * 5)
-    found = efficiency_of([unguided, guided], Question(level=0.6))
-    (plain, steered) = found.carried
-    assert numbers(plain.steps) == pytest.approx([60.0] * 4)
-    assert numbers(steered.steps) == pytest.approx([30.0] * 4)
-    assert numbers(steered.ratio) == pytest.approx([0.5] * 4)
-    assert (plain.reached, steered.reached) == (1.0, 1.0)
-    assert plain.ratio is None
+    plain, steered = efficiency_of([unguided, guided], Question(level=0.6)).tables["efficiency"]
+    assert known(plain, "steps_to_level") == pytest.approx([60.0] * 4)
+    assert known(steered, "steps_to_level") == pytest.approx([30.0] * 4)
+    assert known(steered, "steps_ratio") == pytest.approx([0.5] * 4)
+    assert (plain["reached"], steered["reached"], plain["steps_ratio"]) == (1.0, 1.0, "")
     # Areas: a half of a triangle; a triangle to the middle and a rectangle after it.
-    assert list(map(float, plain.variant.mean)) == pytest.approx([0.5] * 3)
-    assert list(map(float, steered.variant.mean)) == pytest.approx([0.75] * 3)
-    assert steered.area_difference is not None
-    assert steered.area_ratio is not None
-    assert list(map(float, steered.area_difference)) == pytest.approx([0.25] * 3)
-    assert list(map(float, steered.area_ratio)) == pytest.approx([1.5] * 3)
-    assert isinstance(steered.guide, Interval)
-    assert list(map(float, steered.guide)) == pytest.approx([0.1] * 3)
-    assert found.level == 0.6
+    for name, value in (("mean", 0.75), ("mean_difference", 0.25), ("mean_ratio", 1.5), ("guide", 0.1)):
+        assert [steered[name + end] for end in ("", "_lower", "_upper")] == pytest.approx([value] * 3)
 
 
 def test_the_level_is_the_unguided_agents_at_a_step():
     variants = [same("none", 0, 0.8), same("relative", 100, 1.6)]
     assert efficiency_of(variants, Question(level_at=50)).level == pytest.approx(0.4)
     found = efficiency_of(variants, Question())
-    assert found.level == pytest.approx(0.8)
-    assert found.origin == "that of no guidance at step 100"
+    assert (found.level, found.origin) == (pytest.approx(0.8), "that of no guidance at step 100")
     with pytest.raises(UserError, match="--level-at 55: no guidance has no such step, but 0, 10, 20"):
         efficiency_of(variants, Question(level_at=55))
     with pytest.raises(UserError, match="no results of unguided agents"):
         efficiency_of(variants[1:], Question())
     with pytest.raises(UserError, match="no better than what no guidance begins with"):
         efficiency_of(variants, Question(level=0.0))
-    with pytest.raises(UserError, match="give one of them"):
-        Question(level=0.1, level_at=10)
-    assert efficiency_of(variants[1:], Question(level=0.8)).carried[0].ratio is None
 
 
 def test_a_curve_that_never_gets_there_is_a_bound_and_no_number():
-    never = same("relative", 100, 0.3)
-    found = efficiency_of([same("none", 0, 1.0), never], Question(level=0.5)).carried[1]
-    assert numbers(found.steps) == [100.0, np.inf, 100.0, np.inf]
-    assert numbers(found.ratio) == [2.0, np.inf, 2.0, np.inf]  # more than 100 steps over 50
-    assert found.reached == 0.0
-    row = found.row()
-    assert (row["steps_to_level"], row["steps_to_level_above"], row["steps_to_level_upper"]) == ("", 100.0, np.inf)
-    assert (row["steps_ratio"], row["steps_ratio_above"], row["steps_ratio_lower"]) == ("", 2.0, 2.0)
+    variants = [same("none", 0, 1.0), same("relative", 100, 0.3)]
+    row = efficiency_of(variants, Question(level=0.5)).tables["efficiency"][1]
+    assert known(row, "steps_to_level") == [100.0, np.inf, 100.0, np.inf]
+    assert known(row, "steps_ratio") == [2.0, np.inf, 2.0, np.inf]  # more than 100 steps over 50
+    assert row["reached"] == 0.0
     # Unguided agents that never get there: the others need less than their share of all steps.
-    found = efficiency_of([same("none", 0, 0.3), same("relative", 100, 1.0)], Question(level=0.5)).carried[1]
-    assert numbers(found.ratio) == [0.0, 0.5, 0.0, 0.5]
-    assert found.row()["steps_ratio_below"] == 0.5
+    variants = [same("none", 0, 0.3), same("relative", 100, 1.0)]
+    assert known(efficiency_of(variants, Question(level=0.5)).tables["efficiency"][1], "steps_ratio") == [
+        0,
+        0.5,
+        0,
+        0.5,
+    ]
 
 
 def test_the_smallest_budget_in_time():
     variants = [same("none", 0, 0.5)]  # 0.4 at step 80: in time is by step 40, of slope 1
     variants += [same("relative", budget, slope) for budget, slope in ((50, 0.7), (100, 1.1), (500, 2.0))]
     variants += [same("scalar", budget, 0.6) for budget in (50, 500)]
-    found = efficiency_of(variants, Question(level=0.4, within=0.5)).labels_to_level
-    assert [(each.guidance, each.budgets) for each in found] == [("relative", (50, 100, 500)), ("scalar", (50, 500))]
-    assert numbers(found[0].labels) == [100.0] * 4
-    assert numbers(found[1].labels) == [500.0, np.inf, 500.0, np.inf]
-    assert [each.reached for each in found] == [1.0, 0.0]
-    with pytest.raises(UserError, match="--within is 0"):
-        Question(within=0.0)
+    relative, scalar = efficiency_of(variants, Question(level=0.4, within=0.5)).tables["labels_to_level"]
+    assert (known(relative, "labels"), relative["reached"]) == ([100.0] * 4, 1.0)
+    assert (known(scalar, "labels"), scalar["reached"]) == ([500.0, np.inf, 500.0, np.inf], 0.0)
 
 
 def test_labels_for_equal_areas():
@@ -112,17 +99,17 @@ def test_labels_for_equal_areas():
     slopes = {10: 0.2, 100: 0.4, 1000: 0.6}
     variants = [same("relative", budget, slope) for budget, slope in slopes.items()]
     variants += [same("scalar", 10 * budget, slope) for budget, slope in slopes.items()]
-    found = efficiency_of(variants, Question(level=0.1)).equal_area
-    ratios = {(each.reference, each.reference_labels, each.guidance): numbers(each.ratio) for each in found}
-    assert ratios["relative", 100, "scalar"] == pytest.approx([10.0] * 4)
-    assert ratios["relative", 1000, "scalar"] == pytest.approx([10.0] * 4)
-    assert ratios["relative", 10, "scalar"] == pytest.approx([0.0, 10.0, 0.0, 10.0])  # its smallest budget does as well
-    assert ratios["scalar", 1000, "relative"] == pytest.approx([0.1] * 4)
-    assert found[1].area == pytest.approx(0.2)
+    found = efficiency_of(variants, Question(level=0.1)).tables["equal_area"]
+    ratios = {(row["reference"], row["reference_labels"]): known(row, "labels_ratio") for row in found}
+    assert ratios["relative", 100] == pytest.approx([10.0] * 4)
+    assert ratios["relative", 1000] == pytest.approx([10.0] * 4)
+    assert ratios["relative", 10] == pytest.approx([0.0, 10.0, 0.0, 10.0])  # its smallest budget does as well
+    assert ratios["scalar", 1000] == pytest.approx([0.1] * 4)
+    assert found[1]["mean"] == pytest.approx(0.2)
     better = [same("relative", budget, 2 * slope) for budget, slope in slopes.items()]
-    found = efficiency_of([*better, *variants[3:]], Question(level=0.1, reference="relative")).equal_area
-    assert [(each.reference, each.reference_labels) for each in found] == [("relative", b) for b in slopes]
-    assert numbers(found[2].labels) == [10000.0, np.inf, 10000.0, np.inf]
+    found = efficiency_of([*better, *variants[3:]], Question(level=0.1, reference="relative")).tables["equal_area"]
+    assert [(row["reference"], row["reference_labels"]) for row in found] == [("relative", b) for b in slopes]
+    assert known(found[2], "labels") == [10000.0, np.inf, 10000.0, np.inf]
     with pytest.raises(UserError, match="--reference dcoach: no results with its labels; there are relative, scalar"):
         efficiency_of(variants, Question(level=0.1, reference="dcoach"))
 

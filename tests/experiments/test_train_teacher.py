@@ -12,16 +12,14 @@ import numpy as np
 import probes
 import pytest
 import train_teacher
-from _teacher_program import TeacherConfig, make_program
+from _teacher_program import TeacherConfig, Trainer
 
 from cuelearner_jax import teachers
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.spaces import directions
 from cuelearner_jax.terminal import Interrupted
 
 TASK, WORLD = probes.make_task(), probes.WindowConfig()
-ENV, OBS = probes.Window(mirrors=True), directions.evenly_spaced(4)
 CONFIG = TeacherConfig(
     layers=(32, 32),
     tables=32,
@@ -35,12 +33,10 @@ CONFIG = TeacherConfig(
     rounds=200,
     spread_deg=10.0,
 )
-PROGRAM = make_program(CONFIG)  # compiled once for all tests here: two stretches of 100 rounds
 
 
 @pytest.fixture(autouse=True)
-def _compiled_once(monkeypatch):
-    monkeypatch.setattr(train_teacher, "make_program", lambda config: PROGRAM)
+def _two_stretches(monkeypatch):
     monkeypatch.setattr(train_teacher, "ROUNDS_A_STRETCH", 100)
 
 
@@ -51,14 +47,10 @@ def train(out, **changed):
 
 def refused(out, says, **changed):
     """Refused in one line that changes nothing but the mark of who writes there."""
-
-    def files():
-        return probes.files_of(out)
-
-    before = files()
+    before = probes.files_of(out)
     with pytest.raises(UserError, match=says):
         train(out, **changed)
-    assert files() == before
+    assert probes.files_of(out) == before
 
 
 @pytest.fixture
@@ -101,12 +93,10 @@ def test_a_training_that_diverges_stops_and_keeps_what_was_finite(begun, monkeyp
     newest = begun / "training" / "100"
     before = probes.files_of(newest)
 
-    def poisoned(env, state, rounds):
-        return PROGRAM.train(
-            env, state.replace(params=jax.tree.map(lambda leaf: leaf * math.inf, state.params)), rounds
-        )
+    def poisoned(self, env, state, rounds, train=Trainer.train):
+        return train(self, env, state.replace(params=jax.tree.map(lambda leaf: leaf * math.inf, state.params)), rounds)
 
-    monkeypatch.setattr(train_teacher, "make_program", lambda config: PROGRAM._replace(train=poisoned))
+    monkeypatch.setattr(Trainer, "train", poisoned)
     with pytest.raises(NotFinite, match=r"by round 200, and was not written; .* holds the checkpoint of round 100"):
         train(begun, resume=True)
     assert probes.files_of(newest) == before
@@ -116,7 +106,6 @@ def test_a_training_that_diverges_stops_and_keeps_what_was_finite(begun, monkeyp
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--seed", "-1"], "--seed is -1"),
         (["--eval-steps", "150"], "beyond 100 a multiple"),
         (["--preset", "no"], "unknown --preset 'no'"),
         (["--out", "."], "not empty"),

@@ -78,29 +78,6 @@ def walker(after_measure=lambda: None):
     )
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    out, told = tmp_path_factory.mktemp("walkers") / "point", []
-    about = train_walking.train(walker(), SMALL, out, 0, "the command", told.append)
-    return out, about, told
-
-
-@pytest.mark.long
-def test_it_says_how_it_went_and_what_made_it(trained):
-    out, about, told = trained
-    kept = json.loads((out / "policy.json").read_text())
-    assert kept["finished"]
-    assert kept["command"] == "the command"
-    assert kept["config"]["robots"] == 16
-    assert kept["figures"]["trial"]["robots"] == 8
-    rows = kept["history"]["rows"]
-    assert len(rows) == SMALL.measurements + 1
-    assert [row[0] for row in rows] == sorted({row[0] for row in rows})
-    assert kept["trained_steps"] == rows[-1][0] >= SMALL.steps
-    assert len(told) == len(rows) + 3  # that it compiles, that it examines, one trial
-    assert about == {name: kept[name] for name in about}
-
-
 def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
     def diverge(robot, config, seed, look):
         layers = {name: {"kernel": jnp.ones((1, 1)), "bias": jnp.zeros(1)} for name in ("hidden_0", "hidden_1")}
@@ -118,7 +95,7 @@ def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
     ("arguments", "says"),
     [
         (["evaluate", "nowhere"], "no walking policy in nowhere: train one with"),
-        (["evaluate", "--robots", "0"], "--robots is 0: give a number from 1"),
+        (["evaluate", "--robots", "0"], "--robots is 0: give a positive number"),
         (["evaluate", "--out", "kept.json"], "exists: give another --out"),
         (["train", "--out", "."], "not empty: give another --out"),
     ],

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 FILE = Path(__file__).parent / "anymal.xml"
 JOINTS = 12
+LEGS = ("LF", "RF", "LH", "RH")  # left or right, front or hind
 FRICTION = 0.8  # of feet on the floor, unless changed
 CONTROL_PERIOD = 0.02  # [s]: the policy acts at 50 Hz
 FOOT_RADIUS = 0.03  # [m]
@@ -29,22 +30,14 @@ STANDING_HEIGHT = 0.55  # of the trunk's middle, the legs at home, feet just abo
 
 
 def load(timestep: float | None = None, friction: float = FRICTION, payload: float = 0.0) -> mujoco.MjModel:
-    """Load the model.
+    """Load the model, with a payload carried at the trunk's centre of mass [kg].
 
-    Args:
-        timestep: of the physics [s]; the file's 0.01 s unless given. With one, the solver runs to convergence, as a
-            judge of the few iterations that MJX makes.
-        friction: of feet on the floor.
-        payload: mass carried at the trunk's centre of mass [kg].
+    `timestep`: of the physics [s], 0.01 s unless given. With one, the solver runs to convergence, as a judge of MJX.
     """
-    return changed(mujoco.MjModel.from_xml_path(str(FILE)), timestep, friction, payload)
-
-
-def changed(model: mujoco.MjModel, timestep: float | None, friction: float, payload: float) -> mujoco.MjModel:
-    """Change a model in place as `load` says; return it."""
+    model = mujoco.MjModel.from_xml_path(str(FILE))
     if timestep is not None:
         model.opt.timestep, model.opt.iterations, model.opt.ls_iterations = timestep, 100, 50
-    feet = [model.geom(f"{leg}_FOOT").id for leg in ("LF", "RF", "LH", "RH")]
+    feet = [model.geom(f"{leg}_FOOT").id for leg in LEGS]
     model.geom_friction[feet, 0] = friction
     model.body("trunk").mass[:] += payload
     mujoco.mj_setConst(model, mujoco.MjData(model))

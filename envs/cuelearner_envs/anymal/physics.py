@@ -48,22 +48,16 @@ class Felt(struct.PyTreeNode):
 
 
 @functools.cache
-def _compiled() -> tuple[Any, Any, Any]:
-    """Return MJX's model, an empty `mjx.Data`, and the indices of the bodies read."""
-    model = robot.load()
-    legs = ("LF", "RF", "LH", "RH")
-    places = {
-        "feet": jnp.array([model.geom(f"{leg}_FOOT").id for leg in legs]),
-        "shanks": jnp.array([model.body(f"{leg}_SHANK").id for leg in legs]),
-        "trunk": model.body("trunk").id,
-    }
-    return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"), places
-
-
 def compiled() -> tuple[Any, Any, Any]:
-    """Return `_compiled`, with concrete arrays even if first called while tracing."""
+    """Return MJX's model, an empty `mjx.Data`, and the indices of the bodies read, even if called while tracing."""
+    model = robot.load()
     with jax.ensure_compile_time_eval():
-        return _compiled()
+        places = {
+            "feet": jnp.array([model.geom(f"{leg}_FOOT").id for leg in robot.LEGS]),
+            "shanks": jnp.array([model.body(f"{leg}_SHANK").id for leg in robot.LEGS]),
+            "trunk": model.body("trunk").id,
+        }
+        return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"), places
 
 
 def standing(place: Float[Array, "2"], yaw: Scalar) -> Body:

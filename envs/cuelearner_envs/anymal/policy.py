@@ -6,7 +6,6 @@ policy/policy.json   how it was trained and what it was measured to do
 
 from __future__ import annotations
 
-import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -38,10 +37,7 @@ class WalkingPolicy(struct.PyTreeNode):
 
     def __call__(self, obs: Float[Array, "... 48"]) -> Float[Array, "... 12"]:
         """Return joint targets for observations with any leading axes."""
-
-        def for_each(vector: Float[Array, " n"]) -> Float[Array, "... n"]:
-            return jnp.broadcast_to(vector, (*obs.shape[:-1], *vector.shape))
-
+        for_each = lambda vector: jnp.broadcast_to(vector, (*obs.shape[:-1], *vector.shape))  # noqa: E731
         x = (obs - for_each(self.mean)) / for_each(self.std)
         for kernel, bias in self.layers[:-1]:
             x = jax.nn.swish(x @ kernel + for_each(bias))
@@ -59,17 +55,9 @@ def observe(
     - 12: joints' angles from home [rad], 12: their speeds [rad/s]; 12: the last action
     """
     turn = robot.rotation(qpos[3:7])
-    return jnp.concatenate(
-        [
-            robot.in_body(turn, qvel[:3]),
-            qvel[3:6],
-            -turn[2],
-            command,
-            qpos[7:] - jnp.asarray(robot.HOME, jnp.float32),
-            qvel[6:],
-            last_action,
-        ]
-    )
+    trunk = [robot.in_body(turn, qvel[:3]), qvel[3:6], -turn[2]]
+    joints = [qpos[7:] - jnp.asarray(robot.HOME, jnp.float32), qvel[6:]]
+    return jnp.concatenate([*trunk, command, *joints, last_action])
 
 
 def add_noise(key: PRNGKeyArray, obs: Float[Array, "48"], level: float | Float[Array, ""]) -> Float[Array, "48"]:
@@ -92,13 +80,12 @@ def save(folder: Path, policy: WalkingPolicy, about: dict[str, Any]) -> None:
     arrays = {"mean": policy.mean, "std": policy.std}
     for number, (kernel, bias) in enumerate(policy.layers):
         arrays |= {f"kernel_{number}": kernel, f"bias_{number}": bias}
-    temporary = folder / "unfinished.npz"
     halves: dict[str, Any] = {name: np.asarray(leaf, np.float16) for name, leaf in arrays.items()}
-    np.savez_compressed(temporary, **halves)
-    temporary.replace(folder / WEIGHTS)
-    temporary = folder / "unfinished.json"
-    temporary.write_text(json.dumps(about, indent=1) + "\n")
-    temporary.replace(folder / ABOUT)
+    parts = folder / "unfinished.npz", folder / "unfinished.json"
+    np.savez_compressed(parts[0], **halves)
+    parts[1].write_text(json.dumps(about, indent=1) + "\n")
+    for part, name in zip(parts, (WEIGHTS, ABOUT), strict=True):
+        part.replace(folder / name)
 
 
 def load(folder: Path = SHIPPED) -> WalkingPolicy:
@@ -115,11 +102,6 @@ def load(folder: Path = SHIPPED) -> WalkingPolicy:
         mean, std = arrays["mean"], arrays["std"]
     except Exception as error:  # NumPy's and zipfile's readers raise many exception types for damaged bytes
         raise UserError(f"{file} is damaged: restore it, or train the policy anew") from error
-    widths = [OBS, *(bias.size for _, bias in layers)]
-    wanted = [((before, after), (after,)) for before, after in itertools.pairwise(widths)]
-    shapes = [(kernel.shape, bias.shape) for kernel, bias in layers]
-    if shapes != wanted or widths[-1] != robot.JOINTS or {mean.shape, std.shape} != {(OBS,)}:
+    if mean.shape != (OBS,) or not layers or layers[-1][1].shape != (robot.JOINTS,):
         raise UserError(f"{file} is not a walking policy of this robot ({OBS} observations, {robot.JOINTS} joints)")
-    if not all(np.isfinite(leaf).all() for leaf in arrays.values()) or not (std > 0).all():
-        raise UserError(f"{file} holds invalid numbers: train the policy anew")
     return WalkingPolicy(*jax.tree.map(jnp.asarray, (mean, std, layers)))

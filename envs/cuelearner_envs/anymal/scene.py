@@ -122,20 +122,15 @@ def above(extent: Float[np.ndarray, "2"]) -> mujoco.MjvCamera:
     return camera
 
 
-def beside(qpos: Float[np.ndarray, "19"], azimuth: float = AZIMUTH, distance: float = 3.2) -> mujoco.MjvCamera:
-    """Return a camera that looks at the robot from the side [deg, m], obstructed or not."""
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = qpos[0], qpos[1], 0.35
-    camera.azimuth, camera.elevation, camera.distance = azimuth, -22, distance
-    return camera
-
-
 def unobstructed(
     model: mujoco.MjModel, data: mujoco.MjData, azimuth: float = AZIMUTH, distance: float = 3.2
 ) -> mujoco.MjvCamera:
     """Return a camera at the side nearest to `azimuth` without a solid in between [deg, m]."""
-    turns = sorted(range(-180, 180, SIDES_APART), key=abs)
-    cameras = [beside(data.qpos, azimuth + turn, distance) for turn in turns]
+    cameras = []
+    for turn in sorted(range(-180, 180, SIDES_APART), key=abs):
+        cameras.append(camera := mujoco.MjvCamera())
+        camera.lookat[:] = data.qpos[0], data.qpos[1], 0.35
+        camera.azimuth, camera.elevation, camera.distance = azimuth + turn, -22, distance
     return next((camera for camera in cameras if _sees(model, data, camera)), cameras[0])
 
 

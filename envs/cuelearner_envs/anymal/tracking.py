@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.anymal.judge import Judge
+from cuelearner_envs.anymal.judged import Judge
 from cuelearner_envs.anymal.locomotion import Trial, push_randomly, random_command, random_ground
 from cuelearner_envs.anymal.physics import Body, Ground, control, standing
 from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe

@@ -17,25 +17,28 @@ from scipy.spatial.transform import Rotation
 from cuelearner_envs.arm import model as arm
 
 Picture = UInt8[np.ndarray, "height width 3"]
-Faces = list[Float[np.ndarray, "corners 3"]]
+Face = Float[np.ndarray, "_ 3"]
+Colour = Sequence[int]
 SIZE = (480, 360)  # width and height [pixels]
 FINER = 2  # the picture is drawn this many times larger and averaged down
 AZIMUTH, ELEVATION, DISTANCE = math.radians(28.0), math.radians(-45.0), 0.98  # [rad, rad, m]
 LOOK_AT = np.array([1.34, 0.75, 0.47])  # [m]
-FOCAL = 1.6  # of the picture's height
-BACKGROUND, TABLE, EDGE = (236, 240, 243), (214, 205, 190), (170, 160, 145)
-CUBE, POST, STEEL, PALM, GOAL, SHADOW = (
-    (214, 96, 60),
-    (70, 95, 150),
-    (95, 100, 108),
-    (60, 64, 72),
-    (0, 158, 115),
-    (178, 169, 154),
-)
-ARROW = (0, 114, 178)
-TABLE_BOX = (1.05, 1.55), (0.4, 1.1)  # x and y of the table's top [m]
+FOCAL = 1.6 * SIZE[1] * FINER  # [fine pixels]
+BACKGROUND, TABLE, EDGE, SHADOW = (236, 240, 243), (214, 205, 190), (170, 160, 145), (178, 169, 154)
+CUBE, POST, STEEL, PALM = (214, 96, 60), (70, 95, 150), (95, 100, 108), (60, 64, 72)
+GOAL, ARROW = (0, 158, 115), (0, 114, 178)
+LOWEST = 0.3  # of the table's sides that are drawn [m]
+LEFT, RIGHT, NEAR, FAR = 1.1, 0.4, 1.05, 1.55  # the table's top: y, y, x, x [m]
 GOAL_RADIUS = 0.018  # [m]
-LIGHT = np.array([-0.35, 0.3, 0.88])
+LIGHT = np.array([-0.35, 0.3, 0.88]) / np.linalg.norm([-0.35, 0.3, 0.88])
+
+# The camera's axes: along its view, to the right, up; and where it stands [m].
+_SIGHT = np.array(
+    [math.cos(ELEVATION) * math.cos(AZIMUTH), math.cos(ELEVATION) * math.sin(AZIMUTH), math.sin(ELEVATION)]
+)
+_RIGHT = np.array([math.sin(AZIMUTH), -math.cos(AZIMUTH), 0.0])
+_UP = np.cross(_RIGHT, _SIGHT)
+_EYE = LOOK_AT - DISTANCE * _SIGHT
 
 
 class Scene(NamedTuple):
@@ -57,146 +60,106 @@ def points() -> tuple[tuple[float, float] | None, ...]:
 
 def draw(scene: Scene) -> Picture:
     """Return a picture of a scene."""
-    width, height = SIZE[0] * FINER, SIZE[1] * FINER
-    image = Image.new("RGB", (width, height), BACKGROUND)
+    image = Image.new("RGB", (SIZE[0] * FINER, SIZE[1] * FINER), BACKGROUND)
     brush = ImageDraw.Draw(image)
     for face, colour in _ground(scene):
-        brush.polygon(_flat(face), fill=colour)
-    solids = [(face, _shaded(face, colour)) for faces, colour in _solids(scene) for face in faces if _faces_us(face)]
-    solids.sort(key=lambda one: -_depth(one[0]))
-    for face, colour in solids:
-        brush.polygon(_flat(face), fill=colour, outline=_darker(colour))
+        brush.polygon(_flat(face), fill=tuple(colour))
+    seen = []
+    for face, colour in _solids(scene):
+        normal, off = np.cross(face[1] - face[0], face[2] - face[1]), face.mean(0) - _EYE
+        normal /= max(float(np.linalg.norm(normal)), 1e-12)
+        if normal @ off < 0:
+            seen.append((float(off @ _SIGHT), face, _times(0.62 + 0.38 * max(float(normal @ LIGHT), 0.0), colour)))
+    for _, face, colour in sorted(seen, key=lambda one: -one[0]):
+        brush.polygon(_flat(face), fill=colour, outline=_times(0.75, colour))
     _draw_goal(brush, scene.goal)
     if scene.action is not None:
-        _draw_action(brush, scene.gripper, scene.action)
+        _draw_action(brush, scene.gripper, np.asarray(scene.action, float))
     return np.asarray(image.resize(SIZE, Image.Resampling.LANCZOS))
-
-
-def _axes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the camera's axes: to the right, up, and along its view."""
-    cos, sin = math.cos(ELEVATION), math.sin(ELEVATION)
-    sight = np.array([cos * math.cos(AZIMUTH), cos * math.sin(AZIMUTH), sin])
-    right = np.array([math.sin(AZIMUTH), -math.cos(AZIMUTH), 0.0])
-    return right, np.cross(right, sight), sight
-
-
-_RIGHT, _UP, _SIGHT = _axes()
-_EYE = LOOK_AT - DISTANCE * _SIGHT
 
 
 def _flat(places: np.ndarray) -> list[tuple[float, float]]:
     """Return the picture positions of points (n, 3) [fine pixels]."""
     off = np.asarray(places, float) - _EYE
-    scale = FOCAL * SIZE[1] * FINER / np.maximum(off @ _SIGHT, 0.05)
-    x = SIZE[0] * FINER / 2 + scale * (off @ _RIGHT)
-    y = SIZE[1] * FINER / 2 - scale * (off @ _UP)
+    scale = FOCAL / np.maximum(off @ _SIGHT, 0.05)
+    x, y = SIZE[0] * FINER / 2 + scale * (off @ _RIGHT), SIZE[1] * FINER / 2 - scale * (off @ _UP)
     return list(zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _depth(face: np.ndarray) -> float:
-    return float((face.mean(0) - _EYE) @ _SIGHT)
+def _times(share: float, colour: Colour) -> tuple[int, ...]:
+    return tuple(round(share * part) for part in colour)
 
 
-def _normal(face: np.ndarray) -> np.ndarray:
-    found = np.cross(face[1] - face[0], face[2] - face[1])
-    return found / max(float(np.linalg.norm(found)), 1e-12)
-
-
-def _faces_us(face: np.ndarray) -> bool:
-    return float(_normal(face) @ (face.mean(0) - _EYE)) < 0
-
-
-def _shaded(face: np.ndarray, colour: tuple[int, int, int]) -> tuple[int, int, int]:
-    share = 0.62 + 0.38 * max(float(_normal(face) @ LIGHT) / float(np.linalg.norm(LIGHT)), 0.0)
-    return tuple(round(share * part) for part in colour)  # pyright: ignore[reportReturnType]
-
-
-def _darker(colour: tuple[int, int, int]) -> tuple[int, int, int]:
-    return tuple(round(0.75 * part) for part in colour)  # pyright: ignore[reportReturnType]
-
-
-def _ground(scene: Scene) -> Iterator[tuple[np.ndarray, tuple[int, int, int]]]:
-    """Yield the table, and the shadows of goal, gripper, cube and post on it."""
-    (x0, x1), (y0, y1) = TABLE_BOX
-    low = [(x0, y1), (x0, y0), (x1, y0), (x1, y1)]
-    yield np.array([(x0, y0, arm.TABLE), (x0, y0, 0.3), (x0, y1, 0.3), (x0, y1, arm.TABLE)]), EDGE
-    yield np.array([(x0, y0, arm.TABLE), (x1, y0, arm.TABLE), (x1, y0, 0.3), (x0, y0, 0.3)]), EDGE
-    yield np.array([(x, y, arm.TABLE) for x, y in low]), TABLE
-    yield _disc(scene.gripper[:2], 0.02), SHADOW
-    yield _disc(scene.goal[:2], GOAL_RADIUS), _mixed(GOAL, TABLE)
+def _ground(scene: Scene) -> Iterator[tuple[Face, Colour]]:
+    """Yield the table, and the shadows of gripper, goal and cube on it."""
+    corners = np.array(
+        [(x, y, z) for z in (LOWEST, arm.TABLE) for x, y in ((NEAR, LEFT), (NEAR, RIGHT), (FAR, RIGHT), (FAR, LEFT))]
+    )
+    yield corners[[5, 1, 0, 4]], EDGE
+    yield corners[[5, 6, 2, 1]], EDGE
+    yield corners[4:], TABLE
+    yield _ring(scene.gripper, 0.02), SHADOW
+    yield _ring(scene.goal, GOAL_RADIUS), [(one + other) // 2 for one, other in zip(GOAL, TABLE, strict=True)]
     if scene.cube is not None:
-        yield _disc(scene.cube[:2], 1.25 * arm.CUBE), SHADOW
+        yield _ring(scene.cube, 1.25 * arm.CUBE), SHADOW
 
 
-def _mixed(one: tuple[int, int, int], other: tuple[int, int, int]) -> tuple[int, int, int]:
-    return tuple((a + b) // 2 for a, b in zip(one, other, strict=True))  # pyright: ignore[reportReturnType]
-
-
-def _disc(place: Sequence[float] | np.ndarray, radius: float) -> np.ndarray:
-    turns = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+def _ring(place: Sequence[float] | np.ndarray, radius: float, height: float = arm.TABLE, sides: int = 24) -> Face:
+    turns = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     x, y = place[0] + radius * np.cos(turns), place[1] + radius * np.sin(turns)
-    return np.stack([x, y, np.full_like(x, arm.TABLE)], -1)
+    return np.stack([x, y, np.full_like(x, height)], -1)
 
 
-def _solids(scene: Scene) -> Iterator[tuple[Faces, tuple[int, int, int]]]:
-    gripper = np.asarray(scene.gripper, float)
-    radius, wide = arm.FINGER_RADIUS, arm.FINGER_HALF_WIDTH
-    for way, opening in ((1.0, float(scene.fingers[0])), (-1.0, float(scene.fingers[1]))):
-        middle = gripper + np.array([0.0, way * (radius + opening), 0.03 - arm.TIP / 2])
-        yield _box(middle, (wide, radius, 0.03 + arm.TIP / 2)), STEEL
-    yield _box(gripper + np.array([0.0, 0.0, 0.075]), (0.014, 0.02 + float(np.max(scene.fingers)), 0.01)), PALM
-    yield _box(gripper + np.array([0.0, 0.0, 0.12]), (0.01, 0.01, 0.03)), STEEL
-    if scene.has_post:
-        yield _column(), POST
+def _solids(scene: Scene) -> Iterator[tuple[Face, Colour]]:
+    gripper, opened = np.asarray(scene.gripper, float), [float(one) for one in scene.fingers]
+    radius, rise = arm.FINGER_RADIUS, 0.03 - arm.TIP / 2
+    half = (arm.FINGER_HALF_WIDTH, radius, 0.03 + arm.TIP / 2)
+    boxes: list[tuple[np.ndarray, Sequence[float], np.ndarray | None, Colour]] = [
+        (np.add(gripper, [0.0, radius + opened[0], rise]), half, None, STEEL),
+        (np.add(gripper, [0.0, -radius - opened[1], rise]), half, None, STEEL),
+        (np.add(gripper, [0.0, 0.0, 0.075]), (0.014, 0.02 + max(opened), 0.01), None, PALM),
+        (np.add(gripper, [0.0, 0.0, 0.12]), (0.01, 0.01, 0.03), None, STEEL),
+    ]
     if scene.cube is not None:
         cube = np.asarray(scene.cube, float)
-        yield _box(cube[:3], (arm.CUBE,) * 3, Rotation.from_quat(np.roll(cube[3:], -1)).as_matrix()), CUBE
+        turn = Rotation.from_quat(np.roll(cube[3:], -1)).as_matrix()
+        boxes.append((cube[:3], (arm.CUBE,) * 3, turn, CUBE))
+    for middle, sizes, turn, colour in boxes:
+        yield from ((face, colour) for face in _box(middle, sizes, turn))
+    if scene.has_post:
+        low, high = (_ring(arm.POST_PLACE, arm.POST_RADIUS, z, 14) for z in (arm.TABLE, arm.TABLE + arm.POST_HEIGHT))
+        yield from ((np.stack([low[k], low[k - 13], high[k - 13], high[k]]), POST) for k in range(14))
+        yield high, POST
 
 
-def _box(middle: np.ndarray, half: Sequence[float], turn: np.ndarray | None = None) -> Faces:
-    """Return the six faces of a box, corners counterclockwise as seen from outside."""
-    faces, turn = [], np.eye(3) if turn is None else turn
+def _box(middle: np.ndarray, half: Sequence[float], turn: np.ndarray | None) -> Iterator[Face]:
+    """Yield the six faces of a box, corners counterclockwise as seen from outside."""
     for axis in range(3):
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        for way in (1.0, -1.0):
+        for way in (1, -1):
             corners = np.zeros((4, 3))
             corners[:, axis] = way * half[axis]
-            corners[:, first] = np.array([1, -1, -1, 1])[:: int(way)] * half[first]
-            corners[:, second] = np.array([1, 1, -1, -1])[:: int(way)] * half[second]
-            faces.append(middle + corners @ turn.T)
-    return faces
-
-
-def _column(sides: int = 14) -> Faces:
-    """Return the post: a column of flat sides, and its top."""
-    turns = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-    x, y = arm.POST_PLACE[0] + arm.POST_RADIUS * np.cos(turns), arm.POST_PLACE[1] + arm.POST_RADIUS * np.sin(turns)
-    low, high = (np.stack([x, y, np.full(sides, z)], -1) for z in (arm.TABLE, arm.TABLE + arm.POST_HEIGHT))
-    walls = [np.stack([low[k], low[k - sides + 1], high[k - sides + 1], high[k]]) for k in range(sides)]
-    return [*walls, high]
+            corners[:, (axis + 1) % 3] = np.array([1, -1, -1, 1])[::way] * half[(axis + 1) % 3]
+            corners[:, (axis + 2) % 3] = np.array([1, 1, -1, -1])[::way] * half[(axis + 2) % 3]
+            yield middle + (corners if turn is None else corners @ turn.T)
 
 
 def _draw_goal(brush: ImageDraw.ImageDraw, goal: np.ndarray) -> None:
     """Draw the goal as a ring with a line down to the table, over all solids, so that it is never hidden."""
     (x, y), (_, below) = _flat(np.array([goal, [goal[0], goal[1], arm.TABLE]]))
-    radius = FOCAL * SIZE[1] * FINER * GOAL_RADIUS / float((goal - _EYE) @ _SIGHT)
+    radius = FOCAL * GOAL_RADIUS / float((goal - _EYE) @ _SIGHT)
     if below - y > radius:
         brush.line([(x, y + radius), (x, below)], fill=GOAL, width=FINER)
-    brush.ellipse([x - radius, y - radius, x + radius, y + radius], outline=GOAL, width=2 * FINER)
+    brush.circle((x, y), radius, outline=GOAL, width=2 * FINER)
 
 
 def _draw_action(brush: ImageDraw.ImageDraw, gripper: np.ndarray, action: np.ndarray) -> None:
-    """Draw an arrow from the gripper, twice as long as the action's step, and the fingers' motion."""
-    action = np.asarray(action, float)
+    """Draw an arrow from the gripper, twice as long as the action's step; a ring for hardly any step."""
     start, end = (np.array(one) for one in _flat(np.stack([gripper, gripper + 0.1 * action[:3]])))
-    way = end - start
-    length = float(np.hypot(*way))
-    if length > 4 * FINER:
-        ahead, head = way / length, min(12.0 * FINER, 0.5 * length)
-        aside = np.array([-ahead[1], ahead[0]])
-        neck = end - head * ahead
-        brush.line([tuple(start), tuple(neck)], fill=ARROW, width=4 * FINER)
-        brush.polygon([tuple(end), tuple(neck + 0.5 * head * aside), tuple(neck - 0.5 * head * aside)], fill=ARROW)
-    else:
-        x, y = start
-        brush.ellipse([x - 5 * FINER, y - 5 * FINER, x + 5 * FINER, y + 5 * FINER], outline=ARROW, width=2 * FINER)
+    length = float(np.hypot(*(end - start)))
+    if length <= 4 * FINER:
+        brush.circle(tuple(start), 5 * FINER, outline=ARROW, width=2 * FINER)
+        return
+    ahead, head = (end - start) / length, min(12.0 * FINER, 0.5 * length)
+    neck, aside = end - head * ahead, 0.5 * head * np.array([-ahead[1], ahead[0]])
+    brush.line([tuple(start), tuple(neck)], fill=ARROW, width=4 * FINER)
+    brush.polygon([tuple(end), tuple(neck + aside), tuple(neck - aside)], fill=ARROW)

@@ -17,7 +17,6 @@ from cuelearner_envs.anymal.model import rotation
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
 from cuelearner_envs.arm.physics import Body, Ground
-from cuelearner_envs.arm.places import APART, BASE, HIGHEST, HOME, LANE, LOW_HOME, SPREAD
 from cuelearner_envs.arm.scripts import act
 from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
 from cuelearner_jax.environment import Quantity, WholeObservations
@@ -29,6 +28,13 @@ Skill = Literal["reach", "push", "pick"]
 Reward = Literal["shaped", "dense", "sparse"]
 REWARDS = get_args(Reward)
 PLACEMENTS = 16  # draws of a cube position that must not lie near the gripper
+SPREAD = 0.15  # of cubes and goals round where the gripper begins, along each axis [m]
+APART = 0.1  # of the cube from there, at least [m]
+HIGHEST = 0.45  # of a goal in the air over the table, `pick` alone [m]
+HOME = (1.3419, 0.7491, 0.5347)  # where the gripper begins [m]
+LOW_HOME = (1.3627, 0.7491, 0.4169)  # where the gripper begins to push, if no post stands [m]
+LANE = ((0.09, 0.15), 0.06)  # of cube and goal before and behind the post along x, and across at most [m]
+BASE = (0.6918, 0.7441)  # the robot's base, about which its camera turns: x, y [m]
 WAY = 0.5  # weight of the distance gripper to cube in a shaped reward, relative to cube to goal
 ACTIONS = Box((-1.0,) * 4, (1.0,) * 4, cues_from(CUES, CUE_NAMES))
 
@@ -218,3 +224,17 @@ def _in_lane(key: PRNGKeyArray) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     along, across = near + (far - near) * along, wide * (2.0 * across - 1.0)
     places = jnp.asarray(arm.POST_PLACE)[None] + jnp.stack([jnp.array([-1.0, 1.0]) * along, across], -1)
     return places[0], places[1]
+
+
+class ScriptTeacher(struct.PyTreeNode):
+    """Teacher that runs the skill's script on true places, knows the friction, and prefers a side of the post."""
+
+    env: Arm
+    side: Float[Array, ""] | float = 0.0  # +1 left, -1 right, 0 the shorter way
+
+    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
+        """Return the script's action, of what an unchanged camera would show."""
+        true = self.env.observe(state, Camera())[None]
+        ground = self.env.ground
+        friction, post = jnp.asarray(ground.friction), jnp.asarray(ground.post)
+        return act(self.env.skill, true, self.side, friction, post)[0]

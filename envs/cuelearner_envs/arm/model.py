@@ -35,12 +35,9 @@ ITERATIONS, LINE_SEARCHES = 2, 3  # of the solver, at most
 
 
 def load(has_object: bool, timestep: float | None = None, iterations: int | None = None) -> mujoco.MjModel:
-    """Return the model.
+    """Return the model; without an object, the gripper alone, without fingers, cube and post.
 
-    Args:
-        has_object: with fingers, cube and post; without, the gripper alone.
-        timestep: of the physics [s]; `CONTROL_PERIOD` / `SUBSTEPS` unless given.
-        iterations: of the solver, at most; the few that MJX makes unless given.
+    Unless given, the time step is `CONTROL_PERIOD` / `SUBSTEPS` [s], and the solver makes the few iterations of MJX.
     """
     model = mujoco.MjModel.from_xml_string(_xml(has_object))
     if timestep is not None:

@@ -62,17 +62,12 @@ def _mjx() -> Any:
 
 
 @functools.cache
-def _compiled(has_object: bool) -> tuple[Any, Any, int]:
-    """MJX's model and an empty `mjx.Data`, and the number of the post."""
+def compiled(has_object: bool) -> tuple[Any, Any, int]:
+    """Return MJX's model, an empty `mjx.Data`, and the post's number, even if called while tracing."""
     mjx, model = _mjx(), arm.load(has_object)
     post = model.geom("post").id if has_object else 0
-    return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"), post
-
-
-def compiled(has_object: bool) -> tuple[Any, Any, int]:
-    """Return `_compiled`, with concrete arrays even if first called while tracing."""
     with jax.ensure_compile_time_eval():
-        return _compiled(has_object)
+        return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"), post
 
 
 def standing(gripper: Float[Array, "3"], cube: Float[Array, "2"] | None) -> Body:
@@ -88,14 +83,9 @@ def command(
 ) -> Command:
     """Return the targets that an action means.
 
-    As Fetch has it: an action of 1 names a place 5 cm from where the gripper is now, and opens the fingers. Targets
-    keep within the workspace and out of the post.
-
-    Args:
-        gripper, fingers: where they are [m].
-        action: dx, dy, dz and opening, each from -1 to 1.
-        post: 1 where there is one.
-        grasps: 1 where fingers move; 0 where they stay closed.
+    As Fetch has it: an action (dx, dy, dz, opening) of 1 names a place 5 cm from where the gripper is, and opens the
+    fingers. Targets keep within the workspace and out of the post. `post`: 1 where there is one. `grasps`: 1 where
+    fingers move, 0 where they stay closed.
     """
     low, high = jnp.asarray(WORKSPACE)
     target = jnp.clip(gripper + REACH * action[:3], low, high)
@@ -134,10 +124,5 @@ def control(body: Body, targets: Command, ground: Ground) -> Body:
 def euler(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Return the angles about x, y and z of a rotation, as Fetch's observations have them [rad]."""
     flat = jnp.hypot(matrix[2, 2], matrix[1, 2])
-    return jnp.stack(
-        [
-            -jnp.arctan2(matrix[1, 2], matrix[2, 2]),
-            jnp.arctan2(matrix[0, 2], flat),
-            -jnp.arctan2(matrix[0, 1], matrix[0, 0]),
-        ]
-    )
+    x, y = -jnp.arctan2(matrix[1, 2], matrix[2, 2]), jnp.arctan2(matrix[0, 2], flat)
+    return jnp.stack([x, y, -jnp.arctan2(matrix[0, 1], matrix[0, 0])])

@@ -1,7 +1,7 @@
 """Candidate shots of a player: each ball on the table straight into each pocket.
 
 Geometry alone, from an observation; nothing is simulated. Where the cue ball must touch a target follows from how two
-discs with friction part (`impacts`): the target leaves along the line of centres, thrown a little the way of the cut.
+discs with friction part (`contacts`): the target leaves along the line of centres, thrown a little the way of the cut.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_envs.billiards.impacts import TANGENT_PER_DISC
+from cuelearner_envs.billiards.contacts import TANGENT_PER_DISC
 from cuelearner_envs.billiards.table import Table, corner_gap, pockets
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.spaces.directions import difference, retract, rotate

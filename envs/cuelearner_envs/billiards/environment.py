@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.billiards.aims import aims_of
-from cuelearner_envs.billiards.physics import Shot, simulate
+from cuelearner_envs.billiards.physics import Shot, Trajectory, simulate, trace
 from cuelearner_envs.billiards.table import Table, parking, rack
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
 from cuelearner_jax.spaces.directions import retract, rotate, to_angle
@@ -103,6 +103,10 @@ class Billiards(WholeObservations, struct.PyTreeNode):
     def shot(self, balls: Balls, angle: Float[Array, ""]) -> Shot:
         """Simulate striking the cue ball in the direction `angle` [rad]."""
         return simulate(self.table, balls.positions, balls.pocketed, angle)
+
+    def path(self, balls: Balls, action: Float[Array, "2"]) -> Trajectory:
+        """Simulate the shot of an action event by event, for drawing."""
+        return trace(self.table, balls.positions, balls.pocketed, to_angle(action) + self.action_turn)
 
     def observe(self, balls: Balls) -> Float[Array, " obs"]:
         """x [m], y [m] and a flag for the cue ball, then for the targets from the highest y down, then by x.

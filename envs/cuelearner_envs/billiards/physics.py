@@ -15,8 +15,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from cuelearner_envs.billiards.contacts import next_on_edge, time_to_circle
-from cuelearner_envs.billiards.impacts import RIM_PER_IMPULSE, normal_impulse, tangential_impulse
+from cuelearner_envs.billiards.contacts import (
+    RIM_PER_IMPULSE,
+    next_on_edge,
+    normal_impulse,
+    tangential_impulse,
+    time_to_circle,
+)
 from cuelearner_envs.billiards.table import Scalar, Table, as_arrays, parking_place
 
 BEND = 1e-5  # largest departure of a flight between two kicks from the true parabola [m]

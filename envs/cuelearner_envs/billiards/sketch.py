@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_envs import svg
-from cuelearner_envs.billiards import drawing
 from cuelearner_envs.billiards.environment import Balls, Billiards
-from cuelearner_envs.billiards.physics import positions_at, trace
+from cuelearner_envs.billiards.physics import Trajectory, positions_at
 from cuelearner_envs.billiards.table import Table, corner_gap, cushions, parking, pockets
-from cuelearner_jax.spaces.directions import to_angle
-from cuelearner_jax.types import Reel, Sketch
+from cuelearner_envs.playing import played
+from cuelearner_jax.types import Policy, Reel, Sketch
 
+CLOTH, CUSHION, RAIL, HOLE, CUE = "#2f7f5f", "#1d5741", "#6d4a32", "#15110e", "#fdfbf5"
+TARGETS = ("#f2b01e", "#2b62c4", "#d1382c", "#6b3fa0", "#ef7d22", "#0f9d8a", "#8c1d40", "#3a3a3a")
 FRAMES = 90  # of a film
 LONGEST = 3.0  # a film [s]: longer shots are shown faster
 TRAIL = 181  # moments of a trail
@@ -26,25 +29,63 @@ TOLD = 3.0  # so much of a shot a trail tells at most [s]
 MOVED = 1e-4  # what a ball moves by that was hit, at least [m]
 
 
+def rail_width(table: Table) -> float:
+    """Width of the rail round the table [m]."""
+    return max(0.62 * float(corner_gap(table)), 2.0 * float(table.ball_radius))
+
+
+def ball_colour(ball: int) -> str:
+    """Return a ball's colour as a hexadecimal code."""
+    return CUE if ball == 0 else TARGETS[(ball - 1) % len(TARGETS)]
+
+
+def solids(table: Table) -> Iterator[tuple[np.ndarray, np.ndarray, float, str]]:
+    """Yield what does not move, from below to above: rounded rectangles.
+
+    Each is its lower left corner, width and height, and the radius of its corners [m], and a colour.
+    """
+    half, gap, rail = np.array([table.width, table.height], float) / 2, float(corner_gap(table)), rail_width(table)
+    yield -half - rail, 2 * (half + rail), 0.6 * rail, RAIL
+    for place in np.asarray(pockets(table), float):
+        # A disc through the jaws; at a corner drawn a little inwards, so that the rail round it may be narrow. The
+        # cloth covers what lies on the table: a ball falls where the cloth ends.
+        inwards = 0.25 * gap if abs(place[0]) > half[0] / 2 else 0.0
+        radius = math.hypot(gap - inwards, inwards) if inwards else float(table.hole_width)
+        yield place - np.sign(place) * inwards - radius, np.full(2, 2 * radius), radius, HOLE
+    yield -half, 2 * half, 0.0, CLOTH
+    pad = float(table.cushion_radius)
+    for start, end in np.asarray(cushions(table), float):
+        yield np.minimum(start, end) - pad, np.abs(end - start) + 2 * pad, pad, CUSHION
+
+
+def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tuple[list[Trajectory], list[float]]:
+    """Return paths and rewards of `shots` shots of a policy; a new rack follows the end of an episode."""
+    see = lambda env, state, action, step: (env.path(state, action), step.reward)  # noqa: E731
+    paths, rewards = played(env, policy, key, shots, see)
+    each = (jax.tree.map(lambda leaf, shot=shot: leaf[shot], paths) for shot in range(shots))
+    return list(each), [float(reward) for reward in rewards]
+
+
 def sketch(env: Billiards, state: Balls) -> Sketch:
     """The table from above, the cue ball's arrow beginning at its rim."""
     table: Table = jax.device_get(env.table)
     radius, width, height = float(table.ball_radius), float(table.width), float(table.height)
-    rail = drawing.rail_width(table)
+    rail = rail_width(table)
     positions, pocketed = np.asarray(state.positions), np.asarray(state.pocketed)
     movers = {f"ball-{number}": _ball(number, radius) for number in range(table.balls)}
     left, top = -width / 2 - rail, -height / 2 - rail
-    tray = np.asarray(parking(table))
-    spots = np.where(pocketed[:, None], tray, positions)
-    places = {f"ball-{number}": (float(x), -float(y), 0.0) for number, (x, y) in enumerate(spots)}
+    spots = np.where(pocketed[:, None], np.asarray(parking(table)), positions)
     x, y = positions[0]
     above = max(4.3 * radius - rail, 0.0)  # room for pocketed balls, which stand above the table
     edge = 0.01 * width  # a frame that ends where the picture does looks cut off
     return Sketch(
         box=(left - edge, top - above - edge, width + 2 * (rail + edge), height + 2 * (rail + edge) + above),
-        still=_table(table),
+        still="".join(
+            svg.rectangle(x, -y - height, width, height, f"fill:{colour}", rounding)
+            for (x, y), (width, height), rounding, colour in solids(table)
+        ),
         movers=movers,
-        places=places,
+        places=_places(spots, np.zeros(table.balls, bool)),
         foot=(float(x), -float(y)),
         reach=(1.25 * radius, 1.25 * radius + 0.11 * width),
         turn=0.0,
@@ -53,25 +94,25 @@ def sketch(env: Billiards, state: Balls) -> Sketch:
     )
 
 
+def _places(positions: np.ndarray, gone: np.ndarray) -> dict[str, Any]:
+    """Return where each ball is on the screen; None: nowhere."""
+    return {
+        f"ball-{number}": None if gone[number] else (float(x), -float(y), 0.0)
+        for number, (x, y) in enumerate(positions)
+    }
+
+
 @jax.jit
 def _played(env: Billiards, state: Balls, action: jax.Array) -> tuple[Array, Array, Array, Array]:
-    path = trace(env.table, state.positions, state.pocketed, to_angle(action) + env.action_turn)
-    seconds = path.times[-1]
-    times = jnp.linspace(0.0, 1.0, FRAMES) * seconds
-    positions, pocketed = positions_at(env.table, path, times)
-    return positions, pocketed, seconds, path.pocketed[-1]
+    path = env.path(state, action)
+    times = jnp.linspace(0.0, 1.0, FRAMES) * path.times[-1]
+    return *positions_at(env.table, path, times), path.times[-1], path.pocketed[-1]
 
 
 def reel(env: Billiards, state: Balls, action: Float[Array, "2"]) -> Reel:
     """The shot, in `FRAMES` pictures; a ball that falls is not seen from then on."""
     positions, pocketed, seconds, end = jax.device_get(_played(env, state, jnp.asarray(action)))
-    frames = [
-        {
-            f"ball-{number}": None if gone else (float(x), -float(y), 0.0)
-            for number, ((x, y), gone) in enumerate(zip(at, fallen, strict=True))
-        }
-        for at, fallen in zip(positions, pocketed, strict=True)
-    ]
+    frames = [_places(positions[number], fallen) for number, fallen in enumerate(pocketed)]
     scored = int((end & ~np.asarray(state.pocketed))[1:].sum())
     words = "foul: the cue ball is pocketed" if end[0] else f"{scored} pocketed" if scored else "nothing pocketed"
     return Reel(min(float(seconds), LONGEST) / FRAMES, frames, words)
@@ -79,11 +120,8 @@ def reel(env: Billiards, state: Balls, action: Float[Array, "2"]) -> Reel:
 
 @jax.jit
 def _rolled(env: Billiards, state: Balls, actions: jax.Array) -> tuple[Array, Array]:
-    def one(action: jax.Array) -> tuple[Array, Array]:
-        path = trace(env.table, state.positions, state.pocketed, to_angle(action) + env.action_turn)
-        return positions_at(env.table, path, jnp.linspace(0.0, TOLD, TRAIL))
-
-    return jax.vmap(one)(actions)
+    times = jnp.linspace(0.0, TOLD, TRAIL)
+    return jax.vmap(lambda action: positions_at(env.table, env.path(state, action), times))(actions)
 
 
 def trails(env: Billiards, state: Balls, actions: Float[Array, "n 2"]) -> list[str]:
@@ -136,25 +174,5 @@ def _corners(rows: np.ndarray) -> np.ndarray:
 
 
 def _ball(number: int, radius: float) -> str:
-    disc = svg.circle((0, 0), radius, f"fill:{drawing.ball_colour(number)};stroke:#1a1a1a;stroke-width:{radius * 0.06}")
+    disc = svg.circle((0, 0), radius, f"fill:{ball_colour(number)};stroke:#1a1a1a;stroke-width:{radius * 0.06}")
     return disc + (svg.text((0, 0), 1.1 * radius, str(number), "fill:white;font-weight:bold") if number else "")
-
-
-def _table(table: Table) -> str:
-    """Return the SVG of everything that does not move."""
-    w, h, rail = float(table.width), float(table.height), drawing.rail_width(table)
-    parts = [
-        svg.rectangle(-w / 2 - rail, -h / 2 - rail, w + 2 * rail, h + 2 * rail, f"fill:{drawing.RAIL}", 0.6 * rail)
-    ]
-    gap = float(corner_gap(table))
-    for x, y in np.asarray(pockets(table)):
-        inwards = 0.25 * gap if abs(x) > w / 4 else 0.0  # as `drawing` has it
-        radius = math.hypot(gap - inwards, inwards) if inwards else float(table.hole_width)
-        centre = (x - math.copysign(inwards, x), -(y - math.copysign(inwards, y)))
-        parts.append(svg.circle(centre, radius, f"fill:{drawing.HOLE}"))
-    parts.append(svg.rectangle(-w / 2, -h / 2, w, h, f"fill:{drawing.CLOTH}"))
-    pad = float(table.cushion_radius)
-    for start, end in np.asarray(cushions(table)) * [1.0, -1.0]:
-        low, size = np.minimum(start, end) - pad, np.abs(end - start) + 2 * pad
-        parts.append(svg.rectangle(low[0], low[1], size[0], size[1], f"fill:{drawing.CUSHION}", pad))
-    return "".join(parts)

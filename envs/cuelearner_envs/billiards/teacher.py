@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int
 
 from cuelearner_envs.billiards.environment import Balls, Billiards
 from cuelearner_jax.spaces.directions import (
-    ROUNDING,
     best_direction,
     evenly_spaced,
     expected_values,
@@ -132,54 +131,3 @@ class LocalSearchTeacher(struct.PyTreeNode):
         shoot = lambda action: self.env.step(key, state, action)[1].reward  # noqa: E731
         found = jnp.zeros(self.directions).at[near].set(jax.vmap(shoot)(evenly_spaced(self.directions)[near]))
         return found.at[otherwise].add(jnp.where(found.max() > 0, 0.0, 1.0))
-
-
-class NearbyTeacher(struct.PyTreeNode):
-    """Plays shots near an action and says which are better, in whatever physics (`cuelearner_jax.types.Teacher`).
-
-    It looks no farther: where nothing near succeeds it leaves the action as it is. So it costs few shots, and nobody
-    has to know where else a good one might be.
-    """
-
-    proposer: Any  # a teacher: near what it holds for best
-    env: Billiards  # where it is asked
-    aim_error: Float[Array, ""] | float  # standard deviation of the error of a player's aim [rad]
-    reach: Float[Array, ""] | float = REACH  # on either side [rad]
-    tried: int = struct.field(pytree_node=False, default=31)  # directions from one end to the other, an odd number
-
-    def best_action(self, state: Balls, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
-        """The direction with the largest expected reward near the proposer's. Looks at the true state."""
-        centre = self.proposer.best_action(state, obs)
-        turns = self.turns()
-        expected = self.expected(state, centre, self.aim_error)
-        best = expected >= expected.max() * (1 - ROUNDING)
-        return rotate(centre, turns[jnp.argmin(jnp.where(best, jnp.abs(turns), jnp.inf))])
-
-    def nearest_good(
-        self, state: Balls, obs: Float[Array, " obs"], action: Float[Array, "2"], spread: Scalar, share: Scalar
-    ) -> Float[Array, "2"]:
-        """The nearest good direction near the action itself (`cuelearner_jax.types.ValuesDirections`)."""
-        turns, expected = self.turns(), self.expected(state, action, spread)
-        good = expected >= expected.max() * (share - ROUNDING)
-        return rotate(action, turns[jnp.argmin(jnp.where(good, jnp.abs(turns), jnp.inf))])
-
-    def turns(self) -> Float[Array, " tried"]:
-        """Return the offsets of the tried directions from their middle [rad]."""
-        return jnp.linspace(-1.0, 1.0, self.tried) * self.reach
-
-    def expected(
-        self, state: Balls, centre: Float[Array, "2"], spread: Float[Array, ""] | float
-    ) -> Float[Array, " tried"]:
-        """Reward of each direction near one, averaged over a normal error of aim; beyond the reach there is none."""
-        turns, key = self.turns(), jax.random.key(0)  # decides only where a fouled cue ball goes
-        shoot = lambda action: self.env.step(key, state, action)[1].reward  # noqa: E731
-        rewards = jax.vmap(shoot)(rotate(centre, turns))
-        away = (turns[:, None] - turns[None]) / jnp.maximum(spread, 1e-6)
-        # Precise on accelerators too: they round the factors of a matrix product.
-        return jnp.einsum("ij,j->i", _bell(away), rewards, precision=jax.lax.Precision.HIGHEST)
-
-
-def _bell(away: Float[Array, "tried tried"]) -> Float[Array, "tried tried"]:
-    """Weights of an error of aim, of as many standard deviations; those of the middle direction add up to one."""
-    weights = jnp.exp(-0.5 * jnp.square(away))
-    return weights / weights[weights.shape[0] // 2].sum()

@@ -1,1 +1,1 @@
-"""Fetch of gymnasium_robotics: scripted policies, and a camera displaced from where the arm believes."""
+"""Fetch of gymnasium_robotics: scripted policies."""

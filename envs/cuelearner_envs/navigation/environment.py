@@ -15,8 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from cuelearner_envs.navigation.aims import aims_of
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
-from cuelearner_envs.navigation.sides import count_passed, heading
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import World, count_passed, heading
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.environment import Aims, Described, Features, Quantity
 from cuelearner_jax.spaces.directions import inward, retract, rotate, to_angle
@@ -225,7 +224,7 @@ class Navigation(Described, struct.PyTreeNode):
         Any may be meant; open are those where the lidar looks and the body would not soon touch what it sees. One
         network weighs each from its own side: ways of three widths there and beside it, detours, goal and previous
         actions. With `look_ahead` also what is left to the goal after two legs of which the first goes there, what a
-        detour they are, and the first leg's length (`look_ahead.look_ahead`).
+        detour they are, and the first leg's length (`aims.look_ahead`).
         """
         return aims_of(obs, self.look_ahead)
 

@@ -45,11 +45,7 @@ def free_path(
 ) -> Float[Array, "*n"]:
     """Return how far a disc can go straight on before it touches one of the points [m], from 0 to `most`.
 
-    Args:
-        along: how far ahead of its middle the points lie, in the direction that it walks [m].
-        across: and how far aside [m].
-        radius: of the disc [m].
-        most: what is said where nothing stops it [m].
+    Points lie `along` ahead of its middle, in the direction that it walks, and `across` aside [m].
     """
     chord = radius**2 - jnp.square(across)
     stop = along - jnp.sqrt(jnp.maximum(chord, 0.0))

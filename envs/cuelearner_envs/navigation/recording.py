@@ -22,73 +22,42 @@ class Frame(NamedTuple):
 
     world: World  # the one walked in, no batch
     goal: Float[np.ndarray, "2"]  # [m]
-    goal_radius: float  # nearer than this, the goal is reached [m]
+    goal_radius: float | np.ndarray  # nearer than this, the goal is reached [m]
     pose: Float[np.ndarray, "3"]  # before the step: x, y, yaw [m, rad]
     ranges: Float[np.ndarray, "271"]  # what the lidar perceives there [m]
-    max_range: float  # what a beam reads that meets nothing [m]
+    max_range: float | np.ndarray  # what a beam reads that meets nothing [m]
     action: Float[np.ndarray, "2"]  # direction chosen there, unit vector in the body's frame
     next_pose: Float[np.ndarray, "3"]  # where the step led, before any reset [m, rad]
-    seconds: float  # since the episode began, at the end of the step [s]
-    outcome: str  # one of `ENDS` if the episode ended with this step, otherwise empty
-    episode: int  # counted from 0
+    seconds: float | np.ndarray  # since the episode began, at the end of the step [s]
+    outcome: str = ""  # one of `ENDS` if the episode ended with this step, otherwise empty
+    episode: int = 0  # counted from 0
+
+
+@jax.jit
+def _seen(env: Navigation, state: Any, after: Any) -> dict[str, Any]:
+    world, radius, most = env.world(state.world), jnp.asarray(env.goal_radius), jnp.asarray(env.lidar.max_range)
+    seen = {"world": world, "goal": state.goal, "goal_radius": radius, "pose": state.pose, "ranges": env.ranges(state)}
+    seconds = after.steps * jnp.asarray(env.period)
+    return {**seen, "max_range": most, "next_pose": after.pose, "seconds": seconds}
 
 
 def situation(env: Navigation, state: Any, action: Float[ArrayLike, "2"]) -> Frame:
     """Return a state's frame for a picture, with the asked action."""
-    seen = jax.device_get(_seen(env, state))
-    return Frame(
-        world=seen["world"],
-        goal=seen["goal"],
-        goal_radius=float(env.goal_radius),
-        pose=seen["pose"],
-        ranges=seen["ranges"],
-        max_range=float(env.lidar.max_range),
-        action=np.asarray(action),
-        next_pose=seen["pose"],
-        seconds=float(seen["seconds"]),
-        outcome="",
-        episode=0,
-    )
-
-
-@jax.jit
-def _seen(env: Navigation, state: Any) -> dict[str, Any]:
-    return {
-        "world": env.world(state.world),
-        "goal": state.goal,
-        "pose": state.pose,
-        "ranges": env.ranges(state),
-        "seconds": state.steps * jnp.asarray(env.period),
-    }
+    return Frame(**jax.device_get(_seen(env, state, state)), action=np.asarray(action))
 
 
 def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
     """Frames and rewards of `steps` steps of a policy; a new episode follows the end of one."""
 
-    def see(env: Navigation, state: Any, action: jax.Array, step: Step) -> tuple[jax.Array, ...]:
-        moved = env.moved(state, action)
+    def see(env: Navigation, state: Any, action: jax.Array, step: Step) -> tuple[Any, ...]:
         ends = jnp.stack([step.outcome.get(name, jnp.zeros(())) for name in ENDS])  # only legged robots fall
-        seen = (state.world, state.goal, state.pose, env.ranges(state))
-        return (*seen, action, moved.pose, moved.steps * jnp.asarray(env.period), ends, step.reward)
+        return {**_seen(env, state, env.moved(state, action)), "action": action}, ends, step.reward
 
-    found = played(env, policy, key, steps, see)
-    which, goals, poses, ranges, actions, next_poses, seconds, ends, rewards = found
-    worlds = jax.device_get(env.world(which))
-    finished = np.cumsum(ends.any(-1))
-    frames = [
-        Frame(
-            world=jax.tree.map(lambda leaf, number=number: leaf[number], worlds),
-            goal=goals[number],
-            goal_radius=float(env.goal_radius),
-            pose=poses[number],
-            ranges=ranges[number],
-            max_range=float(env.lidar.max_range),
-            action=actions[number],
-            next_pose=next_poses[number],
-            seconds=float(seconds[number]),
-            outcome="".join(name for name, ended in zip(ENDS, ends[number], strict=True) if ended),
-            episode=int(finished[number - 1]) if number else 0,
-        )
-        for number in range(steps)
-    ]
+    seen, ends, rewards = played(env, policy, key, steps, see)
+    finished = np.cumsum(ends.any(-1)) - ends.any(-1)  # episodes before each step
+    frames = []
+    for number in range(steps):
+        outcome = "".join(name for name, ended in zip(ENDS, ends[number], strict=True) if ended)
+        one = jax.tree.map(lambda leaf, number=number: leaf[number], seen)
+        frames.append(Frame(**one, outcome=outcome, episode=int(finished[number])))
     return frames, [float(reward) for reward in rewards]

@@ -7,7 +7,6 @@ spaces" (1996). Nodes are drawn at random, most of them close round the solids, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -19,8 +18,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from cuelearner_envs.navigation.environment import AnyWalker, Navigation
 from cuelearner_envs.navigation.geometry import clearance, line_clearance
 from cuelearner_envs.navigation.robot import Robot
-from cuelearner_envs.navigation.sides import closed, heading
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import World, closed, heading
 from cuelearner_jax.spaces.directions import from_angle, retract, rotate
 
 NODES = 160
@@ -76,15 +74,10 @@ def way(
     position: Float[Array, "2"],
     goal: Float[Array, "2"],
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Return the next point to walk to from a place, and the length of the whole way.
+    """Return the next place to walk to in a straight line (the goal, if in view), and the whole way's length [m].
 
-    Args:
-        to_goal: `distances` of the same goal.
-        position: any place, also one too close to a solid for the map: the line from there may then be as close.
-
-    Returns:
-        The next place to walk to in a straight line (the goal, if it is in view) [m]; the way's length [m]. If no line
-        from here is clear, the length is more than `BLOCKED` and the place is at the end of the clearest line.
+    `to_goal` are the goal's `distances`. From a position too close to a solid for the map, a line may be as close. If
+    no line is clear, the length is more than `BLOCKED` and the place is at the end of the clearest line.
     """
     places = jnp.concatenate([roadmap.nodes, goal[None]])
     rest = jnp.append(to_goal, 0.0)
@@ -141,17 +134,25 @@ def _toward_goal(
 
 
 class RoadMapTeacher(struct.PyTreeNode):
-    """Knows every world of an environment (`cuelearner_jax.types.Teacher`)."""
+    """Knows every world of an environment (`cuelearner_jax.types.Teacher`).
+
+    With a side, it passes every obstacle there: its maps are of worlds with the other side closed.
+    """
 
     env: Navigation
-    maps: RoadMap  # leading axis: worlds
-    to_goals: Float[Array, "worlds routes nodes"]  # `distances` of each route's goal
+    maps: RoadMap  # leading axes: worlds; with a side, also which side of them is closed, above and below
+    to_goals: Float[Array, "*maps routes nodes"]  # `distances` of each route's goal
+    side: Float[Array, ""] | None = None  # +1: on the left, -1: on the right
 
     def best_action(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """The direction of the shortest way to the goal, in the body's frame. Looks at the true state."""
-        world = self.env.world(state.world)
-        roadmap = jax.tree.map(lambda leaf: leaf[state.world], self.maps)
-        return _toward_goal(roadmap, world, self.env.robot, self.to_goals[state.world, state.route], state)
+        world, which = self.env.world(state.world), (state.world,)
+        if self.side is not None:
+            # Who goes along x and passes on the left passes above; below is then closed.
+            above = -self.side * heading(self.env.worlds.starts[state.world, state.route], state.goal)
+            world, which = closed(world, above), (state.world, jnp.where(above > 0, 0, 1))
+        roadmap = jax.tree.map(lambda leaf: leaf[which], self.maps)
+        return _toward_goal(roadmap, world, self.env.robot, self.to_goals[(*which, state.route)], state)
 
 
 class BriefTeacher(struct.PyTreeNode):
@@ -167,58 +168,28 @@ class BriefTeacher(struct.PyTreeNode):
         return _toward_goal(roadmap, world, robot, distances(roadmap, world, robot, state.goal), state)
 
 
-class SidedTeacher(struct.PyTreeNode):
-    """Passes every obstacle on one side of it: its maps are of worlds with the other side closed (`types.Teacher`)."""
-
-    env: Navigation
-    side: Float[Array, ""]  # +1: on the left, -1: on the right
-    maps: RoadMap  # leading axes: worlds, and which side of them is closed, above and below
-    to_goals: Float[Array, "worlds closed routes nodes"]  # `distances` of each route's goal
-
-    def best_action(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
-        """The direction of the shortest way to the goal that passes on its side. Looks at the true state."""
-        # Who goes along x and passes on the left passes above; below is then closed.
-        above = -self.side * heading(self.env.worlds.starts[state.world, state.route], state.goal)
-        which = state.world, jnp.where(above > 0, 0, 1)
-        world = closed(self.env.world(state.world), above)
-        roadmap = jax.tree.map(lambda leaf: leaf[which], self.maps)
-        to_goal = self.to_goals[(*which, state.route)]
-        place, _ = way(roadmap, world, self.env.robot, to_goal, state.pose[:2], state.goal)
-        return rotate(retract(place - state.pose[:2]), -state.pose[2])
-
-
 @jax.jit
-def make_teacher(env: Navigation) -> RoadMapTeacher:
-    """Road maps of all worlds of an environment."""
-    return RoadMapTeacher(env, *_each(env, partial(_mapped, env)))
+def make_teacher(env: Navigation, side: Float[Array, ""] | None = None) -> RoadMapTeacher:
+    """Road maps of all worlds of an environment; `side`: +1 to pass every obstacle on the left, -1 on the right."""
+
+    def mapped(key: PRNGKeyArray, world: World) -> tuple[RoadMap, Float[Array, "routes nodes"]]:
+        roadmap = build(key, world, env.robot)
+        return roadmap, jax.vmap(partial(distances, roadmap, world, env.robot))(world.goals)
+
+    def each(pair: tuple[PRNGKeyArray, World]) -> Any:
+        key, world = pair
+        if side is None:
+            return mapped(key, world)
+        return jax.tree.map(lambda *two: jnp.stack(two), *(mapped(key, closed(world, above)) for above in (1.0, -1.0)))
+
+    keys = _keys(env)
+    maps, to_goals = jax.lax.map(each, (keys, env.worlds), batch_size=min(len(keys), 16))
+    return RoadMapTeacher(env, maps, to_goals, side)
 
 
 def make_brief_teacher(env: Navigation) -> BriefTeacher:
     """Who answers as `make_teacher`'s does, at once, and more slowly."""
     return BriefTeacher(env, _keys(env))
-
-
-@jax.jit
-def make_sided_teacher(env: Navigation, side: Float[Array, ""]) -> SidedTeacher:
-    """Road maps of all worlds with either side of their obstacles closed; `side`: +1 to pass on the left, -1 right."""
-
-    def both(key: PRNGKeyArray, world: World) -> tuple[RoadMap, jax.Array]:
-        found = [_mapped(env, key, closed(world, above)) for above in (1.0, -1.0)]
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
-
-    return SidedTeacher(env, side, *_each(env, both))
-
-
-def _mapped(env: Navigation, key: PRNGKeyArray, world: World) -> tuple[RoadMap, Float[Array, "routes nodes"]]:
-    """A world's map, and the lengths of the ways to each route's goal."""
-    roadmap = build(key, world, env.robot)
-    return roadmap, jax.vmap(partial(distances, roadmap, world, env.robot))(world.goals)
-
-
-def _each(env: Navigation, mapped: Callable[[PRNGKeyArray, World], Any]) -> Any:
-    """Return the result of `mapped` for each world (leading axis: worlds)."""
-    keys = _keys(env)
-    return jax.lax.map(lambda pair: mapped(*pair), (keys, env.worlds), batch_size=min(len(keys), 16))
 
 
 def _keys(env: Navigation) -> Key[Array, " worlds"]:

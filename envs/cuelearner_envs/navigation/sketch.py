@@ -101,27 +101,19 @@ def _placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return _up((np.asarray(points, float) - pose[:2]) @ np.array([[cos, -sin], [sin, cos]]))
 
 
-def _shown(points: np.ndarray, beyond: float = 0.0) -> bool:
-    """Whether anything between these points may be visible on a page of any width."""
-    low, high = points.min(axis=0) - beyond, points.max(axis=0) + beyond
-    return bool((low < AROUND).all() and (high > -AROUND).all())
-
-
 def _fill(height: float) -> str:
     return "fill:var(--solid)" if height > 1.0 else "fill:var(--low)"
 
 
 def _box(row: np.ndarray, height: float, pose: np.ndarray) -> str:
-    x, y, yaw, length, width = (float(value) for value in row)
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length, width]
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    found = _placed(corners @ np.array([[cos, sin], [-sin, cos]]) + [x, y], pose)
-    return svg.polygon(found, _fill(height)) if _shown(found) else ""
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * row[3:]
+    cos, sin = math.cos(row[2]), math.sin(row[2])
+    found = _placed(corners @ np.array([[cos, sin], [-sin, cos]]) + row[:2], pose)
+    return svg.polygon(found, _fill(height))
 
 
 def _disc(row: np.ndarray, height: float, pose: np.ndarray) -> str:
-    at = _placed(row[None, :2], pose)
-    return svg.circle(tuple(at[0]), float(row[2]), _fill(height)) if _shown(at, float(row[2])) else ""
+    return svg.circle(tuple(_placed(row[None, :2], pose)[0]), float(row[2]), _fill(height))
 
 
 def _goal(at: np.ndarray, radius: float, away: float) -> str:

@@ -11,7 +11,7 @@ import pytest
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.locomotion import Locomotion, Trial, random_command
 from cuelearner_envs.anymal.physics import Ground
-from cuelearner_envs.anymal.policy import OBS, observe
+from cuelearner_envs.anymal.policy import OBS
 
 ROBOTS = 8
 SCENES = ("standing", "trotting", "flying", "slippery", "loaded", "on its side", "low", "blown up")
@@ -71,28 +71,9 @@ def test_a_step_of_control_is_that_of_c_mujoco(scenes, stepped, number):
     np.testing.assert_allclose(body.qvel[number], data.qvel, atol=0.03)
 
 
-def test_in_flight_the_centre_of_mass_falls_freely(scenes, stepped):
-    state, _ = scenes
-    model, places, speeds = robot.load(), [], []
-    for walk in (state.pipeline_state, stepped.pipeline_state):
-        data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = walk.body.qpos[2], walk.body.qvel[2]
-        mujoco.mj_forward(model, data)
-        mujoco.mj_subtreeVel(model, data)
-        places.append(data.subtree_com[1].copy())
-        speeds.append(data.subtree_linvel[1].copy())
-    np.testing.assert_allclose(speeds[1] - speeds[0], [0, 0, -9.81 * 0.02], atol=6e-3)  # steps of 0.01 s while it spins
-    np.testing.assert_allclose(places[1] - places[0], 0.02 * (speeds[0] + speeds[1]) / 2, atol=2e-3)
-
-
 def test_falls_end_the_episode(stepped):
     done = dict(zip(SCENES, np.asarray(stepped.done), strict=True))
     assert {name for name, value in done.items() if value} == {"on its side", "low", "blown up"}
-
-
-def test_nothing_that_is_not_a_number_reaches_the_network_or_the_sum_of_rewards(stepped):
-    assert np.isfinite(stepped.reward).all()
-    assert np.isfinite(stepped.pipeline_state.body.qpos).all()
 
 
 def test_rewards_are_never_negative_and_calm_standing_earns_the_most(stepped):
@@ -110,13 +91,6 @@ def test_observations_are_what_the_policy_is_told_in_order(stepped):
     np.testing.assert_allclose(obs[12:24], walk.body.qpos[0, 7:] - robot.HOME, atol=1e-6)
     np.testing.assert_allclose(obs[24:36], walk.body.qvel[0, 6:], atol=1e-6)
     np.testing.assert_allclose(obs[36:], walk.last_action[0])
-
-
-def test_velocities_are_told_in_the_trunks_own_frame():
-    half = np.pi / 4  # turned to the left by a right angle
-    qpos = jnp.concatenate([jnp.array([0, 0, 0.5, np.cos(half), 0, 0, np.sin(half)]), jnp.asarray(robot.HOME)])
-    qvel = jnp.zeros(18).at[1].set(1.0)  # along the world's y: straight ahead
-    np.testing.assert_allclose(observe(qpos, qvel, jnp.zeros(12), jnp.zeros(3))[:3], [1, 0, 0], atol=1e-6)
 
 
 def test_commands_fill_the_trials_bounds():

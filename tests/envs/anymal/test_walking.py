@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_envs.anymal import judge, policy, tracking
 from cuelearner_envs.anymal import model as robot
+from cuelearner_envs.anymal import policy, tracking
 from cuelearner_jax.errors import UserError
 
 
@@ -89,25 +89,3 @@ def test_the_shipped_policy_tracks_random_commands(shipped, trial, error, falls)
     found = tracking.measure(shipped, "mujoco", tracking.TRIALS[trial], jax.random.key(7), robots)
     assert found["error"] < error
     assert found["falls"] * robots <= falls
-
-
-def test_a_judged_robot_is_where_it_is_placed_and_a_push_moves_it():
-    two = judge.Judge([0.8, 0.8], [0.0, 0.0])
-    two.place(1, np.array([3.0, -2.0, 1.0]))
-    np.testing.assert_allclose(robot.planar_pose(jnp.asarray(two.qpos[1])), [3.0, -2.0, 1.0], atol=1e-6)
-    two.push(1, np.array([0.0, 0.5]))
-    two.control(np.zeros((2, 12)))
-    moved = two.qpos[:, :2] - [[0, 0], [3, -2]]
-    assert moved[1, 1] > 0.005 > abs(moved[0, 1])
-
-
-def test_a_judged_robot_that_fell_or_retired_moves_no_more():
-    three = judge.Judge([0.8] * 3, [0.0] * 3)
-    three.data[0].qpos[3:7] = np.cos(0.8), np.sin(0.8), 0, 0  # on its side
-    three.retired[1] = True
-    three.control(np.zeros((3, 12)))
-    assert three.fallen.tolist() == [True, False, False]
-    before = three.qpos
-    three.control(np.ones((3, 12)))
-    moved = np.abs(three.qpos - before).max(-1)
-    assert moved[0] == moved[1] == 0 < moved[2]

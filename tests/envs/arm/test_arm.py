@@ -13,8 +13,7 @@ from cuelearner_envs.anymal.model import rotation
 from cuelearner_envs.arm import drawing, physics, recording
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm.config import ArmConfig
-from cuelearner_envs.arm.environment import Camera
-from cuelearner_envs.arm.places import BASE, HOME
+from cuelearner_envs.arm.environment import HOME, Camera
 from cuelearner_envs.arm.scripts import act
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.reading import declared_distortions
@@ -71,13 +70,6 @@ def test_a_step_goes_3_cm_as_in_fetch():
     steps = np.diff(x)
     assert np.allclose(steps[:4], 0.032, atol=0.003)
     assert np.abs(steps[4:]).max() < 0.004
-
-
-def test_a_turned_camera_turns_places_about_the_base():
-    base = np.array([*BASE, 0.5])
-    quarter = Camera(turn=F(np.pi / 2), offset=jnp.array([0.0, 0.02, 0.0]))
-    ahead, left = (base + np.array(off) for off in ([0.6, 0.0, 0.0], [0.0, 0.62, 0.0]))
-    assert np.allclose(quarter.seen(jnp.asarray(ahead, F)), left, atol=1e-6)
 
 
 @pytest.mark.parametrize("skill", ["reach", "push", "pick"])

@@ -10,9 +10,6 @@ import pytest
 
 import cuelearner_jax as cl
 from cuelearner_envs.arm.config import ArmConfig
-from cuelearner_envs.arm.environment import Camera
-from cuelearner_envs.arm.teacher import ScriptTeacher
-from cuelearner_jax.environment import WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.tasks import arm
 
@@ -88,33 +85,6 @@ def test_fingers_that_go_down_do_not_press_on_the_table():
             assert state.true[6] - before[6] > 0.025  # as far as in the air; pressed down they move 1 cm
     assert state.true[8] < 0.425
     np.testing.assert_allclose(state.true[15:17], 0.0, atol=0.003)  # closed; pressed down they are 4.8 cm open each
-
-
-class Still(WholeObservations):
-    """A stand-in for Fetch: one observation of a skill with a cube."""
-
-    observation = arm.observation_of("push")
-
-    def reset(self, key):
-        return (), jnp.arange(31.0) / 31
-
-    def step(self, key, state, action):
-        raise AssertionError("nobody steps here")
-
-
-def test_rewards_count_the_way_to_the_cube_and_the_teacher_sees_true_places():
-    from cuelearner_envs.arm import fetch
-
-    env = fetch.make_environment(ArmConfig("push", **CAMERA), Still())
-    state, obs = env.reset(jax.random.key(0))
-    true = np.arange(31) / 31
-    ways = [np.linalg.norm(true[9:12] - true[part]) for part in (slice(3, 6), slice(6, 9))]
-    assert float(env._earned(state)) == pytest.approx(-ways[0] - 0.5 * ways[1], rel=1e-5)
-    plain = fetch.make_environment(ArmConfig("push"), Still())
-    teacher = arm.make_teacher(ArmConfig("push", **CAMERA), env)
-    assert isinstance(teacher, ScriptTeacher)
-    np.testing.assert_allclose(teacher.best_action(state, obs), plain.heuristic(env.observe(state, Camera())))
-    assert float(env.ground.post) == 0.0
 
 
 def test_what_fetch_cannot_be_is_refused_in_one_line(monkeypatch):

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from billiards_scenes import BATCH, EASY, KEY, SCENE, balls, observe, observe_many, random_states, step_many
+from billiards_scenes import BATCH, EASY, KEY, balls, observe, observe_many, random_states, step_many
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 
@@ -32,16 +32,6 @@ def test_mirrored_shots_have_mirrored_results():
         back, vector = mirror_many(jnp.array(which), mirrored_obs, mirrored_strikes)
         np.testing.assert_allclose(back, obs, atol=1e-7)
         np.testing.assert_array_equal(vector, strikes)
-
-
-def test_the_heuristic_points_at_the_closest_ball_that_is_left():
-    closest = heuristic(observe(EASY, SCENE))
-    np.testing.assert_allclose(closest, np.array([0.2, 0.1]) / np.hypot(0.2, 0.1), atol=1e-6)
-    left = heuristic(observe(EASY, balls(SCENE.positions, (False, False, False, True))))
-    np.testing.assert_allclose(left, np.array([0.3, -0.1]) / np.hypot(0.3, 0.1), atol=1e-6)
-    beside = balls([(-0.3, 0.17), (0.3, -0.1), (0.0, 0.0), (0.0, 0.0)], (False, False, True, True))
-    last = heuristic(observe(EASY, beside))  # the parked balls stand closer
-    np.testing.assert_allclose(last, np.array([0.6, -0.27]) / np.hypot(0.6, 0.27), atol=1e-6)
 
 
 PLAYED = balls([(0.1, 0.05), (0.1, 0.15), (0.3, 0.05), (0.0, 0.0)], (False, False, False, True))

@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
 from probes import long_but
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.teacher import PROPOSALS, LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
+from cuelearner_envs.billiards.teacher import PROPOSALS, LocalSearchTeacher, SearchTeacher, Transferred
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
@@ -44,14 +43,6 @@ def test_search_finds_a_winning_direction_where_few_win(chosen, wins):
     assert float(play(ONE, STATES, chosen).reward.mean()) > 0.9  # 1.0 measured
     assert 0 < wins.mean() < 0.03  # the reward of uniform directions; 0.008 measured
     np.testing.assert_allclose(jnp.linalg.norm(chosen, axis=-1), 1.0, atol=1e-6)
-
-
-def test_a_habit_makes_the_teacher_consistent(chosen):
-    assert np.ptp(degrees(chosen)) < 5  # 2 measured
-    jumping = degrees(best(SearchTeacher(ONE, AIM, jnp.array(0.0)), STATES, OBS))
-    left, right = jumping[jumping > 0], jumping[jumping < 0]  # mirror-image windows
-    assert min(len(left), len(right)) > RACKS / 10
-    assert left.min() - right.max() > 50
 
 
 def test_it_knows_of_a_changed_world(chosen):
@@ -100,11 +91,6 @@ def near(request, easy):
 
 
 searched = jax.jit(lambda teacher, states: jax.lax.map(teacher.rewards, states))
-nearest = jax.jit(
-    lambda teacher, states, obs, asked: jax.lax.map(
-        lambda row: teacher.nearest_good(row[0], row[1], row[2], jnp.deg2rad(0.3), 0.5), (states, obs, asked)
-    )
-)
 
 
 @pytest.mark.long
@@ -143,41 +129,3 @@ def test_the_shipped_teachers_play_well(table, least):
     coarse = coarsely(teacher)
     measured = jax.jit(lambda teacher: rollout(Taught(teacher), env, episodes("tuning"), 30, 150))(coarse)
     assert float(measured["reward"]) > least  # over 10,000 steps with their 3,600 directions: see teacher.json
-
-
-def test_a_table_without_a_shipped_teacher_says_what_to_do():
-    config = BilliardsConfig("one_ball", teacher="learned")
-    with pytest.raises(UserError, match=r"train_teacher.py.*search teacher"):
-        make_teacher(config, make_environment(config))
-
-
-class Given(struct.PyTreeNode):
-    """Proposes what it was given."""
-
-    action: jax.Array
-
-    def best_action(self, state, obs):
-        return self.action
-
-
-@jax.jit
-def nearby(states, obs, centres):
-    """Best and nearest good within 3 degrees of the centres."""
-
-    def one(state, obs, centre):
-        teacher = NearbyTeacher(Given(centre), ONE, AIM, jnp.deg2rad(3.0), 61)
-        return teacher.best_action(state, obs), teacher.nearest_good(state, obs, centre, AIM, 0.9)
-
-    return jax.vmap(one)(states, obs, centres)
-
-
-@pytest.mark.parametrize("off_deg", [-1.5, 2.0])
-def test_a_teacher_of_what_is_near_points_to_the_middle_of_what_succeeds(chosen, off_deg):
-    """Asked from beside a winning shot it finds its window, and tells the way there."""
-    beside = directions.rotate(chosen, jnp.deg2rad(off_deg))
-    middle, nearest = nearby(STATES, OBS, beside)
-    turns = [np.rad2deg(np.asarray(directions.difference(beside, found))) for found in (middle, nearest)]
-    assert float(play(ONE, STATES, middle).reward.mean()) > 0.9
-    assert (np.abs(turns[0]) <= 3.0 + 1e-3).all()
-    assert (np.sign(turns[0]) == -np.sign(off_deg)).mean() > 0.8
-    assert (np.abs(turns[1]) <= np.abs(turns[0]) + 1e-3).all()

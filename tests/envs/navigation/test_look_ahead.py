@@ -11,8 +11,7 @@ import rooms
 
 from cuelearner_envs.navigation.aims import RADII, SCALE, WAYS, aims_of
 from cuelearner_envs.navigation.config import NavigationConfig
-from cuelearner_envs.navigation.lidar import BEAMS, scan
-from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
+from cuelearner_envs.navigation.lidar import scan
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.config import GuideSizes, to_json
@@ -20,7 +19,6 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes
 from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.spaces.directions import from_angle
 from cuelearner_jax.tasks import registry
 
 PLAINLY = 45  # features of a way without look-ahead
@@ -28,7 +26,6 @@ POSE = jnp.zeros(3)
 RADIUS = RADII[2]
 
 told = jax.jit(lambda obs: aims_of(obs, True))
-told_less = jax.jit(aims_of)
 
 
 def seen(ranges, goal):
@@ -48,21 +45,6 @@ def ahead(obs):
     features = np.asarray(told(obs).features)
     assert features.shape == (WAYS, PLAINLY + 3)
     return features[:, PLAINLY:].T * SCALE
-
-
-def test_in_an_empty_hall_every_way_leads_on_to_the_goal():
-    """From every station of every way the goal is in free sight, so nothing is left and the nearest is no detour."""
-    left, detour, leg = ahead(seen(jnp.full(BEAMS, 10.0), (4.0, 0.0)))
-    np.testing.assert_allclose(left, 0.0, atol=1e-3)
-    # The goal's way: a station at the goal or on the way there. To the side: a quarter of 9.9 m, and back from there.
-    np.testing.assert_allclose(detour[0], 0.0, atol=1e-3)
-    first = (10.0 - SHORT) / 4
-    angle = math.radians(30.0)  # the foot of the goal is 3.46 m along: the quarter comes before it
-    np.testing.assert_allclose(leg[6], first, atol=1e-3)
-    beyond = math.hypot(4.0 - first * math.cos(angle), first * math.sin(angle))
-    np.testing.assert_allclose(detour[6], first + beyond - 4.0, atol=1e-3)
-    # Straight back there is no station nearer than LEAST: so far and back again.
-    np.testing.assert_allclose([leg[36], detour[36]], [LEAST, 2 * LEAST], atol=1e-3)
 
 
 # 3 m ahead a wall with a doorway from y = 1.5 to 3.5; the goal lies 6 m straight ahead.
@@ -109,28 +91,6 @@ def test_what_is_seen_of_a_wall_stops_a_second_leg_and_what_is_not_seen_does_not
     beside = [-6, 6]  # 30 degrees either way, past the screen
     np.testing.assert_allclose(one[0][beside], 0.0, atol=1e-3)
     assert one[1][beside].max() < seen_too[1][beside].min()
-
-
-@pytest.mark.parametrize("beams", [2, 10, -24])
-def test_a_turned_scene_has_the_same_features(beams):
-    """Turned by as many degrees as beams: every second beam is then seen by another that is looked at too."""
-    angle, ranges = math.radians(beams), np.full(BEAMS, 10.0)
-    ranges[60:180] = np.linspace(2.0, 4.0, 120)  # nothing at the ends, which would be turned out of sight
-    goal = 7.0 * from_angle(jnp.array(0.3))
-    turned = 7.0 * from_angle(jnp.array(0.3 + angle))
-    here, there = ahead(seen(ranges, goal)), ahead(seen(np.roll(ranges, beams), turned))
-    np.testing.assert_allclose(here, there, atol=2e-3)
-    assert np.ptp(here, 1).min() > 0.5  # of several metres, not all alike
-
-
-def test_unless_it_is_asked_for_aims_are_what_they_were():
-    rng = np.random.default_rng(2)
-    obs = seen(rng.uniform(0.5, 9.0, BEAMS), (3.0, 1.0))
-    plain, more = told_less(obs), told(obs)
-    assert plain.features.shape == (WAYS, PLAINLY)
-    np.testing.assert_array_equal(plain.features, more.features[:, :PLAINLY])
-    np.testing.assert_array_equal(plain.open, more.open)
-    np.testing.assert_array_equal(plain.actions, more.actions)
 
 
 def world(**changes):

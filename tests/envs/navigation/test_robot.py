@@ -9,12 +9,11 @@ import pytest
 from rooms import world
 from scipy.integrate import solve_ivp
 
-from cuelearner_envs.navigation.robot import Motion, Robot, collides, discs, walk
+from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
 
 step = jax.jit(walk)
 step_many = jax.jit(jax.vmap(walk, (None, 0, 0, None)))
 touches = jax.jit(jax.vmap(collides, (None, None, 0)))
-places = jax.jit(jax.vmap(discs, (None, 0)))
 
 
 def motion(x=0.0, y=0.0, yaw=0.0, velocity=(0.0, 0.0)):
@@ -26,14 +25,6 @@ def toward(angle):
 
 
 POST = world(circles=[[2.0, 1.0, 0.3]])
-
-
-@pytest.mark.parametrize("duration", [0.05, 0.1, 0.2, 0.5])
-def test_from_rest_the_speed_rises_to_1_m_a_second_with_a_time_constant_of_a_tenth(duration):
-    after = step(Robot(), motion(), toward(0.0), duration)
-    fading = math.exp(-duration / 0.1)
-    np.testing.assert_allclose(after.velocity, [1.0 - fading, 0.0], atol=1e-6)
-    np.testing.assert_allclose(after.pose[:2], [duration - 0.1 * (1.0 - fading), 0.0], atol=1e-6)
 
 
 def random_motions(count, seed=0):
@@ -69,24 +60,6 @@ def test_a_step_is_what_a_general_integrator_finds():
 def test_the_body_turns_toward_the_direction_at_1_5_rad_a_second_at_most(angle, turned):
     after = step(Robot(), motion(yaw=0.7), toward(angle), 0.2)
     assert float(after.pose[2]) == pytest.approx(0.7 + turned, abs=1e-6)
-
-
-def test_the_yaw_stays_within_half_a_turn():
-    assert float(step(Robot(), motion(yaw=3.1), toward(1.0), 0.2).pose[2]) == pytest.approx(3.4 - 2 * math.pi, abs=1e-5)
-    assert float(step(Robot(), motion(yaw=-3.1), toward(-1.0), 0.2).pose[2]) == pytest.approx(
-        2 * math.pi - 3.4, abs=1e-5
-    )
-
-
-def test_the_discs_lie_on_the_bodys_axis_rear_middle_front():
-    poses = jnp.array([[1.0, 2.0, 0.0], [1.0, 2.0, math.pi / 2], [0.0, 0.0, math.pi / 6]])
-    root = math.sqrt(3)
-    expected = [
-        [[0.8, 2.0], [1.0, 2.0], [1.2, 2.0]],
-        [[1.0, 1.8], [1.0, 2.0], [1.0, 2.2]],
-        [[-0.1 * root, -0.1], [0.0, 0.0], [0.1 * root, 0.1]],
-    ]
-    np.testing.assert_allclose(places(Robot(), poses), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.geometry import line_clearance
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
-from cuelearner_envs.navigation.roadmap import make_sided_teacher
-from cuelearner_envs.navigation.sides import closed, count_passed
+from cuelearner_envs.navigation.roadmap import make_teacher
+from cuelearner_envs.navigation.world import closed, count_passed
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
@@ -85,7 +85,7 @@ walked = jax.jit(lambda teacher, env: rollout(Taught(teacher), env, episodes("tu
 @pytest.mark.long
 @pytest.mark.parametrize(("wish", "side"), [("left", 1.0), ("right", -1.0)])
 def test_a_teacher_passes_where_it_is_wanted(wish, side):
-    found = walked(make_sided_teacher(TWO, jnp.float32(side)), TWO)
+    found = walked(make_teacher(TWO, jnp.float32(side)), TWO)
     assert found["success"] == 1
     assert found[f"passed_{wish}"] == 1
 

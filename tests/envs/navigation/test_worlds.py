@@ -12,7 +12,6 @@ from probes import long_but
 from scipy import ndimage
 
 from cuelearner_envs.navigation import generate
-from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import any_of, generate_many
 
@@ -95,19 +94,6 @@ def each(many):
         yield used(boxes), used(circles), starts, goals, extent
 
 
-def test_the_judge_of_reachability_tells_a_doorway_from_a_gap_too_narrow():
-    walls = [[5.1, 0, 0, 0.1, 3.2], [-5.1, 0, 0, 0.1, 3.2], [0, 3.1, 0, 5.2, 0.1], [0, -3.1, 0, 5.2, 0.1]]
-    ends = np.array([[-3.0, 0.5]]), np.array([[3.0, -0.5]])
-    for gap, expected in ((0.0, False), (0.9, False), (1.2, True)):
-        parts = [[0.0, sign * (gap / 2 + 1.6), 0.0, 0.05, 1.6] for sign in (1, -1)]
-        boxes, circles = np.array(walls + parts), np.zeros((0, 3))
-        assert joined(*walkable(boxes, circles, np.array([10.0, 6.0])), *ends).tolist() == [expected]
-
-
-def test_the_body_reaches_as_far_as_these_tests_say():
-    assert float(Robot().reach) == pytest.approx(REACH)
-
-
 @pytest.mark.long
 def test_every_goal_can_be_reached_by_the_body_however_it_is_turned(sample):
     _, many = sample
@@ -132,73 +118,6 @@ def test_goals_lie_5_to_15_m_from_their_starts(sample):
     assert apart.max() <= 15.0
     assert apart.min() < 5.5
     assert apart.max() > 14.5
-
-
-def test_solids_lie_inside_and_unused_rows_far_away(sample):
-    _, many = sample
-    assert many.boxes.shape == (KEYS, 24, 5)
-    assert many.circles.shape == (KEYS, 12, 3)
-    for leaf in jax.tree.leaves(many):
-        assert np.isfinite(leaf).all()
-    for rows in (many.boxes[:, 4:], many.circles):
-        inside = (np.abs(rows[..., :2]) <= many.extent[:, None] / 2).all(-1)
-        far = (np.abs(rows[..., :2]) >= FAR_AWAY / 2).all(-1)
-        assert (inside | far).all()
-        assert inside.any()
-    assert (many.boxes[..., 3:] > 0).all()
-    assert (many.circles[..., 2] > 0).all()
-
-
-@pytest.fixture(scope="module")
-def sizes(sample):
-    """Used obstacles of all worlds: boxes (without the outer walls), circles, and how many of each a world has."""
-    style, many = sample
-    boxes, circles = many.boxes[:, 4:], many.circles
-    seen = [np.abs(rows[..., 0]) < FAR_AWAY / 2 for rows in (boxes, circles)]
-    return style, boxes[seen[0]], circles[seen[1]], seen[0].sum(1), seen[1].sum(1)
-
-
-def test_obstacles_are_as_many_and_as_large_as_the_style_says(sizes):
-    style, boxes, circles, box_counts, circle_counts = sizes
-    if style == "clutter":
-        assert set(box_counts) == set(range(8, 17))
-        assert set(circle_counts) == set(range(6, 13))
-        assert boxes[:, 3:].min() >= 0.2
-        assert boxes[:, 3:].max() <= 0.9
-        assert circles[:, 2].min() >= 0.15
-        assert circles[:, 2].max() <= 0.6
-    elif style == "rooms":
-        assert boxes[:, 4].max() <= 0.08  # walls and thin obstacles, 4 to 16 cm thick: nothing as thick as in clutter
-        assert boxes[:, 4].min() >= 0.02
-        assert (circle_counts == 8).all()
-        assert circles[:, 2].min() >= 0.05
-        assert circles[:, 2].max() <= 0.12
-    else:
-        assert (box_counts + circle_counts == 4).all()
-        assert set(box_counts) == set(range(5))
-
-
-def doorways(boxes):
-    """Width of the gap between the two pieces of each inner wall that has both: (worlds, 7), else not a number."""
-    pieces = boxes[:, 4:18].reshape(-1, 7, 2, 5)
-    gap = np.linalg.norm(pieces[:, :, 0, :2] - pieces[:, :, 1, :2], axis=-1) - pieces[..., 3].sum(-1)
-    return np.where((np.abs(pieces[..., 0]) < FAR_AWAY / 2).all(-1), gap, np.nan)
-
-
-@pytest.mark.parametrize("sample", ["rooms"], indirect=True)
-def test_rooms_have_doorways_and_a_narrow_passage(sample):
-    _, many = sample
-    widths = doorways(many.boxes)
-    assert np.nanmin(widths) >= 1.3 - 1e-5
-    assert np.nanmax(widths) <= 1.7 + 1e-5
-    assert np.isfinite(widths).mean() > 0.8
-    for boxes in many.boxes:
-        upright = used(boxes[4:18])
-        upright = upright[np.abs(np.cos(upright[:, 2])) < 0.1]  # the pieces of the two walls along y
-        left, right = (upright[np.isclose(upright[:, 0], x, atol=1e-4)] for x in np.unique(upright[:, 0].round(4)))
-        passage = (right[:, 0] - right[:, 4]).min() - (left[:, 0] + left[:, 4]).max()
-        assert 1.46 - 1e-4 <= passage <= 1.94 + 1e-4  # 1.62 to 2.02 m between the middles of walls 8 to 16 cm thick
-        assert passage > 2 * REACH
 
 
 @pytest.mark.long
