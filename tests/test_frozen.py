@@ -94,7 +94,7 @@ def runs(tmp_path_factory):
 def test_a_training_ends_with_the_stored_parameters_replay_and_rows(runs, world, kind):
     folder = runs / world / kind
     (replay,) = [leaf for name, leaf in checkpoint(folder, "rest").items() if name.endswith(".agent.replay")]
-    rtol = 2e-2 if kind.startswith("clic") else 1e-4  # Langevin steps carry another processor's rounding far
+    rtol = 2e-2 if kind.startswith("clic") else 1e-4  # its search carries another processor's rounding far
     check(f"{world} {kind} policy", sums(checkpoint(folder, "policy").values()), rtol)
     check(f"{world} {kind} replay", sums([replay]), rtol)
     last = rows(folder)[-1]
