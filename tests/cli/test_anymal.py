@@ -16,7 +16,7 @@ AGENT = Path(__file__).parents[2] / "docs" / "data" / "navigation_agent"
 FEW = ["--episodes", "3", "--task.worlds", "8", "--task.max-steps", "4"]
 
 REFUSED = [
-    (["evaluate", "billiards", "--robot", "anymal"], "unknown robot 'anymal'"),
+    (["evaluate", "billiards", "--robot", "anymal"], "billiards has no robots to choose from: leave out --robot"),
     (["train", "navigation", "--robot", "anymall", "--out", "run"], "unknown robot 'anymall', did you mean 'anymal'"),
     (["sweep", "navigation", "--robot", "anymal:own", "--out", "run"], "training takes no folder of a robot: give its"),
     (["evaluate", "navigation", "--robot", "anymall"], "unknown robot 'anymall', did you mean 'anymal'"),
