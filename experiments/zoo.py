@@ -29,7 +29,8 @@ from cuelearner_jax.devices import each_lane
 from cuelearner_jax.reading import fitting
 from cuelearner_jax.reading.fitting import Fit, Hypothesis, Reader
 from cuelearner_jax.reading.linear import Labels
-from cuelearner_jax.reading.session import BATCHES, FIRST, USED
+from cuelearner_jax.reading.posterior import PRIORS, habits
+from cuelearner_jax.reading.session import BATCHES, FIRST, MOST_WRONG, USED
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 from cuelearner_jax.storage.provenance import provenance
 
@@ -197,6 +198,12 @@ def _played(worlds: Any, states: Asked) -> dict[str, jax.Array]:
     return each_lane(one)(worlds, states)
 
 
+@jax.jit
+def _wrong(fits: Fit) -> jax.Array:
+    """Return the share of answers about something else, by each cell's fit."""
+    return jax.vmap(lambda fit: habits(fit.posterior.hyper, 1.0, PRIORS).lapse)(fits)
+
+
 def worlds_of(robots: Any, cells: list[Cell]) -> tuple[Any, jax.Array]:
     """Return the worlds of cells, stacked, and their keys."""
     rows = jnp.array([cell.robot for cell in cells]), jnp.array([cell.error for cell in cells])
@@ -219,13 +226,14 @@ def measure(robots: Any, cells: list[Cell], labels: int) -> list[dict[str, Any]]
         state = each_lane(read)(worlds, *labelled, state.plain, state.smooth)
     values = jax.tree.map(np.asarray, _played(worlds, state))
     evidence = np.asarray(state.evidence)
+    used = (evidence >= USED) & (np.asarray(_wrong(state.fit)) < MOST_WRONG)
     judged = [
         {end: values[f"{name} {end}"][:, :JUDGED] for end in ("success", "return")} for name in ("before", "after")
     ]
     test = PairedTest(len(cells))
     test.add(differences((judged[0], judged[1]), "success"))
     decided = {
-        "evidence": evidence, "used_by_labels": evidence >= USED, "used_by_test": test.better,
+        "evidence": evidence, "used_by_labels": used, "used_by_test": test.better,
         "covered": values.pop("covered"),
     }  # fmt: skip
     return rows_of(robots, cells, {**decided, **means_of(values)})

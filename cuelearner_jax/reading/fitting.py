@@ -7,6 +7,7 @@ estimate `ROUNDS` times. They are compared by how well each answer is predicted 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -39,7 +40,6 @@ HYPOTHESES: tuple[tuple[str, ...], ...] = (
 ENTRIES = 3  # largest number of unknowns that a fit starts from
 TRIED = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)  # shifts of an unknown that are tried, in its steps
 WITH_PROCESS = 2  # hypotheses that are tried with the process: the first and the best
-EVEN = 0.2  # share of predictions that is the same for all hypotheses
 WORTH = 3.0  # nats by which a hypothesis must predict better than "nothing changed": a factor of 20
 # Logarithm of the width that a fit starts from: answers about actions far from the right one then still say which way
 # it lies, where a narrow width would take them for answers about something else.
@@ -148,7 +148,8 @@ class Reader:
         moves, theta = _moves(self.family, frame), nothing.theta
         for _ in range(ENTRIES):
             tried = jax.vmap(lambda theta: nothing.replace(theta=theta))(theta[None] + moves)
-            worth = self._worth(labels, tried) - WORTH * (jnp.arange(len(moves)) > 0)
+            # the best of many must be better than the best of chance
+            worth = self._worth(labels, tried) - (WORTH + math.log(len(moves))) * (jnp.arange(len(moves)) > 0)
             theta = tried.theta[jnp.argmax(worth)]
         change = nothing.replace(theta=theta)
         both = jax.tree.map(lambda own, other: jnp.concatenate([own, other[None]]), plain.change, change)
@@ -197,9 +198,9 @@ class Reader:
         return _predicted(self.space, self.family, fitted, *rest)
 
     def ratio(self, fits: Fit, labels: Labels) -> Float[Array, ""]:
-        """Return log p(answers | all hypotheses by their shares) less log p(answers | nothing changed)."""
-        each = [self.predict(pick(fits, number), labels)[2].sum() for number in range(len(fits.score))]
-        return jax.nn.logsumexp(jnp.nan_to_num(jnp.stack(each), nan=-jnp.inf) + shares(fits)) - each[0]
+        """Return log((1 + r) / 2), r = p(answers | best hypothesis) / p(answers | nothing changed)."""
+        best, nothing = (self.predict(pick(fits, number), labels)[2].sum() for number in (best_of(fits), 0))
+        return jnp.logaddexp(best - nothing, 0.0) - math.log(2)
 
     def spread(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n cues"]:
         """Return the standard deviation of the right action along each cue, in the unit of `space.log`."""
@@ -235,13 +236,6 @@ def best_of(fitted: Fit) -> Array:
     score = jnp.nan_to_num(fitted.score, nan=-jnp.inf)
     best = jnp.argmax(score)
     return jnp.where(score[best] < score[0] + WORTH, 0, best)
-
-
-@jax.jit
-def shares(fitted: Fit) -> Float[Array, " hypotheses"]:
-    """Return the logarithm of the share of each hypothesis in predictions: by its score, and a little of each."""
-    by_score = jax.nn.log_softmax(jnp.nan_to_num(fitted.score, nan=-jnp.inf))
-    return jnp.logaddexp(jnp.log1p(-EVEN) + by_score, jnp.log(EVEN / len(by_score)))
 
 
 @jax.jit

@@ -96,8 +96,10 @@ def describe_fit(
     more = np.asarray(posterior.process(fitted.posterior, inputs, inputs, priors))[valid]
     depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
     depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
-    alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(met), inputs[valid])
-    near = float((alike.max(1) >= ALIKE_SITUATION).mean()) if len(met) else None
+    near = None
+    if len(met):
+        alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(met), inputs[valid])
+        near = float((alike.max(1) >= ALIKE_SITUATION).mean())
     wrong = float(posterior.habits(hyper, 1 / SCALE, priors).lapse)
     return tuple(estimates), depends, near, wrong
 

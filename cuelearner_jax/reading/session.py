@@ -4,9 +4,10 @@
     reading.learn(obs, actions, answers)    # as often as there are new ones
     reading.policy(), reading.result()
 
-Before a batch of answers is read, all hypotheses so far, each by its share, and "nothing changed" predict it. The
-product of the ratios of the two is a test martingale: where nothing changed it exceeds 20 with probability 1/20 at
-most, however often one looks (Ville's inequality). From 20 on the correction is used.
+Before a batch of answers is read, the correction so far and "nothing changed" predict it; r is the ratio of the two.
+The product of (1 + r) / 2 is a test martingale: half of its capital is staked on each batch, so that one batch
+predicted badly halves it at most. Where nothing changed it exceeds 20 with probability 1/20 at most, however often one
+looks (Ville's inequality). From 20 on the correction is used.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from cuelearner_jax.spaces import Space
 BATCHES = 5  # in which a budget of labels is asked or read
 LEAST_BATCH = 10
 USED = math.log(20)  # log of the test martingale from which a correction is used
+MOST_WRONG = 0.4  # share of answers about something else from which none is believed
 MET = 200  # situations met that are kept
 FIRST = 3.0  # spread of the first questions about the policy's actions, in eps
 
@@ -149,11 +151,11 @@ class Reading:
         if self.fits is None or self.fit is None:
             return Result(False, False, 0.0, (), 0.0, None, 0.0, self.policy())
         number = int(fitting.best_of(self.fits))
-        used = number > 0 and self.evidence >= USED
         met = jnp.asarray(self.met)
         inputs = linear.inputs(self.space, self.fit.frame, met, self._acts(met)) if len(met) else met
         rest = (self.space, self.family, self.eps, self.observation, np.asarray(inputs))
         described = describe_fit(self.fit, *rest)
+        used = number > 0 and self.evidence >= USED and described[-1] < MOST_WRONG
         return Result(used, number > 0, self.evidence, *described, self.policy())
 
     def act(self, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:

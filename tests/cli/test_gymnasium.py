@@ -116,7 +116,7 @@ def test_pictures_are_written(tmp_path):
         (["train", REACH, "--env", "navigation"], "the task is named twice"),
         (["render", REACH, "--policy", "uniform", "--out", "film.gif"], "cannot be drawn"),
         (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
-        (["adapt", "model.zip", "--env", REACH], "my_policy.py, and give my_policy:POLICY (module:NAME"),
+        (["adapt", "model.zip", "--env", REACH], "and give my_policy:POLICY (module:NAME"),
         (["adapt", "./mine.py:policy", "--env", REACH], "give package.module:NAME, for instance my_code:MINE"),
         (
             ["evaluate", REACH, "--policy", "uniform", "--task.arguments", "[]"],
