@@ -16,7 +16,11 @@ def shown(session, acts, finish=None):
             await user.open("/")
             await acts(user, pages)
 
-    asyncio.run(used())
+    loop = asyncio.new_event_loop()
+    try:
+        loop.run_until_complete(used())
+    finally:
+        loop.close()  # `asyncio.run` would wait for the page's tasks for good where `acts` failed
 
 
 async def press(user, name, moved):
