@@ -109,6 +109,7 @@ def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path):
     command = [sys.executable, "-c", script, *bandit, "--out", str(tmp_path / "run")]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path])}
     env["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # JAX warns of programs that it can't keep
+    env["PYTHONDONTWRITEBYTECODE"] = "1"  # Python keeps a compiled module that was cut, for all who import it later
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 1
     # Orbax's threads may complain beside it.
