@@ -139,9 +139,8 @@ def adapt(
         nothing, unknown = np.zeros(lanes.number), np.full((lanes.number, 3), np.nan)
         evidence, used = (np.array([getattr(one, name) for one in results]) for name in ("evidence", "used"))
         judged = Judgement(LABELS, nothing, evidence, used, lanes.bound_deg, unknown, nothing.astype(int))
-    keep, nothing = jnp.asarray(judged.used), of.unread(None, block.correction).correction
-    chosen = lambda own, none: jnp.where(keep.reshape(-1, *[1] * none.ndim), own, none)  # noqa: E731
-    block = block.replace(correction=jax.tree.map(chosen, block.correction, nothing))
+    nothing = of.unread(None, block.correction).correction
+    block = block.replace(correction=_chosen(judged.used, block.correction, nothing))
     return AdaptationResult(of, lanes, block, judged, judge.curve, tuple(results))
 
 
@@ -162,7 +161,7 @@ def _asked(
         policies.append(policy)
         states, obs = walk.situations(k_where, policy, CHOICE * size)
         index, action = reading.questions(np.asarray(obs), count, k_ask)
-        states, obs = jax.tree.map(lambda leaf, index=index: leaf[index], (states, obs))
+        states, obs = _rows((states, obs), index)
         answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
         rows.append((np.asarray(obs), action, answer))
         there = np.isfinite(answer).any(-1)
@@ -170,6 +169,18 @@ def _asked(
     obs, action, answer = (np.concatenate(column) for column in zip(*rows, strict=True))
     valid = np.asarray(np.isfinite(answer).any(-1))
     return Label(obs, action, np.where(valid[:, None], answer, 0), valid), policies  # pyright: ignore[reportArgumentType]
+
+
+@jax.jit
+def _chosen(keep: Array, own: Correction, nothing: Correction) -> Correction:
+    """Return each lane's correction, or nothing where it is not kept."""
+    one = lambda own, none: jnp.where(keep.reshape(-1, *[1] * none.ndim), own, none)  # noqa: E731
+    return jax.tree.map(one, own, nothing)
+
+
+@jax.jit
+def _rows(tree: Any, index: Array) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _stacked(corrections: list[Correction]) -> Correction:

@@ -147,16 +147,11 @@ class Reader:
         nothing = linear.no_change(self.space, self.family, labels.obs.shape[-1])
         moves, theta = _moves(self.family, frame), nothing.theta
         for _ in range(ENTRIES):
-            tried = jax.vmap(lambda theta: nothing.replace(theta=theta))(theta[None] + moves)
-            # the best of many must be better than the best of chance
-            worth = self._worth(labels, tried) - (WORTH + math.log(len(moves))) * (jnp.arange(len(moves)) > 0)
-            theta = tried.theta[jnp.argmax(worth)]
+            tried = _each(nothing, theta, moves)
+            theta = _taken(tried, self._worth(labels, tried))
         change = nothing.replace(theta=theta)
-        both = jax.tree.map(lambda own, other: jnp.concatenate([own, other[None]]), plain.change, change)
-        worth = self._worth(labels, both)
-        better = (worth[-1] > worth[:-1] + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
-        chosen = lambda own, other: jnp.where(better.reshape(-1, *[1] * other.ndim), other[None], own)  # noqa: E731
-        return Hypothesis(plain.parts, jax.tree.map(chosen, plain.change, change), plain.hyper)
+        worth = self._worth(labels, _and(plain.change, change))
+        return plain.replace(change=_better(plain.change, change, worth))
 
     def _worth(self, labels: Labels, changes: Change) -> Float[Array, " k"]:
         """Return the log likelihood of labels by each of stacked estimates, without the process."""
@@ -271,6 +266,7 @@ def _predicted(
     return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, habits)
 
 
+@partial(jax.jit, static_argnames="family")
 def _moves(family: Family, frame: Frame) -> Float[Array, "k unknowns"]:
     """Return no shift, and shifts of each unknown alone: of a family, or of the entries that matter most."""
     size = len(frame.step)
@@ -278,6 +274,32 @@ def _moves(family: Family, frame: Frame) -> Float[Array, "k unknowns"]:
     each = jnp.eye(size)[entries] * frame.step[None]
     several = (jnp.array(TRIED)[:, None, None] * each[None]).reshape(-1, size)
     return jnp.concatenate([jnp.zeros((1, size)), several])
+
+
+@jax.jit
+def _each(nothing: Change, theta: Array, moves: Array) -> Change:
+    """Return the estimates that are tried, stacked."""
+    return jax.vmap(lambda move: nothing.replace(theta=theta + move))(moves)
+
+
+@jax.jit
+def _taken(tried: Change, worth: Array) -> Array:
+    """Return the unknowns of the best estimate; the first moves nothing."""
+    # the best of many must be better than the best of chance
+    return tried.theta[jnp.argmax(worth.at[1:].add(-WORTH - math.log(len(worth))))]
+
+
+@jax.jit
+def _and(changes: Change, change: Change) -> Change:
+    return jax.tree.map(lambda own, other: jnp.concatenate([own, other[None]]), changes, change)
+
+
+@jax.jit
+def _better(changes: Change, change: Change, worth: Array) -> Change:
+    """Return estimates of all hypotheses, in which another one, whose worth stands last, replaces what is worse."""
+    better = (worth[-1] > worth[:-1] + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
+    chosen = lambda own, other: jnp.where(better.reshape(-1, *[1] * other.ndim), other[None], own)  # noqa: E731
+    return jax.tree.map(chosen, changes, change)
 
 
 @partial(jax.jit, static_argnames="family")

@@ -118,6 +118,7 @@ def basis(space: Space, action: Float[Array, "n action"]) -> Float[Array, "n bas
     return jnp.concatenate([jnp.ones((len(action), 1)), even], 1)
 
 
+@partial(jax.jit, static_argnums=0)
 def frame_of(
     family: Family, labels: Labels, step: Float[Array, " unknowns"] | None = None, mixed: Int[Array, " m"] | None = None
 ) -> Frame:
@@ -143,6 +144,7 @@ def probes(family: Family, frame: Frame, change: Change, obs: Float[Array, "n ob
     return jnp.concatenate([obs[None], moved])
 
 
+@partial(jax.jit, static_argnums=(0, 1))
 def jumps(
     space: Space,
     family: Family,
@@ -172,6 +174,7 @@ def _sides(
     return space.log(whole[:1], whole[1 : 1 + size]), space.log(whole[:1], whole[1 + size :])
 
 
+@partial(jax.jit, static_argnums=0)
 def influence(space: Space, frame: Frame, labels: Labels, actions: Float[Array, "k n action"]) -> Int[Array, " mixed"]:
     """Return the entries on which the policy's actions depend most, from its answers to `probes`."""
     size = len(frame.step)
