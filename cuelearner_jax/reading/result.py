@@ -85,10 +85,10 @@ def describe_fit(
     x = np.asarray(fitted.data.features, np.float64)
     valid = np.asarray(fitted.data.answers.valid).any(-1)
     effect = x[valid].reshape(-1, x.shape[-1])
-    seen = len(fitted.hypothesis.change.theta)
-    names = _names(family, seen, observation)
+    unknowns = len(fitted.hypothesis.change.theta)
+    names = _names(family, unknowns, observation)
     step = np.asarray(fitted.frame.step, np.float64)
-    estimates = _seen(weights[:seen], root[:seen], effect[:, :seen], names, family, step)
+    estimates = _seen(weights[:unknowns], root[:unknowns], effect[:, :unknowns], names, family, step)
     own = slice(len(weights) - linear.terms(*fitted.hypothesis.change.action.shape).shape[1], None)
     estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
     hyper = fitted.posterior.hyper
