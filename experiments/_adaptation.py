@@ -202,7 +202,7 @@ def by_labels(bench: Bench) -> Iterator[Row]:
 def by_answers(bench: Bench) -> Iterator[Row]:
     """Read answers, which also decide whether the correction is used."""
     piece, env = bench.piece, bench.env("training")
-    kind, scalars = guidances.find("reading"), by_reading.settling(bench.scalars(), None)
+    kind, scalars = guidances.find("reading"), bench.scalars()
     guidance = kind(by_model.SIZES, spaces_of(env))
     lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (actions_of(env).reach,))
     family = declared_distortions(env)

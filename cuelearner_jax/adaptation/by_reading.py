@@ -7,7 +7,6 @@ found.results[0].words(), found.policy(env)
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -17,15 +16,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax.adaptation.by_model import SIZES, AdaptationResult
-from cuelearner_jax.adaptation.judging import LABELS, Judge, Judgement, Judging
+from cuelearner_jax.adaptation.by_model import AdaptationResult, finished
+from cuelearner_jax.adaptation.judging import Judge, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
-from cuelearner_jax.config import GuideSizes, Scalars, TeacherFaults
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, ignore_progress
-from cuelearner_jax.reading import Read, Reading, Result, Walk
+from cuelearner_jax.reading import Read, Reading, Walk
 from cuelearner_jax.reading.correction import Correction
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.policy import unread
@@ -35,8 +32,6 @@ from cuelearner_jax.types import Label, Teacher
 USUAL = 100  # default number of labels
 LEAST = 2 * LEAST_BATCH  # labels: those of the first batch say nothing for or against a correction
 CHOICE = 6  # situations met for each question
-# fields of the scalars that a reading uses
-USED = ("eps_deg", *(entry.name for entry in dataclasses.fields(TeacherFaults)))
 
 
 class ReadingAdaptation(Adaptation):
@@ -49,6 +44,12 @@ class ReadingAdaptation(Adaptation):
         """Return every lane's corrected policy."""
         base, space = self.bases.lane(block.base), actions_of(self.env)
         return Read(base, block.correction, block.bound, space, self.family, self.named)
+
+    def keep_used(self, block: Any, used: Bool[Array, " lanes"]) -> Any:
+        """Return the lanes, without a correction where it is not used."""
+        nothing = self.unread(None, block.correction).correction
+        chosen = lambda own, none: jnp.where(used.reshape(-1, *[1] * none.ndim), own, none)  # noqa: E731
+        return block.replace(correction=jax.tree.map(chosen, block.correction, nothing))
 
     def unread(self, base: Any, like: Correction | None = None) -> Read:
         """Return a policy that corrects nothing; `like`: a correction with the sizes of its arrays."""
@@ -65,27 +66,9 @@ class Evidence(struct.PyTreeNode):
     asked: Int[Array, " lanes"]
     bound: Float[Array, " lanes"]
     corrects: Bool[Array, " lanes"]  # True where the answers show a change
+    evidence: Float[Array, " lanes"]  # `Result.evidence`
+    used: Bool[Array, " lanes"]  # `Result.used`: the judgement where labels judge
     failed: Bool[Array, " lanes"]
-
-
-def settling(scalars: Scalars, eps_deg: float | None) -> Scalars:
-    """Return the scalars of a teacher whose answers have strength `eps_deg` (None: the given scalars' strength)."""
-    kept = {name: getattr(scalars, name) for name in USED} | ({} if eps_deg is None else {"eps_deg": eps_deg})
-    return dataclasses.replace(Scalars(), **kept)
-
-
-def check_unused(sizes: GuideSizes, scalars: Scalars, **others: Any) -> None:
-    """Raise UserError for a setting of feedback models or of refinement, which a reading does not use."""
-    plain = dataclasses.replace(SIZES, labels_per_round=sizes.labels_per_round)
-    groups = [("sizes", sizes, plain), ("scalars", scalars, settling(scalars, None))]
-    wrong = [
-        f"{name}.{entry.name}"
-        for name, group, used in groups
-        for entry in dataclasses.fields(used)
-        if getattr(group, entry.name) != getattr(used, entry.name)
-    ]
-    for name in [*wrong, *(name for name, value in others.items() if value not in ((), None))]:
-        raise UserError(f"{name} is given, but guidance reading fits no network: leave {name} out")
 
 
 def adapt(
@@ -122,7 +105,9 @@ def adapt(
         labels=_padded(rows) if labels is None else labels,
         asked=jnp.asarray(lanes.budget),
         bound=jnp.asarray(space.from_unit(lanes.bound_deg)),
-        corrects=jnp.asarray(np.array([one.changed for one in results])),
+        corrects=np.array([one.changed for one in results]),
+        evidence=np.array([one.evidence for one in results]),
+        used=np.array([one.used for one in results]),
         failed=jnp.zeros(lanes.number, bool),
     )
     judge = Judge(of, lanes, how, lane_mesh(jax.local_devices()[:1]), watch)
@@ -131,18 +116,7 @@ def adapt(
             then = _stacked([lane[min(step, len(lane) - 1)] for lane in steps])
             count = np.minimum(step * _batch(lanes.budget), lanes.budget)
             judge.measure(block.replace(correction=then, asked=jnp.asarray(count)))
-    if how.by != LABELS:
-        judged, block = judge.judge_lanes(block)
-    else:
-        if how.env is not None:
-            judge.measure(block)
-        nothing, unknown = np.zeros(lanes.number), np.full((lanes.number, 3), np.nan)
-        evidence, used = (np.array([getattr(one, name) for one in results]) for name in ("evidence", "used"))
-        judged = Judgement(LABELS, nothing, evidence, used, lanes.bound_deg, unknown, nothing.astype(int))
-    keep, nothing = jnp.asarray(judged.used), of.unread(None, block.correction).correction
-    chosen = lambda own, none: jnp.where(keep.reshape(-1, *[1] * none.ndim), own, none)  # noqa: E731
-    block = block.replace(correction=jax.tree.map(chosen, block.correction, nothing))
-    return AdaptationResult(of, lanes, block, judged, judge.curve, tuple(results))
+    return finished(judge, block, lanes.number, tuple(results))
 
 
 def _batch(budget: Any) -> Any:
@@ -191,12 +165,3 @@ def _padded(sets: list[Label]) -> Label:
         return np.pad(np.asarray(leaf), [(0, most - len(leaf)), *[(0, 0)] * (np.ndim(leaf) - 1)])
 
     return jax.tree.map(lambda *leaves: np.stack([padded(leaf) for leaf in leaves]), *sets)
-
-
-def to_json(results: tuple[Result, ...]) -> list[dict[str, Any]]:
-    """Return the results as JSON values, without their policies."""
-    kept = ("used", "changed", "evidence", "depends", "near", "wrong")
-    return [
-        {name: getattr(one, name) for name in kept} | {"estimates": [estimate._asdict() for estimate in one.estimates]}
-        for one in results
-    ]

@@ -98,10 +98,13 @@ class Judge:
         """
         how, lanes = self.how, self.lanes
         if how.by == LABELS:
-            judgement = judged_by_labels(self.of, block)
             if how.env is not None:
                 self.measure(block)
-            return judgement, block
+            by_evidence = self.of.guidance.by_evidence
+            columns = (np.zeros(lanes.number), block.evidence, block.used) if by_evidence else None
+            unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
+            before_after_used = columns or judged_by_labels(self.of, block)
+            return Judgement(LABELS, *before_after_used, bounds_of(self.of, block), unknown, none), block
         if how.every:
             self.measure(block)
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
@@ -200,8 +203,8 @@ def differences(pair: tuple[dict[str, np.ndarray], ...], by: str) -> np.ndarray:
     return relative(by)
 
 
-def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
-    """Compare a model with answering "already right" always, on every fifth label, which the model was not fitted to.
+def judged_by_labels(of: Adaptation, block: LaneState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return before, after and used of a `Judgement`: "already right" always, and a model, on every fifth label.
 
     The model in use is fitted to all labels; a second one is fitted for this comparison alone.
 
@@ -216,9 +219,7 @@ def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
     if np.asarray(block.guide.labels.valid).sum(-1)[~failed].min(initial=HELD_OUT) < HELD_OUT:
         raise UserError(f"fewer than {HELD_OUT} labels cannot judge a model: give more, or --judge-by a metric")
     zero, right = jax.device_get(_predicted(of, block))
-    used = ~failed & (right >= zero)
-    unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
-    return Judgement(LABELS, zero, right, used, bounds_of(of, block), unknown, none)
+    return zero, right, ~failed & (right >= zero)
 
 
 @jax.jit

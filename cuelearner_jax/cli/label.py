@@ -33,7 +33,7 @@ from cuelearner_jax.cli.options import (
 )
 from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, typed_name, with_cues
 from cuelearner_jax.cli.train import asking_kind
-from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
+from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -146,9 +146,8 @@ def _suggested(task: Task, preset: Preset, source: PolicySource | None, ahead: N
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
     if named is not None or task.proposed is not None:
         frame = source.config.sizes.frame if source else sizes.frame
-        sizes = by_model.SIZES if by_evidence else dataclasses.replace(by_model.SIZES, frame=frame)
-        settling = by_reading.settling if by_evidence else by_model.settling
-        scalars = settling(scalars, scenario.eps_deg if scenario else None)
+        sizes = dataclasses.replace(by_model.SIZES, frame=frame)
+        scalars = by_model.settling(scalars, scenario.eps_deg if scenario else None)
         bound = scenario.bound_deg if scenario and not by_evidence else None
     return Label(
         task=world,
@@ -191,8 +190,8 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
             f"--bound-deg is {options.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
     guidance = merged.guide_in(env, guidances.kind_name(options.guidance))
-    if guidance.by_evidence:
-        _check_evidence(options)
+    if guidance.by_evidence and (options.policy is None or options.again is not None):
+        raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
     if guidance.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
@@ -208,14 +207,6 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
     family = _family(options, env) if guidance.by_evidence else ()
     base = _base(task, options, source, env)
     return Plan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
-
-
-def _check_evidence(options: Label) -> None:
-    """Raise UserError for options that a reading does not use."""
-    if options.policy is None or options.again is not None:
-        raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
-    scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(options.scalars))
-    by_reading.check_unused(options.sizes, scalars, bound_deg=options.bound_deg)
 
 
 def _family(options: Label, env: Any) -> Family:

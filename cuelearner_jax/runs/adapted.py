@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import by_reading, serialization
+from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
@@ -63,22 +63,17 @@ class AdaptedLanes:
 
     def policy(self, env: Any) -> Any:
         """Return a block of the lanes' policies. Raises UserError if they cannot be read."""
-        values, arrays = self.values["policy"], self._arrays(env)
-        base = serialization.from_json(values["base"], arrays["base"], env, self.code, self.changes)
-        base = Common(base) if self.rows is None else base.lane(self.lanes.base)
-        made = serialization.from_json({**values, "base": {"policy": "uniform"}}, arrays, env, changes=self.changes)
-        return replace(made, base=base)
+        policy = serialization.from_json(self.values["policy"], env, self.code, self.changes)
+        like = _with_rows(serialization.arrays_of(policy), self.lanes.number)
+        like["base"] = _with_rows(serialization.arrays_of(policy.base), self.rows)
+        policy = serialization.with_arrays(policy, policy_folders.read_arrays(self.folder, like, self.values))
+        return policy.replace(base=Common(policy.base) if self.rows is None else policy.base.lane(self.lanes.base))
 
-    def base(self, env: Any) -> Any:
-        """Return the base policies, one per lane, or as `Common`. Raises UserError as `policy`."""
-        return self.policy(env).base
 
-    def _arrays(self, env: Any) -> Any:
-        values = self.values["policy"]
-        alone = {**values, "base": {"policy": "uniform"}}
-        lanes = serialization.shapes_of(alone, env, self.lanes.number, self.changes)
-        like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows, self.changes)}
-        return policy_folders.read_arrays(self.folder, like, self.values)
+def _with_rows(arrays: Any, rows: int | None) -> Any:
+    """Return the shapes of arrays that have a row for each of several policies; None: one policy."""
+    leading = () if rows is None else (rows,)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape), leaf.dtype), arrays)
 
 
 def open_folder(
@@ -147,7 +142,7 @@ def write(
             "difference": [_plain(ends) for ends in judged.difference],
             "rewarded_steps": judged.rewarded_steps.tolist(),
         },
-        **({"reading": by_reading.to_json(adapted.results)} if adapted.results else {}),
+        **({"reading": [one.to_json() for one in adapted.results]} if adapted.results else {}),
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,

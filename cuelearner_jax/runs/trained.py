@@ -92,7 +92,8 @@ def make(
         return Taught(teacher)
     if POLICIES[name].adapted:
         assert adapted is not None
-        return adapted.policy(view) if name == "adapted" else adapted.base(view)
+        policy = adapted.policy(view)
+        return policy if name == "adapted" else policy.base
     assert lanes is not None
     agent = Agent(lanes.policies["params"], config.agent_in(view), view)
     if name == "agent":

@@ -182,16 +182,11 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         if labels_from is not None:
             file = label_files.read(labels_from)
             eps_deg, labels = file.eps if eps_deg is None else eps_deg, (file.budget,)
-        settling, frame = by_model.settling, {"frame": config.sizes.frame}
-        if kind.by_evidence:
-            settling, frame = by_reading.settling, {}
         if scalars is None:
             eps_deg = rules.eps_deg if eps_deg is None else eps_deg
-            scalars = replace(settling(config.scalars, eps_deg), **rules.scalars)
-        elif not kind.by_evidence:
-            scalars = settling(scalars, eps_deg)
-        elif eps_deg is not None:
-            scalars = replace(scalars, eps_deg=eps_deg)
+            scalars = replace(by_model.settling(config.scalars, eps_deg), **rules.scalars)
+        else:
+            scalars = by_model.settling(scalars, eps_deg)
         by = judging.LABELS if kind.by_evidence else task.judge_by(config.task) if task else cls.judge_by
         own = config.kinds.get(kind.name) or (kind.config and kind.config())
         kinds: Any = {kind.name: replace(own, **rules.options)} if own else {}
@@ -205,7 +200,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             labels_from=labels_from,
             judge_by=judge_by or rules.judge_by or by,
             judge_bounds=() if judge_by == judging.LABELS else rules.judge_bounds,
-            sizes=replace(by_model.SIZES, **{**frame, **rules.sizes}),
+            sizes=replace(by_model.SIZES, **{"frame": config.sizes.frame, **rules.sizes}),
             scalars=scalars,
             kinds=kinds,
         )
@@ -224,9 +219,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         kind = guidances.resolve(self.guidance)
         if not kind.asks:
             raise UserError(f"guidance {kind.name!r} asks no questions, so nothing is learned: choose another kind")
-        if kind.by_evidence:
-            by_reading.check_unused(sizes, scalars, judge_bounds=self.judge_bounds)
-        elif subject.changes is not None:
+        if subject.changes is not None and not kind.by_evidence:
             raise UserError(f"changes is given, but guidance {kind.name!r} does not use it: give guidance reading")
         guidance = guidances.make(kind.name, sizes, env, kinds.get(kind.name))
         shared = lanes_in(bases) is None
