@@ -39,13 +39,12 @@ PASSES = 20  # threshold tau as a share of eps: a pass that turns an action by l
 
 @dataclass(frozen=True)
 class AdaptationResult:
-    """The adapted lanes, their judgement and learning curve. A lane whose model is not used acts as its base."""
+    """The adapted lanes and their judgement. A lane whose model is not used acts as its base."""
 
     of: Adaptation
     lanes: Lanes
     block: Any  # `LaneState`, or `by_reading.Evidence`
     judged: Judgement
-    curve: list[dict[str, Any]]  # a row a measurement: "asked" (lanes,) labels so far, and metrics (lanes,) by name
     results: tuple[Result, ...] = ()  # reading only: each lane's estimates
 
     @property
@@ -130,8 +129,6 @@ def adapt(
         asks, number, tell = place(mesh, teacher, SHARED), rounds(lanes, of.sizes), watch("labels")
         for done in range(number):
             tell(done, number)
-            if how.every and done * of.sizes.labels_per_round % how.every == 0:
-                judge.measure(block)
             block = jax.block_until_ready(ask_round(placed, asks, block, mesh))
             if block.failed.all():
                 blame(placed, asks, block)
@@ -144,9 +141,8 @@ def finished(judge: Judge, block: Any, count: int, results: tuple[Result, ...] =
     judged, block = judge.judge_lanes(block)
     block = judge.of.keep_used(block, jnp.asarray(judged.used))
     block, lanes = jax.tree.map(lambda leaf: leaf[:count], block), Lanes(*(column[:count] for column in judge.lanes))
-    curve = [{name: values[:count] for name, values in row.items()} for row in judge.curve]
     judged = Judgement(judged.by, *(column[:count] for column in judged[1:]))
-    return AdaptationResult(judge.of, lanes, block, judged, curve, results)
+    return AdaptationResult(judge.of, lanes, block, judged, results)
 
 
 def check_bounds(space: Space, bounds: Sequence[float]) -> None:

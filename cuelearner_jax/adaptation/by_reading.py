@@ -63,7 +63,6 @@ class Evidence(struct.PyTreeNode):
     base: Int[Array, " lanes"]
     correction: Correction  # (lanes, ...)
     labels: Label  # (lanes, slots, ...)
-    asked: Int[Array, " lanes"]
     bound: Float[Array, " lanes"]
     corrects: Bool[Array, " lanes"]  # True where the answers show a change
     evidence: Float[Array, " lanes"]  # `Result.evidence`
@@ -84,18 +83,17 @@ def adapt(
     Arguments as for `by_model.adapt`. `how.by` "labels": the answers decide, each batch predicted before it is read.
     """
     tell, total, space = watch("labels"), int(lanes.budget.sum()), actions_of(of.env)
-    rows, results, steps, asked = [], [], [], 0  # `steps`: the corrections before each batch of questions
+    rows, results, asked = [], [], 0
     for base, seed, budget, _ in zip(*(column.tolist() for column in lanes), strict=True):
         observation = getattr(of.env, "observation", ())
         reading = Reading(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation)
         if labels is None:
             progress = lambda count, before=asked: tell(before + count, total)  # noqa: E731
-            own, policies = _asked(of, reading, seed, budget, teacher, progress)
+            own = _asked(of, reading, seed, budget, teacher, progress)
         else:
-            own, policies = jax.tree.map(lambda leaf: np.asarray(leaf)[len(rows)], labels), []
+            own = jax.tree.map(lambda leaf: np.asarray(leaf)[len(rows)], labels)
             reading.read_in_batches(*(part[own.valid] for part in (own.obs, own.action, own.answer)))
         rows.append(own)
-        steps.append([policy.correction for policy in policies])
         results.append(reading.result())
         asked += budget
         tell(asked, total)
@@ -103,7 +101,6 @@ def adapt(
         base=jnp.asarray(lanes.base),
         correction=_stacked([one.policy.correction for one in results]),
         labels=_padded(rows) if labels is None else labels,
-        asked=jnp.asarray(lanes.budget),
         bound=jnp.asarray(space.from_unit(lanes.bound_deg)),
         corrects=np.array([one.changed for one in results]),
         evidence=np.array([one.evidence for one in results]),
@@ -111,30 +108,20 @@ def adapt(
         failed=jnp.zeros(lanes.number, bool),
     )
     judge = Judge(of, lanes, how, lane_mesh(jax.local_devices()[:1]), watch)
-    if how.every and how.env is not None:
-        for step in range(max(map(len, steps))):
-            then = _stacked([lane[min(step, len(lane) - 1)] for lane in steps])
-            count = np.minimum(step * _batch(lanes.budget), lanes.budget)
-            judge.measure(block.replace(correction=then, asked=jnp.asarray(count)))
     return finished(judge, block, lanes.number, tuple(results))
-
-
-def _batch(budget: Any) -> Any:
-    return np.maximum(LEAST_BATCH, -(-budget // BATCHES))
 
 
 def _asked(
     of: ReadingAdaptation, reading: Reading, seed: int, budget: int, teacher: Any, tell: Callable[[int], None]
-) -> tuple[Label, list[Read]]:
-    """Return one lane's labels, and its policies before each batch of questions."""
-    walk, rows, policies = Walk(of.env, teacher, of.scalars), [], []
-    key, size = jax.random.key(seed), int(_batch(budget))
+) -> Label:
+    """Return one lane's labels, asked and read in batches."""
+    walk, rows = Walk(of.env, teacher, of.scalars), []
+    key, size = jax.random.key(seed), max(LEAST_BATCH, -(-budget // BATCHES))
     for asked in range(0, budget, size):
         tell(asked)
         key, k_where, k_ask, k_answer = jax.random.split(key, 4)
-        count, policy = min(size, budget - asked), reading.policy()
-        policies.append(policy)
-        states, obs = walk.situations(k_where, policy, CHOICE * size)
+        count = min(size, budget - asked)
+        states, obs = walk.situations(k_where, reading.policy(), CHOICE * size)
         index, action = reading.questions(np.asarray(obs), count, k_ask)
         states, obs = jax.tree.map(lambda leaf, index=index: leaf[index], (states, obs))
         answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
@@ -143,7 +130,7 @@ def _asked(
         reading.learn(np.asarray(obs)[there], action[there], answer[there])
     obs, action, answer = (np.concatenate(column) for column in zip(*rows, strict=True))
     valid = np.asarray(np.isfinite(answer).any(-1))
-    return Label(obs, action, np.where(valid[:, None], answer, 0), valid), policies  # pyright: ignore[reportArgumentType]
+    return Label(obs, action, np.where(valid[:, None], answer, 0), valid)  # pyright: ignore[reportArgumentType]
 
 
 def _stacked(corrections: list[Correction]) -> Correction:

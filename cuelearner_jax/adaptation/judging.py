@@ -39,13 +39,12 @@ SHARES = ("success", "finished")  # metrics within [0, 1]
 
 @dataclass(frozen=True)
 class Judging:
-    """Settings of the comparison between policies and their bases, at the end and along the learning curve."""
+    """Settings of the comparison between policies and their bases."""
 
     env: Environment | None  # the changed world with the episodes of `SPLIT`; None: there is no simulator
     num_envs: int = 50  # episodes at most
     steps: int = 100  # environment steps of each
     by: str = "reward"  # a metric, or "labels"
-    every: int = 0  # labels between two measurements on the way (0: at the end alone)
     bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
 
 
@@ -75,21 +74,15 @@ def _step_of(env: Any) -> Any:
 
 
 class Judge:
-    """Measures the lanes of an adaptation along the learning curve, and decides in the end which models are used.
+    """Decides which models of an adaptation's lanes are used.
 
-    A block of lanes is a `LaneState`, or any record with `base`, `bound`, `asked`, `corrects` and `failed`.
+    A block of lanes is a `LaneState`, or any record with `base`, `bound`, `corrects` and `failed`.
     """
 
     def __init__(self, of: Adaptation, lanes: Lanes, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
         """`mesh`: devices that share the lanes; `watch`: given the name of a piece of work, who is told progress."""
         self.of, self.lanes, self.how, self.watch = of, lanes, how, watch
         self.mesh = mesh if mesh.size > 1 else None
-        self.curve: list[dict[str, np.ndarray]] = []
-
-    def measure(self, block: Any) -> None:
-        """Roll out the lanes' current policies, and add a row to the learning curve."""
-        rollout = self._rolled(self.of.policy(block, self.how.env), "the adapted policy")
-        self.curve.append({"asked": np.asarray(block.asked), "failed": np.asarray(block.failed), **rollout.means})
 
     def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
         """Return the judgement of the finished lanes, and the lanes with the bounds that are used.
@@ -98,15 +91,11 @@ class Judge:
         """
         how, lanes = self.how, self.lanes
         if how.by == LABELS:
-            if how.env is not None:
-                self.measure(block)
             by_evidence = self.of.guidance.by_evidence
             columns = (np.zeros(lanes.number), block.evidence, block.used) if by_evidence else None
             unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
             before_after_used = columns or judged_by_labels(self.of, block)
             return Judgement(LABELS, *before_after_used, bounds_of(self.of, block), unknown, none), block
-        if how.every:
-            self.measure(block)
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
         block, steps = self._narrowed(block)
         test, values = PairedTest(lanes.number), []

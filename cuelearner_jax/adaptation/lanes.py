@@ -83,11 +83,6 @@ class LaneState(struct.PyTreeNode):
     failed: Bool[Array, ""]  # True once the model stopped being finite; the lane then keeps its last finite state
 
     @property
-    def asked(self) -> Int[Array, "*lanes"]:
-        """Number of questions so far."""
-        return self.guide.asked
-
-    @property
     def corrects(self) -> Bool[Array, "*lanes"]:
         """Whether the lane has a fitted model."""
         return self.guide.model.fitted

@@ -7,6 +7,7 @@ many other answers a policy agrees with.
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.adaptation.lanes import blame
-from cuelearner_jax.api.labels import Labels, LabelSet, labels_from_file, labels_of, rows_of
+from cuelearner_jax.api.labels import Labels, labels_from_file, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, config_of, load_policy
 from cuelearner_jax.api.worlds import World, numbers, teacher_of_world
 from cuelearner_jax.config import GuideSizes, Scalars, from_json, normalize_options
@@ -35,6 +36,7 @@ from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
 from cuelearner_jax.storage import policy_folders
+from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.studies.adapt import AdaptedStudy, AdaptRequest, Subject
 from cuelearner_jax.studies.evaluate import Agreement
 from cuelearner_jax.studies.evaluate import agreement as agreement_of
@@ -244,15 +246,19 @@ def correct(
     before = getattr(getattr(policy, "trained", None), "task", None)
     before = before if isinstance(before, LogsConfig) else None
     label_set = _labels(labels, space, cues, low, high, before)
+    if label_set.eps is not None:
+        if eps is not None and not math.isclose(eps, label_set.eps, rel_tol=1e-6):
+            raise UserError(f"the label file holds answers of {label_set.eps:g} {label_set.space.unit}: leave out eps")
+        eps = label_set.eps
     own = as_policy(policy)
     acting = CallablePolicy(policy_of(own, label_set.space), actions=label_set.space)
-    acting(label_set.rows.obs)  # refuses what gives no actions
+    acting(label_set.labels.obs)  # refuses what gives no actions
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
         world_of(label_set, before),
-        labels=labels_of(label_set.rows),
+        labels=labels_of(label_set.labels),
         bound_deg=bound,
-        eps_deg=label_set.strength(eps),
+        eps_deg=eps,
         guidance=guidance,
         sizes=sizes,
         scalars=scalars,
@@ -291,12 +297,12 @@ def agreement(
         eps = float((getattr(own, "scalars", None) or plain_scalars(label_set.space)).eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base)
     base = None if base is None else policy_of(base, label_set.space)
-    return agreement_of(policy_of(own, label_set.space), label_set.rows, label_set.space, eps, base)
+    return agreement_of(policy_of(own, label_set.space), label_set.labels, label_set.space, eps, base)
 
 
 def _labels(
     labels: Any, space: Any, cues: Any = "", low: Any = None, high: Any = None, before: LogsConfig | None = None
-) -> LabelSet:
+) -> LabelFile:
     """Return checked labels with their space; `before`: the recording by which the policy was corrected before.
 
     Raises UserError for labels that do not fit their space.
@@ -319,15 +325,15 @@ def _labels(
             raise UserError(f"low and high bound {len(low)} and {len(high)} entries: give {rows.action.shape[1]} each")
         space = Box(tuple(low), tuple(high), cues_from(cues) if cues else ())
     external_labels.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
-    return LabelSet(rows, space)
+    return LabelFile({}, RELATIVE.name, space, None, np.zeros(len(rows.obs)), rows)
 
 
-def world_of(label_set: LabelSet, before: LogsConfig | None = None) -> World:
+def world_of(label_set: LabelFile, before: LogsConfig | None = None) -> World:
     """Return the situations of labels as a world of the task `logs`, which names no folder.
 
     Networks of a policy that was corrected `before` keep their view. Raises UserError where that cannot be.
     """
-    size, obs, space = label_set.rows.obs.shape[1], np.asarray(label_set.rows.obs), label_set.space
+    size, obs, space = label_set.labels.obs.shape[1], np.asarray(label_set.labels.obs), label_set.space
     own = {name: value for name, value in label_set.task.items() if name not in ("name", "from")}
     config = from_json(LogsConfig, own) if label_set.task.get("name") == logs.NAME else None
     if before is not None:
@@ -353,5 +359,5 @@ def world_of(label_set: LabelSet, before: LogsConfig | None = None) -> World:
         )
     if logs.space_of(config).to_json() != space.to_json():
         raise UserError(f"the space {space.name!r} is not one that a recording can have: give a box with plain cues")
-    filled = lambda config, split: logs.filled(config, obs, label_set.rows.action)  # noqa: E731
+    filled = lambda config, split: logs.filled(config, obs, label_set.labels.action)  # noqa: E731
     return World(logs.configured(config, dataclasses.replace(logs.BODY, environment=filled)), config)

@@ -12,7 +12,7 @@ from cuelearner_jax import asking, user_code
 from cuelearner_jax.asking import GuideState
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.labelling import controls
-from cuelearner_jax.labelling.learner import EvidenceLearner, Learner
+from cuelearner_jax.labelling.learner import Learner
 from cuelearner_jax.labelling.plan import Plan, advance, keys_of
 from cuelearner_jax.policies import policy_name
 from cuelearner_jax.types import EnvState, Reel, Sketch
@@ -34,13 +34,12 @@ class Questions:
     """Makes items, and holds the model that later items are asked by."""
 
     def __init__(self, plan: Plan, env: Any) -> None:
-        """Begin to compile the model's fit."""
+        """Make the model that later items are asked by."""
         self.plan, self.env, self.pictures, self.space = plan, env, plan.task.pictures(), actions_of(env)
         self.keys = keys_of(plan.seed)
         slots = asking.label_slots(plan.labels, plan.config.sizes)
         self._blank = asking.start(plan.guidance, env, slots, plan.labels, self.keys.model, self.keys.start)
-        kind = EvidenceLearner if plan.guidance.by_evidence else Learner
-        self.learner = kind(plan, env, self._blank, self.keys.session)
+        self.learner = Learner(plan, env, self._blank, self.keys.session)
 
     def guide_in(self, state: EnvState, obs: jax.Array) -> GuideState:
         """Return a guide without labels in a situation."""

@@ -19,8 +19,7 @@ from cuelearner_jax.environment import actions_of
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.policies import Common, lanes_in, layers
 from cuelearner_jax.runs.grid import world_of
-from cuelearner_jax.storage import formats, label_files, policy_folders, results
-from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage import formats, label_files, policy_folders
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
@@ -151,7 +150,6 @@ def write(
     with place.writing() as folder:
         policy_folders.write(folder, described, arrays)
         _write_labels(folder, adapted, task, world)
-        _write_curve(folder, place.folder.name, adapted, task)
 
 
 def _plain(values: np.ndarray) -> list[float | None]:
@@ -178,31 +176,3 @@ def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: An
         sets = jax.tree.map(lambda leaf, own=own: leaf[own], rows)
         file = folder / labels_name(lanes, float(bound))
         label_files.write(file, told, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
-
-
-def _write_curve(folder: Path, name: str, adapted: AdaptationResult, task: Task) -> None:
-    """Write the policies' performance by number of labels, as runs do for their guides."""
-    of = adapted.of
-    if not adapted.curve:
-        return
-    constants = {
-        "run": name,
-        "task": task.name,
-        "guidance": of.guidance.name,
-        "split": SPLIT,
-        "config_hash": "",
-        **provenance(),
-    }
-    lanes = {"seed": adapted.lanes.seed, "labels": adapted.lanes.budget, "bound_deg": adapted.lanes.bound_deg}
-    with tables.TableWriter(folder, results.GUIDES, constants) as writer:
-        done = np.full(adapted.lanes.number, -1)
-        for row in adapted.curve:
-            new = row["asked"] > done  # a lane that has used up its budget does not change any more
-            done = row["asked"]
-            metrics = {f"guide_{metric}": row[metric] for metric in row if metric not in ("asked", "failed")}
-            columns = {**lanes, "asked": row["asked"], "failed": row["failed"].astype(float), **metrics}
-            number = -(-int(row["asked"].max()) // of.sizes.labels_per_round)
-            chosen = {column: np.asarray(values)[new] for column, values in columns.items()}
-            if new.any():
-                writer.append(round=number, step=0, wall_s=0.0, **chosen)
-    tables.finish(folder, results.GUIDES)

@@ -3,7 +3,6 @@
     policy.json       the policy's parts, where it was adapted, how it was evaluated
     arrays/           networks and bounds, as a checkpoint with digests
     labels.parquet    the answers; labels-60deg.parquet and so on where lanes differ in their bounds
-    guide.parquet     the policy's performance by number of labels
 
 The folder appears atomically, once all of it is written (`whole.Place`). It names code but never contains any.
 """

@@ -137,8 +137,6 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     that is not shown to make the policy better is not used."""
     judge_episodes: int = 50
     """Largest number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
-    judge_every: int = 0
-    """Measure the policy each time this many labels are new, into guide.parquet (0: only at the end)."""
     judge_bounds: tuple[float, ...] = ()
     """Also try the model within these shares of its bound, for instance 0.5 0.25, and use the bound that scores best on
     the tuning episodes."""
@@ -295,11 +293,9 @@ class AdaptRequest(Generic[TaskT, KindsT]):
 
     def _judging(self, subject: Subject) -> Judging:
         """Return how policies are judged. Raises UserError for invalid settings."""
-        by, task, shares, unit = self.judge_by, subject.task, self.judge_bounds, self.sizes.labels_per_round
+        by, task, shares = self.judge_by, subject.task, self.judge_bounds
         if not 1 <= self.judge_episodes <= MOST_ENVS:
             raise UserError(f"judge_episodes is {self.judge_episodes}: give a number from 1 to {MOST_ENVS:,}")
-        if self.judge_every < 0 or self.judge_every % unit:
-            raise UserError(f"judge_every is {self.judge_every}: give a multiple of sizes.labels_per_round ({unit})")
         if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
             given = " ".join(f"{share:g}" for share in shares)
             raise UserError(f"judge_bounds is {given}: give shares of the bound above 0 and below 1, each once")
@@ -312,9 +308,9 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         steps, tuned = judging.STEPS, None
         if task and task.longest:
             steps = task.longest(self.task)
-        if by != judging.LABELS or self.judge_every:
+        if by != judging.LABELS:
             tuned = task.environment(self.task, judging.SPLIT) if task else subject.env
-        return Judging(tuned, self.judge_episodes, steps, by, self.judge_every, bounds=shares)
+        return Judging(tuned, self.judge_episodes, steps, by, shares)
 
 
 class AdaptedStudy(NamedTuple):

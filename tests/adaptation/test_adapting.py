@@ -56,8 +56,8 @@ def of(bases=BASES):
 
 @cache
 def found():
-    """All lanes, measured on the way."""
-    return by_model.adapt(of(), LANES, dataclasses.replace(JUDGING, every=10), EXPERT, mesh=MESH)
+    """All lanes."""
+    return by_model.adapt(of(), LANES, JUDGING, EXPERT, mesh=MESH)
 
 
 # In one program each, as all lanes have the same shapes.
@@ -143,14 +143,6 @@ def test_budgets_are_masks_and_lanes_do_not_know_each_other():
         alone = ask_round(of(own), EXPERT, alone, MESH)
     kept = jax.tree.map(lambda leaf: leaf[lane], block.guide.model)
     chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[0], alone.guide.model), kept)
-
-
-def test_the_curve_says_what_policies_were_worth_on_the_way():
-    curve = found().curve
-    assert [row["asked"].max() for row in curve] == list(range(0, 90, 10))
-    np.testing.assert_array_equal(curve[0]["reward"], found().judged.before)
-    np.testing.assert_allclose(curve[-1]["reward"], found().judged.after, atol=0.1)  # on other episodes
-    assert curve[-1]["asked"].tolist() == LANES.budget.tolist()
 
 
 def test_given_labels_lead_where_asking_for_them_did():

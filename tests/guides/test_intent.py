@@ -3,12 +3,14 @@
 import dataclasses
 import math
 
+import box_task
 import jax
 import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
 
+from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides import intent, registry
 from cuelearner_jax.spaces import DIRECTIONS, directions
@@ -43,6 +45,9 @@ def told(sizes, env=ENV, options=OPTIONS):
     return bundle, jax.jit(bundle.fit)(jax.random.key(1), env, labels, former, probes.SCALARS)
 
 
+act = jax.jit(lambda bundle, *given: bundle.act(*given), static_argnums=0)
+
+
 class Shut(probes.Aimed):
     """Its expert means the second aim, which nobody is to follow."""
 
@@ -54,9 +59,9 @@ def test_what_is_not_open_may_be_meant_and_is_not_followed(fitted):
     bundle, model = fitted
     bundle = dataclasses.replace(bundle, options=dataclasses.replace(OPTIONS, aim_doubt=1e9))
     scalars = dataclasses.replace(probes.SCALARS, k_max=200)
-    found = bundle.act(model, Shut(), OBS, BASE, EVERYWHERE, scalars).actions
+    found = act(bundle, model, Shut(), OBS, BASE, EVERYWHERE, scalars).actions
     second = directions.rotate(OBS, jnp.asarray(0.6))
-    meant = bundle.act(model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
+    meant = act(bundle, model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
     np.testing.assert_allclose(DIRECTIONS.distance(meant, second), 0.0, atol=1e-3)
     assert np.asarray(DIRECTIONS.distance(found, second)).min() > 0.5
 
@@ -70,7 +75,7 @@ def test_any_aim_leads_to_the_nearest_that_may_be_followed():
     bundle, obs = registry.make("any_aim", SIZES, ENV), jnp.array([[1.0, 0.0]])
     base = directions.rotate(obs, jnp.array([-0.7]))
     for env, turn in ((ENV, -1.0), (Alone(), 2.5)):
-        acted = bundle.act(bundle.init(jax.random.key(0)), env, obs, base, jnp.ones(1, bool), probes.SCALARS)
+        acted = act(bundle, bundle.init(jax.random.key(0)), env, obs, base, jnp.ones(1, bool), probes.SCALARS)
         np.testing.assert_allclose(acted.actions, directions.rotate(obs, jnp.array([turn])), atol=1e-6)
 
 
@@ -81,7 +86,7 @@ def fitted():
 
 def acted(fitted, env, base=BASE, **scalars):
     bundle, model = fitted
-    return bundle.act(model, env, OBS, base, EVERYWHERE, dataclasses.replace(probes.SCALARS, **scalars))
+    return act(bundle, model, env, OBS, base, EVERYWHERE, dataclasses.replace(probes.SCALARS, **scalars))
 
 
 def test_an_answer_makes_aims_on_its_side_likely():
@@ -111,6 +116,26 @@ def test_a_pass_goes_by_at_most_eps(fitted):
 def test_in_which_order_aims_are_told_changes_nothing(fitted):
     one, other = acted(fitted, ENV), acted(fitted, SHUFFLED)
     np.testing.assert_allclose(one.actions, other.actions, atol=1e-6)
+
+
+def test_in_a_box_answers_lead_to_the_aim_that_is_meant():
+    class Boxed(box_task.Reach):
+        """Three aims, of which the second is the goal; the features tell which they are."""
+
+        def aims(self, obs):
+            changes = jnp.array([[0.3] * 3, [0.0] * 3, [-0.25] * 3])
+            moved = jax.vmap(lambda change: self.actions.exp(self.best(obs), change))(changes)
+            return Aims(moved, jnp.eye(3), jnp.ones(3, bool))
+
+    env, space, teacher, scalars = Boxed(), box_task.SMALL, probes.Expert(Boxed()), box_task.SCALARS
+    keys = jax.random.split(jax.random.key(3), 60)
+    obs, asked = jax.vmap(lambda key: env.reset(key)[1])(keys), space.sample(jax.random.key(4), (60,))
+    tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, env, teacher, obs, obs, a, scalars)[0])
+    labels = Label(obs, asked, tell(keys, obs, asked), jnp.ones(60, bool))
+    bundle = registry.make("intent", SIZES, env, OPTIONS)
+    model = jax.jit(bundle.fit)(keys[0], env, labels, bundle.init(keys[1]), scalars)
+    found = act(bundle, model, env, obs, space.sample(keys[2], (60,)), jnp.ones(60, bool), scalars).actions
+    assert np.median(space.distance(found, jax.vmap(env.best)(obs))) < 0.06
 
 
 def test_without_a_possible_aim_actions_stay_as_they_are(fitted):

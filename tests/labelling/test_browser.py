@@ -75,16 +75,6 @@ def test_every_key_is_in_the_file_once(browser, tmp_path):
     assert all(0 <= row["seconds"] < 60 for row in rows)
 
 
-def test_the_buttons_of_three_cues_lie_above_the_fold(browser, tmp_path):
-    with served(tmp_path / "labels", task="box_task:TASK") as (_, address):
-        page = entered(browser, address)
-        ends = "() => [...document.querySelectorAll('.answers button')].map(one => one.getBoundingClientRect().bottom)"
-        found = page.evaluate(ends)
-        assert len(found) == 3 * 4 + 3
-        assert max(found) <= 800
-        assert page.evaluate("() => document.querySelector('svg.scene').getBoundingClientRect().height") > 300
-
-
 def test_a_picture_has_the_width_and_words_of_six_cues_lie_beside_it(browser, tmp_path):
     recorded.write(tmp_path / "situations")
     cues = ["--cues", "left,right;forward,back;up,down;tilt up,tilt down;roll left,roll right;open,close"]
