@@ -175,15 +175,14 @@ def adapt(
         raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
     scalars, eps_deg = scalars and normalize_options(scalars, "scalars"), eps_deg and float(eps_deg)
     task, scenario = (known.task, known.scenario) if known else (None, None)
-    options: dict[str, Any] = {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
-    if file is None and rows is None and labels is not None:
-        options["labels"] = (labels,)
-    if sizes is not None:
-        options["sizes"] = normalize_options(sizes, "sizes")
-    if bound_deg is not None:
-        options["bound_deg"] = (float(bound_deg),)
-    if judge_bounds is not None:
-        options["judge_bounds"] = tuple(map(float, judge_bounds))
+    given = {
+        "labels": (labels,) if file is None and rows is None and labels is not None else None,
+        "sizes": sizes and normalize_options(sizes, "sizes"),
+        "bound_deg": None if bound_deg is None else (float(bound_deg),),
+        "judge_bounds": None if judge_bounds is None else tuple(map(float, judge_bounds)),
+    }
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    options |= {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
     request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, scalars)
     subject = Subject(env, Common(as_policy_in(policy, env)), task=task, teacher=teacher, rows=rows, changes=changes)
     outcome = dataclasses.replace(request, **options).run(subject)

@@ -1,4 +1,4 @@
-"""A session's model, fitted in the background: a guide from scratch to all labels so far, or a reading of answers."""
+"""A session's model: a guide fitted from scratch to all labels so far, or a reading of answers."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import dataclasses
 import os
 import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -107,7 +105,7 @@ class Fitted(NamedTuple):
     lines: tuple[str, ...] = ()  # reading only: what changed, in words
 
 
-def _step_back() -> None:
+def step_back() -> None:
     """Lower this thread's priority, where the system has priorities per thread."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
@@ -115,10 +113,7 @@ def _step_back() -> None:
 
 
 class Learner:
-    """Fit whenever a full round of labels is new, one fit at a time, in a thread of its own.
-
-    A guide is fitted from scratch to all labels; a reading reads those that are new.
-    """
+    """The model of a session's answers: a guide fitted from scratch to all labels, or a reading of new ones."""
 
     def __init__(self, plan: Plan, env: Any, blank: GuideState, key: PRNGKeyArray) -> None:
         """`blank`: a guide without labels; `key`: the session's."""
@@ -129,9 +124,6 @@ class Learner:
         self._reads = plan.guidance.by_evidence
         self._read: list[np.ndarray] = []  # reading: observations, actions and answers that the newest model has read
         self.newest = Fitted(self._unread() if self._reads else blank.model)
-        self.running = False
-        self._lock = threading.Lock()
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="fit", initializer=_step_back)
         options: Any = ALONE if jax.default_backend() == "cpu" else None
         self._fit = jax.jit(asking.fit, static_argnums=0, compiler_options=options)
 
@@ -159,8 +151,13 @@ class Learner:
             blank.obs[slot], blank.action[slot], blank.answer[slot], blank.valid[slot] = obs, action, answer, True
         return blank
 
+    def is_due(self, count: int) -> bool:
+        """Return whether a full round of labels is new."""
+        every = self._plan.config.sizes.labels_per_round
+        return count // every > self.newest.labels // every
+
     def fit(self, labels: Label) -> None:
-        """Fit to these labels now; return when the fit is done."""
+        """Fit to these labels."""
         if (count := int(labels.valid.sum())) and self._reads:
             self.newest = self._reading_of(
                 [np.asarray(part)[:count] for part in (labels.obs, labels.action, labels.answer)]
@@ -192,32 +189,3 @@ class Learner:
             reading.read_in_batches(*rows)
         self._read = rows
         return Fitted(reading, len(rows[0]), self.newest.number + 1, lines=tuple(reading.result().words()))
-
-    def fit_later(self, labels: Callable[[], Label], count: int, done: Callable[[], None]) -> bool:
-        """Start a background fit if due; return whether one started.
-
-        The thread fits to what `labels` then returns, and calls `done` afterwards.
-        """
-        every = self._plan.config.sizes.labels_per_round
-        with self._lock:
-            if self.running or count // every <= self.newest.labels // every:
-                return False
-            self.running = True
-
-        def work() -> None:
-            try:
-                self.fit(labels())
-            except Exception as error:  # labels are still saved, whatever happens to the model
-                problem = f"the last fit failed ({type(error).__name__}: {error})"
-                self.newest = self.newest._replace(labels=count, problem=problem)
-            finally:
-                with self._lock:
-                    self.running = False
-            done()
-
-        self._pool.submit(work)
-        return True
-
-    def close(self) -> None:
-        """Wait for a running fit, then stop the thread."""
-        self._pool.shutdown(wait=True, cancel_futures=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import cache, partial
 
 import box_task
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.environment import Aims
+from cuelearner_jax.environment import Aims, actions_of
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides import intent, registry
 from cuelearner_jax.spaces import DIRECTIONS, directions
@@ -35,17 +36,31 @@ EVERYWHERE = jnp.ones(16, bool)
 def told(sizes, env=ENV, options=OPTIONS):
     """A bundle and its model of 40 of the expert's answers about random actions."""
     bundle = registry.make("intent", sizes, env, options)
-    keys = jax.random.split(jax.random.key(3), 40)
-    obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
-    asked = directions.uniform(jax.random.key(4), (40,))
-    tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, ENV, probes.Expert(ENV), obs, obs, a, probes.SCALARS))
-    answers, _ = tell(keys, obs, asked)
-    labels = Label(obs, asked, answers, jnp.ones(40, bool))
-    former = bundle.init(jax.random.key(0))
+    former, labels = bundle.init(jax.random.key(0)), labels_in(ENV, probes.SCALARS)
     return bundle, jax.jit(bundle.fit)(jax.random.key(1), env, labels, former, probes.SCALARS)
 
 
-act = jax.jit(lambda bundle, *given: bundle.act(*given), static_argnums=0)
+@partial(jax.jit, static_argnames="count")
+def labels_in(env, scalars, count=40):
+    """The expert's answers about random actions."""
+
+    def one(key):
+        _, obs = env.reset(key)
+        asked = actions_of(env).sample(jax.random.fold_in(key, 1))
+        answer, answered = RELATIVE.answer(key, env, probes.Expert(env), obs, obs, asked, scalars)
+        return Label(obs, asked, answer, answered)
+
+    return jax.vmap(one)(jax.random.split(jax.random.key(3), count))
+
+
+@cache
+def act_in(world):
+    """A compiled `act` for each class of worlds: JAX takes classes of equal fields for one."""
+    return jax.jit(lambda bundle, *given: bundle.act(*given), static_argnums=0)
+
+
+def act(bundle, model, env, *given):
+    return act_in(type(env))(bundle, model, env, *given)
 
 
 class Shut(probes.Aimed):
@@ -127,15 +142,14 @@ def test_in_a_box_answers_lead_to_the_aim_that_is_meant():
             moved = jax.vmap(lambda change: self.actions.exp(self.best(obs), change))(changes)
             return Aims(moved, jnp.eye(3), jnp.ones(3, bool))
 
-    env, space, teacher, scalars = Boxed(), box_task.SMALL, probes.Expert(Boxed()), box_task.SCALARS
-    keys = jax.random.split(jax.random.key(3), 60)
-    obs, asked = jax.vmap(lambda key: env.reset(key)[1])(keys), space.sample(jax.random.key(4), (60,))
-    tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, env, teacher, obs, obs, a, scalars)[0])
-    labels = Label(obs, asked, tell(keys, obs, asked), jnp.ones(60, bool))
-    bundle = registry.make("intent", SIZES, env, OPTIONS)
-    model = jax.jit(bundle.fit)(keys[0], env, labels, bundle.init(keys[1]), scalars)
-    found = act(bundle, model, env, obs, space.sample(keys[2], (60,)), jnp.ones(60, bool), scalars).actions
-    assert np.median(space.distance(found, jax.vmap(env.best)(obs))) < 0.06
+    env, scalars, key = Boxed(), box_task.SCALARS, jax.random.key(1)
+    labels, bundle = labels_in(env, scalars, 60), registry.make("intent", SIZES, env, OPTIONS)
+    model = jax.jit(bundle.fit)(key, env, labels, bundle.init(key), scalars)
+    found = act(bundle, model, env, labels.obs, labels.action, labels.valid, scalars).actions
+    assert (
+        np.median(jax.jit(jax.vmap(lambda obs, one: env.actions.distance(env.best(obs), one)))(labels.obs, found))
+        < 0.06
+    )
 
 
 def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
