@@ -192,6 +192,8 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
     guidance = merged.guide_in(env, guidances.kind_name(options.guidance))
     if guidance.by_evidence and (options.policy is None or options.again is not None):
         raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
+    if guidance.by_evidence and options.bound_deg is not None:
+        raise UserError("bound_deg is given, but guidance reading asks without a bound: leave bound_deg out")
     if guidance.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
