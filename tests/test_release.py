@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import cuelearner_jax as cl
-from cuelearner_jax.cli import label
+from cuelearner_jax.cli import sources
 from cuelearner_jax.storage import formats
 from cuelearner_jax.tasks import registry, shipped
 
@@ -59,9 +59,8 @@ def test_each_task_of_its_own_has_a_shipped_agent():
 
 
 def test_a_shipped_agent_can_be_labelled_and_is_no_code():
-    task = registry.find("billiards")
-    source = label._source(task, "shipped:billiards", None)
-    assert source is not None
+    assert not sources.is_code("shipped:billiards")
+    source = sources.source_in(shipped.folder_of("shipped:billiards"), registry.find("billiards"), None, None)
     assert (source.folder.name, source.task.name, source.default_policy) == ("billiards", "billiards", "agent")
 
 

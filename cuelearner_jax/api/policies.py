@@ -176,9 +176,10 @@ def measure(
     Returns:
         `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
     """
-    source = trained.PolicySource(world.task, config_of(policy, world), None, Path(world.task.name))
-    request = EvaluateRequest(task=world.config, episodes=episodes, steps=steps, envs=envs, engine=engine)
-    (found,) = evaluate.run(source, request, policy=as_policy_in(policy, world.env))
+    code, name = as_policy_in(policy, world.env), Path(world.task.name)
+    source = trained.PolicySource(world.task, config_of(policy, world), None, name, code=code)
+    request = EvaluateRequest(task=world.config, policy="own", episodes=episodes, steps=steps, envs=envs, engine=engine)
+    (found,) = evaluate.run(source, request)
     return found
 
 

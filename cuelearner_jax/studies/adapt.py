@@ -41,6 +41,7 @@ from cuelearner_jax.runs.order import read_labels
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
+from cuelearner_jax.studies.lanes import BaseLanes
 from cuelearner_jax.task import Scenario, Task
 from cuelearner_jax.types import Label, Teacher
 
@@ -49,22 +50,6 @@ KindsT = TypeVar("KindsT")
 
 MOST_ENVS = 100_000  # more do not fit into memory
 AS_IT_IS = Scenario("the world as it is", {})
-
-
-@dataclass(frozen=True)
-class BaseLanes:
-    """Choice of the lanes of the folder to adapt."""
-
-    policy: str = "agent"
-    """Which of its policies."""
-    guidance: str | None = None
-    """Kind of guidance of the lanes to adapt (default: the run's last)."""
-    labels: int | None = None
-    """Label budget of the lanes to adapt (default: the largest)."""
-    bound_deg: float | None = None
-    """Bound of the lanes to adapt, for a policy folder (default: the largest) [deg]."""
-    seeds: tuple[int, ...] = ()
-    """Seeds of the lanes to adapt, each with labels of its own (default: the first lane)."""
 
 
 class Subject(NamedTuple):
@@ -81,30 +66,28 @@ class Subject(NamedTuple):
     changes_named: str = "code"  # package.module:NAME of `changes`
 
 
-def subject_of(
-    source: PolicySource, world: Any, base: BaseLanes, policy: Any = None, named: str | None = None
-) -> Subject:
-    """Return policies of a folder, or the code `policy`, in a world of the source's task.
+def subject_of(source: PolicySource, world: Any, base: BaseLanes, named: str | None = None) -> Subject:
+    """Return the source's policies, or its code, in a world of its task.
 
-    `named`: package.module:NAME of the code. Raises UserError if the policies cannot act there.
+    `named`: package.module:NAME of code that acts or is in the folder. Raises UserError if the policies cannot act
+    there.
     """
     env = source.task.environment(world)
-    if policy is not None:
-        if base != BaseLanes(policy=source.default_policy):
+    if source.code is not None:
+        if base != BaseLanes():
             raise UserError(f"--base.… chooses among the lanes of a folder, but {named} is not a folder: leave it out")
-        policy = policy_of(policy, actions_of(env))
+        policy = policy_of(source.code, actions_of(env))
         user_code.acts_in(named or "policy", policy, env)
         return Subject(env, Common(policy), origin={"code": named}, task=source.task)
-    source.check(base.policy, world, base.guidance)
-    if trained.POLICIES[base.policy].taught:
-        raise UserError(f"policy {base.policy!r} asks the teacher, so there is nothing to adapt: choose another")
+    name = base.name_in(source, world)
+    if trained.POLICIES[name].taught:
+        raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
     if len(set(base.seeds)) < len(base.seeds):
         raise UserError("--base.seeds: give each seed once")
-    policies, seeds = trained.several(
-        source, world, base.policy, base.guidance, base.labels, base.seeds, base.bound_deg, env
-    )
-    chosen = {name: value for name, value in dataclasses.asdict(base).items() if value not in (None, ())}
-    origin = {"folder": source.folder.name, **chosen, "seeds": list(seeds), **({"code": named} if named else {})}
+    policies, seeds = trained.several(source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env)
+    chosen = {option: value for option, value in dataclasses.asdict(base).items() if value not in (None, ())}
+    origin = {"folder": source.folder.name, **chosen, "policy": name, "seeds": list(seeds)}
+    origin |= {"code": named} if named else {}
     bases = Common(policies[0]) if len(policies) == 1 else side_by_side(policies)
     return Subject(env, bases, seeds, origin, source.task)
 
@@ -125,11 +108,6 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     """First seed; the others count up from it."""
     guidance: str = Reading.name
     """Kind of guidance: what is asked, and what a model makes of the answers."""
-    scenario: str | None = None
-    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
-    robot: str | None = None
-    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
-    policy."""
     labels_from: Path | None = None
     """Label file to use instead of asking the teacher."""
     judge_by: str = "reward"
@@ -201,7 +179,6 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             labels=labels,
             bound_deg=() if rules.bound_deg is None else (rules.bound_deg,),
             guidance=kind.name,
-            scenario=scenario,
             labels_from=labels_from,
             judge_by=judge_by or rules.judge_by or by,
             judge_bounds=() if judge_by == judging.LABELS else rules.judge_bounds,
@@ -335,5 +312,5 @@ class AdaptedStudy(NamedTuple):
         """Write the policy folder. Raises UserError if the policy cannot be kept."""
         path, task = self.request.labels_from, self.subject.task
         assert task is not None  # a folder names it
-        used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": self.request.robot}
+        used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": task.robot or None}
         adapted.write(place, self.found, task, self.request.task, self.subject.origin, used)

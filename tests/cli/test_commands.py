@@ -75,19 +75,6 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     assert capsys.readouterr().out.count("difference over seeds") == 3  # a table for each kind and budget
 
 
-@pytest.mark.long
-def test_each_label_is_about_the_situation_that_members_disagree_on(tmp_path):
-    out, task = tmp_path / "run", "examples.reach:TASK"
-    command = ["train", task, "--preset", "quickstart", "--guidance", "relative", "--labels", "25"]
-    command += ["--schedule.total-steps", "1000", "--agent.q-layers", "8", "--sizes.feedback-layers", "8"]
-    command += ["--sizes.fit-steps", "20"]
-    command += ["--schedule.guide-eval-every", "10"]
-    assert main([*command, "--sizes.ensemble", "2", "--sizes.candidates", "3", "--out", str(out)]) == 0
-    found = results.read_guides([out])
-    assert found is not None
-    assert [(row["asked"], row["step"]) for row in found.to_pylist()] == [(10, 0), (20, 0), (25, 0)]
-
-
 def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, capsys):
     """What needs no training fits whatever the world shows."""
     table = ["billiards", "--task.table", "one_ball"]
@@ -185,7 +172,3 @@ def test_help_lists_options_and_what_a_task_has_to_choose_from(command, subject,
         assert "--task.table {one_ball,easy,regulation}" in out
     else:
         assert "tasks: arm, billiards, " in " ".join(out.split())
-
-
-def test_an_option_that_does_not_exist_is_refused_in_one_line(refused, tmp_path):
-    refused(["sweep", "billiards", "--seedz", "3", "--out", tmp_path / "x"], "Perhaps you meant: --seeds", tmp_path)

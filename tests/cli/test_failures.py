@@ -35,7 +35,10 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--policy", "agnt"], "did you mean 'agent'"),
     (["evaluate", "billiards", "--compare", "nowhere"], "--compare is 'nowhere': give a run folder, a policy folder"),
     (["evaluate", "billiards", "--compare", "heuristic"], "the policy that is evaluated: give another one"),
-    (["evaluate", "billiards", "--compare", "docs/data/navigation_agent"], "compare within one task"),
+    (
+        ["evaluate", "billiards", "--compare", "docs/data/navigation_agent"],
+        "not of billiards: give one of billiards",
+    ),
     (["evaluate", "billiards", "--compare", "agent"], "needs a trained run"),
     (["evaluate", "billiards", "--steps", "150"], "multiple of envs"),
     (["evaluate", "billiards", "--scenario", "tilted_tabel"], "did you mean 'tilted_table'"),

@@ -8,7 +8,6 @@ import pytest
 from box_task import EPS, GRIPPER, SCALARS, TASK
 
 from cuelearner_jax.cli import label
-from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR
 from cuelearner_jax.labelling import controls, view
@@ -20,9 +19,8 @@ from cuelearner_jax.storage import label_files
 def planned(**options):
     """What `cuelearner label` plans for the task."""
     config = TASK.presets["paper"].config
-    sizes, scalars = label._part(GuideSizes, config.sizes), label._part(GuideScalars, SCALARS)
     options = {"labels": 20, "guidance": "relative", **options}
-    asked = label.Label(task=config.task, sizes=sizes, scalars=scalars, out=label.Path("labels"), **options)
+    asked = label.Label(task=config.task, sizes=config.sizes, scalars=SCALARS, out=label.Path("labels"), **options)
     return label.make_plan(TASK, config, asked)
 
 
