@@ -148,7 +148,12 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
         del columns["trained steps"]
     if all(row.bound_deg is None for row in found):
         columns.pop("within", None)
-    table = _table(*columns, "metric", "mean", "95% interval", title=title, caption=_over(found, episodes))
+    over = {
+        "episodes": f"one policy: mean and bootstrap over {episodes}",
+        "seeds": "several seeds: interquartile mean and bootstrap over seeds",
+    }
+    caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, found))
+    table = _table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
     for row in found:
         own = [told(row) for told in columns.values()]
         for name, values in row.metrics.items():
@@ -162,16 +167,6 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
             own = [""] * len(own)
         table.add_section()
     return table
-
-
-def _over(found: list[Measured], episodes: str) -> str:
-    """Return what the means and intervals are computed over, in words."""
-    kinds = {measurements.over(row) for row in found}
-    told = {
-        "episodes": f"one policy: mean and bootstrap over {episodes}",
-        "seeds": "several seeds: interquartile mean and bootstrap over seeds",
-    }
-    return "; ".join(text for kind, text in told.items() if kind in kinds)
 
 
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:

@@ -98,7 +98,7 @@ class Finished(Changed, Parts):
 
 
 ONE = ("task", "env", "teacher", "preset", "scenario", "agent", "arbiter", "base", "changes", "labels-from", "judge-by")
-SEVERAL = ("guidance", "compare")  # options with several words
+ONE += ("task.actions", "cues")
 
 
 class _Ahead(argparse.ArgumentParser):
@@ -115,12 +115,8 @@ def look_ahead(arguments: list[str]) -> argparse.Namespace:
     parser = _Ahead(add_help=False, allow_abbrev=False)
     for name in ONE:
         parser.add_argument(f"--{name}")
-    for name in SEVERAL:
-        parser.add_argument(f"--{name}", nargs="*")
-    for name in ("low", "high"):
-        parser.add_argument(f"--task.{name}", nargs="*", type=float)
-    parser.add_argument("--task.actions")
-    parser.add_argument("--cues")
+    for name, kind in {"guidance": str, "compare": str, "task.low": float, "task.high": float}.items():
+        parser.add_argument(f"--{name}", nargs="*", type=kind)
     ahead, rest = parser.parse_known_args(arguments)
     ahead.words = list(takewhile(lambda word: not word.startswith("-"), rest))
     return ahead

@@ -38,10 +38,7 @@ def recorded_or_task(ahead: Namespace) -> Task:
     if not folder or folder in registry.names() or not (Path(folder).exists() or folder != ahead.words[0]):
         return task_of(ahead)
     low, high, actions = (getattr(ahead, f"task.{name}") for name in ("low", "high", "actions"))
-
-    def note(words: str) -> None:
-        console.print(words.replace("give low and high", "give --task.low and --task.high"))
-
+    note = lambda words: console.print(words.replace("give low and high", "give --task.low and --task.high"))  # noqa: E731
     return logs.task_of(folder, ahead.cues or "", low, high, actions or "box", note=note)
 
 
