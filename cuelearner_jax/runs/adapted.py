@@ -16,11 +16,13 @@ from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.policies import Common, lanes_in, layers
 from cuelearner_jax.runs.grid import world_of
 from cuelearner_jax.storage import formats, label_files, policy_folders, results
 from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage.checkpoint import Checkpoints, digest
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
@@ -78,7 +80,14 @@ class AdaptedLanes:
         alone = {**values, "base": {"policy": "uniform"}}
         lanes = serialization.shapes_of(alone, env, self.lanes.number, self.changes)
         like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows, self.changes)}
-        return policy_folders.read_arrays(self.folder, like, self.values)
+        place, remedy = self.folder / policy_folders.ARRAYS, "restore it, or adapt the policy anew"
+        if not place.is_dir():
+            raise UserError(f"{place} is missing: {remedy}")
+        with Checkpoints(place, read_only=True, remedy=remedy) as saved:
+            found = saved.restore({"policy": like})["policy"]
+        if digest(found) != self.values.get("arrays"):
+            raise UserError(f"{place} holds the arrays of another policy: {remedy}")
+        return found
 
 
 def open_folder(
@@ -154,7 +163,9 @@ def write(
         **provenance(),
     }
     with place.writing() as folder:
-        policy_folders.write(folder, described, arrays)
+        with Checkpoints(folder / policy_folders.ARRAYS) as saved:
+            saved.save(0, {"policy": arrays})
+        formats.write("policy", folder / policy_folders.POLICY, {**described, "arrays": digest(arrays)})
         _write_labels(folder, adapted, task, world)
         _write_curve(folder, place.folder.name, adapted, task)
 

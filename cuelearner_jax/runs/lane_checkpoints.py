@@ -12,7 +12,7 @@ import numpy as np
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.storage.checkpoint import Checkpoints
 
 
 def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
@@ -32,24 +32,19 @@ def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]
     }
 
 
-def _clock(saved: Checkpoints, lanes: int) -> tuple[dict[str, Any], int, int]:
-    """Return the item "clock", the number of blocks and lanes per block. Raises UserError for too few lanes."""
+def _clock(saved: Checkpoints) -> tuple[dict[str, Any], int, int]:
+    """Return the item "clock", the number of blocks and lanes per block."""
     like = {"clock": jax.eval_shape(start_clock), "wall_s": np.float32(0), "cut": np.zeros(2, np.int32)}
     clock = saved.restore({"clock": like})["clock"]
-    count, size = (int(number) for number in clock["cut"])
-    if size < 1 or count * size < lanes:
-        raise UserError(
-            f"the checkpoint holds {count * size} lanes, the run has {lanes}: start the run again with --overwrite"
-        )
-    return clock, count, size
+    return clock, *clock["cut"].tolist()
 
 
 def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainState], Clock, float]:
     """Restore the newest checkpoint: blocks in this group's cut, the clock, and the seconds of training.
 
-    Raises UserError if there is no readable checkpoint or it holds other lanes.
+    Raises UserError if there is no readable checkpoint.
     """
-    clock, count, size = _clock(saved, len(group.seeds))
+    clock, count, size = _clock(saved)
     cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
     shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
     found = saved.restore({name: shapes[name] for name in ("policy", "rest", "failed")})
@@ -83,8 +78,8 @@ def restore_policies(folder: Path, like: Any, lanes: int, run: str) -> tuple[dic
     """
     if not (folder / "checkpoints").is_dir():
         raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
-    with checkpoints(folder / "checkpoints", read_only=True, run=run) as saved:
-        clock, count, size = _clock(saved, lanes)
+    with Checkpoints(folder / "checkpoints", read_only=True, run=run) as saved:
+        clock, count, size = _clock(saved)
         block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), like)
         found = saved.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})
     blocks = [{**policy, "failed": failed} for policy, failed in zip(found["policy"], found["failed"], strict=True)]

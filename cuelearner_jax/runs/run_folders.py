@@ -16,7 +16,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
-from cuelearner_jax.runs.grid import Grid, defaults, load, run_key
+from cuelearner_jax.runs.grid import Grid, load, run_key
 from cuelearner_jax.runs.lane_checkpoints import restore_policies
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import CONFIG
@@ -49,27 +49,22 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
 
     Raises UserError for a folder without runs, an unknown task, or shards of different sweeps.
     """
-    files = [] if (folder / CONFIG).exists() else sorted(folder.glob(f"shard-*-of-*/{CONFIG}"))
-    if not files:
-        task, config, grid = load(folder, find)
-        return task, config, grid, (Piece(folder, grid),)
-    described = [formats.read("config", file) for file in files]
-    loaded = [load(file.parent, find) for file in files]
-    task, config, first = loaded[0]
-    for file, other in zip(files, described, strict=True):
-        if found := shards.differing_options(described[0], other, defaults(task)):
-            raise UserError(
-                f"{files[0].parent} and {file.parent} are shards of different sweeps (they differ "
-                f"in {found}): give the "
-                "folder of one of them"
-            )
-    pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
-    folders: dict[int, Path] = {}
+    whole = (folder / CONFIG).exists()
+    folders = [] if whole else sorted(file.parent for file in folder.glob(f"shard-*-of-*/{CONFIG}"))
+    loaded = [load(one, find) for one in folders or [folder]]
+    pieces = tuple(Piece(one, grid) for one, (_, _, grid) in zip(folders or [folder], loaded, strict=True))
+    first, of_seed = formats.read("config", pieces[0].folder / CONFIG), {}
     for piece in pieces:
+        if found := shards.differing_options(first, formats.read("config", piece.folder / CONFIG)):
+            raise UserError(
+                f"{pieces[0].folder} and {piece.folder} are shards of different sweeps (they differ in {found}): "
+                "give the folder of one of them"
+            )
         for seed in piece.grid.seeds:
-            if (other := folders.setdefault(seed, piece.folder)) != piece.folder:
+            if (other := of_seed.setdefault(seed, piece.folder)) != piece.folder:
                 raise UserError(f"{other} and {piece.folder} both hold seed {seed}: delete the one that is a copy")
-    return task, config, Grid(first.guidance, tuple(folders), first.labels), pieces
+    task, config, grid = loaded[0]
+    return task, config, Grid(grid.guidance, tuple(of_seed), grid.labels), pieces
 
 
 def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:
@@ -92,9 +87,8 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
             told.append(f"{folder}: no checkpoint of {kind} guidance, left out")
             continue
         seeds, budgets = grid.lanes(guidance)
-        policies, step = restore_policies(
-            folder / kind, like, len(seeds), run_key(formats.read("config", folder / CONFIG), kind)
-        )
+        key = run_key(formats.read("config", folder / CONFIG), kind)
+        policies, step = restore_policies(folder / kind, like, len(seeds), key)
         found.setdefault(step, []).append(RunLanes(guidance, seeds, budgets, policies, step))
         if step < config.schedule.total_steps:
             told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")

@@ -19,7 +19,7 @@ from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.storage import label_files, provenance, results, tracking
 from cuelearner_jax.storage import table as tables
-from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.storage.table import TableWriter
 from cuelearner_jax.terminal import Interrupted, console
 from cuelearner_jax.types import Teacher
@@ -62,7 +62,7 @@ class Runner:
             return
         asks = self.group.guidance.asks
         self._bar = self.bars.add_task(self.name, total=self.group.config.schedule.total_steps, note="preparing")
-        with checkpoints(self.folder / "checkpoints", run=self.key) as saved:
+        with Checkpoints(self.folder / "checkpoints", run=self.key) as saved:
             self._restore(saved)
             constants, about = self._constants(), {"run": self.key}
             with (

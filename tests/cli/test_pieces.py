@@ -72,19 +72,6 @@ def test_pieces_at_other_steps_are_not_averaged(pieces, measured):
     assert told == f"{pieces / 'shard-2-of-2'}: none guidance at step 100 of 200\n"
 
 
-@pytest.mark.long
-def test_pieces_are_of_one_sweep_though_one_was_begun_before_a_field_existed(pieces, refused):
-    """By the command line: evaluated together, and a piece that is finished is found so."""
-    for file in (pieces / "shard-2-of-2").rglob("digests/metadata"):  # checkpoints did not name their run then
-        edit_json(file, lambda told: told.pop("run"))
-    for group, name in (("sizes", "frame"), ("agent", "polyak"), ("scalars", "answer"), ("task", "mirrors")):
-        edit_json(pieces / "shard-2-of-2" / "config.json", lambda told, group=group, name=name: told[group].pop(name))
-    assert main(["evaluate", str(pieces), "--steps", "20", "--envs", "20"]) == 0
-    assert main([*SWEEP, "--shard", "1/2", "--out", str(pieces)]) == 0
-    edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["sizes"].update(frame="action"))
-    refused([*SWEEP, "--shard", "1/2", "--out", pieces], "is a shard of a sweep with another sizes.frame", pieces)
-
-
 def test_pieces_of_different_sweeps_are_refused(pieces, refused):
     edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["scalars"].update(eps_deg=3.0))
     refused(

@@ -13,7 +13,6 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
-from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import check_folder, prepare_folder
 from cuelearner_jax.studies import train
 
@@ -85,25 +84,6 @@ def test_everything_that_determines_results_is_described(out, name, config, grid
     check_folder(out, described(), resume=True, overwrite=False)
     with pytest.raises(UserError, match=rf"was run with other values of {name}: give the same options"):
         check_folder(out, described(config, grid, **options), resume=True, overwrite=False)
-
-
-def at_defaults(values):
-    """Takes out of a description every field that has its default, as if it had been written before there were any."""
-    for group, standard in runs.defaults(TASK).items():
-        values[group] = {name: value for name, value in values[group].items() if standard.get(name, ...) != value}
-
-
-def test_a_run_described_before_a_field_existed_had_its_default(out):
-    probes.edit_json(out / "config.json", at_defaults)
-    told = formats.read("config", out / "config.json")
-    assert "frame" not in told["sizes"]
-    assert "polyak" not in told["agent"]
-    assert told["task"] == {"name": TASK.name}
-    check_folder(out, described(), resume=True, overwrite=False, defaults=runs.defaults(TASK))
-    assert runs.load(out, find)[1] == probes.CONFIG
-    other = described(probes.config(sizes={"frame": "action"}))
-    with pytest.raises(UserError, match=r"was run with other values of sizes\.frame: give"):
-        check_folder(out, other, resume=True, overwrite=False, defaults=runs.defaults(TASK))
 
 
 def test_the_hash_of_a_configuration_depends_on_what_a_lane_learns_from_alone():

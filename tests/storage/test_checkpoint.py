@@ -10,7 +10,7 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import checkpoint
-from cuelearner_jax.storage.checkpoint import KEPT, checkpoints
+from cuelearner_jax.storage.checkpoint import KEPT, Checkpoints
 
 pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
 
@@ -40,13 +40,13 @@ def assert_bitwise(mine, theirs):
 
 
 def save(folder, *numbers, run=""):
-    with checkpoints(folder, run=run) as saved:
+    with Checkpoints(folder, run=run) as saved:
         for number in numbers:
             saved.save(number, {"policy": state(number), "rest": state(number + 100)})
 
 
 def restore(folder, like=None, read_only=True, run=""):
-    with checkpoints(folder, read_only, run=run) as saved:
+    with Checkpoints(folder, read_only, run=run) as saved:
         return saved.restore({"policy": shapes(state())} if like is None else like)
 
 
@@ -85,7 +85,7 @@ def test_a_deleted_newest_leads_back_to_the_one_before(saved, tmp_path):
 
 
 def test_no_checkpoint_is_said_so(tmp_path):
-    with checkpoints(tmp_path) as opened:
+    with Checkpoints(tmp_path) as opened:
         assert opened.latest() is None
         with pytest.raises(UserError, match="stopped before its first checkpoint"):
             opened.restore({"policy": state()})
