@@ -263,7 +263,7 @@ def scaled(piece: Piece, scale: Scale) -> Piece | None:
 
 def open_bench(folder: Path, study: Study, piece: Piece, scale: Scale) -> Bench:
     """Open the base agents and world of a piece. Raises UserError if the folder holds no such agents."""
-    source = PolicySource.of_run(folder, registry.find)
+    source = PolicySource.of_folder(folder, registry.find)
     if source.task.name != study.task:
         raise UserError(f"{folder} holds agents of {source.task.name}: give --bases a run of {study.task}")
     source = source.on(piece.robot)

@@ -143,25 +143,21 @@ class Runner:
             if labels is not None:
                 now.take(labels)
                 self._tell_failed("after its labels")
-                self._examine(guides, before=0)
+                if row := now.guides(before=0):
+                    guides.append(**row)
             else:
                 assert teacher is not None  # `teacher` may be None only where a file was given
                 for done in now.label_rounds(teacher):
                     self.bars.update(bar, completed=done)
                     self._tell_failed(f"after {done * self.group.config.sizes.labels_per_round} labels")
-                    self._examine(guides, before=done - 1)
+                    if row := now.guides(before=done - 1):
+                        guides.append(**row)
                     if done % ROUNDS_A_CHUNK == 0:
                         self._save(saved)
                     self._stop_if_asked(saved)
         self._write_labels()
         if asks:
             self._save(saved)
-
-    def _examine(self, guides: TableWriter, before: int) -> None:
-        """Write the evaluations of guides that are due after the rounds since `before`."""
-        row = self.training.guides(before)
-        if row is not None:
-            guides.append(**row)
 
     def _write_labels(self) -> None:
         form, config = self.group.guidance.form, self.group.config

@@ -39,8 +39,6 @@ class Training:
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
         self.wall = 0.0  # seconds of labelling and training so far
-        # round of the newest evaluation of guides, and its result
-        self._guides: tuple[int, dict[str, np.ndarray]] | None = None
 
     def begin(self) -> None:
         """Start fresh lanes."""
@@ -65,11 +63,6 @@ class Training:
     def labelled(self) -> bool:
         """Whether all questions have been asked."""
         return not self.group.guidance.asks or self.round >= self.group.rounds
-
-    @property
-    def done(self) -> bool:
-        """Whether training is finished."""
-        return self.step >= self.group.config.schedule.total_steps
 
     @property
     def failed(self) -> np.ndarray:
@@ -98,15 +91,15 @@ class Training:
         taken = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
         self.clock = place(group.mesh, taken, SHARED)
 
-    def guides(self, before: int) -> dict[str, Any] | None:
-        """Return the columns of an evaluation of the guides alone after the rounds since `before`; None: none is due.
+    def guides(self, before: int) -> dict[str, Any]:
+        """Return the columns of an evaluation of the guides alone after the rounds since `before`.
 
-        Scalars, or one entry for each lane whose guide is due, see `LaneGroup.examined`.
+        Scalars, or one entry for each lane whose guide is due, see `LaneGroup.examined`. Empty: none is due.
         """
         group, rounds = self.group, self.round
         due = group.examined(rounds, before)
         if not due.any():
-            return None
+            return {}
         own = {"round": rounds, "step": self.step, "wall_s": self.wall}
         each = {"seed": group.seeds, "labels": group.budgets, "asked": group.asked(rounds)}
         each |= {"failed": self.failed.astype(float), **self.guide_alone()}
@@ -129,7 +122,7 @@ class Training:
         if self.step == 0:
             yield {**self.evaluation(), **self.guide_alone()}
         iterations = schedule.eval_every // group.config.sizes.num_envs
-        while not self.done:
+        while self.step < schedule.total_steps:
             started = time.perf_counter()
             self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
             self.wall += time.perf_counter() - started
@@ -153,15 +146,7 @@ class Training:
         return Agent(params, self.group.config.agent_in(view), view)
 
     def guide_alone(self) -> dict[str, np.ndarray]:
-        """Return metrics (lanes,) of the actions that questions begin with, under guidance; without it that is chance.
-
-        Guides change only in label rounds, so one evaluation per round is enough.
-        """
-        if self._guides is None or self._guides[0] != self.round:
-            self._guides = self.round, self._of_guides()
-        return self._guides[1]
-
-    def _of_guides(self) -> dict[str, np.ndarray]:
+        """Return metrics (lanes,) of the actions that questions begin with, under guidance; without that, of chance."""
         group, base = self.group, asked_from(self.group.env, self.group.config.sizes)
 
         def guide(lane: TrainState) -> PolicyNode:
@@ -170,11 +155,9 @@ class Training:
         return {f"guide_{name}": values for name, values in self._measured(guide).items()}
 
     def _measured(self, policy_of: Any) -> dict[str, np.ndarray]:
-        schedule = self.group.config.schedule
-        key = episodes(self.split)
+        schedule, key = self.group.config.schedule, episodes(self.split)
         size = (schedule.eval_envs, schedule.eval_steps)
-        found = self.group.evaluate(policy_of, self.examined, key, *size, self.blocks)
-        return self._of_finite(found)
+        return self._of_finite(self.group.evaluate(policy_of, self.examined, key, *size, self.blocks))
 
     def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Replace failed lanes' metrics (lanes,) by NaN, so that they never enter a mean unnoticed."""

@@ -23,7 +23,7 @@ from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, mean_interv
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
-from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource, blocks_of, make
+from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource
 from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Label
@@ -121,9 +121,9 @@ def run(
     named, unit = POLICIES[name], actions_of(env).unit.replace("degrees", "deg")
     teacher = task.make_teacher(world, env) if policy is None and named.taught else None
     if policy is None and named.kept:
-        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
+        blocks = source.blocks(name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
     else:
-        policy = make(name, source.config, view_of(env), teacher, code=source.code) if policy is None else policy
+        policy = source.alone(name, view_of(env), teacher) if policy is None else policy
         none = np.zeros(1, int)
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
     rows = []

@@ -48,7 +48,7 @@ def rows(out):
 
 
 def policy_of(folder, seed=1):
-    source = PolicySource.of_run(folder, lambda name: TASK)
+    source = PolicySource.of_folder(folder, lambda name: TASK)
     return one_policy(source, WalkConfig(), "agent", None, None, seed)
 
 
