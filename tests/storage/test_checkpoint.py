@@ -78,12 +78,6 @@ def test_a_part_can_be_read_without_the_rest_and_reading_changes_nothing(saved, 
     assert probes.files_of(folder) == before
 
 
-def test_a_deleted_newest_leads_back_to_the_one_before(saved, tmp_path):
-    folder = shutil.copytree(saved, tmp_path / "copy")
-    shutil.rmtree(folder / "12")
-    assert_bitwise(restore(folder, run="mine"), {"policy": state(5)})
-
-
 def test_no_checkpoint_is_said_so(tmp_path):
     with Checkpoints(tmp_path) as opened:
         assert opened.latest() is None
