@@ -65,29 +65,24 @@ class AdaptedLanes:
 
     def policy(self, env: Any) -> Any:
         """Return a block of the lanes' policies. Raises UserError if they cannot be read."""
-        values, arrays = self.values["policy"], self._arrays(env)
-        base = serialization.from_json(values["base"], arrays["base"], env, self.code, self.changes)
-        base = Common(base) if self.rows is None else base.lane(self.lanes.base)
-        made = serialization.from_json({**values, "base": {"policy": "uniform"}}, arrays, env, changes=self.changes)
-        return replace(made, base=base)
-
-    def base(self, env: Any) -> Any:
-        """Return the base policies, one per lane, or as `Common`. Raises UserError as `policy`."""
-        return self.policy(env).base
-
-    def _arrays(self, env: Any) -> Any:
-        values = self.values["policy"]
+        values, changes = self.values["policy"], self.changes
         alone = {**values, "base": {"policy": "uniform"}}
-        lanes = serialization.shapes_of(alone, env, self.lanes.number, self.changes)
-        like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows, self.changes)}
+        like = serialization.shapes_of(alone, env, self.lanes.number, changes)
+        like = {**like, "base": serialization.shapes_of(values["base"], env, self.rows, changes)}
         place, remedy = self.folder / policy_folders.ARRAYS, "restore it, or adapt the policy anew"
         if not place.is_dir():
             raise UserError(f"{place} is missing: {remedy}")
         with Checkpoints(place, read_only=True, remedy=remedy) as saved:
-            found = saved.restore({"policy": like})["policy"]
-        if digest(found) != self.values.get("arrays"):
+            arrays = saved.restore({"policy": like})["policy"]
+        if digest(arrays) != self.values.get("arrays"):
             raise UserError(f"{place} holds the arrays of another policy: {remedy}")
-        return found
+        base = serialization.from_json(values["base"], arrays["base"], env, self.code, changes)
+        base = Common(base) if self.rows is None else base.lane(self.lanes.base)
+        return replace(serialization.from_json(alone, arrays, env, changes=changes), base=base)
+
+    def base(self, env: Any) -> Any:
+        """Return the base policies, one per lane, or as `Common`. Raises UserError as `policy`."""
+        return self.policy(env).base
 
 
 def open_folder(
@@ -174,43 +169,28 @@ def _plain(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-def labels_name(lanes: Lanes, bound_deg: float) -> str:
-    """Return the name of the label file of the lanes with a bound."""
-    several = len(np.unique(lanes.bound_deg)) > 1
-    return f"labels-{bound_deg:g}deg.parquet" if several else label_files.PARQUET
-
-
 def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: Any) -> None:
     """Write one label file per bound: for each seed the largest budget's set, which starts with the smaller sets."""
     of, lanes = adapted.of, adapted.lanes
     form: AnswerForm | None = of.guidance.form
     assert form is not None
     told, space = {"name": task.name, **configuration.to_json(world)}, actions_of(of.env)
-    rows: Label = adapted.labels
-    largest = lanes.budget == lanes.budget.max()
-    for bound in np.unique(lanes.bound_deg):
+    eps, largest = of.scalars.eps_deg if form.by_eps else None, lanes.budget == lanes.budget.max()
+    for bound in (bounds := np.unique(lanes.bound_deg)):
         own = np.flatnonzero(largest & (lanes.bound_deg == bound))
-        eps = of.scalars.eps_deg if form.by_eps else None
-        sets = jax.tree.map(lambda leaf, own=own: leaf[own], rows)
-        file = folder / labels_name(lanes, float(bound))
+        sets: Label = jax.tree.map(lambda leaf, own=own: leaf[own], adapted.labels)
+        file = folder / (label_files.PARQUET if len(bounds) == 1 else f"labels-{bound:g}deg.parquet")
         label_files.write(file, told, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
 
 
 def _write_curve(folder: Path, name: str, adapted: AdaptationResult, task: Task) -> None:
     """Write the policies' performance by number of labels, as runs do for their guides."""
-    of = adapted.of
     if not adapted.curve:
         return
-    constants = {
-        "run": name,
-        "task": task.name,
-        "guidance": of.guidance.name,
-        "split": SPLIT,
-        "config_hash": "",
-        **provenance(),
-    }
+    of = adapted.of
+    constants = {"run": name, "task": task.name, "guidance": of.guidance.name, "split": SPLIT, "config_hash": ""}
     lanes = {"seed": adapted.lanes.seed, "labels": adapted.lanes.budget, "bound_deg": adapted.lanes.bound_deg}
-    with tables.TableWriter(folder, results.GUIDES, constants) as writer:
+    with tables.TableWriter(folder, results.GUIDES, constants | provenance()) as writer:
         done = np.full(adapted.lanes.number, -1)
         for row in adapted.curve:
             new = row["asked"] > done  # a lane that has used up its budget does not change any more

@@ -17,8 +17,9 @@ from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, load, run_key
-from cuelearner_jax.runs.lane_checkpoints import restore_policies
+from cuelearner_jax.runs.training import restore_clock
 from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
@@ -38,7 +39,7 @@ class RunLanes:
     guidance: Guide
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
-    policies: Any  # what they act with, see `lane_checkpoints.items`, leading axis: lanes
+    policies: Any  # what they act with, see `restore_policies`, leading axis: lanes
     step: int
 
 
@@ -97,6 +98,34 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     if not found:
         raise UserError(f"there is no checkpoint of {kind} guidance: train first, or choose another --guidance")
     return [_joined(found[step]) for step in sorted(found, reverse=True)]
+
+
+def restore_policies(folder: Path, like: Any, lanes: int, run: str) -> tuple[dict[str, Any], int]:
+    """Restore what the lanes of a run's folder act with, and whether each has failed.
+
+    A failed lane is restored at its last finite state.
+
+    Args:
+        folder: the folder of one kind of guidance.
+        like: shapes of what one lane acts with: {"params": the agent's, "guidance": the guide's model}.
+        lanes: number of lanes.
+        run: the key of the run and kind (`grid.run_key`).
+
+    Returns:
+        What the lanes act with, and "failed", with lanes as leading axis; and their training step.
+
+    Raises:
+        UserError: there is no readable checkpoint.
+    """
+    if not (folder / "checkpoints").is_dir():
+        raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
+    with Checkpoints(folder / "checkpoints", read_only=True, run=run) as saved:
+        clock, _, count, size = restore_clock(saved)
+        block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), like)
+        found = saved.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})
+    blocks = [{**policy, "failed": failed} for policy, failed in zip(found["policy"], found["failed"], strict=True)]
+    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:lanes], *blocks)
+    return policies, int(clock.step)
 
 
 def _joined(parts: list[RunLanes]) -> RunLanes:

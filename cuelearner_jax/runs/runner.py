@@ -13,10 +13,9 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.runs.failures import named
 from cuelearner_jax.runs.grid import config_hash, run_key
-from cuelearner_jax.runs.lane_checkpoints import items, restore_blocks
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
-from cuelearner_jax.runs.training import Training, mean_of_finite
+from cuelearner_jax.runs.training import Training, items, mean_of_finite
 from cuelearner_jax.storage import label_files, provenance, results, tracking
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import Checkpoints
@@ -64,7 +63,17 @@ class Runner:
         self._bar = self.bars.add_task(self.name, total=self.group.config.schedule.total_steps, note="preparing")
         with Checkpoints(self.folder / "checkpoints", run=self.key) as saved:
             self._restore(saved)
-            constants, about = self._constants(), {"run": self.key}
+            about, constants = (
+                {"run": self.key},
+                {
+                    "run": self.order.out.name,
+                    "task": self.order.task.name,
+                    "guidance": self.name,
+                    "split": self.order.split,
+                    "config_hash": config_hash(self.described),
+                    **provenance.provenance(),
+                },
+            )
             with (
                 TableWriter(self.folder, results.SCHEMA, constants, about) as writer,
                 TableWriter(self.folder, results.GUIDES, constants, about) if asks else nullcontext() as guides,
@@ -77,23 +86,13 @@ class Runner:
             tables.finish(self.folder, results.GUIDES)
         tables.finish(self.folder, results.SCHEMA)  # last, since a kind with finished results counts as finished
 
-    def _constants(self) -> dict[str, Any]:
-        return {
-            "run": self.order.out.name,
-            "task": self.order.task.name,
-            "guidance": self.name,
-            "split": self.order.split,
-            "config_hash": config_hash(self.described),
-            **provenance.provenance(),
-        }
-
     def _restore(self, saved: Checkpoints) -> None:
         """Restore the newest checkpoint, or start afresh; drop the rows after it."""
         last_step = last_round = -1
         if saved.latest() is None:
             self.training.begin()
         else:
-            self.training.go_on(*restore_blocks(self.group, saved))
+            self.training.restore(saved)
             self.failed = self.training.failed
             last_step = self.training.step or -1  # a checkpoint of labels alone precedes the rows of step 0
             last_round = self.training.round

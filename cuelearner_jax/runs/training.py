@@ -1,4 +1,4 @@
-"""Training of one kind of guidance, from the first label to the last step, without disk access."""
+"""Training of one kind of guidance, from the first label to the last step; and what a checkpoint holds of it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,32 @@ from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import Agent, Guided, PolicyNode, asked_from
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.types import Label, Params, Teacher
+
+
+def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
+    """Return a run's state as checkpoint items; acting needs only the first, the last gives the cut of lanes."""
+    return {
+        "policy": [{"params": block.agent.params, "guidance": block.guide.model} for block in blocks],
+        "rest": [
+            block.replace(agent=block.agent.replace(params=None), guide=block.guide.replace(model=None), failed=None)
+            for block in blocks
+        ],
+        "failed": [block.failed for block in blocks],
+        "clock": {
+            "clock": clock,
+            "wall_s": np.float32(wall),
+            "cut": np.array([len(blocks), blocks[0].key.shape[0]], np.int32),
+        },
+    }
+
+
+def restore_clock(saved: Checkpoints) -> tuple[Clock, float, int, int]:
+    """Return the newest checkpoint's clock, seconds of training, number of blocks and lanes of a block."""
+    like = {"clock": jax.eval_shape(start_clock), "wall_s": np.float32(0), "cut": np.zeros(2, np.int32)}
+    found = saved.restore({"clock": like})["clock"]
+    return found["clock"], float(found["wall_s"]), *found["cut"].tolist()
 
 
 class Training:
@@ -44,10 +69,22 @@ class Training:
         """Start fresh lanes."""
         self.blocks = self.group.start()
 
-    def go_on(self, blocks: list[TrainState], clock: Clock, wall: float) -> None:
-        """Continue from a saved state."""
-        self.blocks, self.wall = blocks, wall
-        self.clock = place(self.group.mesh, clock, SHARED)
+    def restore(self, saved: Checkpoints) -> None:
+        """Continue from the newest checkpoint, in this group's cut of the lanes. Raises as `Checkpoints.restore`."""
+        group, (clock, self.wall, count, size) = self.group, restore_clock(saved)
+        self.clock = place(group.mesh, clock, SHARED)
+        cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
+        shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
+        found = saved.restore({name: shapes[name] for name in ("policy", "rest", "failed")})
+        blocks = [
+            rest.replace(
+                agent=rest.agent.replace(params=policy["params"]),
+                guide=rest.guide.replace(model=policy["guidance"]),
+                failed=failed,
+            )
+            for policy, rest, failed in zip(found["policy"], found["rest"], found["failed"], strict=True)
+        ]
+        self.blocks = group.recut(blocks)
 
     @property
     def step(self) -> int:

@@ -18,7 +18,7 @@ from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.runs import lane_checkpoints, lanes, runner, training
+from cuelearner_jax.runs import lanes, runner, training
 from cuelearner_jax.runs.grid import Grid, run_key
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.trained import PolicySource
@@ -88,7 +88,7 @@ def newest(out, kind, grid=GRID):
     """The newest checkpoint's arrays and number."""
     env = TASK.environment(CONFIG.task)
     group = lanes.LaneGroup(CONFIG, env, guidances.make(kind, CONFIG.sizes, env), grid)
-    like = lane_checkpoints.items(group.shapes_of(group.cut), jax.eval_shape(start_clock), 0.0)
+    like = training.items(group.shapes_of(group.cut), jax.eval_shape(start_clock), 0.0)
     key = run_key(formats.read("config", out / "config.json"), kind)
     with Checkpoints(out / kind / "checkpoints", read_only=True, run=key) as saved:
         found = saved.restore(like)
@@ -268,13 +268,13 @@ def refused(out, message):
 def test_a_checkpoint_whose_lanes_had_another_state_is_refused(whole, tmp_path, monkeypatch):
     out = copied(whole, tmp_path)
     (out / "none" / results.PARQUET).unlink()
-    of_now = lane_checkpoints.items
+    of_now = training.items
 
     def of_a_newer_program(blocks, clock, wall):
         made = of_now(blocks, clock, wall)
         return {**made, "rest": [block.replace(arbiter=(block.arbiter, block.failed)) for block in made["rest"]]}
 
-    monkeypatch.setattr(lane_checkpoints, "items", of_a_newer_program)
+    monkeypatch.setattr(training, "items", of_a_newer_program)
     refused(out, "of another configuration or version of the program, use that one")
 
 
