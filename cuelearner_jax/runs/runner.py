@@ -63,21 +63,13 @@ class Runner:
         self._bar = self.bars.add_task(self.name, total=self.group.config.schedule.total_steps, note="preparing")
         with Checkpoints(self.folder / "checkpoints", run=self.key) as saved:
             self._restore(saved)
-            about, constants = (
-                {"run": self.key},
-                {
-                    "run": self.order.out.name,
-                    "task": self.order.task.name,
-                    "guidance": self.name,
-                    "split": self.order.split,
-                    "config_hash": config_hash(self.described),
-                    **provenance.provenance(),
-                },
-            )
+            about, order = {"run": self.key}, self.order
+            constants = {"run": order.out.name, "task": order.task.name, "guidance": self.name, "split": order.split}
+            constants |= {"config_hash": config_hash(self.described), **provenance.provenance()}
             with (
                 TableWriter(self.folder, results.SCHEMA, constants, about) as writer,
                 TableWriter(self.folder, results.GUIDES, constants, about) if asks else nullcontext() as guides,
-                tracking.open_tracker(self.order.track, self.folder, self.described, self.training.step) as tracker,
+                tracking.open_tracker(order.track, self.folder, self.described, self.training.step) as tracker,
             ):
                 if guides is not None:
                     self._label(saved, guides, teacher, labels)
