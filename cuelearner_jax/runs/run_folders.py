@@ -39,7 +39,7 @@ class RunLanes:
     guidance: Guide
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
-    policies: Any  # what they act with, see `restore_policies`, leading axis: lanes
+    policies: Any  # "params" and "guidance", which they act with, and "failed"; leading axis: lanes
     step: int
 
 
@@ -71,8 +71,10 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
 def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:
     """Return the lanes of one kind of guidance, grouped by step, the furthest step first.
 
-    Missing or unfinished shards are named on the console, one line each. `sweep`: whether these are a sweep's shards,
-    some of which may not have begun. Raises UserError if there is no checkpoint, or one is damaged.
+    A failed lane is restored at its last finite state. Missing or unfinished shards are named on the console, one line
+    each. `sweep`: whether these are a sweep's shards, some of which may not have begun.
+
+    Raises UserError if there is no checkpoint, or one is damaged.
     """
     env = shape_of(task, config.task)
     guidance = config.guide_in(env, kind)
@@ -84,48 +86,30 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     found: dict[int, list[RunLanes]] = {}
     told = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
     for folder, grid in pieces:
-        if sweep and not (folder / kind / "checkpoints").is_dir():
+        if not (folder / kind / "checkpoints").is_dir():
             told.append(f"{folder}: no checkpoint of {kind} guidance, left out")
             continue
         seeds, budgets = grid.lanes(guidance)
         key = run_key(formats.read("config", folder / CONFIG), kind)
-        policies, step = restore_policies(folder / kind, like, len(seeds), key)
+        with Checkpoints(folder / kind / "checkpoints", read_only=True, run=key) as saved:
+            policies, step = _restored(saved, like, len(seeds))
         found.setdefault(step, []).append(RunLanes(guidance, seeds, budgets, policies, step))
         if step < config.schedule.total_steps:
             told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")
-    for line in told:
-        console.print(line)
     if not found:
         raise UserError(f"there is no checkpoint of {kind} guidance: train first, or choose another --guidance")
+    for line in told:
+        console.print(line)
     return [_joined(found[step]) for step in sorted(found, reverse=True)]
 
 
-def restore_policies(folder: Path, like: Any, lanes: int, run: str) -> tuple[dict[str, Any], int]:
-    """Restore what the lanes of a run's folder act with, and whether each has failed.
-
-    A failed lane is restored at its last finite state.
-
-    Args:
-        folder: the folder of one kind of guidance.
-        like: shapes of what one lane acts with: {"params": the agent's, "guidance": the guide's model}.
-        lanes: number of lanes.
-        run: the key of the run and kind (`grid.run_key`).
-
-    Returns:
-        What the lanes act with, and "failed", with lanes as leading axis; and their training step.
-
-    Raises:
-        UserError: there is no readable checkpoint.
-    """
-    if not (folder / "checkpoints").is_dir():
-        raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
-    with Checkpoints(folder / "checkpoints", read_only=True, run=run) as saved:
-        clock, _, count, size = restore_clock(saved)
-        block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), like)
-        found = saved.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})
+def _restored(saved: Checkpoints, like: Any, lanes: int) -> tuple[dict[str, Any], int]:
+    """Return what lanes act with (one lane: shapes `like`) and whether each has failed, and their training step."""
+    clock, _, count, size = restore_clock(saved)
+    block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), like)
+    found = saved.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})
     blocks = [{**policy, "failed": failed} for policy, failed in zip(found["policy"], found["failed"], strict=True)]
-    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:lanes], *blocks)
-    return policies, int(clock.step)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:lanes], *blocks), int(clock.step)
 
 
 def _joined(parts: list[RunLanes]) -> RunLanes:

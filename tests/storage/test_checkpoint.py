@@ -105,14 +105,12 @@ def changed(change):
 @pytest.mark.parametrize(
     "like",
     [
-        changed(lambda item: item.update(weights=jax.ShapeDtypeStruct((3, 401), jnp.float32))),
         changed(lambda item: item.update(weights=jax.ShapeDtypeStruct((2, 400), jnp.float32))),
-        changed(lambda item: item.update(weights=jax.ShapeDtypeStruct((1200,), jnp.float32))),
         changed(lambda item: item.update(more=jax.ShapeDtypeStruct((2,), jnp.float32))),
         changed(lambda item: item.pop("weights")),
         {"clock": state()},
     ],
-    ids=["wider", "fewer lanes", "flat", "one more", "one fewer", "an item never saved"],
+    ids=["fewer lanes", "one more", "one fewer", "an item never saved"],
 )
 def test_a_checkpoint_of_other_shapes_is_refused(saved, like):
     with pytest.raises(UserError, match="if it is of another configuration or version") as refused:
