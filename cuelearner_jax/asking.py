@@ -136,8 +136,8 @@ def question(
         scalars = bound_scalars(space, scalars, of.bound)
 
     def one(key: PRNGKeyArray, obs: Array, first: Array) -> Array:
-        asked = of.guidance.question(key, guide.model, of.env, obs, first, scalars)
-        return asked if of.bound is None else space.clip(asked, first, of.bound)
+        action = of.guidance.question(key, guide.model, of.env, obs, first, scalars)
+        return action if of.bound is None else space.clip(action, first, of.bound)
 
     if several:
         return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, first), first
@@ -157,8 +157,8 @@ def record(
     positions = position + jnp.arange(len(obs))
     rows = Label(obs, action, answer, answered & (positions < guide.budget), base)
     put = lambda known, new: jax.lax.dynamic_update_slice_in_dim(known, new, position, 0)  # noqa: E731
-    asked = jnp.minimum(position + len(obs), guide.budget)
-    return guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=asked)
+    count = jnp.minimum(position + len(obs), guide.budget)
+    return guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=count)
 
 
 def proceed(
@@ -283,8 +283,8 @@ def blame(
         assert key is not None
         user_code.check_actions(space.only_actions(base.act(key, states, obs)), policy_name(base))
     if teacher is not None:
-        given = space.only_actions(best_actions(teacher, states, obs))
-        user_code.check_actions(given, f"teacher {type(teacher).__name__}")
+        actions = space.only_actions(best_actions(teacher, states, obs))
+        user_code.check_actions(actions, f"teacher {type(teacher).__name__}")
 
 
 def label_round(
@@ -300,14 +300,14 @@ def label_round(
         return proceed(of.env, guide, question(of, guide, own)[0], own), None
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
-        asked = ask(of, teacher, guide, lane_key, first + offset, sizes.ask_all)
+        after = ask(of, teacher, guide, lane_key, first + offset, sizes.ask_all)
         if sizes.question_every == 1:
-            return asked, None
+            return after, None
         key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), first + offset)
-        return jax.lax.scan(walk, asked, jax.random.split(key, sizes.question_every - 1))[0], None
+        return jax.lax.scan(walk, after, jax.random.split(key, sizes.question_every - 1))[0], None
 
-    asked, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
-    fitted = fit(of.guidance, of.env, of.scalars, asked, lane_key, first // sizes.labels_per_round)
+    after, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
+    fitted = fit(of.guidance, of.env, of.scalars, after, lane_key, first // sizes.labels_per_round)
     return jax.tree.map(lambda new, old: jnp.where(first < guide.budget, new, old), fitted, guide)
 
 

@@ -60,15 +60,15 @@ class Quantity(NamedTuple):
 
 def checked_quantities(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
     """Return the slices of an observation. Raises UserError for an unknown unit or kind, which would have no effect."""
-    found = tuple(quantities)
-    for name, _, unit, _, kind, *_ in found:
+    checked = tuple(quantities)
+    for name, _, unit, _, kind, *_ in checked:
         if not UNIT.fullmatch(unit):
             raise UserError(
                 f"the unit of {name!r} is {unit!r}: give a symbol, as m, rad or m/s, or 1 (known: {', '.join(SYMBOLS)})"
             )
         if kind not in KINDS:
             raise UserError(f"the kind of {name!r} is {kind!r}: give {', '.join(KINDS[1:])}, or none")
-    return found
+    return checked
 
 
 # What `spaces.DIRECTIONS` are, where an environment does not say more by its own `action`.
@@ -217,10 +217,10 @@ def check_layout(whose: str, observation: Sequence[Quantity], actions: Space, en
         env: the world, or what `task.shape_of` gives for it.
     """
     wanted = "give the world that it was made for, or options that keep its observations and actions"
-    known, now = _entries(observation), _entries(env.observation)
-    if len(known) != len(now):
-        raise UserError(f"{whose} observes {len(known)} entries, this world has {len(now)}: {wanted}")
-    for number, (own, other) in enumerate(zip(known, now, strict=True), 1):
+    before, now = _entries(observation), _entries(env.observation)
+    if len(before) != len(now):
+        raise UserError(f"{whose} observes {len(before)} entries, this world has {len(now)}: {wanted}")
+    for number, (own, other) in enumerate(zip(before, now, strict=True), 1):
         if own and other and own != other and (own[1] == UNKNOWN_UNIT) == (other[1] == UNKNOWN_UNIT):
             seen, there = (f"{name!r} ({unit})" for name, unit in (own, other))
             raise UserError(f"{whose} observes {seen} as entry {number}, this world has {there}: {wanted}")
@@ -249,8 +249,8 @@ def spaces_of(env: Any) -> Spaces:
     obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
     features, aims = _traced(_classes(jax.tree.structure(env)))
     if offers(env, "features"):
-        seen = jax.eval_shape(features, env, obs, action)
-        spaces = spaces._replace(features=(seen.own.shape[-1], seen.turned.shape[-1]))
+        shapes = jax.eval_shape(features, env, obs, action)
+        spaces = spaces._replace(features=(shapes.own.shape[-1], shapes.turned.shape[-1]))
     if offers(env, "aims"):
         spaces = spaces._replace(aims=jax.eval_shape(aims, env, obs).features.shape[-1])
     return spaces

@@ -77,9 +77,9 @@ def user_code_error(named: str, error: BaseException) -> UserCodeError:
 
 def format_numbers(numbers: Iterable[float]) -> str:
     """Return sorted numbers for a message: a range where they are consecutive, else at most 20 numbers."""
-    known = sorted(set(numbers))
-    texts = [f"{number:g}" if isinstance(number, float) else str(number) for number in known]
-    if len(known) > 2 and known == list(range(int(known[0]), int(known[0]) + len(known))):
+    ordered = sorted(set(numbers))
+    texts = [f"{number:g}" if isinstance(number, float) else str(number) for number in ordered]
+    if len(ordered) > 2 and ordered == list(range(int(ordered[0]), int(ordered[0]) + len(ordered))):
         return f"{texts[0]} to {texts[-1]}"
     return ", ".join(texts[:MOST_LISTED]) + (" and others" if len(texts) > MOST_LISTED else "")
 

@@ -94,27 +94,27 @@ def _opened(image: Any) -> tuple[Image.Image, str]:
             raise UserError(f"a picture is {image.dtype} {image.shape}: {wanted}")
         return Image.fromarray(image), ""
     try:
-        found = Image.open(io.BytesIO(image), formats=tuple(SHOWN))
-        kind = found.format or ""
-        if found.getexif().get(TURNED, 1) != 1:
-            found, kind = ImageOps.exif_transpose(found), ""  # rotated, so the stored bytes are not reused
-        found.load()
+        picture = Image.open(io.BytesIO(image), formats=tuple(SHOWN))
+        kind = picture.format or ""
+        if picture.getexif().get(TURNED, 1) != 1:
+            picture, kind = ImageOps.exif_transpose(picture), ""  # rotated, so the stored bytes are not reused
+        picture.load()
     except Exception as error:  # Pillow raises many kinds for damaged files
         raise UserError(f"a picture cannot be read ({error}): give the bytes of a PNG or JPEG file") from error
-    return found, kind
+    return picture, kind
 
 
 def _uri(image: Source, largest: int) -> tuple[str, tuple[int, int]]:
     """Return a picture as a data URI with its longer side at most `largest`, and its width and height [pixels]."""
-    found, kind = _opened(image)
+    picture, kind = _opened(image)
     data = image if isinstance(image, bytes) else b""
-    if kind not in SHOWN or max(found.size) > largest:
-        found = found.convert("RGB")
-        found.thumbnail((largest, largest))
+    if kind not in SHOWN or max(picture.size) > largest:
+        picture = picture.convert("RGB")
+        picture.thumbnail((largest, largest))
         file, kind = io.BytesIO(), "JPEG"
-        found.save(file, format=kind, quality=92, subsampling=0)
+        picture.save(file, format=kind, quality=92, subsampling=0)
         data = file.getvalue()
-    return f"data:{SHOWN[kind]};base64,{base64.b64encode(data).decode()}", found.size
+    return f"data:{SHOWN[kind]};base64,{base64.b64encode(data).decode()}", picture.size
 
 
 def write_film(

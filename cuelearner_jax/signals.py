@@ -69,13 +69,13 @@ def listen() -> None:
     """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    known = _install(lambda number, frame: None, ignored=NUMBERS)
+    handlers = _install(lambda number, frame: None, ignored=NUMBERS)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     _listening.set()
 
     def hear() -> None:
         while number := os.read(reading, 1)[0]:
-            if number in known:
+            if number in handlers:
                 _hear(number)
 
     threading.Thread(target=hear, name="signals", daemon=True).start()

@@ -217,10 +217,10 @@ class Task:
         robot, (body, _, folder) = body, body.partition(":")
         if len(self.bodies) == 1:
             raise UserError(f"{self.name} has no robots to choose from: leave out --robot")
-        known = {one.name: one for one in self.bodies}
-        if body not in known:
-            raise UserError(f"unknown robot {body!r}{suggestion(body, known)}")
-        others, first = tuple(one for one in self.bodies if one.name != body), known[body]
+        bodies = {one.name: one for one in self.bodies}
+        if body not in bodies:
+            raise UserError(f"unknown robot {body!r}{suggestion(body, bodies)}")
+        others, first = tuple(one for one in self.bodies if one.name != body), bodies[body]
         if folder and first.made_of is None:
             raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
         first = first.made_of(Path(folder)) if folder and first.made_of else first

@@ -48,8 +48,7 @@ class ReadingAdaptation(Adaptation):
     def keep_used(self, block: Any, used: Bool[Array, " lanes"]) -> Any:
         """Return the lanes, without a correction where it is not used."""
         nothing = self.unread(None, block.correction).correction
-        chosen = lambda own, none: jnp.where(used.reshape(-1, *[1] * none.ndim), own, none)  # noqa: E731
-        return block.replace(correction=jax.tree.map(chosen, block.correction, nothing))
+        return block.replace(correction=_chosen(used, block.correction, nothing))
 
     def unread(self, base: Any, like: Correction | None = None) -> Read:
         """Return a policy that corrects nothing; `like`: a correction with the sizes of its arrays."""
@@ -123,7 +122,7 @@ def _asked(
         count = min(size, budget - asked)
         states, obs = walk.situations(k_where, reading.policy(), CHOICE * size)
         index, action = reading.questions(np.asarray(obs), count, k_ask)
-        states, obs = jax.tree.map(lambda leaf, index=index: leaf[index], (states, obs))
+        states, obs = _rows((states, obs), index)
         answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
         rows.append((np.asarray(obs), action, answer))
         there = np.isfinite(answer).any(-1)
@@ -131,6 +130,18 @@ def _asked(
     obs, action, answer = (np.concatenate(column) for column in zip(*rows, strict=True))
     valid = np.asarray(np.isfinite(answer).any(-1))
     return Label(obs, action, np.where(valid[:, None], answer, 0), valid)  # pyright: ignore[reportArgumentType]
+
+
+@jax.jit
+def _chosen(keep: Array, own: Correction, nothing: Correction) -> Correction:
+    """Return each lane's correction, or nothing where it is not kept."""
+    one = lambda own, none: jnp.where(keep.reshape(-1, *[1] * none.ndim), own, none)  # noqa: E731
+    return jax.tree.map(one, own, nothing)
+
+
+@jax.jit
+def _rows(tree: Any, index: Array) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _stacked(corrections: list[Correction]) -> Correction:

@@ -40,10 +40,11 @@ class Joined(nn.Module):
         kernel = self.param("kernel", nn.initializers.xavier_uniform(), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.width,))
         obs, action, kernel, bias = (jnp.asarray(x, self.dtype) for x in (obs, action, kernel, bias))
-        seen, chosen = obs @ kernel[: obs.shape[-1]], action @ kernel[obs.shape[-1] :]
-        rank = max(seen.ndim, chosen.ndim)
-        bias, seen, chosen = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in (bias, seen, chosen))
-        return (seen + bias) + chosen
+        from_obs, from_action = obs @ kernel[: obs.shape[-1]], action @ kernel[obs.shape[-1] :]
+        rank = max(from_obs.ndim, from_action.ndim)
+        parts = (bias, from_obs, from_action)
+        bias, from_obs, from_action = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in parts)
+        return (from_obs + bias) + from_action
 
 
 class MLP(nn.Module):

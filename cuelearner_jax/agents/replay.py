@@ -124,8 +124,8 @@ def ring_buffer(example: StoredStep) -> RingBuffer:
         newer = jnp.mod(step - 1 - numbers, capacity)  # rows written after each
         places = jnp.mod(numbers[:, None] + further[None], capacity)
         # Three neighbouring numbers of each row, not the row.
-        found = rows[places[..., None], reward_column + jnp.arange(3)[None, None]]
-        return LaterSteps(*jnp.moveaxis(found, -1, 0), known=further[None] <= newer[:, None])
+        later = rows[places[..., None], reward_column + jnp.arange(3)[None, None]]
+        return LaterSteps(*jnp.moveaxis(later, -1, 0), known=further[None] <= newer[:, None])
 
     return RingBuffer(width, empty, pack, add, draw, read, follow)
 
@@ -158,13 +158,13 @@ class Memory(NamedTuple):
         to the other.
         """
         k_sample, k_mirror = jax.random.split(key)
-        found = self._drawn(k_sample, size, n_step, discount, guided_share)
+        batches = self._drawn(k_sample, size, n_step, discount, guided_share)
         if self.labelled is not None:
             k_labelled, k_choice = jax.random.split(jax.random.fold_in(k_sample, 1))
             labelled = self.labelled._drawn(k_labelled, size, n_step, discount, None)
             chosen = self._labelled_places(k_choice, size, guided_share)
-            found = [_replaced(chosen, *both) for both in zip(labelled, found, strict=True)]
-        return [apply_symmetries(k_mirror, self.env, batch) for batch in found]
+            batches = [_replaced(chosen, *both) for both in zip(labelled, batches, strict=True)]
+        return [apply_symmetries(k_mirror, self.env, batch) for batch in batches]
 
     def _drawn(self, key: PRNGKeyArray, size: int, n_step: int, discount: Any, guided_share: Any) -> list[Transition]:
         """Return the batches of `batches`, of this memory's own rows and without symmetries."""
@@ -173,10 +173,10 @@ class Memory(NamedTuple):
         else:
             wanted = jnp.arange(size) < jnp.round(guided_share * size)
             numbers = draw_sorts(key, self.guided[:, 0], self.filled, wanted)
-        found = [self.one_step(self.buffer.read(self.rows, numbers))]
+        batches = [self.one_step(self.buffer.read(self.rows, numbers))]
         if n_step > 1:
-            found.append(self.n_step(numbers, n_step, discount))
-        return found
+            batches.append(self.n_step(numbers, n_step, discount))
+        return batches
 
     def _labelled_places(self, key: PRNGKeyArray, size: int, guided_share: Any) -> Bool[Array, " batch"]:
         """Return the places of a batch for labelled steps: a share in front, or at random, as often as other steps."""
@@ -241,9 +241,9 @@ def draw_sorts(
     first = jnp.where(lost > 0, lost + 1, 0)
     before = jnp.where(lost > 0, counts[jnp.mod(lost, capacity)], 0)
     among = filled - first
-    found = counts[jnp.mod(filled - 1, capacity)] - before
-    guided = jnp.where(found == 0, False, jnp.where(found == among, True, guided))
-    rank = jax.random.randint(key, guided.shape, 0, jnp.maximum(jnp.where(guided, found, among - found), 1)) + 1
+    counted = counts[jnp.mod(filled - 1, capacity)] - before
+    guided = jnp.where(counted == 0, False, jnp.where(counted == among, True, guided))
+    rank = jax.random.randint(key, guided.shape, 0, jnp.maximum(jnp.where(guided, counted, among - counted), 1)) + 1
 
     def halve(_: Int[Array, ""], ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
@@ -294,15 +294,15 @@ def stored_step(
     obs: Float[Array, " memory"], action: Float[Array, " action"], step: Step, bootstraps: bool
 ) -> StoredStep:
     """Return what replay stores of one step from the remembered observation `obs`."""
-    kept = slice(None) if bootstraps else slice(0)
+    columns = slice(None) if bootstraps else slice(0)
     ended: Bool[Array, ""] = step.terminated | step.truncated
     return StoredStep(
         obs=obs,
         action=action,
         reward=step.reward,
-        discount=1.0 - step.terminated[None].astype(jnp.float32)[kept],
-        ended=ended[None].astype(jnp.float32)[kept],
-        aftermath=step.aftermath[kept],
+        discount=1.0 - step.terminated[None].astype(jnp.float32)[columns],
+        ended=ended[None].astype(jnp.float32)[columns],
+        aftermath=step.aftermath[columns],
     )
 
 

@@ -59,9 +59,9 @@ def intended_action(
         return _taught(space, teacher, teacher.best_action(state, obs), action)
     assert isinstance(teacher, ValuesDirections)  # see `check_teacher`
     # A biased teacher sees every action with the bias, so it searches around the action without the bias.
-    seen = add_bias(space, action, -space.from_unit(scalars.teacher_bias_deg))
+    perceived = add_bias(space, action, -space.from_unit(scalars.teacher_bias_deg))
     spread = space.from_unit(scalars.nearest_aim_deg)
-    return _taught(space, teacher, teacher.nearest_good(state, obs, seen, spread, scalars.nearest_share), action)
+    return _taught(space, teacher, teacher.nearest_good(state, obs, perceived, spread, scalars.nearest_share), action)
 
 
 def add_bias(space: Space, action: Float[Array, " action"], bias: Float[Array, ""]) -> Float[Array, " action"]:
@@ -69,18 +69,18 @@ def add_bias(space: Space, action: Float[Array, " action"], bias: Float[Array, "
     return space.toward(action, jnp.ones(len(space.cues)), bias)
 
 
-def _taught(space: Space, teacher: Any, given: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
+def _taught(space: Space, teacher: Any, value: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
     """Return a teacher's action; NaN where it is not an action. Raises UserError for another shape."""
     wanted = f"give an action of shape {action.shape}, of real numbers"
     try:
-        found = jnp.asarray(given)
+        taught = jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        raise UserError(f"teacher {type(teacher).__name__} gave {format_value(given)}: {wanted}") from error
-    if found.shape != action.shape:
-        raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {found.shape}: {wanted}")
-    if not jnp.issubdtype(found.dtype, jnp.floating) and not jnp.issubdtype(found.dtype, jnp.integer):
-        raise UserError(f"teacher {type(teacher).__name__} gave {found.dtype} numbers: {wanted}")
-    return space.only_actions(found.astype(action.dtype))
+        raise UserError(f"teacher {type(teacher).__name__} gave {format_value(value)}: {wanted}") from error
+    if taught.shape != action.shape:
+        raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {taught.shape}: {wanted}")
+    if not jnp.issubdtype(taught.dtype, jnp.floating) and not jnp.issubdtype(taught.dtype, jnp.integer):
+        raise UserError(f"teacher {type(teacher).__name__} gave {taught.dtype} numbers: {wanted}")
+    return space.only_actions(taught.astype(action.dtype))
 
 
 def relative_feedback(

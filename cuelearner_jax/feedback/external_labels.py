@@ -42,14 +42,14 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
         space = spaces.actions
         _refuse(off, f"{named}: {name} are no {space.about}", f"the space {space.name} gives the nearest by `retract`")
     if form is not None and form.values is not None:
-        known = form.values(spaces.actions)
-        values = ", ".join(f"{value:g}" for value in known)
-        wrong = ~np.isin(labels.answer, known)
-        _refuse(wrong, f"{named}: an answer is none of {values}", f"each means {form.meaning(spaces.actions)}")
+        values = form.values(spaces.actions)
+        names = ", ".join(f"{value:g}" for value in values)
+        wrong = ~np.isin(labels.answer, values)
+        _refuse(wrong, f"{named}: an answer is none of {names}", f"each means {form.meaning(spaces.actions)}")
 
 
 def _refuse(wrong: np.ndarray, reason: str, remedy: str) -> None:
     """Raise UserError if an entry of any label is wrong: (labels, ...)."""
-    found = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))
-    if len(found):
-        raise UserError(f"{reason} ({len(found)} of {len(wrong)} labels, the first is number {found[0] + 1}): {remedy}")
+    rows = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))
+    if len(rows):
+        raise UserError(f"{reason} ({len(rows)} of {len(wrong)} labels, the first is number {rows[0] + 1}): {remedy}")

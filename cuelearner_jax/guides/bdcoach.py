@@ -98,14 +98,14 @@ class BatchCoach(DeepCoach):
 
         def move(key: PRNGKeyArray, coached: BatchCoached, batch: Example, own: Array) -> BatchCoached:
             """Return the policy after one step; `own`: rows that keep their label's target."""
-            seen = self.augmented(key, batch)
+            shown = self.augmented(key, batch)
 
             def loss(policy: Params) -> Array:
-                acted = self.member.predict(env, policy, seen.obs, seen.action)
-                targets = self.policy_targets(env, coached.human, seen, acted, scalars)
+                acted = self.member.predict(env, policy, shown.obs, shown.action)
+                targets = self.policy_targets(env, coached.human, shown, acted, scalars)
                 pick = lambda one, other: jnp.where(own[:, None], one, other)  # noqa: E731
-                said = None if seen.said is None else pick(seen.said, targets.said)
-                both = seen.replace(target=pick(seen.target, targets.target), said=said)
+                said = None if shown.said is None else pick(shown.said, targets.said)
+                both = shown.replace(target=pick(shown.target, targets.target), said=said)
                 return jnp.mean(squared_errors(both, acted))
 
             updates, state = adam.update(jax.grad(loss)(coached.policy), coached.optimizer, coached.policy)

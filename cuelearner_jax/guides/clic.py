@@ -182,9 +182,9 @@ class Clic(Guide):
         space, count = self.spaces.actions, self.options.sampled_actions - 2
         k_any, k_near = jax.random.split(key)
         change = NEAR * space.from_unit(scalars.eps_deg) * jax.random.normal(k_near, (count // 2, len(space.cues)))
-        known = jnp.stack([row.action, self.target_action(row, scalars)])
+        from_label = jnp.stack([row.action, self.target_action(row, scalars)])
         near = space.exp(jnp.broadcast_to(row.action, (count // 2, space.size)), change)
-        return jnp.concatenate([known, space.sample(k_any, (count - count // 2,)), near])
+        return jnp.concatenate([from_label, space.sample(k_any, (count - count // 2,)), near])
 
     def losses(self, env: Any, scalars: GuideScalars, params: Params, rows: Contrast) -> Float[Array, " n"]:
         """Return for each row -log of the probability that the policy's action lies in the desired set."""
@@ -245,11 +245,11 @@ class Clic(Guide):
             return space.exp(jnp.broadcast_to(center, (count, space.size)), half * offsets)
 
         everywhere = count // 2
-        found = best(jnp.concatenate([base[None], space.spread(everywhere), box(base, bound, count - everywhere)]))
+        lowest = best(jnp.concatenate([base[None], space.spread(everywhere), box(base, bound, count - everywhere)]))
         half = 2.0 * bound * count ** (-1.0 / cues)
         for number in range(PASSES):
-            found = best(jnp.concatenate([found[None], box(found, 0.5**number * half, AROUND * cues)]))
-        return found
+            lowest = best(jnp.concatenate([lowest[None], box(lowest, 0.5**number * half, AROUND * cues)]))
+        return lowest
 
     def act(
         self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars

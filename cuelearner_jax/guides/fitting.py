@@ -73,9 +73,9 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
         env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "m action"]
     ) -> Float[Array, "m outputs"]:
         """Return predictions for m situations with an action each, or for one situation with m actions."""
-        bare, known = jnp.split(actions, [size], -1)
+        bare, base = jnp.split(actions, [size], -1)
         of_obs, of_action = networks.network_inputs(sizes.frame, env, obs, bare)
-        of_action = jnp.concatenate([of_action, known], -1) if beside else of_action
+        of_action = jnp.concatenate([of_action, base], -1) if beside else of_action
         return networks.as_function(network)(params, of_obs, of_action)
 
     model = ensemble(sizes.ensemble, init, predict)

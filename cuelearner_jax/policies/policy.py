@@ -74,8 +74,8 @@ def _lane(part: Any, axes: Any, index: int | ArrayLike) -> Any:
 def lanes_in(policy: PolicyNode) -> int | None:
     """Return the number of lanes of a block; None where no leaf has a lane axis."""
     count = lambda axis, own: [] if axis is SHARED else [len(leaf) for leaf in jax.tree.leaves(own)]  # noqa: E731
-    found = jax.tree.leaves(jax.tree.map(count, policy.axes, policy, is_leaf=lambda axis: axis is SHARED))
-    return found[0] if found else None
+    counts = jax.tree.leaves(jax.tree.map(count, policy.axes, policy, is_leaf=lambda axis: axis is SHARED))
+    return counts[0] if counts else None
 
 
 def described_code(policy: Any) -> dict[str, Any]:
@@ -285,9 +285,9 @@ class Corrected(PolicyNode):
         space, first = self.actions, self.base.act(key, states, obs)
         eps = space.from_unit(self.scalars.eps_deg)
         best = wanted_actions(space, self.teacher, states, obs, first, self.scalars)
-        told = lambda action, best: space.toward(action, relative_feedback(space, action, best, eps), eps) - action  # noqa: E731
+        step = lambda action, best: space.toward(action, relative_feedback(space, action, best, eps), eps) - action  # noqa: E731
         return refine(
-            lambda current: jax.vmap(told)(current, best),
+            lambda current: jax.vmap(step)(current, best),
             first,
             jnp.ones(obs.shape[0], bool),
             space=space,

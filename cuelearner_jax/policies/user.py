@@ -112,27 +112,29 @@ class Opaque(PolicyNode):
                 raise UserError(f"{name} {MEMORY}")
             chosen = chosen[0]
         try:
-            found = as_array(chosen)
+            actions = as_array(chosen)
         except Exception as error:  # PyTorch's own kinds too
             why = " ".join(str(error).split())[:200]
             raise UserError(
                 f"{name} returned {format_value(chosen)} ({why}): return an array of shape {wanted}"
             ) from error
-        is_whole = jnp.issubdtype(found.dtype, jnp.integer)
-        if not is_whole and not jnp.issubdtype(found.dtype, jnp.floating):
-            raise UserError(f"{name} returned {found.dtype} numbers: return real ones, of shape {wanted}")
-        if isinstance(self.actions, Choices) and found.shape == (rows,) and is_whole:
-            inside, one_hot = (found >= 0) & (found < wanted[1]), found[:, None] == np.arange(wanted[1])
+        is_whole = jnp.issubdtype(actions.dtype, jnp.integer)
+        if not is_whole and not jnp.issubdtype(actions.dtype, jnp.floating):
+            raise UserError(f"{name} returned {actions.dtype} numbers: return real ones, of shape {wanted}")
+        if isinstance(self.actions, Choices) and actions.shape == (rows,) and is_whole:
+            inside, one_hot = (actions >= 0) & (actions < wanted[1]), actions[:, None] == np.arange(wanted[1])
             if isinstance(inside, np.ndarray) and not inside.all():
                 raise UserError(
-                    f"{name} chose {found[~inside][0]}: give the number of a choice, 0 to {wanted[1] - 1}, whatever "
+                    f"{name} chose {actions[~inside][0]}: give the number of a choice, 0 to {wanted[1] - 1}, whatever "
                     "number the environment starts from"
                 )
             return jnp.where(inside[:, None], one_hot, jnp.nan) if as_array is jnp.asarray else np.float32(one_hot)
-        if found.shape != wanted:
-            raise UserError(f"{name} returned actions of shape {found.shape} for {rows} observations: return {wanted}")
+        if actions.shape != wanted:
+            raise UserError(
+                f"{name} returned actions of shape {actions.shape} for {rows} observations: return {wanted}"
+            )
         with np.errstate(over="ignore"):
-            return found.astype(np.float32)
+            return actions.astype(np.float32)
 
 
 @lru_cache(maxsize=64)  # once for each function
@@ -212,8 +214,8 @@ def policy_of(given: Any, space: Space | None = None) -> Any:
     return policy.replace(actions=space)
 
 
-def _acts(given: Any) -> bool:
-    return hasattr(given, "act") and not isinstance(given, type)
+def _acts(code: Any) -> bool:
+    return hasattr(code, "act") and not isinstance(code, type)
 
 
 def _required(given: Any) -> list[str] | None:
@@ -305,15 +307,15 @@ def _forwarded(module: Any, obs: np.ndarray) -> Any:
             for part, _ in modes:
                 part.training = False
             with torch.no_grad():
-                found = act(torch.as_tensor(np.array(obs), device=weights.device, dtype=weights.dtype))
+                actions = act(torch.as_tensor(np.array(obs), device=weights.device, dtype=weights.dtype))
         finally:
             for part, mode in modes:
                 part.training = mode
-    if isinstance(found, tuple | list) and found:
+    if isinstance(actions, tuple | list) and actions:
         if RECURRENT & {getattr(part, "original_name", type(part).__name__) for part in module.modules()}:
             raise UserError(f"policy {type(module).__qualname__} {MEMORY}")
-        found = found[0]
-    return found.detach().cpu().float().numpy() if isinstance(found, torch.Tensor) else found  # pyright: ignore
+        actions = actions[0]
+    return actions.detach().cpu().float().numpy() if isinstance(actions, torch.Tensor) else actions  # pyright: ignore
 
 
 def _predicted(model: Any, obs: np.ndarray) -> Any:
@@ -361,8 +363,8 @@ def _onnx(path: Path) -> Foreign:
         raise UserError(f"{path} cannot be run by onnxruntime ({why}): export the policy again") from error
     inputs, outputs = session.get_inputs(), [one.name for one in session.get_outputs()]
     if len(inputs) != 1 or inputs[0].type not in REAL or len(inputs[0].shape) != 2:
-        told = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs)
-        raise UserError(f"{path} has the inputs {told}: give a policy with one input of real numbers, (n, obs)")
+        shapes = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs)
+        raise UserError(f"{path} has the inputs {shapes}: give a policy with one input of real numbers, (n, obs)")
     chosen = [name for name in outputs if name in ("action", "actions")] or outputs
     if len(chosen) != 1:
         raise UserError(f"{path} has the outputs {', '.join(outputs)}: give a policy with one, or one named action")

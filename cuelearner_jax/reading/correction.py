@@ -32,11 +32,11 @@ class Correction(struct.PyTreeNode):
 
 
 def correction_of(
-    found: Posterior, change: Change, frame: Frame, known: Float[Array, "n z"], eps: Any, priors: Priors
+    fitted: Posterior, change: Change, frame: Frame, known: Float[Array, "n z"], eps: Any, priors: Priors
 ) -> Correction:
     """Return what is needed to act by a posterior."""
-    alpha = posterior.amplitudes(found.hyper, priors)[None] ** 2 * found.alpha
-    return Correction(change, frame, known, alpha, posterior.lengths(found.hyper, priors), jnp.float32(SCALE * eps))
+    alpha = posterior.amplitudes(fitted.hyper, priors)[None] ** 2 * fitted.alpha
+    return Correction(change, frame, known, alpha, posterior.lengths(fitted.hyper, priors), jnp.float32(SCALE * eps))
 
 
 def corrected(

@@ -117,15 +117,15 @@ def declared_distortions(env: Any) -> Family:
     declaration.
     """
     places = _places(env.observation)
-    found: list[Distortion] = []
+    distortions: list[Distortion] = []
     for (unit, size), slices in _alike(places).items():
-        found.append(_shift(unit, size, slices))
+        distortions.append(_shift(unit, size, slices))
         if unit == "m":
-            found.append(_gain(slices))
-    found += _turned_places(places)
-    found += [_roll(quantity, start) for quantity, start in places if quantity.kind == "beams"]
-    found += [_turned(quantity, start) for quantity, start in places if quantity.kind == "directions"]
-    return check_family(found) if found else ()
+            distortions.append(_gain(slices))
+    distortions += _turned_places(places)
+    distortions += [_roll(quantity, start) for quantity, start in places if quantity.kind == "beams"]
+    distortions += [_turned(quantity, start) for quantity, start in places if quantity.kind == "directions"]
+    return check_family(distortions) if distortions else ()
 
 
 def _places(observation: Sequence[Quantity]) -> list[tuple[Quantity, int]]:
@@ -219,12 +219,12 @@ def _turned_places(places: list[tuple[Quantity, int]]) -> list[Distortion]:
             if quantity.unit != "m" or quantity.size < 2:
                 raise UserError(f"slice {quantity.name!r} has an origin but is not a place: give x and y in metres")
             groups.setdefault(quantity.origin, []).append((quantity, start))
-    found = []
+    turns = []
     for origin, slices in groups.items():
         names = {quantity.name for quantity, _ in slices}
         followers = [(start, starts[one.follows]) for one, start in places if one.follows in names]
-        found.append(_turned_about(origin, slices, followers))
-    return found
+        turns.append(_turned_about(origin, slices, followers))
+    return turns
 
 
 def _turned_about(

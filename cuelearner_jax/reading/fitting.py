@@ -130,9 +130,9 @@ class Reader:
         """Return the units of the linear model, and the labels about which the policy answers steadily."""
         frame = linear.frame_of(self.family, labels, self.step)
         change = linear.no_change(self.space, self.family, labels.obs.shape[-1])
-        asked = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
-        actions = self._ask(asked)
-        steady = ~linear.jumps(self.space, self.family, frame, change, asked, actions, self.eps).any(-1)
+        near = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
+        actions = self._ask(near)
+        steady = ~linear.jumps(self.space, self.family, frame, change, near, actions, self.eps).any(-1)
         if not self.family:
             mixed = linear.influence(self.space, frame, labels, actions)
             frame = linear.frame_of((), labels, None, mixed)
@@ -147,16 +147,11 @@ class Reader:
         nothing = linear.no_change(self.space, self.family, labels.obs.shape[-1])
         moves, theta = _moves(self.family, frame), nothing.theta
         for _ in range(ENTRIES):
-            tried = jax.vmap(lambda theta: nothing.replace(theta=theta))(theta[None] + moves)
-            # the best of many must be better than the best of chance
-            worth = self._worth(labels, tried) - (WORTH + math.log(len(moves))) * (jnp.arange(len(moves)) > 0)
-            theta = tried.theta[jnp.argmax(worth)]
+            tried = _each(nothing, theta, moves)
+            theta = _taken(tried, self._worth(labels, tried))
         change = nothing.replace(theta=theta)
-        both = jax.tree.map(lambda own, other: jnp.concatenate([own, other[None]]), plain.change, change)
-        worth = self._worth(labels, both)
-        better = (worth[-1] > worth[:-1] + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
-        chosen = lambda own, other: jnp.where(better.reshape(-1, *[1] * other.ndim), other[None], own)  # noqa: E731
-        return Hypothesis(plain.parts, jax.tree.map(chosen, plain.change, change), plain.hyper)
+        worth = self._worth(labels, _and(plain.change, change))
+        return plain.replace(change=_better(plain.change, change, worth))
 
     def _worth(self, labels: Labels, changes: Change) -> Float[Array, " k"]:
         """Return the log likelihood of labels by each of stacked estimates, without the process."""
@@ -166,17 +161,17 @@ class Reader:
     def _fit(self, frame: Frame, labels: Labels, hypothesis: Hypothesis) -> Fit:
         """Return stacked hypotheses fitted to labels."""
         rows = self._data(frame, labels, hypothesis.change)
-        found = _unread(rows, hypothesis.hyper)
+        posteriors = _unread(rows, hypothesis.hyper)
         for number in range(ROUNDS):
             rows = self._data(frame, labels, hypothesis.change) if number else rows
-            found, hypothesis = _update(rows, frame, hypothesis, found, self.priors)
+            posteriors, hypothesis = _update(rows, frame, hypothesis, posteriors, self.priors)
         rows = self._data(frame, labels, hypothesis.change)
-        return _scored(rows, frame, hypothesis, found, self.priors)
+        return _scored(rows, frame, hypothesis, posteriors, self.priors)
 
     def _data(self, frame: Frame, labels: Labels, change: Change) -> Data:
         """Return the linear models at stacked estimates."""
-        asked = _probes(self.family, frame, change, labels.obs)
-        return _data(self.space, self.family, frame, change, labels, asked, self._ask(asked), self.eps)
+        near = _probes(self.family, frame, change, labels.obs)
+        return _data(self.space, self.family, frame, change, labels, near, self._ask(near), self.eps)
 
     def act(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return corrected actions by one fit."""
@@ -192,9 +187,9 @@ class Reader:
         Changes are in units of `SCALE` eps; log p [nats] is of the answer about each cue, 0 where nothing was said.
         """
         frame, change = fitted.frame, fitted.hypothesis.change
-        asked = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
+        near = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
         own = self.act(fitted, labels.obs)
-        rest = (labels, asked, self._ask(asked), own, self.eps, self.priors)
+        rest = (labels, near, self._ask(near), own, self.eps, self.priors)
         return _predicted(self.space, self.family, fitted, *rest)
 
     def ratio(self, fits: Fit, labels: Labels) -> Float[Array, ""]:
@@ -257,20 +252,21 @@ def _predicted(
     family: Family,
     fitted: Fit,
     labels: Labels,
-    asked: Array,
+    near: Array,
     actions: Array,
     own: Array,
     eps: Any,
     priors: Priors,
 ) -> tuple[Array, Array, Array]:
-    rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, asked, actions, eps)
-    parts, found = fitted.hypothesis.parts, fitted.posterior
-    _, variance = posterior.predict(found, fitted.data, parts, rows.features, rows.inputs, priors)
+    rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, near, actions, eps)
+    parts, fit = fitted.hypothesis.parts, fitted.posterior
+    _, variance = posterior.predict(fit, fitted.data, parts, rows.features, rows.inputs, priors)
     mean = space.log(labels.action, own) / (SCALE * eps)
-    habits = posterior.habits(found.hyper, 1 / SCALE, priors)
+    habits = posterior.habits(fit.hyper, 1 / SCALE, priors)
     return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, habits)
 
 
+@partial(jax.jit, static_argnames="family")
 def _moves(family: Family, frame: Frame) -> Float[Array, "k unknowns"]:
     """Return no shift, and shifts of each unknown alone: of a family, or of the entries that matter most."""
     size = len(frame.step)
@@ -278,6 +274,32 @@ def _moves(family: Family, frame: Frame) -> Float[Array, "k unknowns"]:
     each = jnp.eye(size)[entries] * frame.step[None]
     several = (jnp.array(TRIED)[:, None, None] * each[None]).reshape(-1, size)
     return jnp.concatenate([jnp.zeros((1, size)), several])
+
+
+@jax.jit
+def _each(nothing: Change, theta: Array, moves: Array) -> Change:
+    """Return the estimates that are tried, stacked."""
+    return jax.vmap(lambda move: nothing.replace(theta=theta + move))(moves)
+
+
+@jax.jit
+def _taken(tried: Change, worth: Array) -> Array:
+    """Return the unknowns of the best estimate; the first moves nothing."""
+    # the best of many must be better than the best of chance
+    return tried.theta[jnp.argmax(worth.at[1:].add(-WORTH - math.log(len(worth))))]
+
+
+@jax.jit
+def _and(changes: Change, change: Change) -> Change:
+    return jax.tree.map(lambda own, other: jnp.concatenate([own, other[None]]), changes, change)
+
+
+@jax.jit
+def _better(changes: Change, change: Change, worth: Array) -> Change:
+    """Return estimates of all hypotheses, in which another one, whose worth stands last, replaces what is worse."""
+    better = (worth[-1] > worth[:-1] + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
+    chosen = lambda own, other: jnp.where(better.reshape(-1, *[1] * other.ndim), other[None], own)  # noqa: E731
+    return jax.tree.map(chosen, changes, change)
 
 
 @partial(jax.jit, static_argnames="family")
@@ -312,26 +334,26 @@ def _probes(family: Family, frame: Frame, change: Change, obs: Array) -> Array:
 
 @partial(jax.jit, static_argnames=("space", "family"))
 def _data(
-    space: Space, family: Family, frame: Frame, change: Change, labels: Labels, asked: Array, actions: Array, eps: Array
+    space: Space, family: Family, frame: Frame, change: Change, labels: Labels, near: Array, actions: Array, eps: Array
 ) -> Data:
-    one = lambda change, asked, actions: linear.data(space, family, frame, change, labels, asked, actions, eps)  # noqa: E731
-    return jax.vmap(one)(change, asked, actions)
+    one = lambda change, near, actions: linear.data(space, family, frame, change, labels, near, actions, eps)  # noqa: E731
+    return jax.vmap(one)(change, near, actions)
 
 
 @partial(jax.jit, static_argnames="priors")
 def _update(
-    rows: Data, frame: Frame, hypothesis: Hypothesis, found: Posterior, priors: Priors
+    rows: Data, frame: Frame, hypothesis: Hypothesis, posteriors: Posterior, priors: Priors
 ) -> tuple[Posterior, Hypothesis]:
     """Infer each hypothesis, and move its estimate."""
 
-    def one(rows: Data, hypothesis: Hypothesis, found: Posterior) -> tuple[Posterior, Hypothesis]:
-        found = posterior.infer(rows, hypothesis.parts, jnp.float32(1 / SCALE), found, priors)
+    def one(rows: Data, hypothesis: Hypothesis, posteriors: Posterior) -> tuple[Posterior, Hypothesis]:
+        posteriors = posterior.infer(rows, hypothesis.parts, jnp.float32(1 / SCALE), posteriors, priors)
         at = linear.weights_of(frame, hypothesis.change)
-        weights = hypothesis.parts.weights * (at + jnp.clip(found.mean - at, -TRUST, TRUST))
+        weights = hypothesis.parts.weights * (at + jnp.clip(posteriors.mean - at, -TRUST, TRUST))
         change = linear.change_of(frame, weights, hypothesis.change)
-        return found, Hypothesis(hypothesis.parts, change, found.hyper)
+        return posteriors, Hypothesis(hypothesis.parts, change, posteriors.hyper)
 
-    return each_lane(one)(rows, hypothesis, found)
+    return each_lane(one)(rows, hypothesis, posteriors)
 
 
 @jax.jit
@@ -340,23 +362,23 @@ def _unread(rows: Data, hyper: Hyper) -> Posterior:
 
 
 @partial(jax.jit, static_argnames="priors")
-def _scored(rows: Data, frame: Frame, hypothesis: Hypothesis, found: Posterior, priors: Priors) -> Fit:
+def _scored(rows: Data, frame: Frame, hypothesis: Hypothesis, posteriors: Posterior, priors: Priors) -> Fit:
     """Return fits with the sum of log p(answer | all others) of each, by the cavity of each answer's site."""
 
-    def one(rows: Data, hypothesis: Hypothesis, found: Posterior) -> Array:
-        _, variance = posterior.predict(found, rows, hypothesis.parts, rows.features, rows.inputs, priors)
+    def one(rows: Data, hypothesis: Hypothesis, posteriors: Posterior) -> Array:
+        _, variance = posterior.predict(posteriors, rows, hypothesis.parts, rows.features, rows.inputs, priors)
         # at the estimate itself, of which the linear model is only a tangent
         weights = linear.weights_of(frame, hypothesis.change)
         mean = rows.offset + rows.features @ weights
-        mean = mean + posterior.process(found, rows.inputs, rows.inputs, priors, hypothesis.parts)
-        habits = posterior.habits(found.hyper, 1 / SCALE, priors)
+        mean = mean + posterior.process(posteriors, rows.inputs, rows.inputs, priors, hypothesis.parts)
+        habits = posterior.habits(posteriors.hyper, 1 / SCALE, priors)
         slope, _ = curvature(mean, variance, rows.answers, habits)
-        cavity = variance / jnp.maximum(1 - variance * found.precision, 0.05)
+        cavity = variance / jnp.maximum(1 - variance * posteriors.precision, 0.05)
         return predictive_log_likelihood(mean - cavity * slope, cavity, rows.answers, habits).sum()
 
-    score = each_lane(one)(rows, hypothesis, found)
+    score = each_lane(one)(rows, hypothesis, posteriors)
     frames = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(score), *leaf.shape)), frame)
-    return Fit(hypothesis, found, rows, frames, found.bound, score)
+    return Fit(hypothesis, posteriors, rows, frames, posteriors.bound, score)
 
 
 @jax.jit
@@ -372,7 +394,7 @@ def _first_and_best(first: Fit, smooth: Hypothesis) -> Hypothesis:
 def _together(first: Fit, second: Fit) -> Fit:
     """Return all fits, stacked; those without the process have one of no amplitude."""
     never = lambda hyper: hyper.replace(amplitudes=jnp.full_like(hyper.amplitudes, _NEVER))  # noqa: E731
-    hypothesis, found = first.hypothesis, first.posterior
+    hypothesis, posteriors = first.hypothesis, first.posterior
     hypothesis = hypothesis.replace(parts=Parts(hypothesis.parts.weights, True), hyper=never(hypothesis.hyper))
-    first = first.replace(hypothesis=hypothesis, posterior=found.replace(hyper=never(found.hyper)))
+    first = first.replace(hypothesis=hypothesis, posterior=posteriors.replace(hyper=never(posteriors.hyper)))
     return jax.tree.map(lambda one, other: jnp.concatenate([one, other]), first, second)

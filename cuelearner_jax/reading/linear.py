@@ -118,6 +118,7 @@ def basis(space: Space, action: Float[Array, "n action"]) -> Float[Array, "n bas
     return jnp.concatenate([jnp.ones((len(action), 1)), even], 1)
 
 
+@partial(jax.jit, static_argnums=0)
 def frame_of(
     family: Family, labels: Labels, step: Float[Array, " unknowns"] | None = None, mixed: Int[Array, " m"] | None = None
 ) -> Frame:
@@ -143,6 +144,7 @@ def probes(family: Family, frame: Frame, change: Change, obs: Float[Array, "n ob
     return jnp.concatenate([obs[None], moved])
 
 
+@partial(jax.jit, static_argnums=(0, 1))
 def jumps(
     space: Space,
     family: Family,
@@ -163,15 +165,16 @@ def jumps(
 
 
 def _sides(
-    space: Space, family: Family, frame: Frame, change: Change, asked: Array, actions: Array
+    space: Space, family: Family, frame: Frame, change: Change, probed: Array, actions: Array
 ) -> tuple[Float[Array, "u n cues"], Float[Array, "u n cues"]]:
     """Return the changes from a policy's actions at an estimate to those at both sides of each unknown."""
     size, steps = len(frame.step), jnp.diag(frame.step)
     sides = jnp.concatenate([change.theta[None], change.theta[None] - steps, change.theta[None] + steps])
-    whole = jax.vmap(partial(meant, family))(sides, asked[1:], actions[1:])
+    whole = jax.vmap(partial(meant, family))(sides, probed[1:], actions[1:])
     return space.log(whole[:1], whole[1 : 1 + size]), space.log(whole[:1], whole[1 + size :])
 
 
+@partial(jax.jit, static_argnums=0)
 def influence(space: Space, frame: Frame, labels: Labels, actions: Float[Array, "k n action"]) -> Int[Array, " mixed"]:
     """Return the entries on which the policy's actions depend most, from its answers to `probes`."""
     size = len(frame.step)
@@ -186,7 +189,7 @@ def data(
     frame: Frame,
     change: Change,
     labels: Labels,
-    asked: Float[Array, "k n obs"],
+    near: Float[Array, "k n obs"],
     actions: Float[Array, "k n action"],
     eps: Float[Array, ""],
 ) -> Data:
@@ -194,21 +197,21 @@ def data(
 
     Args:
         space, family, frame, change, labels: the model; `change` is the estimate.
-        asked: `probes` of the labels' observations.
+        near: `probes` of the labels' observations.
         actions: what the policy does there.
         eps: strength of an answer, in the unit of `space.log`.
     """
     scale, size = SCALE * eps, len(frame.step)
     steps, theta = jnp.diag(frame.step), change.theta[None]
     sides = jnp.concatenate([theta, theta - steps, theta + steps])
-    whole = jax.vmap(partial(meant, family))(sides, asked[1:], actions[1:])
+    whole = jax.vmap(partial(meant, family))(sides, near[1:], actions[1:])
     base, slope = whole[0], jnp.moveaxis(space.log(whole[1 : 1 + size], whole[1 + size :]), 0, -1) / (2 * scale)
-    slope = jnp.where(jumps(space, family, frame, change, asked, actions, eps)[:, None], 0.0, slope)
+    slope = jnp.where(jumps(space, family, frame, change, near, actions, eps)[:, None], 0.0, slope)
     x = features(space, frame, slope, labels.obs, base)
     cut = size + len(frame.mixed) ** 2
     offset = space.log(labels.action, base) / scale - x[:, :, :cut] @ weights_of(frame, change)[:cut]
-    seen = inputs(space, frame, labels.obs, actions[0])
-    return Data(offset, x, seen, answers_of(space, labels, eps), groups(space, family, len(frame.mean)))
+    situation = inputs(space, frame, labels.obs, actions[0])
+    return Data(offset, x, situation, answers_of(space, labels, eps), groups(space, family, len(frame.mean)))
 
 
 def answers_of(space: Space, labels: Labels, eps: Float[Array, ""]) -> Answers:

@@ -134,16 +134,16 @@ def amplitudes(hyper: Hyper, priors: Priors) -> Float[Array, " cues"]:
 
 def process(
     posterior: Posterior,
-    known: Float[Array, "n z"],
+    labelled: Float[Array, "n z"],
     inputs: Float[Array, "m z"],
     priors: Priors,
     parts: Parts | None = None,
 ) -> Float[Array, "m cues"]:
-    """Return the mean of the process at `inputs`; `known`: those of the answers."""
+    """Return the mean of the process at `inputs`; `labelled`: those of the answers."""
     if parts is not None and not parts.process:
         return jnp.zeros((len(inputs), posterior.alpha.shape[1]))
     amplitude = amplitudes(posterior.hyper, priors)[None]
-    return amplitude**2 * (correlation(lengths(posterior.hyper, priors), inputs, known) @ posterior.alpha)
+    return amplitude**2 * (correlation(lengths(posterior.hyper, priors), inputs, labelled) @ posterior.alpha)
 
 
 def _sizes(hyper: Hyper, parts: Parts, group: Array, priors: Priors) -> Array:
@@ -160,8 +160,8 @@ def _solve(hyper: Hyper, parts: Parts, data: Data, precision: Array, target: Arr
     logs, hk, back, prior = jnp.zeros(()), None, None, jnp.zeros(residual.shape[1])
     if parts.process:
         prior = amplitudes(hyper, priors)
-        known = correlation(lengths(hyper, priors), data.inputs, data.inputs)
-        hx, hr, hk, back, logs = each_lane(partial(_whitened, known))(hx, hr, root, prior)
+        alike = correlation(lengths(hyper, priors), data.inputs, data.inputs)
+        hx, hr, hk, back, logs = each_lane(partial(_whitened, alike))(hx, hr, root, prior)
         logs = logs.sum()
     inner = jnp.linalg.cholesky(jnp.eye(len(size)) + jnp.einsum("cnp,cnq->pq", hx, hx))
     solve = partial(jax.scipy.linalg.solve_triangular, inner, lower=True)
@@ -183,11 +183,11 @@ def _solve(hyper: Hyper, parts: Parts, data: Data, precision: Array, target: Arr
 
 
 def _whitened(
-    known: Array, hx: Array, hr: Array, root: Array, amplitude: Array
+    alike: Array, hx: Array, hr: Array, root: Array, amplitude: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return one cue's features, residuals and covariance, whitened by process and noise; the last maps to `alpha`."""
     eye = jnp.eye(len(root))
-    half_k = root[:, None] * (amplitude**2 * known)
+    half_k = root[:, None] * (amplitude**2 * alike)
     factor = jnp.linalg.cholesky(eye + half_k * root[None])
     inverse = jax.scipy.linalg.solve_triangular(factor, eye, lower=True)
     back = root[:, None] * inverse.T
@@ -274,11 +274,11 @@ def predict(
         return mean, jnp.maximum(((features @ posterior.root) ** 2).sum(-1), 1e-8)
     hyper, amplitude = posterior.hyper, amplitudes(posterior.hyper, priors)
     cross = correlation(lengths(hyper, priors), data.inputs, inputs)  # (n, m)
-    known = correlation(lengths(hyper, priors), data.inputs, data.inputs)
+    alike = correlation(lengths(hyper, priors), data.inputs, data.inputs)
 
     def of_cue(x: Array, train: Array, w: Array, a: Array) -> Array:
         root = jnp.sqrt(w)
-        factor = jnp.linalg.cholesky(eye + root[:, None] * (a**2 * known) * root[None])
+        factor = jnp.linalg.cholesky(eye + root[:, None] * (a**2 * alike) * root[None])
         half = partial(jax.scipy.linalg.solve_triangular, factor, lower=True)
         hk, hx = half(root[:, None] * a**2 * cross), half(root[:, None] * train)
         return a**2 - (hk**2).sum(0) + (((x - hk.T @ hx) @ posterior.root) ** 2).sum(-1)

@@ -9,9 +9,10 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.reading import linear, posterior
@@ -89,24 +90,35 @@ def describe_fit(
     x = np.asarray(fitted.data.features, np.float64)
     valid = np.asarray(fitted.data.answers.valid).any(-1)
     effect = x[valid].reshape(-1, x.shape[-1])
-    seen = len(fitted.hypothesis.change.theta)
-    names = _names(family, seen, observation)
+    unknowns = len(fitted.hypothesis.change.theta)
+    names = _names(family, unknowns, observation)
     step = np.asarray(fitted.frame.step, np.float64)
-    estimates = _seen(weights[:seen], root[:seen], effect[:, :seen], names, family, step)
+    estimates = _seen(weights[:unknowns], root[:unknowns], effect[:, :unknowns], names, family, step)
     own = slice(len(weights) - linear.terms(*fitted.hypothesis.change.action.shape).shape[1], None)
     estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
     hyper = fitted.posterior.hyper
-    priors = posterior.PRIORS
-    inputs = fitted.data.inputs
-    more = np.asarray(posterior.process(fitted.posterior, inputs, inputs, priors))[valid]
+    more = np.asarray(_process(fitted))[valid]
     depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
     depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
     near = None
     if len(met):
-        alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(met), inputs[valid])
+        alike = np.asarray(_alike(fitted, jnp.asarray(met)))[:, valid]
         near = float((alike.max(1) >= ALIKE_SITUATION).mean())
-    wrong = float(posterior.habits(hyper, 1 / SCALE, priors).lapse)
+    wrong = float(posterior.habits(hyper, 1 / SCALE, posterior.PRIORS).lapse)
     return tuple(estimates), depends, near, wrong
+
+
+@jax.jit
+def _process(fitted: Fit) -> Array:
+    inputs = fitted.data.inputs
+    return posterior.process(fitted.posterior, inputs, inputs, posterior.PRIORS)
+
+
+@jax.jit
+def _alike(fitted: Fit, met: Array) -> Array:
+    """Return the correlation of the process at situations met and at labelled ones."""
+    lengths = posterior.lengths(fitted.posterior.hyper, posterior.PRIORS)
+    return posterior.correlation(lengths, met, fitted.data.inputs)
 
 
 def _names(family: Family, count: int, observation: Sequence[Quantity]) -> list[tuple[str, str]]:

@@ -152,7 +152,7 @@ class Reading:
             return Result(False, False, 0.0, (), 0.0, None, 0.0, self.policy())
         number = int(fitting.best_of(self.fits))
         met = jnp.asarray(self.met)
-        inputs = linear.inputs(self.space, self.fit.frame, met, self._acts(met)) if len(met) else met
+        inputs = _inputs(self.space, self.fit.frame, met, self._acts(met)) if len(met) else met
         rest = (self.space, self.family, self.eps, self.observation, np.asarray(inputs))
         described = describe_fit(self.fit, *rest)
         used = number > 0 and self.evidence >= USED and described[-1] < MOST_WRONG
@@ -183,7 +183,7 @@ def acts_of(policy: Any) -> fitting.Acts:
     def acts(obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         actions = run(jax.random.key(0), None, jnp.asarray(obs)) if is_python(policy) else run(obs)
         actions = jnp.asarray(actions)
-        user_code.check_actions(np.asarray(jnp.isfinite(actions).all()), name)
+        user_code.check_actions(np.isfinite(np.asarray(actions)).all(), name)
         return actions
 
     return acts
@@ -200,6 +200,11 @@ def is_python(policy: Any) -> bool:
 def _near(space: Space, key: Any, actions: Array, spread: Array) -> Array:
     """Return actions at random around others; `spread` is along each cue."""
     return space.exp(actions, spread * jax.random.normal(key, spread.shape))
+
+
+@partial(jax.jit, static_argnums=0)
+def _inputs(space: Space, frame: linear.Frame, obs: Array, actions: Array) -> Array:
+    return linear.inputs(space, frame, obs, actions)
 
 
 @jax.jit

@@ -37,16 +37,17 @@ class Walk:
     def situations(self, key: PRNGKeyArray, policy: Any, count: int) -> tuple[EnvState, Float[Array, "count obs"]]:
         """Let a policy act on, and return `count` situations on the way."""
         envs, steps = -(-count // EACH), EACH * APART
-        k_start, *keys = jax.random.split(key, 1 + steps + (BEFORE if self.states is None else 0))
+        total = steps + (BEFORE if self.states is None else 0)
+        keys = jax.random.split(key, 1 + total)
         if self.states is None or len(self.obs) != envs:
-            self.states, self.obs = _start(self.env, jax.random.split(k_start, envs))
+            self.states, self.obs = _start(self.env, jax.random.split(keys[0], envs))
         act = policy.act if is_python(policy) else partial(_act, policy)
         met = []
-        for number, k_step in enumerate(keys):
-            k_act, k_env = jax.random.split(k_step)
+        for left in reversed(range(total)):
+            k_act, k_env = jax.random.split(keys[total - left])
             action = act(k_act, self.states, self.obs)
             self.states, self.obs = _step(self.env, jax.random.split(k_env, envs), self.states, action)
-            if (len(keys) - 1 - number) % APART == 0 and len(keys) - number <= steps:
+            if left % APART == 0 and left < steps:
                 met.append((self.states, self.obs))
         # Situations of one environment are adjacent, so that one question is chosen from few environments.
         return _adjacent(count, met)

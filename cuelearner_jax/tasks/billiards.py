@@ -47,10 +47,10 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     folder = teacher_folder(config)
     if folder is None:
         return SearchTeacher(env, aim_error, habit, config.search_directions)
-    told = _learned_in(folder, config)
-    own = make_environment(told)
+    trained_in = _learned_in(folder, config)
+    own = make_environment(trained_in)
     network = teachers.load(folder, own, aim_error, habit)
-    if config.teacher == LOCAL_SEARCH or told.acceleration != config.acceleration:
+    if config.teacher == LOCAL_SEARCH or trained_in.acceleration != config.acceleration:
         return LocalSearchTeacher(network, own, env, aim_error, habit)
     return Transferred(network, own, env)
 
@@ -64,9 +64,9 @@ def _learned_in(folder: Path, config: BilliardsConfig) -> BilliardsConfig:
         return teachers.world_of(folder, "billiards", config, TRANSFERRED)
     except UserError as refusal:
         with suppress(UserError):
-            told = teachers.world_of(folder, "billiards", config, (*TRANSFERRED, "acceleration"))
-            if math.dist(told.acceleration, config.acceleration) <= SLIGHT_TILT:
-                return told
+            trained_in = teachers.world_of(folder, "billiards", config, (*TRANSFERRED, "acceleration"))
+            if math.dist(trained_in.acceleration, config.acceleration) <= SLIGHT_TILT:
+                return trained_in
         raise refusal
 
 

@@ -83,9 +83,9 @@ def _simulator(family: str, name: str, backend: str) -> Any:
 def _from_brax(name: str, backend: str) -> Any:
     from brax import envs  # takes seconds to load
 
-    known: dict[str, Any] = envs._envs  # brax has no public list of its environments
-    if name not in known:
-        raise UserError(f"brax has no environment {name!r}{suggestion(name, known)}")
+    names: dict[str, Any] = envs._envs  # brax has no public list of its environments
+    if name not in names:
+        raise UserError(f"brax has no environment {name!r}{suggestion(name, names)}")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Brax System")  # a notice that brax is no longer developed
         return envs.get_environment(name, backend=backend)

@@ -40,15 +40,15 @@ def rollout(
     k_reset, k_run = jax.random.split(key)
     course = begin(jax.random.split(k_reset, num_envs))
     choose = jax.jit(policy.act)
-    running, found = np.ones(num_envs, bool), {}
+    running, outcomes = np.ones(num_envs, bool), {}
     for index in range(steps // num_envs):
         tell(index, steps // num_envs)
         k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))
         outcome, ends = course.step(choose(k_act, course.state, course.obs))
         ended = running & ends
         for name, values in outcome.items():
-            found.setdefault(name, np.full(num_envs, np.nan))[ended] = np.asarray(values)[ended]
+            outcomes.setdefault(name, np.full(num_envs, np.nan))[ended] = np.asarray(values)[ended]
         running &= ~ended
         if not running.any():
             break
-    return {**found, "finished": 1.0 - running}
+    return {**outcomes, "finished": 1.0 - running}

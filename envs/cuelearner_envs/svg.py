@@ -22,11 +22,11 @@ def points(rows: Points) -> str:
 
 def element(name: str, body: str = "", **attributes: SupportsFloat | str) -> str:
     """An element; underscores of attributes' names become hyphens."""
-    told = " ".join(
+    pairs = " ".join(
         f'{key.replace("_", "-")}="{value if isinstance(value, str) else number(value)}"'
         for key, value in attributes.items()
     )
-    return f"<{name} {told}>{body}</{name}>"
+    return f"<{name} {pairs}>{body}</{name}>"
 
 
 def circle(at: Point, radius: float, style: str) -> str:

@@ -87,8 +87,8 @@ def control(body: Body, action: Float[Array, "12"], ground: Ground) -> tuple[Bod
         return Body(done.qpos, done.qvel, done.qacc_warmstart), heights
 
     steps = round(robot.CONTROL_PERIOD / float(robot.load().opt.timestep))
-    body, seen = jax.lax.scan(one, body, length=steps)
-    foot, knee, torques = (leaf[-1] for leaf in seen)
+    body, states = jax.lax.scan(one, body, length=steps)
+    foot, knee, torques = (leaf[-1] for leaf in states)
     return body, Felt(foot - robot.FOOT_RADIUS, torques, fallen(body, knee))
 
 

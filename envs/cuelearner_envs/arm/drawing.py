@@ -64,13 +64,13 @@ def draw(scene: Scene) -> Picture:
     brush = ImageDraw.Draw(image)
     for face, colour in _ground(scene):
         brush.polygon(_flat(face), fill=tuple(colour))
-    seen = []
+    faces = []
     for face, colour in _solids(scene):
         normal, off = np.cross(face[1] - face[0], face[2] - face[1]), face.mean(0) - _EYE
         normal /= max(float(np.linalg.norm(normal)), 1e-12)
         if normal @ off < 0:
-            seen.append((float(off @ _SIGHT), face, _times(0.62 + 0.38 * max(float(normal @ LIGHT), 0.0), colour)))
-    for _, face, colour in sorted(seen, key=lambda one: -one[0]):
+            faces.append((float(off @ _SIGHT), face, _times(0.62 + 0.38 * max(float(normal @ LIGHT), 0.0), colour)))
+    for _, face, colour in sorted(faces, key=lambda one: -one[0]):
         brush.polygon(_flat(face), fill=colour, outline=_times(0.75, colour))
     _draw_goal(brush, scene.goal)
     if scene.action is not None:

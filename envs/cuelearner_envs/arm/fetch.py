@@ -76,13 +76,13 @@ class FetchArm(Arm, kw_only=True):
         return state.true[OBJECT]
 
     def observe(self, state: Played, camera: Camera | None = None) -> Float[Array, " obs"]:
-        """Return what is seen; `camera`: in place of the own one."""
+        """Return what is view; `camera`: in place of the own one."""
         camera, true = self.camera if camera is None else camera, state.true
-        seen = true.at[GOAL].set(camera.seen(state.goal))
+        view = true.at[GOAL].set(camera.seen(state.goal))
         if not self.has_object:
-            return seen
+            return view
         cube = camera.seen(self.cube(state))
-        return seen.at[ACHIEVED].set(cube).at[OBJECT].set(cube).at[RELATIVE].set(cube - self.gripper(state))
+        return view.at[ACHIEVED].set(cube).at[OBJECT].set(cube).at[RELATIVE].set(cube - self.gripper(state))
 
 
 def make_environment(config: ArmConfig, plays: Environment) -> FetchArm:

@@ -27,11 +27,11 @@ FPS = 1.0 / arm.CONTROL_PERIOD  # of a film, a step a frame
 def scene_of(env: Arm, state: Situation, action: Any = None) -> Scene:
     """Return what is drawn of a state, in arrays of NumPy; `action`: in question."""
     qpos, goal, post = jax.device_get((state.body.qpos, state.goal, env.ground.post))
-    asked = None if action is None else np.asarray(action, float)
+    action = None if action is None else np.asarray(action, float)
     if not env.has_object:
-        return Scene(np.asarray(qpos), np.zeros(2), np.asarray(goal), None, False, asked)
+        return Scene(np.asarray(qpos), np.zeros(2), np.asarray(goal), None, False, action)
     cube, fingers = qpos[physics.CUBE], qpos[physics.FINGERS]
-    return Scene(qpos[physics.GRIPPER], fingers, np.asarray(goal), cube, bool(post > 0), asked)
+    return Scene(qpos[physics.GRIPPER], fingers, np.asarray(goal), cube, bool(post > 0), action)
 
 
 def record(env: Arm, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Picture], list[float]]:
@@ -50,8 +50,8 @@ def question(env: Arm, state: Situation, obs: Float[Array, " obs"], action: Floa
 def sketch(env: Arm, state: Situation) -> Sketch:
     """Return the situation for the labelling page."""
     left = int(env.max_steps) - int(state.steps)
-    found = pictures.sketch(draw(scene_of(env, state)), f"{left} steps left; the ring is the goal")
-    return found._replace(points=points())
+    drawing = pictures.sketch(draw(scene_of(env, state)), f"{left} steps left; the ring is the goal")
+    return drawing._replace(points=points())
 
 
 @jax.jit

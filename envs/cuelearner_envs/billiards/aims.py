@@ -130,10 +130,10 @@ def _afterwards(table: Table, contact: Contact) -> tuple[Float[Array, ""], Float
     rolls is given in table heights.
     """
     along, across = jnp.cos(contact.cut), jnp.abs(jnp.sin(contact.cut))
-    kept = across - jnp.minimum(table.friction * along, across / (2.0 * TANGENT_PER_DISC))
+    remains = across - jnp.minimum(table.friction * along, across / (2.0 * TANGENT_PER_DISC))
     tangent = retract(contact.strike - along * contact.normal)
     to = pockets(table) - contact.place[None]
     beside = jnp.abs(to[:, 0] * tangent[1] - to[:, 1] * tangent[0])
     miss = jnp.where(to @ tangent > 0.0, beside, jnp.inf).min() / table.hole_width
-    travel = kept * table.strike_speed / -jnp.log(table.speed_kept) / table.height
+    travel = remains * table.strike_speed / -jnp.log(table.speed_kept) / table.height
     return jnp.minimum(miss, FARTHEST), travel

@@ -114,8 +114,8 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         Pocketed targets come first: they stand beside the table, in the order of their row and not of their number, so
         that equal positions look equal. No sensor looks there: their places have no bias.
         """
-        seen = balls.positions + jnp.asarray(self.observation_bias)[None]
-        entries = jnp.concatenate([seen, jnp.where(balls.pocketed, FLAG, -FLAG)[:, None]], axis=-1)
+        places = balls.positions + jnp.asarray(self.observation_bias)[None]
+        entries = jnp.concatenate([places, jnp.where(balls.pocketed, FLAG, -FLAG)[:, None]], axis=-1)
         return jnp.concatenate([entries[0], self._sorted(entries[1:]).ravel()])
 
     def _sorted(self, targets: Float[Array, "targets 3"]) -> Float[Array, "targets 3"]:

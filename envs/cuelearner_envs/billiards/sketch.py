@@ -164,13 +164,13 @@ def _stroke(width: float, fill: str = "fill:none;") -> str:
 
 def _corners(rows: np.ndarray) -> np.ndarray:
     """The places of a way (n, 2) at which it bends, its first and its last."""
-    kept = [rows[0]]
+    corners = [rows[0]]
     for place, following in pairwise(rows[1:]):
-        way, onward = place - kept[-1], following - place
+        way, onward = place - corners[-1], following - place
         bent = abs(way[0] * onward[1] - way[1] * onward[0]) > BEND * np.hypot(*way) * np.hypot(*onward)
         if np.hypot(*way) > MOVED and (bent or way @ onward < 0):
-            kept.append(place)
-    return np.array([*kept, rows[-1]])
+            corners.append(place)
+    return np.array([*corners, rows[-1]])
 
 
 def _ball(number: int, radius: float) -> str:

@@ -129,5 +129,5 @@ class LocalSearchTeacher(struct.PyTreeNode):
         near = (centres[:, None] + jnp.arange(-reach, reach + 1)[None]).ravel() % self.directions
         key = jax.random.key(0)  # decides only where a fouled cue ball goes
         shoot = lambda action: self.env.step(key, state, action)[1].reward  # noqa: E731
-        found = jnp.zeros(self.directions).at[near].set(jax.vmap(shoot)(evenly_spaced(self.directions)[near]))
-        return found.at[otherwise].add(jnp.where(found.max() > 0, 0.0, 1.0))
+        values = jnp.zeros(self.directions).at[near].set(jax.vmap(shoot)(evenly_spaced(self.directions)[near]))
+        return values.at[otherwise].add(jnp.where(values.max() > 0, 0.0, 1.0))

@@ -56,17 +56,17 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
     goal, away = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2] * FARTHEST
     ways = rotate(jnp.broadcast_to(goal, (WAYS, 2)), jnp.arange(WAYS) * (2 * jnp.pi / WAYS))
     free = free_ways(obs, ways)
-    seen = jnp.abs(to_angle(ways)) <= -BEAM_ANGLES[0] + math.radians(0.5)
-    near = jnp.where(seen[None], jnp.exp(-free), UNSEEN)
+    visible = jnp.abs(to_angle(ways)) <= -BEAM_ANGLES[0] + math.radians(0.5)
+    near = jnp.where(visible[None], jnp.exp(-free), UNSEEN)
     beside = [jnp.roll(near, -step, axis=1) for step in BESIDE]
     previous = obs[BEAMS + 3 : BEAMS + 9].reshape(-1, 2)
     rows = [*_lengths(ways, free[1], goal, away), *_seen_from(ways, goal[None]), *_seen_from(ways, previous)]
-    rows += [jnp.full(WAYS, away / SCALE), ways[:, 0], ways[:, 1], seen.astype(jnp.float32)]
+    rows += [jnp.full(WAYS, away / SCALE), ways[:, 0], ways[:, 1], visible.astype(jnp.float32)]
     if ahead:
         left, detour, leg = look_ahead(points_of(obs)[::EVERY], ways, free[2], away * goal, RADII[2])
         rows += [left / SCALE, jnp.clip(detour / SCALE, 0.0, 3.0), leg / SCALE]
     features = jnp.concatenate([row.reshape(-1, WAYS) for row in [*beside, *rows]]).T
-    room = (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & seen
+    room = (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & visible
     return Aims(ways, features, jnp.ones(WAYS, bool), room)
 
 

@@ -214,8 +214,8 @@ class Navigation(Described, struct.PyTreeNode):
         around = slices[..., :-1] + near * (slices[..., 1:] - slices[..., :-1])
         vectors = jnp.concatenate([obs[BEAMS : BEAMS + 2], obs[BEAMS + 3 :]]).reshape(-1, 2)
         shape = (*count, *vectors.shape)
-        seen = inward(jnp.broadcast_to(vectors, shape), jnp.broadcast_to(actions[..., None, :], shape))
-        turned = jnp.concatenate([around, seen.reshape(*count, -1), actions], axis=-1)
+        ahead = inward(jnp.broadcast_to(vectors, shape), jnp.broadcast_to(actions[..., None, :], shape))
+        turned = jnp.concatenate([around, ahead.reshape(*count, -1), actions], axis=-1)
         return Features(obs[BEAMS + 2 : BEAMS + 3], turned)
 
     def aims(self, obs: Float[Array, " obs"]) -> Aims:

@@ -127,8 +127,8 @@ def _boxes(
         jnp.maximum(*products(leave_behind)),
         jnp.maximum(*products(leave_ahead)),
     )
-    seen = jnp.where(within[:, None], left, entered)
-    return jnp.where(entered >= left, seen, 0.0)
+    inverse = jnp.where(within[:, None], left, entered)
+    return jnp.where(entered >= left, inverse, 0.0)
 
 
 def _circles(
@@ -145,5 +145,5 @@ def _circles(
     along = centre[:, :1] * beams[None, :, 0] + centre[:, 1:] * beams[None, :, 1]
     across = centre[:, :1] * beams[None, :, 1] - centre[:, 1:] * beams[None, :, 0]
     depth = jnp.square(radius)[:, None] - jnp.square(across)
-    seen = (along + other[:, None] * jnp.sqrt(jnp.maximum(depth, 0.0))) / power[:, None]
-    return jnp.where(depth >= 0, seen, 0.0)
+    inverse = (along + other[:, None] * jnp.sqrt(jnp.maximum(depth, 0.0))) / power[:, None]
+    return jnp.where(depth >= 0, inverse, 0.0)

@@ -36,9 +36,9 @@ class Frame(NamedTuple):
 @jax.jit
 def _seen(env: Navigation, state: Any, after: Any) -> dict[str, Any]:
     world, radius, most = env.world(state.world), jnp.asarray(env.goal_radius), jnp.asarray(env.lidar.max_range)
-    seen = {"world": world, "goal": state.goal, "goal_radius": radius, "pose": state.pose, "ranges": env.ranges(state)}
+    view = {"world": world, "goal": state.goal, "goal_radius": radius, "pose": state.pose, "ranges": env.ranges(state)}
     seconds = after.steps * jnp.asarray(env.period)
-    return {**seen, "max_range": most, "next_pose": after.pose, "seconds": seconds}
+    return {**view, "max_range": most, "next_pose": after.pose, "seconds": seconds}
 
 
 def situation(env: Navigation, state: Any, action: Float[ArrayLike, "2"]) -> Frame:
@@ -53,11 +53,11 @@ def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tu
         ends = jnp.stack([step.outcome.get(name, jnp.zeros(())) for name in ENDS])  # only legged robots fall
         return {**_seen(env, state, env.moved(state, action)), "action": action}, ends, step.reward
 
-    seen, ends, rewards = played(env, policy, key, steps, see)
+    views, ends, rewards = played(env, policy, key, steps, see)
     finished = np.cumsum(ends.any(-1)) - ends.any(-1)  # episodes before each step
     frames = []
     for number in range(steps):
         outcome = "".join(name for name, ended in zip(ENDS, ends[number], strict=True) if ended)
-        one = jax.tree.map(lambda leaf, number=number: leaf[number], seen)
+        one = jax.tree.map(lambda leaf, number=number: leaf[number], views)
         frames.append(Frame(**one, outcome=outcome, episode=int(finished[number])))
     return frames, [float(reward) for reward in rewards]

@@ -176,8 +176,8 @@ def sight_of(world: World, state: State) -> Sight:
 def observe(world: World, state: State) -> Float[Array, " obs"]:
     """Return the observation that the policy acts on."""
     sight = sight_of(world, state)
-    seen = lambda place: world.about + world.turn @ (place - world.about) + world.shift  # noqa: E731
-    return encode(world.robot, sight.replace(goal=seen(sight.goal), thing=seen(sight.thing)))
+    view = lambda place: world.about + world.turn @ (place - world.about) + world.shift  # noqa: E731
+    return encode(world.robot, sight.replace(goal=view(sight.goal), thing=view(sight.thing)))
 
 
 def step(world: World, state: State, action: Float[Array, " n"]) -> tuple[State, Float[Array, ""]]:
