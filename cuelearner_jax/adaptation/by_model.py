@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.judging import LABELS, Judge, Judgement, Judging
+from cuelearner_jax.adaptation.judging import LABELS, PERSON, Judge, Judgement, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, ask_round, begin, blame, rounds, take_labels
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
@@ -79,7 +79,10 @@ class AdaptationResult:
     def _verdict(self, lane: int, unit: str) -> str:
         judged, bound = self.judged, self.lanes.bound_deg[lane]
         before, after, narrowed = (column[lane] for column in (judged.before, judged.after, judged.within_deg))
-        if judged.by != LABELS:
+        if judged.by == PERSON:
+            preferred = f"the policy as it was in {before:.0%}, the corrected in {after:.0%}"
+            why = f"of pairs of films a person preferred {preferred}"
+        elif judged.by != LABELS:
             difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*judged.difference[lane])
             spent = f"difference {difference}; {judged.rewarded_steps[lane]:,} rewarded steps"
             why = f"{judged.by} on tuning episodes {before:.4g} before, {after:.4g} after ({spent})"

@@ -1,13 +1,16 @@
 """Judge whether an adapted policy is better than its base. An adapted policy is used only if it is.
 
 With a simulator both play the same episodes of the changed world, those of the split "tuning", until a sequential test
-of the paired differences decides (`PairedTest`). Reported figures are measured on other episodes. Without a simulator,
-held-out labels are predicted, against answering "already right" always; a reading has a rule of its own.
+of the paired differences decides (`PairedTest`). Reported figures are measured on other episodes. A person may compare
+films of such episodes in place of a metric. Without a simulator, held-out labels are predicted, against answering
+"already right" always; a reading has a rule of its own.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,6 +22,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
+from cuelearner_jax.adaptation.person import Person, preferences
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
@@ -29,6 +33,7 @@ from cuelearner_jax.spaces import is_answered
 
 HELD_OUT = 5  # every fifth label is held out
 LABELS = "labels"  # `Judging.by` where held-out labels judge in place of a metric
+PERSON = "person"  # where a person does
 SPLIT = "tuning"  # the split that the judging episodes come from
 STEPS = 100  # steps of each environment, where a task counts steps
 AT_ONCE = 10  # episodes between two looks
@@ -44,14 +49,15 @@ class Judging:
     env: Environment | None  # the changed world with the episodes of `SPLIT`; None: there is no simulator
     num_envs: int = 50  # episodes at most
     steps: int = 100  # environment steps of each
-    by: str = "reward"  # a metric, or "labels"
+    by: str = "reward"  # a metric, "labels" or "person"
+    person: Person | None = None
     bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
 
 
 class Judgement(NamedTuple):
     """The values of the base policies and of the adapted ones, one entry a lane; larger is better."""
 
-    by: str  # a metric, or "labels": the share of held-out answers that are predicted
+    by: str  # a metric; "labels": the share of held-out answers that are predicted; "person": of pairs preferred
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
     used: np.ndarray  # (lanes,) bool: is the correction used? Only if it is shown to be better, and finite
@@ -97,6 +103,8 @@ class Judge:
             before_after_used = columns or judged_by_labels(self.of, block)
             return Judgement(LABELS, *before_after_used, bounds_of(self.of, block), unknown, none), block
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
+        if how.person is not None:
+            return self._compared(how.person, block, usable), block
         block, steps = self._narrowed(block)
         test, values = PairedTest(lanes.number), []
         for number in range(-(-how.num_envs // AT_ONCE)):
@@ -109,6 +117,24 @@ class Judge:
         before, after = (np.concatenate([pair[end][how.by] for pair in values], -1) for end in (0, 1))
         means, difference = (before.mean(-1), after.mean(-1)), mean_interval(after - before).T
         return Judgement(how.by, *means, usable & test.better, bounds_of(self.of, block), difference, steps), block
+
+    def _compared(self, person: Person, block: Any, usable: np.ndarray) -> Judgement:
+        """Return what a person says of the only lane's episodes."""
+        assert self.how.env is not None
+        assert self.lanes.number == 1  # `AdaptRequest`
+        test, answers = PairedTest(1), []
+        policies = self.of.bases.lane(0), self.of.policy(block, self.how.env).lane(0)
+        told = preferences(person, self.how.env, policies, episodes(SPLIT), self.how.steps)
+        with contextlib.closing(told):
+            for answer in itertools.islice(told, self.how.num_envs if usable[0] else 0):
+                answers.append(answer)
+                test.add(np.array([[float(answer)]]))
+                if test.decided[0]:
+                    break
+        each = np.array([answers], float).reshape(1, -1)
+        shares = [np.mean(each == which, -1) if answers else np.zeros(1) for which in (-1, 1)]
+        difference = mean_interval(each).T if answers else np.full((1, 3), np.nan)
+        return Judgement(PERSON, *shares, usable & test.better, bounds_of(self.of, block), difference, np.zeros(1, int))
 
     def _pair(self, block: Any, number: int) -> tuple[tuple[dict[str, np.ndarray], ...], np.ndarray]:
         """Play episodes by base and adapted policy; return the values of each (lanes, episodes), and the steps."""

@@ -20,8 +20,9 @@ import numpy as np
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.adaptation.judging import LABELS
+from cuelearner_jax.adaptation.judging import LABELS, PERSON
 from cuelearner_jax.adaptation.lanes import blame
+from cuelearner_jax.adaptation.person import Prefer
 from cuelearner_jax.api.labels import Labels, labels_from_file, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, config_of, load_policy
 from cuelearner_jax.api.worlds import World, numbers, teacher_of_world
@@ -123,7 +124,7 @@ def adapt(
     sizes: GuideSizes | None = None,
     scalars: Scalars | None = None,
     seed: int = 0,
-    judge_by: str | None = None,
+    judge_by: str | Prefer | None = None,
     judge_episodes: int = 50,
     judge_bounds: Sequence[float] | None = None,
     changes: Any = None,
@@ -150,7 +151,8 @@ def adapt(
         scalars: settings of fitting, of refinement and of the teacher's faults.
         seed: seed of all random numbers.
         judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones (default: the
-            scenario's or the task's; of a reading "labels").
+            scenario's or the task's; of a reading "labels"); or a function of two film files (.gif) of the same start
+            that returns -1 where the left one is better, 1 where the right one is, and else 0.
         judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
@@ -183,8 +185,10 @@ def adapt(
     }
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     options |= {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
+    prefer, judge_by = (judge_by, PERSON) if callable(judge_by) else (None, judge_by)
     request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, scalars)
-    subject = Subject(env, Common(as_policy_in(policy, env)), task=task, teacher=teacher, rows=rows, changes=changes)
+    about = {"task": task, "teacher": teacher, "rows": rows, "changes": changes, "prefer": prefer}
+    subject = Subject(env, Common(as_policy_in(policy, env)), **about)
     outcome = dataclasses.replace(request, **options).run(subject)
     result = outcome.found
     if result.failed.any():

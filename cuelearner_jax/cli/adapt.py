@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import shlex
 from argparse import Namespace
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from cuelearner_jax.adaptation import changes
+from cuelearner_jax.adaptation.judging import PERSON
 from cuelearner_jax.api.adaptation import world_of
 from cuelearner_jax.api.labels import labels_from_file
+from cuelearner_jax.cli.label import page_module
 from cuelearner_jax.cli.options import Finished, Flag, Kinds, about, look_ahead_of, out, parse
 from cuelearner_jax.cli.sources import code_of, is_code, source_of
 from cuelearner_jax.errors import NotFinite, UserError
@@ -53,7 +56,8 @@ def run(arguments: list[str]) -> None:
         # otherwise the changes stand for the folder's code
         if options.changes is not None and (guidances.resolve(options.guidance).by_evidence or source.adapted is None):
             subject = subject._replace(changes=changes.load(options.changes), changes_named=options.changes)
-        outcome = options.run(subject, watched_by(bars))
+        with _person(options.judge_by) as prefer:
+            outcome = options.run(subject._replace(prefer=prefer), watched_by(bars))
         outcome.write(place)
     for line in outcome.found.words:
         out.print(line)
@@ -61,6 +65,13 @@ def run(arguments: list[str]) -> None:
     out.print(f"wrote {options.out} (measure it with: {shlex.join(measure)})", soft_wrap=True)
     if outcome.found.failed.any():
         raise NotFinite("a fit is no longer finite, so its model is not used: lower --scalars.feedback-learning-rate")
+
+
+def _person(judge_by: str) -> Any:
+    """Return a context with the function by which a person judges, on a page; None where none does."""
+    if judge_by != PERSON:
+        return nullcontext()
+    return page_module("films").film_page(0, lambda address: out.print(f"open {address}", soft_wrap=True))
 
 
 def _named_again(options: Adapt, task: Task, code: str | None) -> list[str]:

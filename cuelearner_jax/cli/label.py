@@ -10,6 +10,7 @@ import webbrowser
 from argparse import Namespace
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -115,7 +116,7 @@ def run(arguments: list[str]) -> None:
         UserError: bad input, a port or folder in use, or a folder with labels of another session.
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
-    server = _server()
+    server = page_module("server")
     ahead = look_ahead_of(arguments, "label", Label)
     task = recorded_or_task(ahead)
     named = ahead.words[1] if len(ahead.words) > 1 else None
@@ -297,10 +298,10 @@ def _part(kind: type, values: Any) -> Any:
     return kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
 
 
-def _server() -> Any:
-    """Import the module that serves a page. Raises UserError if its packages are not installed."""
+def page_module(name: str) -> Any:
+    """Import a module of `labelling` that serves a page. Raises UserError if its packages are not installed."""
     try:
-        from cuelearner_jax.labelling import server
+        module = import_module(f"cuelearner_jax.labelling.{name}")
     except ImportError as error:
         raise UserError(
             f"the page needs packages that are not installed ({error.name}): run `make setup`, or "
@@ -308,7 +309,7 @@ def _server() -> Any:
         ) from error
     # Set before JAX starts: each thread's computations run in that thread, at its priority (`learner`).
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    return server
+    return module
 
 
 def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, commands: Any) -> Any:

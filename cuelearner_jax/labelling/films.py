@@ -95,7 +95,7 @@ def film_page(port: int, tell: Callable[[str], None]) -> Iterator[Callable[[Path
         UserError: the port is taken.
         Interrupted: Ctrl-C while an answer is waited for.
     """
-    with bind(port) as listening, interruptible("the answer of the moment") as stopping:
+    with bind(port) as listening:
         token, desk = secrets.token_urlsafe(18), _Desk()
         app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         app.add_route("/", lambda request: desk.page())
@@ -110,10 +110,11 @@ def film_page(port: int, tell: Callable[[str], None]) -> Iterator[Callable[[Path
 
         def ask(left: Path, right: Path) -> int:
             desk.pair = Pair(next(numbers), left, right)
-            while not stopping.is_set():
-                with contextlib.suppress(queue.Empty):
-                    return desk.answers.get(timeout=0.2)
-            raise Interrupted("stopped before it was decided: nothing is written")
+            with interruptible("the answer of the moment") as stopping:
+                while not stopping.is_set():
+                    with contextlib.suppress(queue.Empty):
+                        return desk.answers.get(timeout=0.2)
+                raise Interrupted("stopped before it was decided: nothing is written")
 
         try:
             yield ask

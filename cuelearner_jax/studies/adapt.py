@@ -22,6 +22,7 @@ from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.by_reading import ReadingAdaptation
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, product, side_by_side
+from cuelearner_jax.adaptation.person import Person, Prefer
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.devices import release_programs
@@ -79,6 +80,7 @@ class Subject(NamedTuple):
     rows: Label | None = None  # labels (labels, ...) in place of questions; None: ask
     changes: Any = None  # what may have changed, as `changes.family_of` takes it; None: what the world declares
     changes_named: str = "code"  # package.module:NAME of `changes`
+    prefer: Prefer | None = None  # who judges, where a person does
 
 
 def subject_of(
@@ -133,8 +135,8 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     labels_from: Path | None = None
     """Label file to use instead of asking the teacher."""
     judge_by: str = "reward"
-    """What decides whether the correction is used: a metric on tuning episodes, or held-out answers (labels). A model
-    that is not shown to make the policy better is not used."""
+    """What decides whether the correction is used: a metric on tuning episodes, held-out answers (labels), or you, by
+    films of both policies side by side (person). A model that is not shown to make the policy better is not used."""
     judge_episodes: int = 50
     """Largest number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
     judge_bounds: tuple[float, ...] = ()
@@ -231,6 +233,8 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             by_model.check_amounts(actions_of(env), bounds, scalars)
         lanes = product(1, seeds, grid.labels, bounds, one_each=not shared)
         how = self._judging(subject)
+        if how.by == judging.PERSON and lanes.number > 1:
+            raise UserError("a person judges one policy: give one seed, one number of labels and one bound")
         rows, teacher = None, subject.teacher
         if file is not None:
             slots = label_slots(int(lanes.budget.max()), sizes)
@@ -299,18 +303,25 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
             given = " ".join(f"{share:g}" for share in shares)
             raise UserError(f"judge_bounds is {given}: give shares of the bound above 0 and below 1, each once")
-        if shares and by == judging.LABELS:
+        if shares and by in (judging.LABELS, judging.PERSON):
             raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
-        known = [*judging.metrics_of(subject.env), judging.LABELS]
+        known = [*judging.metrics_of(subject.env), judging.LABELS, judging.PERSON]
         if by not in known:
             name = task.name if task else "this environment"
             raise UserError(f"judge_by is {by!r}, which is not a metric of {name}{suggestion(by, known)}")
-        steps, tuned = judging.STEPS, None
+        steps, tuned, person = judging.STEPS, None, None
         if task and task.longest:
             steps = task.longest(self.task)
         if by != judging.LABELS:
             tuned = task.environment(self.task, judging.SPLIT) if task else subject.env
-        return Judging(tuned, self.judge_episodes, steps, by, shares)
+        if by == judging.PERSON:
+            if task is None or subject.prefer is None:
+                raise UserError("a person compares films: give a world of cl.make or cl.from_gymnasium, and judge_by=")
+            pictures = task.pictures("judge by a metric")
+            if pictures.check is not None:
+                pictures.check(tuned)
+            person = Person(subject.prefer, pictures)
+        return Judging(tuned, self.judge_episodes, steps, by, person, shares)
 
 
 class AdaptedStudy(NamedTuple):
