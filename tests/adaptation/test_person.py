@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from gymnasium_worlds import Adder
-from PIL import Image
+from PIL import Image, ImageSequence
 
 import cuelearner_jax as cl
 
@@ -23,28 +23,28 @@ def fast(obs):
     return np.ones((len(obs), 1), np.float32)
 
 
-def frames(file):
-    return Image.open(file).n_frames
+def seconds(file):
+    return sum(frame.info["duration"] for frame in ImageSequence.Iterator(Image.open(file)))
 
 
 def adapted(world, judge_by, **more):
     return cl.adapt(slow, world, fast, labels=20, judge_by=judge_by, **more)
 
 
-def test_eight_clear_preferences_decide_and_films_change_sides(world):
+def test_seven_clear_preferences_decide_and_films_change_sides(world):
     sides = []
 
     def sooner(left, right):
         """Adder ends as soon as the sum is large enough, so the better film is the shorter one."""
-        sides.append(np.sign(frames(left) - frames(right)))
+        sides.append(np.sign(seconds(left) - seconds(right)))
         return int(sides[-1])
 
     better = adapted(world, sooner)
     assert better.used
     assert better.judged == ("person", 0.0, 1.0)
     assert better.rewarded_steps == 0
-    # mean over the stakes of (1 + stake)**n reaches 20 with the eighth
-    assert len(sides) == 8
+    # mean over the stakes of (1 + stake)**n reaches 20 with the seventh
+    assert len(sides) == 7
     assert set(sides) == {-1, 1}
     assert "a person preferred the policy as it was in 0%, the corrected in 100%" in better.words[-1]
 
