@@ -64,8 +64,8 @@ class Evidence(struct.PyTreeNode):
     labels: Label  # (lanes, slots, ...)
     bound: Float[Array, " lanes"]
     corrects: Bool[Array, " lanes"]  # True where the answers show a change
-    evidence: Float[Array, " lanes"]  # `Result.evidence`
-    used: Bool[Array, " lanes"]  # `Result.used`: the judgement where labels judge
+    evidence: Any  # (lanes,) `Result.evidence`, as NumPy's
+    used: Any  # (lanes,) `Result.used`, the judgement where labels judge
     failed: Bool[Array, " lanes"]
 
 
@@ -101,7 +101,7 @@ def adapt(
         correction=_stacked([one.policy.correction for one in results]),
         labels=_padded(rows) if labels is None else labels,
         bound=jnp.asarray(space.from_unit(lanes.bound_deg)),
-        corrects=np.array([one.changed for one in results]),
+        corrects=jnp.asarray(np.array([one.changed for one in results])),
         evidence=np.array([one.evidence for one in results]),
         used=np.array([one.used for one in results]),
         failed=jnp.zeros(lanes.number, bool),

@@ -172,7 +172,6 @@ def adapt(
     rows = rows_of(labels) if isinstance(labels, tuple) else None
     if teacher is not None:
         teacher = teacher_of_world(teacher, space)
-        user_code.answers_in("teacher", teacher, env)
     elif file is None and rows is None:
         raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
     scalars, eps_deg = scalars and normalize_options(scalars, "scalars"), eps_deg and float(eps_deg)

@@ -16,7 +16,6 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import by_model, by_reading, changes, judging, serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.by_reading import ReadingAdaptation
@@ -95,7 +94,6 @@ def subject_of(
         if base != BaseLanes(policy=source.default_policy):
             raise UserError(f"--base.… chooses among the lanes of a folder, but {named} is not a folder: leave it out")
         policy = policy_of(policy, actions_of(env))
-        user_code.acts_in(named or "policy", policy, env)
         return Subject(env, Common(policy), origin={"code": named}, task=source.task)
     source.check(base.policy, world, base.guidance)
     if trained.POLICIES[base.policy].taught:

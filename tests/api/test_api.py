@@ -150,7 +150,6 @@ WRONG = [
     (lambda: correct(changed(obs=np.ma.masked_array(SEEN, SEEN > 0))), "masked"),
     (lambda: correct(own_labels(), scalars=WILD), "the fit of the feedback model diverged"),
     (lambda: cl.adapt(OF_BILLIARDS, WORLD, TEACHER), "this world has 2: give the world"),
-    (lambda: cl.adapt(policy, WORLD, cl.teacher_of(OF_BILLIARDS)), "teacher"),
     (lambda: cl.adapt(policy, WORLD, TEACHER, scalars=Scalars(eps_deg=float("nan"))), "scalars.eps_deg is nan"),
     (lambda: cl.adapt(policy, WORLD, TEACHER, labels=5), "labels is 5: give at least 20"),
     (lambda: cl.adapt(policy, WORLD, TEACHER, guidance="none"), "asks no questions"),

@@ -285,7 +285,7 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
 def test_the_traceback_of_a_policy_that_fails_stands_below_the_line(tmp_path, capsys):
     assert main(["adapt", "own_turned:failing", *TASK, "--out", str(tmp_path / "new")]) == 2
     first, *below = capsys.readouterr().err.splitlines()
-    assert first == "error: own_turned:failing: policy failing raised RuntimeError: out of ink: mend it first"
+    assert first == "error: policy failing raised RuntimeError: out of ink: mend it first"
     assert any("own_turned.py" in line for line in below)
     assert below[-1] == "RuntimeError: out of ink"
 
