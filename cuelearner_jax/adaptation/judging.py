@@ -132,9 +132,10 @@ class Judge:
                 if test.decided[0]:
                     break
         each = np.array([answers], float).reshape(1, -1)
-        shares = [np.mean(each == which, -1) if answers else np.zeros(1) for which in (-1, 1)]
+        before, after = (np.mean(each == which, -1) if answers else np.zeros(1) for which in (-1, 1))
         difference = mean_interval(each).T if answers else np.full((1, 3), np.nan)
-        return Judgement(PERSON, *shares, usable & test.better, bounds_of(self.of, block), difference, np.zeros(1, int))
+        used, steps = usable & test.better, np.zeros(1, int)
+        return Judgement(PERSON, before, after, used, bounds_of(self.of, block), difference, steps)
 
     def _pair(self, block: Any, number: int) -> tuple[tuple[dict[str, np.ndarray], ...], np.ndarray]:
         """Play episodes by base and adapted policy; return the values of each (lanes, episodes), and the steps."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ class Person(NamedTuple):
 
 def preferences(
     person: Person, env: Environment, policies: tuple[Policy, Policy], key: PRNGKeyArray, steps: int
-) -> Iterator[int]:
+) -> Generator[int, None, None]:
     """Yield, for one start after another, 1 where the second policy is preferred, -1 where the first is, else 0.
 
     Films change sides by chance. `steps`: of an episode, at most. Raises UserError for another answer.
