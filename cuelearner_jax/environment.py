@@ -60,15 +60,15 @@ class Quantity(NamedTuple):
 
 def checked_quantities(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
     """Return the slices of an observation. Raises UserError for an unknown unit or kind, which would have no effect."""
-    checked = tuple(quantities)
-    for name, _, unit, _, kind, *_ in checked:
+    slices = tuple(quantities)
+    for name, _, unit, _, kind, *_ in slices:
         if not UNIT.fullmatch(unit):
             raise UserError(
                 f"the unit of {name!r} is {unit!r}: give a symbol, as m, rad or m/s, or 1 (known: {', '.join(SYMBOLS)})"
             )
         if kind not in KINDS:
             raise UserError(f"the kind of {name!r} is {kind!r}: give {', '.join(KINDS[1:])}, or none")
-    return checked
+    return slices
 
 
 # What `spaces.DIRECTIONS` are, where an environment does not say more by its own `action`.

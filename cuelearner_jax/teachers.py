@@ -130,11 +130,11 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
 def digest(folder: Path) -> str:
     """Return a short hash of a teacher's files. Raises UserError if there is no teacher."""
     read_about(folder)
-    hashed = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for file in [folder / ABOUT, *sorted((folder / "network").rglob("*"))]:
         if file.is_file():
-            hashed.update(f"{file.relative_to(folder).as_posix()}\n".encode() + file.read_bytes())
-    return hashed.hexdigest()[:12]
+            sha256.update(f"{file.relative_to(folder).as_posix()}\n".encode() + file.read_bytes())
+    return sha256.hexdigest()[:12]
 
 
 def read_about(folder: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -28,6 +29,7 @@ from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.reading import Read, Reading, Result, Walk
 from cuelearner_jax.reading.correction import Correction
 from cuelearner_jax.reading.families import Family
+from cuelearner_jax.reading.fitting import pick
 from cuelearner_jax.reading.policy import unread
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.types import Label, Teacher
@@ -140,7 +142,8 @@ def adapt(
         evidence, used = (np.array([getattr(one, name) for one in results]) for name in ("evidence", "used"))
         judged = Judgement(LABELS, nothing, evidence, used, lanes.bound_deg, unknown, nothing.astype(int))
     nothing = of.unread(None, block.correction).correction
-    block = block.replace(correction=_chosen(judged.used, block.correction, nothing))
+    keep = jax.vmap(lambda used, own: jax.tree.map(partial(jnp.where, used), own, nothing))
+    block = block.replace(correction=keep(jnp.asarray(judged.used), block.correction))
     return AdaptationResult(of, lanes, block, judged, judge.curve, tuple(results))
 
 
@@ -161,7 +164,7 @@ def _asked(
         policies.append(policy)
         states, obs = walk.situations(k_where, policy, CHOICE * size)
         index, action = reading.questions(np.asarray(obs), count, k_ask)
-        states, obs = _rows((states, obs), index)
+        states, obs = pick((states, obs), index)
         answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
         rows.append((np.asarray(obs), action, answer))
         there = np.isfinite(answer).any(-1)
@@ -169,18 +172,6 @@ def _asked(
     obs, action, answer = (np.concatenate(column) for column in zip(*rows, strict=True))
     valid = np.asarray(np.isfinite(answer).any(-1))
     return Label(obs, action, np.where(valid[:, None], answer, 0), valid), policies  # pyright: ignore[reportArgumentType]
-
-
-@jax.jit
-def _chosen(keep: Array, own: Correction, nothing: Correction) -> Correction:
-    """Return each lane's correction, or nothing where it is not kept."""
-    one = lambda own, none: jnp.where(keep.reshape(-1, *[1] * none.ndim), own, none)  # noqa: E731
-    return jax.tree.map(one, own, nothing)
-
-
-@jax.jit
-def _rows(tree: Any, index: Array) -> Any:
-    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _stacked(corrections: list[Correction]) -> Correction:

@@ -42,9 +42,8 @@ class Joined(nn.Module):
         obs, action, kernel, bias = (jnp.asarray(x, self.dtype) for x in (obs, action, kernel, bias))
         from_obs, from_action = obs @ kernel[: obs.shape[-1]], action @ kernel[obs.shape[-1] :]
         rank = max(from_obs.ndim, from_action.ndim)
-        parts = (bias, from_obs, from_action)
-        bias, from_obs, from_action = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in parts)
-        return (from_obs + bias) + from_action
+        widen = lambda x: jnp.expand_dims(x, tuple(range(rank - x.ndim)))  # noqa: E731
+        return (widen(from_obs) + widen(bias)) + widen(from_action)
 
 
 class MLP(nn.Module):

@@ -294,15 +294,15 @@ def stored_step(
     obs: Float[Array, " memory"], action: Float[Array, " action"], step: Step, bootstraps: bool
 ) -> StoredStep:
     """Return what replay stores of one step from the remembered observation `obs`."""
-    columns = slice(None) if bootstraps else slice(0)
+    entries = slice(None) if bootstraps else slice(0)
     ended: Bool[Array, ""] = step.terminated | step.truncated
     return StoredStep(
         obs=obs,
         action=action,
         reward=step.reward,
-        discount=1.0 - step.terminated[None].astype(jnp.float32)[columns],
-        ended=ended[None].astype(jnp.float32)[columns],
-        aftermath=step.aftermath[columns],
+        discount=1.0 - step.terminated[None].astype(jnp.float32)[entries],
+        ended=ended[None].astype(jnp.float32)[entries],
+        aftermath=step.aftermath[entries],
     )
 
 

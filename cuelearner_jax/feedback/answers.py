@@ -73,14 +73,14 @@ def _taught(space: Space, teacher: Any, value: Any, action: Float[Array, " actio
     """Return a teacher's action; NaN where it is not an action. Raises UserError for another shape."""
     wanted = f"give an action of shape {action.shape}, of real numbers"
     try:
-        taught = jnp.asarray(value)
+        array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise UserError(f"teacher {type(teacher).__name__} gave {format_value(value)}: {wanted}") from error
-    if taught.shape != action.shape:
-        raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {taught.shape}: {wanted}")
-    if not jnp.issubdtype(taught.dtype, jnp.floating) and not jnp.issubdtype(taught.dtype, jnp.integer):
-        raise UserError(f"teacher {type(teacher).__name__} gave {taught.dtype} numbers: {wanted}")
-    return space.only_actions(taught.astype(action.dtype))
+    if array.shape != action.shape:
+        raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {array.shape}: {wanted}")
+    if not jnp.issubdtype(array.dtype, jnp.floating) and not jnp.issubdtype(array.dtype, jnp.integer):
+        raise UserError(f"teacher {type(teacher).__name__} gave {array.dtype} numbers: {wanted}")
+    return space.only_actions(array.astype(action.dtype))
 
 
 def relative_feedback(

@@ -48,7 +48,7 @@ _NEVER = -30.0  # logarithm of an amplitude that is no process
 
 
 class Hypothesis(struct.PyTreeNode):
-    """What one fit hands to the next."""
+    """Parts, estimate and hyperparameters of one hypothesis, from which the next fit starts."""
 
     parts: Parts
     change: Change
@@ -130,9 +130,9 @@ class Reader:
         """Return the units of the linear model, and the labels about which the policy answers steadily."""
         frame = linear.frame_of(self.family, labels, self.step)
         change = linear.no_change(self.space, self.family, labels.obs.shape[-1])
-        near = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
-        actions = self._ask(near)
-        steady = ~linear.jumps(self.space, self.family, frame, change, near, actions, self.eps).any(-1)
+        probe_obs = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
+        actions = self._ask(probe_obs)
+        steady = ~linear.jumps(self.space, self.family, frame, change, probe_obs, actions, self.eps).any(-1)
         if not self.family:
             mixed = linear.influence(self.space, frame, labels, actions)
             frame = linear.frame_of((), labels, None, mixed)
@@ -144,14 +144,12 @@ class Reader:
         Slopes lead to the nearest optimum alone, and near its goal a policy may turn by any angle. So shifts of one
         entry after another are tried on the policy itself.
         """
-        nothing = linear.no_change(self.space, self.family, labels.obs.shape[-1])
-        moves, theta = _moves(self.family, frame), nothing.theta
+        change, worth = linear.no_change(self.space, self.family, labels.obs.shape[-1]), jnp.zeros(())
         for _ in range(ENTRIES):
-            tried = _each(nothing, theta, moves)
-            theta = _taken(tried, self._worth(labels, tried))
-        change = nothing.replace(theta=theta)
-        worth = self._worth(labels, _and(plain.change, change))
-        return plain.replace(change=_better(plain.change, change, worth))
+            changes = _moves(self.family, frame, change)
+            change, worth = _best(changes, self._worth(labels, changes))
+        own = self._worth(labels, plain.change)
+        return plain.replace(change=_replace_worse(plain.change, own, change, worth))
 
     def _worth(self, labels: Labels, changes: Change) -> Float[Array, " k"]:
         """Return the log likelihood of labels by each of stacked estimates, without the process."""
@@ -170,12 +168,12 @@ class Reader:
 
     def _data(self, frame: Frame, labels: Labels, change: Change) -> Data:
         """Return the linear models at stacked estimates."""
-        near = _probes(self.family, frame, change, labels.obs)
-        return _data(self.space, self.family, frame, change, labels, near, self._ask(near), self.eps)
+        probe_obs = _probes(self.family, frame, change, labels.obs)
+        return _data(self.space, self.family, frame, change, labels, probe_obs, self._ask(probe_obs), self.eps)
 
     def act(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return corrected actions by one fit."""
-        before = _undone(self.family, fitted.hypothesis.change, obs)
+        before = linear.undone(self.family, fitted.hypothesis.change, obs)
         actions = self._ask(jnp.stack([obs, before]))
         return _act(self.space, self.family, fitted, obs, before, actions, self.eps, self.priors)
 
@@ -187,9 +185,9 @@ class Reader:
         Changes are in units of `SCALE` eps; log p [nats] is of the answer about each cue, 0 where nothing was said.
         """
         frame, change = fitted.frame, fitted.hypothesis.change
-        near = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
+        probe_obs = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
         own = self.act(fitted, labels.obs)
-        rest = (labels, near, self._ask(near), own, self.eps, self.priors)
+        rest = (labels, probe_obs, self._ask(probe_obs), own, self.eps, self.priors)
         return _predicted(self.space, self.family, fitted, *rest)
 
     def ratio(self, fits: Fit, labels: Labels) -> Float[Array, ""]:
@@ -234,9 +232,9 @@ def best_of(fitted: Fit) -> Array:
 
 
 @jax.jit
-def pick(fitted: Fit, number: Any) -> Fit:
-    """Return one of stacked fits."""
-    return jax.tree.map(lambda leaf: leaf[number], fitted)
+def pick(stacked: Any, number: Any) -> Any:
+    """Return the part of a number, or of several, of a stacked tree such as a `Fit`."""
+    return jax.tree.map(lambda leaf: leaf[number], stacked)
 
 
 @partial(jax.jit, static_argnames=("space", "family", "priors"))
@@ -252,54 +250,44 @@ def _predicted(
     family: Family,
     fitted: Fit,
     labels: Labels,
-    near: Array,
+    probe_obs: Array,
     actions: Array,
     own: Array,
     eps: Any,
     priors: Priors,
 ) -> tuple[Array, Array, Array]:
-    rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, near, actions, eps)
-    parts, fit = fitted.hypothesis.parts, fitted.posterior
-    _, variance = posterior.predict(fit, fitted.data, parts, rows.features, rows.inputs, priors)
+    rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, probe_obs, actions, eps)
+    parts, hyper = fitted.hypothesis.parts, fitted.posterior.hyper
+    _, variance = posterior.predict(fitted.posterior, fitted.data, parts, rows.features, rows.inputs, priors)
     mean = space.log(labels.action, own) / (SCALE * eps)
-    habits = posterior.habits(fit.hyper, 1 / SCALE, priors)
+    habits = posterior.habits(hyper, 1 / SCALE, priors)
     return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, habits)
 
 
 @partial(jax.jit, static_argnames="family")
-def _moves(family: Family, frame: Frame) -> Float[Array, "k unknowns"]:
-    """Return no shift, and shifts of each unknown alone: of a family, or of the entries that matter most."""
+def _moves(family: Family, frame: Frame, change: Change) -> Change:
+    """Return an estimate, and it with another shift of one unknown: of a family, or of the entries that matter most."""
     size = len(frame.step)
     entries = jnp.arange(size) if family else frame.mixed
     each = jnp.eye(size)[entries] * frame.step[None]
     several = (jnp.array(TRIED)[:, None, None] * each[None]).reshape(-1, size)
-    return jnp.concatenate([jnp.zeros((1, size)), several])
+    moves = jnp.concatenate([jnp.zeros((1, size)), several])
+    return jax.vmap(lambda move: change.replace(theta=change.theta + move))(moves)
 
 
 @jax.jit
-def _each(nothing: Change, theta: Array, moves: Array) -> Change:
-    """Return the estimates that are tried, stacked."""
-    return jax.vmap(lambda move: nothing.replace(theta=theta + move))(moves)
+def _best(changes: Change, worth: Array) -> tuple[Change, Array]:
+    """Return the best of stacked estimates, and its worth. The best of many must beat the first and chance."""
+    best = jnp.argmax(worth.at[1:].add(-WORTH - math.log(len(worth))))
+    return pick(changes, best), worth[best]
 
 
 @jax.jit
-def _taken(tried: Change, worth: Array) -> Array:
-    """Return the unknowns of the best estimate; the first moves nothing."""
-    # the best of many must be better than the best of chance
-    return tried.theta[jnp.argmax(worth.at[1:].add(-WORTH - math.log(len(worth))))]
-
-
-@jax.jit
-def _and(changes: Change, change: Change) -> Change:
-    return jax.tree.map(lambda own, other: jnp.concatenate([own, other[None]]), changes, change)
-
-
-@jax.jit
-def _better(changes: Change, change: Change, worth: Array) -> Change:
-    """Return estimates of all hypotheses, in which another one, whose worth stands last, replaces what is worse."""
-    better = (worth[-1] > worth[:-1] + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
-    chosen = lambda own, other: jnp.where(better.reshape(-1, *[1] * other.ndim), other[None], own)  # noqa: E731
-    return jax.tree.map(chosen, changes, change)
+def _replace_worse(changes: Change, own: Array, change: Change, worth: Array) -> Change:
+    """Return the estimates of all hypotheses with their own worth, in which another estimate replaces worse ones."""
+    better = (worth > own + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
+    chosen = jax.vmap(jnp.where, (0, None, 0))
+    return jax.tree.map(lambda own, other: chosen(better, other, own), changes, change)
 
 
 @partial(jax.jit, static_argnames="family")
@@ -323,21 +311,23 @@ def _worth(
 
 
 @partial(jax.jit, static_argnames="family")
-def _undone(family: Family, change: Change, obs: Array) -> Array:
-    return linear.undone(family, change, obs)
-
-
-@partial(jax.jit, static_argnames="family")
 def _probes(family: Family, frame: Frame, change: Change, obs: Array) -> Array:
     return jax.vmap(lambda one: linear.probes(family, frame, one, obs))(change)
 
 
 @partial(jax.jit, static_argnames=("space", "family"))
 def _data(
-    space: Space, family: Family, frame: Frame, change: Change, labels: Labels, near: Array, actions: Array, eps: Array
+    space: Space,
+    family: Family,
+    frame: Frame,
+    change: Change,
+    labels: Labels,
+    probe_obs: Array,
+    actions: Array,
+    eps: Array,
 ) -> Data:
-    one = lambda change, near, actions: linear.data(space, family, frame, change, labels, near, actions, eps)  # noqa: E731
-    return jax.vmap(one)(change, near, actions)
+    one = lambda change, probe_obs, actions: linear.data(space, family, frame, change, labels, probe_obs, actions, eps)  # noqa: E731
+    return jax.vmap(one)(change, probe_obs, actions)
 
 
 @partial(jax.jit, static_argnames="priors")

@@ -84,6 +84,7 @@ def terms(cues: int, basis: int) -> Int[np.ndarray, "2 own"]:
     return np.stack(np.nonzero((basis <= 1 + MIXED) | (term == 0) | (term == 1 + cue)))
 
 
+@partial(jax.jit, static_argnums=0)
 def undone(family: Family, change: Change, obs: Float[Array, "n obs"]) -> Float[Array, "n obs"]:
     """Return observations as they would be without the change."""
     if family:
@@ -150,7 +151,7 @@ def jumps(
     family: Family,
     frame: Frame,
     change: Change,
-    asked: Float[Array, "k n obs"],
+    probe_obs: Float[Array, "k n obs"],
     actions: Float[Array, "k n action"],
     eps: Float[Array, ""] | float,
 ) -> Bool[Array, "n unknowns"]:
@@ -158,19 +159,19 @@ def jumps(
 
     A policy that takes the best of far-apart actions does so near ties, where a slope says nothing.
     """
-    near, far = _sides(space, family, frame, change, asked, actions)
+    near, far = _sides(space, family, frame, change, probe_obs, actions)
     largest = jnp.maximum(jnp.abs(near), jnp.abs(far)) / (SCALE * eps)
     bent = jnp.abs(near + far) > 0.5 * jnp.abs(near - far)
     return ((largest > JUMP) & bent).any(-1).T
 
 
 def _sides(
-    space: Space, family: Family, frame: Frame, change: Change, probed: Array, actions: Array
+    space: Space, family: Family, frame: Frame, change: Change, probe_obs: Array, actions: Array
 ) -> tuple[Float[Array, "u n cues"], Float[Array, "u n cues"]]:
     """Return the changes from a policy's actions at an estimate to those at both sides of each unknown."""
     size, steps = len(frame.step), jnp.diag(frame.step)
     sides = jnp.concatenate([change.theta[None], change.theta[None] - steps, change.theta[None] + steps])
-    whole = jax.vmap(partial(meant, family))(sides, probed[1:], actions[1:])
+    whole = jax.vmap(partial(meant, family))(sides, probe_obs[1:], actions[1:])
     return space.log(whole[:1], whole[1 : 1 + size]), space.log(whole[:1], whole[1 + size :])
 
 
@@ -189,7 +190,7 @@ def data(
     frame: Frame,
     change: Change,
     labels: Labels,
-    near: Float[Array, "k n obs"],
+    probe_obs: Float[Array, "k n obs"],
     actions: Float[Array, "k n action"],
     eps: Float[Array, ""],
 ) -> Data:
@@ -197,16 +198,16 @@ def data(
 
     Args:
         space, family, frame, change, labels: the model; `change` is the estimate.
-        near: `probes` of the labels' observations.
+        probe_obs: `probes` of the labels' observations.
         actions: what the policy does there.
         eps: strength of an answer, in the unit of `space.log`.
     """
     scale, size = SCALE * eps, len(frame.step)
     steps, theta = jnp.diag(frame.step), change.theta[None]
     sides = jnp.concatenate([theta, theta - steps, theta + steps])
-    whole = jax.vmap(partial(meant, family))(sides, near[1:], actions[1:])
+    whole = jax.vmap(partial(meant, family))(sides, probe_obs[1:], actions[1:])
     base, slope = whole[0], jnp.moveaxis(space.log(whole[1 : 1 + size], whole[1 + size :]), 0, -1) / (2 * scale)
-    slope = jnp.where(jumps(space, family, frame, change, near, actions, eps)[:, None], 0.0, slope)
+    slope = jnp.where(jumps(space, family, frame, change, probe_obs, actions, eps)[:, None], 0.0, slope)
     x = features(space, frame, slope, labels.obs, base)
     cut = size + len(frame.mixed) ** 2
     offset = space.log(labels.action, base) / scale - x[:, :, :cut] @ weights_of(frame, change)[:cut]
@@ -231,6 +232,7 @@ def features(
     return jnp.concatenate([slope, mixed, own], 2)
 
 
+@partial(jax.jit, static_argnums=0)
 def inputs(
     space: Space, frame: Frame, obs: Float[Array, "n obs"], action: Float[Array, "n action"]
 ) -> Float[Array, "n z"]:

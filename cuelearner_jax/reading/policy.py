@@ -35,7 +35,7 @@ class Read(PolicyNode):
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the base's actions, corrected."""
         first = self.base.act(key, states, obs)
-        before = _undone(self.family, self.correction, obs)
+        before = linear.undone(self.family, self.correction.change, obs)
         action = self.base.act(key, states, before)
         return _bounded(self.space, self.family, self.correction, self.bound, obs, before, first, action)
 
@@ -68,11 +68,6 @@ class Read(PolicyNode):
 
 
 # Compiled apart from the base, which may be plain Python.
-@partial(jax.jit, static_argnums=0)
-def _undone(family: Family, correction: Correction, obs: Array) -> Array:
-    return linear.undone(family, correction.change, obs)
-
-
 @partial(jax.jit, static_argnums=(0, 1))
 def _bounded(
     space: Space, family: Family, correction: Correction, bound: Array, obs: Array, *rest: Array

@@ -85,7 +85,7 @@ PRIORS = Priors()
 
 
 class Posterior(struct.PyTreeNode):
-    """What the answers say, ready to predict."""
+    """Normal posterior of the weights and the process, with the factors that predictions need."""
 
     mean: Float[Array, " p"]  # of the weights
     root: Float[Array, "p p"]  # covariance = root @ root.T
@@ -111,6 +111,7 @@ def habits(hyper: Hyper, eps: Float[Array, ""] | float, priors: Priors) -> Habit
     return Habits(jnp.asarray(priors.tau * eps), priors.width * eps * jnp.exp(hyper.width), lapse)
 
 
+@partial(jax.jit, static_argnums=1)
 def lengths(hyper: Hyper, priors: Priors) -> Float[Array, " z"]:
     """Return the length scale of each input of the process."""
     size = len(hyper.lengths)
@@ -118,6 +119,7 @@ def lengths(hyper: Hyper, priors: Priors) -> Float[Array, " z"]:
     return priors.length * size**0.5 * jnp.exp(hyper.lengths + observed * hyper.length)
 
 
+@jax.jit
 def correlation(
     length: Float[Array, " z"], one: Float[Array, "n z"], other: Float[Array, "m z"]
 ) -> Float[Array, "n m"]:
@@ -132,6 +134,7 @@ def amplitudes(hyper: Hyper, priors: Priors) -> Float[Array, " cues"]:
     return priors.amplitude * jnp.exp(hyper.amplitudes + hyper.amplitude)
 
 
+@partial(jax.jit, static_argnums=3)
 def process(
     posterior: Posterior,
     labelled: Float[Array, "n z"],
@@ -160,8 +163,8 @@ def _solve(hyper: Hyper, parts: Parts, data: Data, precision: Array, target: Arr
     logs, hk, back, prior = jnp.zeros(()), None, None, jnp.zeros(residual.shape[1])
     if parts.process:
         prior = amplitudes(hyper, priors)
-        alike = correlation(lengths(hyper, priors), data.inputs, data.inputs)
-        hx, hr, hk, back, logs = each_lane(partial(_whitened, alike))(hx, hr, root, prior)
+        correlations = correlation(lengths(hyper, priors), data.inputs, data.inputs)
+        hx, hr, hk, back, logs = each_lane(partial(_whitened, correlations))(hx, hr, root, prior)
         logs = logs.sum()
     inner = jnp.linalg.cholesky(jnp.eye(len(size)) + jnp.einsum("cnp,cnq->pq", hx, hx))
     solve = partial(jax.scipy.linalg.solve_triangular, inner, lower=True)
@@ -183,11 +186,11 @@ def _solve(hyper: Hyper, parts: Parts, data: Data, precision: Array, target: Arr
 
 
 def _whitened(
-    alike: Array, hx: Array, hr: Array, root: Array, amplitude: Array
+    correlations: Array, hx: Array, hr: Array, root: Array, amplitude: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return one cue's features, residuals and covariance, whitened by process and noise; the last maps to `alpha`."""
     eye = jnp.eye(len(root))
-    half_k = root[:, None] * (amplitude**2 * alike)
+    half_k = root[:, None] * (amplitude**2 * correlations)
     factor = jnp.linalg.cholesky(eye + half_k * root[None])
     inverse = jax.scipy.linalg.solve_triangular(factor, eye, lower=True)
     back = root[:, None] * inverse.T
@@ -274,11 +277,11 @@ def predict(
         return mean, jnp.maximum(((features @ posterior.root) ** 2).sum(-1), 1e-8)
     hyper, amplitude = posterior.hyper, amplitudes(posterior.hyper, priors)
     cross = correlation(lengths(hyper, priors), data.inputs, inputs)  # (n, m)
-    alike = correlation(lengths(hyper, priors), data.inputs, data.inputs)
+    correlations = correlation(lengths(hyper, priors), data.inputs, data.inputs)
 
     def of_cue(x: Array, train: Array, w: Array, a: Array) -> Array:
         root = jnp.sqrt(w)
-        factor = jnp.linalg.cholesky(eye + root[:, None] * (a**2 * alike) * root[None])
+        factor = jnp.linalg.cholesky(eye + root[:, None] * (a**2 * correlations) * root[None])
         half = partial(jax.scipy.linalg.solve_triangular, factor, lower=True)
         hk, hx = half(root[:, None] * a**2 * cross), half(root[:, None] * train)
         return a**2 - (hk**2).sum(0) + (((x - hk.T @ hx) @ posterior.root) ** 2).sum(-1)

@@ -9,10 +9,9 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.reading import linear, posterior
@@ -91,29 +90,16 @@ def describe_fit(
     estimates = _seen(weights[:unknowns], root[:unknowns], effect[:, :unknowns], names, family, step)
     own = slice(len(weights) - linear.terms(*fitted.hypothesis.change.action.shape).shape[1], None)
     estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
-    hyper = fitted.posterior.hyper
-    more = np.asarray(_process(fitted))[valid]
+    hyper, inputs, priors = fitted.posterior.hyper, fitted.data.inputs, posterior.PRIORS
+    more = np.asarray(posterior.process(fitted.posterior, inputs, inputs, priors))[valid]
     depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
     depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
     near = None
     if len(met):
-        alike = np.asarray(_alike(fitted, jnp.asarray(met)))[:, valid]
+        alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(met), inputs[valid])
         near = float((alike.max(1) >= ALIKE_SITUATION).mean())
-    wrong = float(posterior.habits(hyper, 1 / SCALE, posterior.PRIORS).lapse)
+    wrong = float(posterior.habits(hyper, 1 / SCALE, priors).lapse)
     return tuple(estimates), depends, near, wrong
-
-
-@jax.jit
-def _process(fitted: Fit) -> Array:
-    inputs = fitted.data.inputs
-    return posterior.process(fitted.posterior, inputs, inputs, posterior.PRIORS)
-
-
-@jax.jit
-def _alike(fitted: Fit, met: Array) -> Array:
-    """Return the correlation of the process at situations met and at labelled ones."""
-    lengths = posterior.lengths(fitted.posterior.hyper, posterior.PRIORS)
-    return posterior.correlation(lengths, met, fitted.data.inputs)
 
 
 def _names(family: Family, count: int, observation: Sequence[Quantity]) -> list[tuple[str, str]]:

@@ -152,7 +152,7 @@ class Reading:
             return Result(False, False, 0.0, (), 0.0, None, 0.0, self.policy())
         number = int(fitting.best_of(self.fits))
         met = jnp.asarray(self.met)
-        inputs = _inputs(self.space, self.fit.frame, met, self._acts(met)) if len(met) else met
+        inputs = linear.inputs(self.space, self.fit.frame, met, self._acts(met)) if len(met) else met
         rest = (self.space, self.family, self.eps, self.observation, np.asarray(inputs))
         described = describe_fit(self.fit, *rest)
         used = number > 0 and self.evidence >= USED and described[-1] < MOST_WRONG
@@ -177,23 +177,22 @@ class Reading:
 
 def acts_of(policy: Any) -> fitting.Acts:
     """Return a policy's actions as a function that refuses those that are none. Plain Python is not compiled in."""
-    name = policy_name(policy)
-    run = policy.act if is_python(policy) else partial(_act, policy)
+    name, run = policy_name(policy), run_of(policy)
 
     def acts(obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        actions = run(jax.random.key(0), None, jnp.asarray(obs)) if is_python(policy) else run(obs)
-        actions = jnp.asarray(actions)
+        actions = jnp.asarray(run(jax.random.key(0), None, jnp.asarray(obs)))
         user_code.check_actions(np.isfinite(np.asarray(actions)).all(), name)
         return actions
 
     return acts
 
 
-def is_python(policy: Any) -> bool:
-    """Return whether plain Python acts. Such a policy may call JAX itself, and would deadlock if compiled in."""
-    while (base := getattr(policy, "base", None)) is not None:
-        policy = base
-    return bool(getattr(policy, "on_host", False))
+def run_of(policy: Any) -> Any:
+    """Return a policy's `act`, compiled unless plain Python acts: that may call JAX itself, and would deadlock."""
+    innermost = policy
+    while (base := getattr(innermost, "base", None)) is not None:
+        innermost = base
+    return policy.act if getattr(innermost, "on_host", False) else partial(_act, policy)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -202,14 +201,9 @@ def _near(space: Space, key: Any, actions: Array, spread: Array) -> Array:
     return space.exp(actions, spread * jax.random.normal(key, spread.shape))
 
 
-@partial(jax.jit, static_argnums=0)
-def _inputs(space: Space, frame: linear.Frame, obs: Array, actions: Array) -> Array:
-    return linear.inputs(space, frame, obs, actions)
-
-
 @jax.jit
-def _act(policy: Any, obs: Array) -> Array:
-    return policy.act(jax.random.key(0), None, obs)
+def _act(policy: Any, key: PRNGKeyArray, states: Any, obs: Array) -> Array:
+    return policy.act(key, states, obs)
 
 
 def _padded(rows: Sequence[np.ndarray], slots: int) -> Labels:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cuelearner_jax.reading import linear
-from cuelearner_jax.reading.families import Family, unknowns_of
+from cuelearner_jax.reading.families import Family, undo_observation, unknowns_of
 from cuelearner_jax.reading.fitting import Acts
 from cuelearner_jax.spaces import Space
 
@@ -46,8 +46,7 @@ def steps_of(
 
 @partial(jax.jit, static_argnames="family")
 def _undone(family: Family, thetas: Array, obs: Array) -> Array:
-    nothing = linear.Change(thetas[0], jnp.zeros((0, 0)), obs[0], jnp.zeros((0, 0)))
-    return jax.vmap(lambda theta: linear.undone(family, nothing.replace(theta=theta), obs))(thetas)
+    return jax.vmap(lambda theta: jax.vmap(partial(undo_observation, family, theta))(obs))(thetas)
 
 
 @partial(jax.jit, static_argnames=("space", "family"))

@@ -13,7 +13,7 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.feedback.answers import relative_answer
-from cuelearner_jax.reading.session import is_python
+from cuelearner_jax.reading.session import run_of
 from cuelearner_jax.types import EnvState, Teacher
 
 BEFORE = 12  # steps before the first questions
@@ -41,8 +41,7 @@ class Walk:
         keys = jax.random.split(key, 1 + total)
         if self.states is None or len(self.obs) != envs:
             self.states, self.obs = _start(self.env, jax.random.split(keys[0], envs))
-        act = policy.act if is_python(policy) else partial(_act, policy)
-        met = []
+        act, met = run_of(policy), []
         for left in reversed(range(total)):
             k_act, k_env = jax.random.split(keys[total - left])
             action = act(k_act, self.states, self.obs)
@@ -58,11 +57,6 @@ class Walk:
         """Return the teacher's answers; NaN where it says nothing."""
         keys = jax.random.split(key, len(obs))
         return _answers(self.env, self.teacher, self.scalars, keys, states, obs, actions)
-
-
-@jax.jit
-def _act(policy: Any, key: Any, states: Any, obs: Any) -> Any:
-    return policy.act(key, states, obs)
 
 
 @partial(jax.jit, static_argnums=0)

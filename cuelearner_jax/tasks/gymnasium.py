@@ -85,10 +85,9 @@ class GymnasiumConfig:
                 f"give a name, a size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which "
                 "fills them"
             )
-        meanings = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
+        texts = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
         return checked_quantities(
-            Quantity(name, size, unit, meanings.get(name, ""), kind)
-            for name, size, unit, kind in zip(*rows, strict=True)
+            Quantity(name, size, unit, texts.get(name, ""), kind) for name, size, unit, kind in zip(*rows, strict=True)
         )
 
     @property
@@ -282,17 +281,17 @@ def _limit(env: Any) -> int:
 
 
 def _named(
-    name: str, slices: Sequence[Quantity], own_names: Sequence[Any] | None, units: Mapping[str, str]
+    name: str, slices: Sequence[Quantity], names: Sequence[Any] | None, units: Mapping[str, str]
 ) -> tuple[Quantity, ...]:
     """Return the slices with names and units that the caller, or this package, knows."""
     wanted = sum(quantity.size for quantity in slices)
     try:
-        own = slices if own_names is None else own_names
+        own = slices if names is None else names
         own = [one if isinstance(one, Quantity) else Quantity(*one) for one in own]
         total = sum(quantity.size for quantity in own)
     except TypeError as error:
         raise UserError(
-            f'observation is {format_value(own_names)}: give (name, entries, unit) for each slice, as ("goal", 3, "m") '
+            f'observation is {format_value(names)}: give (name, entries, unit) for each slice, as ("goal", 3, "m") '
             'or cuelearner_jax.environment.Quantity("goal", 3, "m", kind="own")'
         ) from error
     if total != wanted:

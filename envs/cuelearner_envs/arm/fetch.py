@@ -76,7 +76,7 @@ class FetchArm(Arm, kw_only=True):
         return state.true[OBJECT]
 
     def observe(self, state: Played, camera: Camera | None = None) -> Float[Array, " obs"]:
-        """Return what is view; `camera`: in place of the own one."""
+        """Return what the camera sees; `camera`: in place of the robot's own."""
         camera, true = self.camera if camera is None else camera, state.true
         view = true.at[GOAL].set(camera.seen(state.goal))
         if not self.has_object:
