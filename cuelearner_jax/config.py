@@ -196,17 +196,6 @@ def fits(value: Any, kind: Any) -> bool:
     return isinstance(value, kind) if isinstance(kind, type) else True
 
 
-def defaults(kind: type) -> dict[str, Any]:
-    """Return the default values of a configuration dataclass's fields, as JSON values."""
-    values = {}
-    for field in dataclasses.fields(kind):
-        if field.init and field.default is not dataclasses.MISSING:
-            values[field.name] = field.default
-        elif field.init and field.default_factory is not dataclasses.MISSING:
-            values[field.name] = field.default_factory()
-    return json.loads(json.dumps(values))
-
-
 def digest(values: dict[str, Any]) -> str:
     """Return a short hash of JSON values: equal configurations have equal hashes."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]

@@ -15,6 +15,11 @@ def one_line(text: str) -> str:
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in text)
 
 
+def first_line(error: object) -> str:
+    """Return the first line of an error's message, cut to 200 characters; empty for an error without words."""
+    return (str(error).splitlines() or [""])[0][:200]
+
+
 class UserError(Exception):
     """Bad input: one line that says what is wrong and what to do, for exit status 2 without a traceback."""
 
@@ -53,8 +58,8 @@ def machine_message(error: BaseException, resumes: bool) -> str | None:
         or errno.ENOMEM in numbers
         or re.search("RESOURCE_EXHAUSTED|Out of memory", words)
     ):
-        why = (str(error).splitlines() or [""])[0][:200]
-        return f"not enough memory ({why}): lower the sizes that were given, or the number of seeds at once"
+        lower = "lower the sizes that were given, or the number of seeds at once"
+        return f"not enough memory ({first_line(error)}): {lower}"
     return None
 
 

@@ -22,7 +22,7 @@ from cuelearner_jax.config import from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.storage import formats
-from cuelearner_jax.storage.checkpoint import checkpoints
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.types import Params
 
 ABOUT = "teacher.json"
@@ -87,7 +87,7 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / "network").exists():  # delete an earlier teacher's file, which would be kept
         shutil.rmtree(folder / "network")
-    with checkpoints(folder / "network") as saved:
+    with Checkpoints(folder / "network") as saved:
         saved.save(0, {"params": params})
     formats.write("teacher", folder / ABOUT, about)
 
@@ -98,7 +98,7 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     layers = tuple(sizes["layers"])
     template = jax.eval_shape(lambda key: init_params(layers, env, key), jax.random.key(0))
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
-    with checkpoints(folder / "network", read_only=True) as saved:
+    with Checkpoints(folder / "network", read_only=True) as saved:
         params = saved.restore({"params": halves})["params"]
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), params)
     aim = jnp.asarray(aim_error, jnp.float32), jnp.asarray(habit, jnp.float32)

@@ -10,11 +10,10 @@ import functools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
-import jax
 import numpy as np
 
 from cuelearner_jax.devices import fixed_numerics
-from cuelearner_jax.errors import UserCodeError, UserError
+from cuelearner_jax.errors import UserError
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -52,32 +51,6 @@ def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
             tell()
 
     return wrapped
-
-
-def acts_in(name: str, policy: Any, env: Any) -> None:
-    """Raise UserError for a policy that cannot act in a world, without acting."""
-    _trace(name, "act", env, policy.act)
-
-
-def answers_in(name: str, teacher: Any, env: Any) -> None:
-    """Raise UserError for a teacher that cannot answer in a world, without asking."""
-    _trace(name, "answer", env, lambda key, states, obs: jax.vmap(teacher.best_action)(states, obs))
-
-
-def _trace(name: str, verb: str, env: Any, function: Any) -> None:
-    """Trace a function of a key, states (1, ...) and observations (1, obs) of a world."""
-    key = jax.random.key(0)
-    states, obs = jax.eval_shape(lambda: jax.vmap(env.reset)(key[None]))
-    try:
-        jax.eval_shape(function, key, states, obs)
-    except UserError as error:
-        if name in str(error):
-            raise
-        raise type(error)(f"{name}: {error}") from error.__cause__
-    except Exception as error:
-        where = f"in this world, whose observations have {obs.shape[-1]} entries"
-        why = " ".join(str(error).split())[:200]
-        raise UserCodeError(f"{name} cannot {verb} {where}: {type(error).__name__}: {why}") from error
 
 
 def check_actions(actions: Any, whose: str) -> None:

@@ -202,7 +202,7 @@ def by_labels(bench: Bench) -> Iterator[Row]:
 def by_answers(bench: Bench) -> Iterator[Row]:
     """Read answers, which also decide whether the correction is used."""
     piece, env = bench.piece, bench.env("training")
-    kind, scalars = guidances.find("reading"), by_reading.settling(bench.scalars(), None)
+    kind, scalars = guidances.find("reading"), bench.scalars()
     guidance = kind(by_model.SIZES, spaces_of(env))
     lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (actions_of(env).reach,))
     family = declared_distortions(env)
@@ -263,7 +263,7 @@ def scaled(piece: Piece, scale: Scale) -> Piece | None:
 
 def open_bench(folder: Path, study: Study, piece: Piece, scale: Scale) -> Bench:
     """Open the base agents and world of a piece. Raises UserError if the folder holds no such agents."""
-    source = PolicySource.of_run(folder, registry.find)
+    source = PolicySource.of_folder(folder, registry.find)
     if source.task.name != study.task:
         raise UserError(f"{folder} holds agents of {source.task.name}: give --bases a run of {study.task}")
     source = source.on(piece.robot)

@@ -115,7 +115,7 @@ def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, An
         values, shots = network.teacher.values, evenly_spaced(network.teacher.directions)
         greedy = lambda obs: best_near_peaks(values, values, shots, obs, COARSE, PEAKS)  # noqa: E731
         return own, Scalars(), {0: policy_of(jax.jit(greedy))}
-    source = PolicySource.of_run(folder, registry.find)
+    source = PolicySource.of_folder(folder, registry.find)
     assert source.grid is not None
     env = task.environment(source.config.task)
     policies, seeds = several(source, source.config.task, "agent", None, None, source.grid.seeds, env=env)

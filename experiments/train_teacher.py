@@ -30,7 +30,7 @@ from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.storage import formats
-from cuelearner_jax.storage.checkpoint import checkpoints
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, in_use, prepare_folder
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import Task, shape_of
@@ -107,7 +107,7 @@ def train(task: Task, asked: Asked, command: str) -> float:
 def _learn(env: Any, config: TeacherConfig, out: Path, seed: int) -> tuple[LearnedTeacher, list[list[float]]]:
     """Train all rounds from the folder's newest checkpoint on; return the teacher and `COLUMNS` per stretch."""
     trainer = Trainer(config)
-    with checkpoints(out / TRAINING) as saved, interruptible() as stopping, progress_bars() as bars:
+    with Checkpoints(out / TRAINING) as saved, interruptible() as stopping, progress_bars() as bars:
         state = trainer.init(env, jax.random.key(seed))
         history = np.zeros((-(-config.rounds // ROUNDS_A_STRETCH), len(COLUMNS)), np.float32)
         if saved.latest() is not None:

@@ -118,7 +118,7 @@ SECONDS = recorded()
 SLOW = sum(SECONDS.values()) / 150  # seconds above which `make test-quick` leaves a file out
 
 # Files that train or call the same compiled programs: one process runs them one after the other, and compiles once.
-SWEEPS = ("commands", "export", "failures", "interruption", "pieces", "shards")
+SWEEPS = ("commands", "export", "failures", "interruption", "shards")
 SHARING = {
     **dict.fromkeys(("tests/test_loop.py", "tests/test_asking.py", "tests/test_policies.py"), "loop"),
     **{f"tests/cli/test_{name}.py": "sweeps of billiards" for name in SWEEPS},

@@ -128,13 +128,6 @@ class Expert(struct.PyTreeNode):
         return self.env.best(obs)
 
 
-class Acting:
-    """A policy of a function: (key, states, observations) -> actions."""
-
-    def __init__(self, act):
-        self.act = act
-
-
 @dataclass(frozen=True)
 class WindowConfig:
     """The bandit as a task's configuration."""

@@ -4,7 +4,6 @@ import contextlib
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -43,14 +42,11 @@ def give(session, count, eps_deg=probes.SCALARS.eps_deg):
     return items
 
 
-def settled(session, fits=None):
-    """Wait until nothing is fitted any more and the questions know of it."""
-    for _ in range(20_000):
-        status = session.status()
-        if not status.fitting and (fits is None or status.newest.number >= fits):
-            break
-        time.sleep(0.005)
-    session._ahead.submit(lambda: None).result()
+def settled(session, fits):
+    """Wait until nothing is fitted any more; there are so many fits."""
+    for thread in (session._fits, session._ahead):
+        thread.submit(lambda: None).result()
+    assert session.status().newest.number == fits
     return session.status()
 
 

@@ -57,18 +57,6 @@ def test_ratio_and_standard_error_by_hand():
     np.testing.assert_allclose(variance, [1.5 / 2 / 4, 0], atol=1e-6)
 
 
-def test_the_standard_error_is_that_of_a_bootstrap():
-    rng = np.random.default_rng(0)
-    lengths = rng.integers(1, 11, 400)
-    gain = np.array([rng.binomial(1, 0.1 + 0.05 * (n < 4), n).sum() for n in lengths]).astype(float)
-    own = (400, gain.sum(), lengths.sum(), (gain**2).sum(), (gain * lengths).sum(), (lengths**2).sum())
-    ratio, variance = pace.scores(pace.ArmSums(*(jnp.array([part, 0.0]) for part in map(float, own))))
-    assert float(ratio[0]) == pytest.approx(gain.sum() / lengths.sum(), rel=1e-5)
-    drawn = rng.integers(0, 400, (4000, 400))
-    means = gain[drawn].sum(-1) / lengths[drawn].sum(-1)
-    assert math.sqrt(variance[0] / 400) == pytest.approx(means.std(), rel=0.06)  # of 4,000 draws: 1.1%
-
-
 def test_sums_fade_with_every_episode_of_either_arm():
     found = seen([[1.0]] * 3, [1] * 3, [False, True, True])
     np.testing.assert_allclose(found.episodes, [FADE**2, FADE + 1], rtol=1e-6)

@@ -117,20 +117,6 @@ def test_after_a_question_comes_what_its_action_leads_to():
     np.testing.assert_array_equal(moved.obs, step.obs)
 
 
-def test_an_answer_stands_in_its_row_and_changes_nothing_else():
-    guide = begun()
-    told = record(guide, 3, jnp.array([0.6, 0.8]), jnp.array([-1.0]), True)
-    row = jax.tree.map(lambda leaf: np.asarray(leaf[3]), told.labels)
-    np.testing.assert_array_equal(row.obs, guide.obs)
-    np.testing.assert_array_equal(row.action, np.array([0.6, 0.8], np.float32))
-    assert (row.answer.tolist(), bool(row.valid)) == ([-1.0], True)
-    others = np.arange(2 * ROUND) != 3
-    rest = [jax.tree.map(lambda leaf: np.asarray(leaf)[others], one.labels) for one in (told, guide)]
-    chex.assert_trees_all_equal(*rest)
-    assert int(told.asked) == 4  # questions with the numbers 0 to 3
-    chex.assert_trees_all_equal(told.replace(labels=None, asked=0), guide.replace(labels=None, asked=0))
-
-
 def test_answers_past_the_budget_do_not_count():
     guide = begun(budget=4)
     for position in range(6):

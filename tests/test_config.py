@@ -4,16 +4,13 @@ import dataclasses
 import json
 import math
 
-import jax
 import probes
 import pytest
 
 from cuelearner_jax import config, run_config
-from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import Episodes, Paced
-from cuelearner_jax.config import Scalars, Schedule, Sizes, static
+from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.run_config import RunConfig
 
 
 @pytest.mark.parametrize(
@@ -57,17 +54,6 @@ def test_options_of_a_part_are_checked_under_its_name():
         run_config.check(probes.config(arbiter=Paced(lead=-1.0)))
 
 
-def test_a_part_is_a_tree_of_what_is_traced_and_the_rest_is_its_structure():
-    assert jax.tree.leaves(ddqn.Config(learning_rate=0.5, n_step_weight=0.25, polyak=0.125, target_every=3)) == [
-        0.5,
-        0.25,
-        0.125,
-        3,
-    ]
-    assert hash(static(ddqn.Config(learning_rate=0.5))) == hash(static(ddqn.Config()))
-    assert static(ddqn.Config(n_step=2)) != static(ddqn.Config())
-
-
 def test_a_run_s_options_come_back_from_json_with_their_parts():
     asked = dataclasses.replace(probes.CONFIG, arbiter=Paced(lead=0.5))
     told = json.loads(json.dumps(run_config.to_json(asked)))
@@ -75,41 +61,6 @@ def test_a_run_s_options_come_back_from_json_with_their_parts():
     assert run_config.from_json(asked.task, told) == asked
     with pytest.raises(UserError, match="unknown agent 'gone'"):
         run_config.from_json(asked.task, {**told, "agent": {"name": "gone"}})
-
-
-def test_defaults_and_probes_can_work():
-    run_config.check(RunConfig(probes.WindowConfig()))
-    run_config.check(probes.CONFIG)
-    run_config.check(probes.config(scalars={"teacher_bias_deg": -3.0, "eps_deg": 180.0, "k_max": 0}))
-
-
-def test_scalars_and_schedule_are_trees_of_their_numbers_and_sizes_are_not():
-    words = {"answer": "nearest", "says": "worst"}
-    assert len(jax.tree.leaves(Scalars())) == len(dataclasses.fields(Scalars)) - len(words)
-    for name, word in words.items():  # part of the program
-        other = dataclasses.replace(Scalars(), **{name: word})
-        assert jax.tree.structure(other) != jax.tree.structure(Scalars())
-    assert len(jax.tree.leaves(Schedule())) == len(dataclasses.fields(Schedule))
-    assert hash(Sizes()) == hash(Sizes())
-
-
-@pytest.mark.parametrize("group", [Scalars(), Schedule()])
-def test_other_scalars_and_schedules_compile_nothing_again(group):
-    traced = []
-
-    @jax.jit
-    def total(group):
-        traced.append(group)
-        return sum(jax.tree.leaves(group))
-
-    before = sum(jax.tree.leaves(group))
-    assert float(total(group)) == pytest.approx(before)
-    numbers = {name: value for name, value in dataclasses.asdict(group).items() if not isinstance(value, str)}
-    for name, value in numbers.items():
-        changed = dataclasses.replace(group, **{name: 2 * value + type(value)(1000)})
-        assert float(total(changed)) == pytest.approx(before + value + 1000)
-    assert len(traced) == 1
-    assert type(traced[0]) is type(group)
 
 
 def test_the_digest_does_not_change_from_version_to_version():

@@ -113,14 +113,6 @@ def test_a_run_begun_on_four_devices_goes_on_with_one(alone, tmp_path):
 
 
 @pytest.mark.long
-def test_a_run_begun_on_one_device_goes_on_with_four(alone, tmp_path):
-    out = tmp_path / "run"
-    many_devices.run(out, 2)  # amid the labels
-    on_four("resume", out)
-    assert_alike(measured(alone), measured(out))
-
-
-@pytest.mark.long
 def test_policies_of_four_devices_are_those_of_one(alone, shared):
     found = []
     for folder in (alone, shared):

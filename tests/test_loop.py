@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -201,39 +201,6 @@ def labelled(program, seeds, budgets, rounds=LARGEST // 10, scalars=probes.SCALA
     for _ in range(rounds):
         clock, state = program.label_round(ENV, EXPERT, scalars, clock, state)
     return clock, state
-
-
-@pytest.fixture(scope="module")
-def taught():
-    """Four lanes after all their labels."""
-    return labelled(probes.window_program("relative"), SEEDS, BUDGETS)
-
-
-def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would(taught):
-    clock, state = taught
-    assert int(clock.round) == 6
-    labels = jax.tree.map(np.asarray, state.guide.labels)
-    assert labels.obs.shape == (4, LARGEST, 2)
-    target = partial(guidances.make("relative", probes.SIZES, ENV).target, scalars=probes.SCALARS)
-    targets = np.asarray(jax.vmap(jax.vmap(target))(labels))
-    for lane, budget in enumerate(BUDGETS):
-        np.testing.assert_array_equal(labels.valid[lane], np.arange(LARGEST) < budget)
-        obs, action, answer = (getattr(labels, name)[lane, :budget].astype(np.float64) for name in PARTS)
-        best = np.arctan2(obs[:, 1], obs[:, 0]) + 0.6
-        angle = np.arctan2(action[:, 1], action[:, 0])
-        error = np.angle(np.exp(1j * (best - angle)))
-        h = np.where(np.abs(error) <= 10 * DEG, 0, np.sign(error))
-        np.testing.assert_array_equal(answer, h[:, None])
-        turned = angle + h * 20 * DEG
-        np.testing.assert_allclose(
-            action + targets[lane, :budget], np.stack([np.cos(turned), np.sin(turned)], -1), atol=1e-5
-        )
-        assert set(h) == {-1, 0, 1}
-    assert state.guide.model.fitted.all()
-    for small, large in ((0, 2), (1, 3)):  # the first labels of a larger budget are those of a smaller
-        for name in PARTS:
-            rows = np.asarray(getattr(state.guide.labels, name))
-            np.testing.assert_allclose(rows[small, :15], rows[large, :15], atol=1e-6)
 
 
 def assert_equal(one, other):

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import cuelearner_jax as cl
-from cuelearner_jax.cli import label
 from cuelearner_jax.storage import formats
 from cuelearner_jax.tasks import registry, shipped
 
@@ -56,13 +55,6 @@ def test_each_task_of_its_own_has_a_shipped_agent():
         described = formats.read("config", shipped.folder_of(name) / "config.json")
         assert f"shipped:{described['task']['name']}" == name
         assert described["task"]["name"] in registry.names()
-
-
-def test_a_shipped_agent_can_be_labelled_and_is_no_code():
-    task = registry.find("billiards")
-    source = label._source(task, "shipped:billiards", None)
-    assert source is not None
-    assert (source.folder.name, source.task.name, source.default_policy) == ("billiards", "billiards", "agent")
 
 
 def test_a_shipped_agent_that_does_not_exist_is_refused():

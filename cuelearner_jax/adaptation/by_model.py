@@ -18,8 +18,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.judging import LABELS, Judge, Judgement, Judging
-from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState, ask_round, begin, blame, rounds, take_labels
+from cuelearner_jax.adaptation.judging import LABELS, PERSON, Judge, Judgement, Judging
+from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, ask_round, begin, blame, rounds, take_labels
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.environment import actions_of
@@ -39,13 +39,12 @@ PASSES = 20  # threshold tau as a share of eps: a pass that turns an action by l
 
 @dataclass(frozen=True)
 class AdaptationResult:
-    """The adapted lanes, their judgement and learning curve. A lane whose model is not used acts as its base."""
+    """The adapted lanes and their judgement. A lane whose model is not used acts as its base."""
 
     of: Adaptation
     lanes: Lanes
     block: Any  # `LaneState`, or `by_reading.Evidence`
     judged: Judgement
-    curve: list[dict[str, Any]]  # a row a measurement: "asked" (lanes,) labels so far, and metrics (lanes,) by name
     results: tuple[Result, ...] = ()  # reading only: each lane's estimates
 
     @property
@@ -80,7 +79,10 @@ class AdaptationResult:
     def _verdict(self, lane: int, unit: str) -> str:
         judged, bound = self.judged, self.lanes.bound_deg[lane]
         before, after, narrowed = (column[lane] for column in (judged.before, judged.after, judged.within_deg))
-        if judged.by != LABELS:
+        if judged.by == PERSON:
+            preferred = f"the policy as it was in {before:.0%}, the corrected in {after:.0%}"
+            why = f"of pairs of films a person preferred {preferred}"
+        elif judged.by != LABELS:
             difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*judged.difference[lane])
             spent = f"difference {difference}; {judged.rewarded_steps[lane]:,} rewarded steps"
             why = f"{judged.by} on tuning episodes {before:.4g} before, {after:.4g} after ({spent})"
@@ -113,51 +115,37 @@ def adapt(
         labels: rows (lanes, slots, ...) in place of questions, fitted at once.
         mesh: devices that share the lanes (default: all of this process's).
         watch: takes the name of a piece of work, returns its progress callback.
+
+    Raises:
+        UserError: all lanes failed for their policy or their teacher, or labels cannot judge.
     """
     mesh, count = mesh or lane_mesh(), lanes.number
     # the block is filled up with repeats of the last lane, which are dropped in the end
     filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)
-    if labels is not None:
-        labels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
     judge = Judge(of, Lanes(*(column[filled] for column in lanes)), how, mesh, watch)
-    due = lambda block, asked: judge.measure(block) if how.every and asked % how.every == 0 else None  # noqa: E731
-    block = learn_lanes(of, judge.lanes, teacher, labels, mesh, watch, due)
-    judged, block = judge.judge_lanes(block)
-    fitted = block.guide.model.fitted & jnp.asarray(judged.used)  # an unfitted model leaves actions unchanged
-    block = block.replace(guide=block.guide.replace(model=block.guide.model.replace(fitted=fitted)))
-    block = jax.tree.map(lambda leaf: leaf[:count], block)
-    curve = [{name: values[:count] for name, values in row.items()} for row in judge.curve]
-    return AdaptationResult(of, lanes, block, Judgement(judged.by, *(column[:count] for column in judged[1:])), curve)
-
-
-def learn_lanes(
-    of: Adaptation,
-    lanes: Lanes,
-    teacher: Teacher | None,
-    labels: Label | None = None,
-    mesh: Mesh | None = None,
-    watch: Callable[[str], Tell] = lambda what: ignore_progress,
-    before_round: Callable[[LaneState, int], None] = lambda block, asked: None,
-) -> LaneState:
-    """Return the lanes with models of a teacher's answers, or of given labels; arguments as for `adapt`.
-
-    `before_round` gets the lanes and the number of questions so far. Raises UserError if all lanes failed for their
-    policy or their teacher.
-    """
-    mesh = mesh or lane_mesh(jax.local_devices()[:1])
     placed = of.replace(env=place(mesh, of.env, SHARED), bases=place(mesh, of.bases, SHARED))
-    block = place(mesh, begin(of, lanes), BY_LANE)
+    block = place(mesh, begin(of, judge.lanes), BY_LANE)
     if labels is not None:
-        return take_labels(placed, place(mesh, labels, BY_LANE), block, mesh)
-    asks, number, tell = place(mesh, teacher, SHARED), rounds(lanes, of.sizes), watch("labels")
-    for done in range(number):
-        tell(done, number)
-        before_round(block, done * of.sizes.labels_per_round)
-        block = jax.block_until_ready(ask_round(placed, asks, block, mesh))
-        if block.failed.all():
-            blame(placed, asks, block)
-    tell(number, number)
-    return block
+        rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
+        block = take_labels(placed, place(mesh, rows, BY_LANE), block, mesh)
+    else:
+        asks, number, tell = place(mesh, teacher, SHARED), rounds(lanes, of.sizes), watch("labels")
+        for done in range(number):
+            tell(done, number)
+            block = jax.block_until_ready(ask_round(placed, asks, block, mesh))
+            if block.failed.all():
+                blame(placed, asks, block)
+        tell(number, number)
+    return finished(judge, block, count)
+
+
+def finished(judge: Judge, block: Any, count: int, results: tuple[Result, ...] = ()) -> AdaptationResult:
+    """Judge a block's first `count` lanes and take out corrections that are not used."""
+    judged, block = judge.judge_lanes(block)
+    block = judge.of.keep_used(block, jnp.asarray(judged.used))
+    block, lanes = jax.tree.map(lambda leaf: leaf[:count], block), Lanes(*(column[:count] for column in judge.lanes))
+    judged = Judgement(judged.by, *(column[:count] for column in judged[1:]))
+    return AdaptationResult(judge.of, lanes, block, judged, results)
 
 
 def check_bounds(space: Space, bounds: Sequence[float]) -> None:

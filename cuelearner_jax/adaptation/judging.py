@@ -1,13 +1,16 @@
 """Judge whether an adapted policy is better than its base. An adapted policy is used only if it is.
 
 With a simulator both play the same episodes of the changed world, those of the split "tuning", until a sequential test
-of the paired differences decides (`PairedTest`). Reported figures are measured on other episodes. Without a simulator,
-held-out labels are predicted, against answering "already right" always; a reading has a rule of its own.
+of the paired differences decides (`PairedTest`). Reported figures are measured on other episodes. A person may compare
+films of such episodes in place of a metric. Without a simulator, held-out labels are predicted, against answering
+"already right" always; a reading has a rule of its own.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,6 +22,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
+from cuelearner_jax.adaptation.person import Person, preferences
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
@@ -29,6 +33,7 @@ from cuelearner_jax.spaces import is_answered
 
 HELD_OUT = 5  # every fifth label is held out
 LABELS = "labels"  # `Judging.by` where held-out labels judge in place of a metric
+PERSON = "person"  # where a person does
 SPLIT = "tuning"  # the split that the judging episodes come from
 STEPS = 100  # steps of each environment, where a task counts steps
 AT_ONCE = 10  # episodes between two looks
@@ -39,20 +44,20 @@ SHARES = ("success", "finished")  # metrics within [0, 1]
 
 @dataclass(frozen=True)
 class Judging:
-    """Settings of the comparison between policies and their bases, at the end and along the learning curve."""
+    """Settings of the comparison between policies and their bases."""
 
     env: Environment | None  # the changed world with the episodes of `SPLIT`; None: there is no simulator
     num_envs: int = 50  # episodes at most
     steps: int = 100  # environment steps of each
-    by: str = "reward"  # a metric, or "labels"
-    every: int = 0  # labels between two measurements on the way (0: at the end alone)
+    by: str = "reward"  # a metric, "labels" or "person"
+    person: Person | None = None
     bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
 
 
 class Judgement(NamedTuple):
     """The values of the base policies and of the adapted ones, one entry a lane; larger is better."""
 
-    by: str  # a metric, or "labels": the share of held-out answers that are predicted
+    by: str  # a metric; "labels": the share of held-out answers that are predicted; "person": of pairs preferred
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
     used: np.ndarray  # (lanes,) bool: is the correction used? Only if it is shown to be better, and finite
@@ -75,21 +80,15 @@ def _step_of(env: Any) -> Any:
 
 
 class Judge:
-    """Measures the lanes of an adaptation along the learning curve, and decides in the end which models are used.
+    """Decides which models of an adaptation's lanes are used.
 
-    A block of lanes is a `LaneState`, or any record with `base`, `bound`, `asked`, `corrects` and `failed`.
+    A block of lanes is a `LaneState`, or any record with `base`, `bound`, `corrects` and `failed`.
     """
 
     def __init__(self, of: Adaptation, lanes: Lanes, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
         """`mesh`: devices that share the lanes; `watch`: given the name of a piece of work, who is told progress."""
         self.of, self.lanes, self.how, self.watch = of, lanes, how, watch
         self.mesh = mesh if mesh.size > 1 else None
-        self.curve: list[dict[str, np.ndarray]] = []
-
-    def measure(self, block: Any) -> None:
-        """Roll out the lanes' current policies, and add a row to the learning curve."""
-        rollout = self._rolled(self.of.policy(block, self.how.env), "the adapted policy")
-        self.curve.append({"asked": np.asarray(block.asked), "failed": np.asarray(block.failed), **rollout.means})
 
     def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
         """Return the judgement of the finished lanes, and the lanes with the bounds that are used.
@@ -98,13 +97,14 @@ class Judge:
         """
         how, lanes = self.how, self.lanes
         if how.by == LABELS:
-            judgement = judged_by_labels(self.of, block)
-            if how.env is not None:
-                self.measure(block)
-            return judgement, block
-        if how.every:
-            self.measure(block)
+            by_evidence = self.of.guidance.by_evidence
+            columns = (np.zeros(lanes.number), block.evidence, block.used) if by_evidence else None
+            unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
+            before_after_used = columns or judged_by_labels(self.of, block)
+            return Judgement(LABELS, *before_after_used, bounds_of(self.of, block), unknown, none), block
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
+        if how.person is not None:
+            return self._compared(how.person, block, usable), block
         block, steps = self._narrowed(block)
         test, values = PairedTest(lanes.number), []
         for number in range(-(-how.num_envs // AT_ONCE)):
@@ -117,6 +117,25 @@ class Judge:
         before, after = (np.concatenate([pair[end][how.by] for pair in values], -1) for end in (0, 1))
         means, difference = (before.mean(-1), after.mean(-1)), mean_interval(after - before).T
         return Judgement(how.by, *means, usable & test.better, bounds_of(self.of, block), difference, steps), block
+
+    def _compared(self, person: Person, block: Any, usable: np.ndarray) -> Judgement:
+        """Return what a person says of the only lane's episodes."""
+        assert self.how.env is not None
+        assert self.lanes.number == 1  # `AdaptRequest`
+        test, answers = PairedTest(1), []
+        policies = self.of.bases.lane(0), self.of.policy(block, self.how.env).lane(0)
+        told = preferences(person, self.how.env, policies, episodes(SPLIT), self.how.steps)
+        with contextlib.closing(told):
+            for answer in itertools.islice(told, self.how.num_envs if usable[0] else 0):
+                answers.append(answer)
+                test.add(np.array([[float(answer)]]))
+                if test.decided[0]:
+                    break
+        each = np.array([answers], float).reshape(1, -1)
+        before, after = (np.mean(each == which, -1) if answers else np.zeros(1) for which in (-1, 1))
+        difference = mean_interval(each).T if answers else np.full((1, 3), np.nan)
+        used, steps = usable & test.better, np.zeros(1, int)
+        return Judgement(PERSON, before, after, used, bounds_of(self.of, block), difference, steps)
 
     def _pair(self, block: Any, number: int) -> tuple[tuple[dict[str, np.ndarray], ...], np.ndarray]:
         """Play episodes by base and adapted policy; return the values of each (lanes, episodes), and the steps."""
@@ -200,8 +219,8 @@ def differences(pair: tuple[dict[str, np.ndarray], ...], by: str) -> np.ndarray:
     return relative(by)
 
 
-def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
-    """Compare a model with answering "already right" always, on every fifth label, which the model was not fitted to.
+def judged_by_labels(of: Adaptation, block: LaneState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return before, after and used of a `Judgement`: "already right" always, and a model, on every fifth label.
 
     The model in use is fitted to all labels; a second one is fitted for this comparison alone.
 
@@ -216,9 +235,7 @@ def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
     if np.asarray(block.guide.labels.valid).sum(-1)[~failed].min(initial=HELD_OUT) < HELD_OUT:
         raise UserError(f"fewer than {HELD_OUT} labels cannot judge a model: give more, or --judge-by a metric")
     zero, right = jax.device_get(_predicted(of, block))
-    used = ~failed & (right >= zero)
-    unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
-    return Judgement(LABELS, zero, right, used, bounds_of(of, block), unknown, none)
+    return zero, right, ~failed & (right >= zero)
 
 
 @jax.jit

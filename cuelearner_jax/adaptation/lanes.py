@@ -83,11 +83,6 @@ class LaneState(struct.PyTreeNode):
     failed: Bool[Array, ""]  # True once the model stopped being finite; the lane then keeps its last finite state
 
     @property
-    def asked(self) -> Int[Array, "*lanes"]:
-        """Number of questions so far."""
-        return self.guide.asked
-
-    @property
     def corrects(self) -> Bool[Array, "*lanes"]:
         """Whether the lane has a fitted model."""
         return self.guide.model.fitted
@@ -114,6 +109,11 @@ class Adaptation(struct.PyTreeNode):
         """
         base, view = self.bases.lane(block.base), view_of(self.env if env is None else env)
         return Guided(base, block.guide.model, view, self.scalars, self.guidance, block.bound, self.sizes)
+
+    def keep_used(self, block: LaneState, used: Bool[Array, " lanes"]) -> LaneState:
+        """Return the lanes, without a fitted model where it is not used: actions are then unchanged."""
+        model = block.guide.model
+        return block.replace(guide=block.guide.replace(model=model.replace(fitted=model.fitted & used)))
 
 
 def rounds(lanes: Lanes, sizes: GuideSizes) -> int:

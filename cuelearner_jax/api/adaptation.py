@@ -7,6 +7,7 @@ many other answers a policy agrees with.
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -19,9 +20,10 @@ import numpy as np
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.adaptation.judging import LABELS
+from cuelearner_jax.adaptation.judging import LABELS, PERSON
 from cuelearner_jax.adaptation.lanes import blame
-from cuelearner_jax.api.labels import Labels, LabelSet, labels_from_file, labels_of, rows_of
+from cuelearner_jax.adaptation.person import Prefer
+from cuelearner_jax.api.labels import Labels, labels_from_file, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, config_of, load_policy
 from cuelearner_jax.api.worlds import World, numbers, teacher_of_world
 from cuelearner_jax.config import GuideSizes, Scalars, from_json, normalize_options
@@ -35,6 +37,7 @@ from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
 from cuelearner_jax.storage import policy_folders
+from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.studies.adapt import AdaptedStudy, AdaptRequest, Subject
 from cuelearner_jax.studies.evaluate import Agreement
 from cuelearner_jax.studies.evaluate import agreement as agreement_of
@@ -121,7 +124,7 @@ def adapt(
     sizes: GuideSizes | None = None,
     scalars: Scalars | None = None,
     seed: int = 0,
-    judge_by: str | None = None,
+    judge_by: str | Prefer | None = None,
     judge_episodes: int = 50,
     judge_bounds: Sequence[float] | None = None,
     changes: Any = None,
@@ -148,7 +151,8 @@ def adapt(
         scalars: settings of fitting, of refinement and of the teacher's faults.
         seed: seed of all random numbers.
         judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones (default: the
-            scenario's or the task's; of a reading "labels").
+            scenario's or the task's; of a reading "labels"); or a function of two film files (.gif) of the same start
+            that returns -1 where the left one is better, 1 where the right one is, and else 0.
         judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
@@ -168,22 +172,22 @@ def adapt(
     rows = rows_of(labels) if isinstance(labels, tuple) else None
     if teacher is not None:
         teacher = teacher_of_world(teacher, space)
-        user_code.answers_in("teacher", teacher, env)
     elif file is None and rows is None:
         raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
     scalars, eps_deg = scalars and normalize_options(scalars, "scalars"), eps_deg and float(eps_deg)
     task, scenario = (known.task, known.scenario) if known else (None, None)
-    options: dict[str, Any] = {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
-    if file is None and rows is None and labels is not None:
-        options["labels"] = (labels,)
-    if sizes is not None:
-        options["sizes"] = normalize_options(sizes, "sizes")
-    if bound_deg is not None:
-        options["bound_deg"] = (float(bound_deg),)
-    if judge_bounds is not None:
-        options["judge_bounds"] = tuple(map(float, judge_bounds))
+    given = {
+        "labels": (labels,) if file is None and rows is None and labels is not None else None,
+        "sizes": sizes and normalize_options(sizes, "sizes"),
+        "bound_deg": None if bound_deg is None else (float(bound_deg),),
+        "judge_bounds": None if judge_bounds is None else tuple(map(float, judge_bounds)),
+    }
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    options |= {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
+    prefer, judge_by = (judge_by, PERSON) if callable(judge_by) else (None, judge_by)
     request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, scalars)
-    subject = Subject(env, Common(as_policy_in(policy, env)), task=task, teacher=teacher, rows=rows, changes=changes)
+    about = {"task": task, "teacher": teacher, "rows": rows, "changes": changes, "prefer": prefer}
+    subject = Subject(env, Common(as_policy_in(policy, env)), **about)
     outcome = dataclasses.replace(request, **options).run(subject)
     result = outcome.found
     if result.failed.any():
@@ -244,15 +248,19 @@ def correct(
     before = getattr(getattr(policy, "trained", None), "task", None)
     before = before if isinstance(before, LogsConfig) else None
     label_set = _labels(labels, space, cues, low, high, before)
+    if label_set.eps is not None:
+        if eps is not None and not math.isclose(eps, label_set.eps, rel_tol=1e-6):
+            raise UserError(f"the label file holds answers of {label_set.eps:g} {label_set.space.unit}: leave out eps")
+        eps = label_set.eps
     own = as_policy(policy)
     acting = CallablePolicy(policy_of(own, label_set.space), actions=label_set.space)
-    acting(label_set.rows.obs)  # refuses what gives no actions
+    acting(label_set.labels.obs)  # refuses what gives no actions
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
         world_of(label_set, before),
-        labels=labels_of(label_set.rows),
+        labels=labels_of(label_set.labels),
         bound_deg=bound,
-        eps_deg=label_set.strength(eps),
+        eps_deg=eps,
         guidance=guidance,
         sizes=sizes,
         scalars=scalars,
@@ -291,12 +299,12 @@ def agreement(
         eps = float((getattr(own, "scalars", None) or plain_scalars(label_set.space)).eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base)
     base = None if base is None else policy_of(base, label_set.space)
-    return agreement_of(policy_of(own, label_set.space), label_set.rows, label_set.space, eps, base)
+    return agreement_of(policy_of(own, label_set.space), label_set.labels, label_set.space, eps, base)
 
 
 def _labels(
     labels: Any, space: Any, cues: Any = "", low: Any = None, high: Any = None, before: LogsConfig | None = None
-) -> LabelSet:
+) -> LabelFile:
     """Return checked labels with their space; `before`: the recording by which the policy was corrected before.
 
     Raises UserError for labels that do not fit their space.
@@ -319,15 +327,15 @@ def _labels(
             raise UserError(f"low and high bound {len(low)} and {len(high)} entries: give {rows.action.shape[1]} each")
         space = Box(tuple(low), tuple(high), cues_from(cues) if cues else ())
     external_labels.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
-    return LabelSet(rows, space)
+    return LabelFile({}, RELATIVE.name, space, None, np.zeros(len(rows.obs)), rows)
 
 
-def world_of(label_set: LabelSet, before: LogsConfig | None = None) -> World:
+def world_of(label_set: LabelFile, before: LogsConfig | None = None) -> World:
     """Return the situations of labels as a world of the task `logs`, which names no folder.
 
     Networks of a policy that was corrected `before` keep their view. Raises UserError where that cannot be.
     """
-    size, obs, space = label_set.rows.obs.shape[1], np.asarray(label_set.rows.obs), label_set.space
+    size, obs, space = label_set.labels.obs.shape[1], np.asarray(label_set.labels.obs), label_set.space
     own = {name: value for name, value in label_set.task.items() if name not in ("name", "from")}
     config = from_json(LogsConfig, own) if label_set.task.get("name") == logs.NAME else None
     if before is not None:
@@ -353,5 +361,5 @@ def world_of(label_set: LabelSet, before: LogsConfig | None = None) -> World:
         )
     if logs.space_of(config).to_json() != space.to_json():
         raise UserError(f"the space {space.name!r} is not one that a recording can have: give a box with plain cues")
-    filled = lambda config, split: logs.filled(config, obs, label_set.rows.action)  # noqa: E731
+    filled = lambda config, split: logs.filled(config, obs, label_set.labels.action)  # noqa: E731
     return World(logs.configured(config, dataclasses.replace(logs.BODY, environment=filled)), config)

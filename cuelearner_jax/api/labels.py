@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,8 +13,9 @@ from cuelearner_jax.api.worlds import numbers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.spaces import Space, says_something
+from cuelearner_jax.spaces import says_something
 from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.types import Label
 
 
@@ -27,23 +27,6 @@ class Labels(NamedTuple):
     # h: of directions +1 counterclockwise ("more to the left"), 0 already right, -1 clockwise; (labels, cues) where a
     # space has several cues, `spaces.UNSAID` for a cue of which nothing was said
     answer: Float[np.ndarray, "labels *cues"]
-
-
-class LabelSet(NamedTuple):
-    """Relative labels with what their file says of them."""
-
-    rows: Label
-    space: Space
-    eps: float | None = None  # strength of an answer in the space's unit; None: not known
-    task: dict[str, Any] = {}  # noqa: RUF012  # name and configuration of the labels' task; empty: not known
-
-    def strength(self, eps: float | None) -> float | None:
-        """Return the strength of the answers. Raises UserError for one that differs from the file's."""
-        if self.eps is None or eps is None:
-            return self.eps if eps is None else eps
-        if not math.isclose(eps, self.eps, rel_tol=1e-6):
-            raise UserError(f"the label file holds answers of {self.eps:g} {self.space.unit}: leave out eps")
-        return self.eps
 
 
 def labels_of(rows: Label) -> Labels:
@@ -71,11 +54,11 @@ def rows_of(labels: Labels) -> Label:
     return Label(obs[said], action[said], answer[said], np.ones(said.sum(), bool))  # pyright: ignore[reportArgumentType]
 
 
-def labels_from_file(path: Path) -> LabelSet:
+def labels_from_file(path: Path) -> LabelFile:
     """Return the labels of a file's first seed. Raises UserError for a file of other answers."""
     file = label_files.read(path)
     if file.answers != RELATIVE.name:
         raise UserError(f"{path} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
     external_labels.check_file(file, None, RELATIVE, str(path))
     own = file.seeds == file.seeds[0]
-    return LabelSet(jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels), file.space, file.eps, file.task)
+    return file._replace(labels=jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels))

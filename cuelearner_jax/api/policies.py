@@ -95,11 +95,10 @@ def as_policy(given: Any) -> Policy:
 
 
 def as_policy_in(given: Any, env: Any) -> Policy:
-    """Return `as_policy` for a world. Raises UserError for a policy that cannot act there."""
+    """Return `as_policy` for a world. Raises UserError for a policy of other observations or actions."""
     policy = policy_of(as_policy(given), actions_of(env))
     if isinstance(given, CallablePolicy) and given.observation:
         check_layout("the policy", given.observation, given.actions, env)
-    user_code.acts_in("policy", policy, env)
     return policy
 
 
@@ -176,9 +175,10 @@ def measure(
     Returns:
         `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
     """
-    source = trained.PolicySource(world.task, config_of(policy, world), None, Path(world.task.name))
-    request = EvaluateRequest(task=world.config, episodes=episodes, steps=steps, envs=envs, engine=engine)
-    (found,) = evaluate.run(source, request, policy=as_policy_in(policy, world.env))
+    code, name = as_policy_in(policy, world.env), Path(world.task.name)
+    source = trained.PolicySource(world.task, config_of(policy, world), None, name, code=code)
+    request = EvaluateRequest(task=world.config, policy="own", episodes=episodes, steps=steps, envs=envs, engine=engine)
+    (found,) = evaluate.run(source, request)
     return found
 
 

@@ -95,7 +95,6 @@ def train(
     """
     if teacher is not None:
         teacher = teacher_of_world(teacher, world.actions)
-        user_code.answers_in("teacher", teacher, world.env)
     file = Path(labels) if isinstance(labels, str | os.PathLike) else None
     request = _suggested(world, config, taught=teacher is not None or file is not None)
     grid = dataclasses.replace(request.grid, guidance=tuple(guidance or request.grid.guidance))

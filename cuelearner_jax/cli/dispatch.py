@@ -23,9 +23,8 @@ from collections.abc import Sequence
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 # JAX takes seconds to load, so a command imports it only when needed, never for `--version` and `--help`.
-from cuelearner_jax import __version__
+from cuelearner_jax import __version__, signals
 from cuelearner_jax.errors import NotFinite, UserCodeError, UserError, machine_message, suggestion
-from cuelearner_jax.signals import Interrupted
 
 COMMANDS = {  # each a file beside this one with `run(arguments)`
     "train": "Train one seed under one kind of guidance.",
@@ -41,7 +40,10 @@ COMMANDS = {  # each a file beside this one with `run(arguments)`
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line. Returns the exit status."""
+    """Run a command line (default: this process's own). Returns the exit status."""
+    if argv is None:
+        _open_streams()
+        signals.listen()  # before anything that takes seconds to load
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         try:
@@ -53,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(error, UserCodeError):
             traceback.print_exception(error.__cause__)
         return 2
-    except (Interrupted, NotFinite) as error:
+    except (signals.Interrupted, NotFinite) as error:
         _print(str(error))
         return error.status
     except BrokenPipeError:  # the reader of the output has gone, as `head` does
@@ -72,6 +74,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
+def _open_streams() -> None:
+    """Open to null any standard stream this process lacks (`2>&-`), so that no other file gets its number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # uses the lowest free number
+            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w"))
+
+
 def _print(line: str) -> None:
     from cuelearner_jax.terminal import console
 
@@ -80,9 +92,8 @@ def _print(line: str) -> None:
 
 def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        width = max(map(len, COMMANDS)) + 2
         print("usage: cuelearner COMMAND ...\n\nLearning from relative feedback with off-policy deep RL.\n")
-        print("commands:", *(f"  {name:<{width}}{about}" for name, about in COMMANDS.items()), sep="\n")
+        print("commands:", *(f"  {name:<10}{about}" for name, about in COMMANDS.items()), sep="\n")
         print("\nEach command has --help, for instance: cuelearner sweep billiards --help; cuelearner --version")
         return 0 if arguments else 2
     command = arguments[0]

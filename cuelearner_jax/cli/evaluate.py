@@ -10,8 +10,8 @@ import numpy as np
 from rich.table import Table
 
 from cuelearner_jax.api.adaptation import agreement
-from cuelearner_jax.cli.options import Finished, look_ahead, out, parse
-from cuelearner_jax.cli.sources import code_of, is_code, source_and_options
+from cuelearner_jax.cli.options import Finished, out
+from cuelearner_jax.cli.sources import source_and_options, source_in
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.measurements import Difference
@@ -20,7 +20,7 @@ from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
-from cuelearner_jax.tasks import registry, shipped
+from cuelearner_jax.tasks import shipped
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 
@@ -31,9 +31,6 @@ class Evaluate(Finished, EvaluateRequest[Any]):
     The policy is of a run or a policy folder, or a task's teacher, heuristic or chance; or, with --env, it is
     package.module:NAME, any function of observations."""
 
-    robot: str | None = None
-    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
-    policy."""
     compare: tuple[str, ...] = ()
     """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference. Two may
     stand here with nothing named before: evaluate --compare A B."""
@@ -46,28 +43,13 @@ class Evaluate(Finished, EvaluateRequest[Any]):
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises UserError for what cannot be evaluated."""
-    ahead = look_ahead(arguments)
-    if ahead.labels_from and ahead.words and is_code(ahead.words[0]):
-        options, alone = parse(Evaluate, arguments, "evaluate", Evaluate()), Path(ahead.labels_from)
-        if options != Evaluate(subject=ahead.words[0], labels_from=alone):
-            raise UserError("the answers of a label file need the policy alone: leave out the other options")
-        _print_agreement(ahead.words[0], code_of(ahead.words[0]), alone)
-        return
     source, options = source_and_options(arguments, "evaluate", Evaluate)
-    if options.labels_from is not None:
-        source.check(options.policy, options.task, guidance=options.guidance)
-        if trained.POLICIES[options.policy].taught:
-            raise UserError(
-                f"policy {options.policy!r} asks the teacher, who looks at the true state: choose another policy"
-            )
-        policy = trained.one_policy(
-            source, options.task, options.policy, next(iter(options.guidance), None), None, None
-        )
-        _print_agreement(f"{source.folder}, {options.policy}", policy, options.labels_from)
-        return
     source.task.engine(options.engine)
     source.check(options.policy, options.task, guidance=options.guidance)
-    amount = evaluate.amount(source.task, options)
+    if options.labels_from is not None:
+        _print_agreement(source, options)
+        return
+    evaluate.amount(source.task, options)
     if options.out and options.out.exists():
         raise UserError(f"{options.out} exists: give another --out")
     other = _other(source, options) if options.compare else None
@@ -75,27 +57,20 @@ def run(arguments: list[str]) -> None:
         watch = watched_by(bars)
         rows = evaluate.run(source, options, watch)
         others = evaluate.run(other[0], replace(options, policy=other[1], guidance=()), watch) if other else []
-    _print_measured(source, options, amount, rows, others)
+    _print_measured(source, options, rows, others)
 
 
-def _print_measured(
-    source: PolicySource,
-    options: Evaluate,
-    amount: tuple[int, int],
-    rows: list[Measured],
-    others: list[Measured],
-) -> None:
+def _print_measured(source: PolicySource, options: Evaluate, rows: list[Measured], others: list[Measured]) -> None:
     """Print the measurements, or the comparison with others, and write them to the chosen file."""
-    envs, steps = amount
+    envs, steps = evaluate.amount(source.task, options)
     compared = measurements.differences(rows, others) if options.compare else None
     about = {"robot": source.task.robot, "engine": options.engine, "scenario": options.scenario}
     about = {name: value for name, value in about.items() if value}
-    robot = {"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {}
     lane = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
     title, other = ", ".join([options.policy, *about.values(), lane]), " ".join(options.compare[-1:])
     if options.out:  # first: whoever reads the table may leave before its end
-        both = (other, compared) if compared is not None else None
-        described = {**about, **robot}
+        both = None if compared is None else (other, compared)
+        described = about | ({"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {})
         measurements.write(options.out, source, options.task, options.policy, envs, steps, rows, described, both)
     shares = f"{envs:,} episodes" if source.task.longest else f"{envs:,} environments of {steps // envs:,} steps"
     if compared is None:
@@ -109,14 +84,21 @@ def _print_measured(
         out.print(f"wrote {options.out}")
 
 
-def _print_agreement(named: str, policy: Any, path: Any) -> None:
-    """Print the share of a label file's answers that a policy agrees with."""
-    found = agreement(policy, path)
-    table = Table(
-        "", "share of answers", "95% interval", title=f"{named}: agreement with {found.labels} labels of {path}"
-    )
-    for name, share in found.rows():
-        table.add_row(name, f"{share[0]:.3f}", f"{share[1]:.3f} to {share[2]:.3f}")
+def _print_agreement(source: PolicySource, options: Evaluate) -> None:
+    """Print the share of a label file's answers that the policy agrees with. Raises UserError for other options."""
+    name, path = options.policy, options.labels_from
+    if unused := [one for one in ("episodes", "steps", "envs", "engine", "compare", "out") if getattr(options, one)]:
+        raise UserError(f"the answers of a label file need the policy alone: leave out --{unused[0]}")
+    if POLICIES[name].taught:
+        raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
+    assert path is not None
+    kind = next(iter(options.guidance), None)
+    found = agreement(trained.one_policy(source, options.task, name, kind, None, None), path)
+    named = options.subject if name == "own" else f"{source.folder}, {name}"
+    title = f"{named}: agreement with {found.labels} labels of {path}"
+    table = Table("", "share of answers", "95% interval", title=title)
+    for row, share in found.rows():
+        table.add_row(row, f"{share[0]:.3f}", "{1:.3f} to {2:.3f}".format(*share))
     out.print(table)
 
 
@@ -126,14 +108,12 @@ def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
         raise UserError(f"--compare {' '.join(options.compare)} names too many policies: give two in all")
     name = options.compare[-1]
     folder = shipped.folder_of(name)
-    if name in POLICIES and not folder.exists():
-        other, policy = source, name
-    elif folder.exists():
+    if folder.exists():
         code = source.adapted.code if source.adapted and policy_folders.is_one(folder) else None
-        other = PolicySource.of_folder(folder, registry.find, code)
-        if other.task.name != source.task.name:
-            raise UserError(f"{name} is of {other.task.name}, not of {source.task.name}: compare within one task")
-        other, policy = other.on(options.robot), other.default_policy
+        other = source_in(folder, source.task, code, None).on(options.robot)
+        policy = other.default_policy
+    elif name in POLICIES:
+        other, policy = source, name
     else:
         known = ", ".join(POLICIES)
         raise UserError(
@@ -143,6 +123,14 @@ def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
         raise UserError(f"--compare is {name!r}, the policy that is evaluated: give another one")
     other.check(policy, options.task)
     return other, policy
+
+
+def _table(*columns: str, **about: Any) -> Table:
+    """Return an empty table whose numbers are never cut."""
+    table = Table(*columns, **about)
+    for column in table.columns:
+        column.no_wrap = True
+    return table
 
 
 def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
@@ -160,9 +148,12 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
         del columns["trained steps"]
     if all(row.bound_deg is None for row in found):
         columns.pop("within", None)
-    table = Table(*columns, "metric", "mean", "95% interval", title=title, caption=_over(found, episodes))
-    for column in table.columns:
-        column.no_wrap = True
+    over = {
+        "episodes": f"one policy: mean and bootstrap over {episodes}",
+        "seeds": "several seeds: interquartile mean and bootstrap over seeds",
+    }
+    caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, found))
+    table = _table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
     for row in found:
         own = [told(row) for told in columns.values()]
         for name, values in row.metrics.items():
@@ -178,29 +169,13 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
     return table
 
 
-def _over(found: list[Measured], episodes: str) -> str:
-    """Return what the means and intervals are computed over, in words."""
-    kinds = {measurements.over(row) for row in found}
-    told = {
-        "episodes": f"one policy: mean and bootstrap over {episodes}",
-        "seeds": "several seeds: interquartile mean and bootstrap over seeds",
-    }
-    return "; ".join(text for kind, text in told.items() if kind in kinds)
-
-
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
     """Return a table of two policies side by side, with their difference."""
     mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
     over = f"{episodes}, paired" if difference.over == "episodes" else "seeds (interquartile means)"
     named = " against ".join(name + (f" ({told})" if told else "") for name, told in ((title, mine), (other, its)))
-    table = Table(
-        *("metric", "policy", "against", "difference"),
-        title=named,
-        caption=f"mean [95% bootstrap interval]; of the difference over {over}",
-        padding=0,
-    )
-    for column in table.columns:
-        column.no_wrap = True
+    caption = f"mean [95% bootstrap interval]; of the difference over {over}"
+    table = _table("metric", "policy", "against", "difference", title=named, caption=caption, padding=0)
     for name, less in difference.metrics.items():
         both = (measurements.spread(row, name) for row in (difference.row, difference.other))
         table.add_row(name, *map(str, both), f"{less.estimate:+.3f} [{less.lower:+.3f}, {less.upper:+.3f}]")

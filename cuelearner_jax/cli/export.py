@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cuelearner_jax.cli.options import Finished, Flag, Lane, out, parse
+from cuelearner_jax.cli.options import Finished, Flag, out, parse, rows
 from cuelearner_jax.cli.sources import source_and_options
 from cuelearner_jax.config import digest, to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.runs import trained
+from cuelearner_jax.studies.lanes import Lane
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +28,6 @@ class Export(Finished, Lane):
     only_correction: Flag[bool] = False
     """Export only the correction of a policy folder: a function of observation and base action. The base policy stays
     on the robot and is not needed here."""
-    scenario: str | None = None
-    """A changed world, by its name, whose observations the golden cases are. Options of the task
-    (--task.…) come on top of it."""
     check: Path | None = None
     """Instead: replay the golden cases of this exported folder."""
 
@@ -38,11 +36,12 @@ def run(arguments: list[str]) -> None:
     """Run the command. Raises UserError for what cannot be exported, or does not fulfil its contract."""
     if any(word.partition("=")[0] == "--check" for word in arguments):
         options = parse(Export, arguments, "export", Export())
-        assert options.check is not None  # tyro
-        _check(options.check)
+        folder = options.check
+        difference = contract.replay_golden_cases(folder)
+        out.print(f"{folder} is unchanged since its export; golden cases replayed, largest difference {difference:.1e}")
         return
-    formats = "\n".join(f"  {name:<11}{about}" for name, about in contract.FORMATS.items())
-    source, options = source_and_options(arguments, "export", Export, f"\n\nformats (--format):\n{formats}")
+    more = f"\n\nformats (--format):\n{rows(contract.FORMATS)}"
+    source, options = source_and_options(arguments, "export", Export, more)
     name = options.name_in(source, options.task)
     if trained.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who needs the true state: choose another policy")
@@ -55,10 +54,11 @@ def run(arguments: list[str]) -> None:
     if options.only_correction:
         policy, seen = correction.correction_of(policy, env)
         drawn = lambda: correction.cases(env)  # noqa: E731
+    lane = {option: getattr(options, option) for option in ("guidance", "labels", "seed", "bound_deg")}
     origin = {
         "subject": source.folder.name,
         "policy": name,
-        **options.chosen,
+        **{option: value for option, value in lane.items() if value is not None},
         "world": {"name": source.task.name, **to_json(options.task)},
         "config": digest(to_json(source.config)),
     }
@@ -68,8 +68,3 @@ def run(arguments: list[str]) -> None:
         f"{golden['cases']} golden cases replayed, largest difference {written['difference']:.1e} "
         f"({golden['steady']} of {golden['drawn']} decisions are insensitive to rounding); wrote {options.out}"
     )
-
-
-def _check(folder: Path) -> None:
-    difference = contract.replay_golden_cases(folder)
-    out.print(f"{folder} is unchanged since its export; golden cases replayed, largest difference {difference:.1e}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import shlex
@@ -10,6 +9,7 @@ import webbrowser
 from argparse import Namespace
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,22 +18,21 @@ import numpy as np
 import tyro
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import by_model, by_reading, changes
+from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.options import (
+    Changed,
     Flag,
-    Lane,
-    Outside,
-    Unnamed,
     Word,
     about,
+    as_options,
     check_numbers,
     look_ahead_of,
     out,
     parse,
 )
-from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, typed_name, with_cues
+from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, source_in, with_cues
 from cuelearner_jax.cli.train import asking_kind
-from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
+from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -41,15 +40,17 @@ from cuelearner_jax.guides.base import Reading
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
 from cuelearner_jax.policies import NearAims, policy_of, uniform_in
-from cuelearner_jax.reading.families import Family, declared_distortions
+from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
+from cuelearner_jax.studies.adapt import AdaptRequest
+from cuelearner_jax.studies.lanes import Lane
 from cuelearner_jax.studies.train import preset_kinds
 from cuelearner_jax.task import PAPER, QUICKSTART, Preset, Task, shape_of
-from cuelearner_jax.tasks import registry, shipped
+from cuelearner_jax.tasks import shipped
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
 UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
@@ -59,7 +60,7 @@ UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch
 
 
 @dataclass(frozen=True, kw_only=True)
-class Label(Outside):
+class Label(Changed):
     """Label actions in a browser: uniform ones, a policy's, or recorded ones.
 
     Name a policy after the task: a run folder, a policy folder, or package.module:NAME of a function of observations.
@@ -67,7 +68,6 @@ class Label(Outside):
 
     policy: Annotated[Word, tyro.conf.arg(metavar="POLICY")] = None
     """Policy to ask about: a run folder, a policy folder, a shipped agent, or package.module:NAME of a function."""
-    task: Any = field(default_factory=Unnamed)
     sizes: GuideSizes = field(default_factory=GuideSizes)
     scalars: GuideScalars = field(default_factory=GuideScalars)
     out: Path = Path("labels/NAME")
@@ -90,17 +90,9 @@ class Label(Outside):
     bound)."""
     again: Path | None = None
     """Ask the questions of this page's file again, for a second opinion. Leave out the policy and --seed then."""
-    scenario: str | None = None
-    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
-    robot: str | None = None
-    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
-    policy."""
     questions: Literal["uniform", "near_aims", "proposed"] = UNIFORM
     """Actions to ask about without a policy: uniform ones, ones near the task's aims (where it has aims), or those
     that a recording proposes."""
-    changes: str | None = None
-    """For guidance reading: package.module:NAME of your own distortions (default: those that the world
-    declares)."""
     port: int = 0
     """Port on 127.0.0.1 (0: any free port)."""
     open: Flag[bool] = False
@@ -115,13 +107,15 @@ def run(arguments: list[str]) -> None:
         UserError: bad input, a port or folder in use, or a folder with labels of another session.
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
-    server = _server()
+    server = page_module("server")
     ahead = look_ahead_of(arguments, "label", Label)
     task = recorded_or_task(ahead)
     named = ahead.words[1] if len(ahead.words) > 1 else None
     usual = QUICKSTART if named is None and task.proposed is None else PAPER
     name, preset = preset_of(task, ahead.preset, usual)
-    source = _source(task, named, ahead.changes)
+    source = None
+    if named is not None and not is_code(named):
+        source = source_in(shipped.folder_of(named), task, None, ahead.changes)
     default = _suggested(task, preset, source, ahead, named)
     options = parse(Label, arguments, "label", default, about(Label, task, preset=usual))
     plan = make_plan(task, preset.config, options, source)
@@ -138,33 +132,22 @@ def run(arguments: list[str]) -> None:
 
 def _suggested(task: Task, preset: Preset, source: PolicySource | None, ahead: Namespace, named: str | None) -> Label:
     """Return the default options; labels that are to correct a policy are asked for as `adapt` corrects it."""
-    scenario = task.scenario(ahead.scenario) if ahead.scenario else None
-    world = (source.config if source else preset.config).task
-    world = scenario.apply(world) if scenario else world
-    world = world if ahead.cues is None else with_cues(task, world, ahead.cues)
-    by_evidence = named is not None if ahead.guidance is None else guidances.resolve(ahead.guidance[0]).by_evidence
-    sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
-    if named is not None or task.proposed is not None:
-        frame = source.config.sizes.frame if source else sizes.frame
-        sizes = by_model.SIZES if by_evidence else dataclasses.replace(by_model.SIZES, frame=frame)
-        settling = by_reading.settling if by_evidence else by_model.settling
-        scalars = settling(scalars, scenario.eps_deg if scenario else None)
-        bound = scenario.bound_deg if scenario and not by_evidence else None
+    config = source.config if source else preset.config
+    kind = asking_kind(preset_kinds(task, preset)) if named is None else Reading.name
+    questions, adapts = UNIFORM, named is not None or task.proposed is not None
+    if named is None:
+        questions = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
+    asked = AdaptRequest.of(task, config, ahead.scenario, ahead.guidance[0] if ahead.guidance else kind)
     return Label(
-        task=world,
-        sizes=_part(GuideSizes, sizes),
-        scalars=_part(GuideScalars, scalars),
+        task=asked.task if ahead.cues is None else with_cues(task, asked.task, ahead.cues),
+        sizes=GuideSizes(**_values(GuideSizes, (asked if adapts else config).sizes)),
+        scalars=GuideScalars(**_values(GuideScalars, (asked if adapts else config).scalars)),
         out=Path("labels") / task.name,
-        guidance=asking_kind(preset_kinds(task, preset)) if named is None else Reading.name,
-        bound_deg=bound,
-        labels=max(preset.labels) if named is None else by_reading.USUAL if by_evidence else Label.labels,
-        questions=UNIFORM if named is not None else _usual_questions(task),
+        guidance=kind,
+        bound_deg=next(iter(asked.bound_deg), None) if adapts else None,
+        labels=max(preset.labels) if named is None else asked.labels[0],
+        questions=questions,
     )
-
-
-def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
-    """Return the default questions where no policy is named."""
-    return PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
 
 
 def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySource | None = None) -> Plan:
@@ -191,8 +174,6 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
             f"--bound-deg is {options.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
     guidance = merged.guide_in(env, guidances.kind_name(options.guidance))
-    if guidance.by_evidence:
-        _check_evidence(options)
     if guidance.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
@@ -201,28 +182,18 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
     controls.check(guidance.form, space)
     if options.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):
         raise UserError("--one-cue is for relative answers about several cues: leave it out")
+    family: Any = ()
+    if guidance.by_evidence:
+        if options.policy is None or options.again is not None:
+            raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
+        if options.bound_deg is not None:
+            raise UserError("bound_deg is given, but guidance reading asks without a bound: leave bound_deg out")
+        named = options.changes
+        family = declared_distortions(env) if named is None else changes.family_of(changes.load(named), env)
     wanted = options.labels, options.seed, options.who.strip(), options.bound_deg, robot
-    if options.again is not None:
-        plan = Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted, one_cue=options.one_cue)
-        return _second(plan, options)
-    family = _family(options, env) if guidance.by_evidence else ()
-    base = _base(task, options, source, env)
-    return Plan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
-
-
-def _check_evidence(options: Label) -> None:
-    """Raise UserError for options that a reading does not use."""
-    if options.policy is None or options.again is not None:
-        raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
-    scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(options.scalars))
-    by_reading.check_unused(options.sizes, scalars, bound_deg=options.bound_deg)
-
-
-def _family(options: Label, env: Any) -> Family:
-    """Return what may have changed. Raises UserError for invalid changes."""
-    return (
-        declared_distortions(env) if options.changes is None else changes.family_of(changes.load(options.changes), env)
-    )
+    base = _base(task, options, source, env) if options.again is None else Base(uniform_in(env), "")
+    plan = Plan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
+    return plan if options.again is None else _second(plan, options, options.again)
 
 
 def _robot(task: Task, name: str | None) -> str:
@@ -231,85 +202,56 @@ def _robot(task: Task, name: str | None) -> str:
     return "" if body.name == task.bodies[0].name else f"{body.name} {body.digest}".strip()
 
 
-def _second(plan: Plan, options: Label) -> Plan:
+def _second(plan: Plan, options: Label, path: Path) -> Plan:
     """Return a plan with the questions of another page's file. Raises UserError if they are not of this world."""
-    assert options.again is not None
-    file = label_files.read(options.again)
+    file = label_files.read(path)
     if file.session is None or file.people is None:
-        raise UserError(f"{options.again} was not written by the labelling page: its questions cannot be asked again")
+        raise UserError(f"{path} was not written by the labelling page: its questions cannot be asked again")
     if options.policy is not None or options.seed or options.bound_deg is not None:
         raise UserError("--again repeats another page's questions: leave out the policy, --seed and --bound-deg")
     for name, value in plan.world.items():
         if file.task.get(name) != value:
-            raise UserError(
-                f"{options.again} asked in a world with another {name} ({file.task.get(name)}, not {value})"
-            )
+            raise UserError(f"{path} asked in a world with another {name} ({file.task.get(name)}, not {value})")
     if (other := file.session.get("robot", "")) != plan.robot:
-        raise UserError(f"{options.again} asked about {other or 'its own robot'}: give the same --robot")
-    found = label_files.found_in(options.again)
+        raise UserError(f"{path} asked about {other or 'its own robot'}: give the same --robot")
+    found = label_files.found_in(path)
     assert found is not None  # the file was read above
     actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(found)}
     again = tuple(actions[number] for number in sorted(actions))
     base = plan.base._replace(name=f"{file.session['base']} {file.session['base_digest']}".strip())
-    wanted, digest = min(plan.labels, len(again)), label_files.digest(options.again)
+    wanted, digest = min(plan.labels, len(again)), label_files.digest(path)
     seed = int(file.session["seed"])
     return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
 
 
-def _source(task: Task, named: str | None, changed: str | None) -> PolicySource | None:
-    """Return the folder that holds the policy; None for uniform actions or code. Raises UserError for another task.
-
-    `changed`: code of the distortions that the policy corrects, if any.
-    """
-    if named is None or is_code(named):
-        return None
-    folder = shipped.folder_of(named)
-    if not folder.is_dir():
-        raise UserError(f"no policy at {named}: give a run folder, a policy folder or package.module:NAME")
-    own = None if changed is None else changes.load(changed)
-    source = PolicySource.of_folder(
-        folder, lambda name: task if task.name == name else registry.find(name), changes=own
-    )
-    if source.task.name != task.name:
-        raise UserError(f"{folder} is of {source.task.name}, not of {task.name}: give one of the same task")
-    return source
-
-
 def _base(task: Task, options: Label, source: PolicySource | None, env: Any) -> Base:
     """Return the policy to ask about. Raises UserError if it is not available, or needs other observations."""
-    lane, named = options.base, options.policy
-    if named is not None and options.questions != UNIFORM:
-        raise UserError(
-            f"--questions is {options.questions}, but the questions are about {named}: leave out one of them"
-        )
-    if source is None:
-        if lane != Lane():
-            raise UserError("--base.… chooses a folder's lane, but no folder is given: leave it out")
-        if named is not None:
-            return Base(policy_of(code_of(named), actions_of(env)), named)
-        if options.questions == UNIFORM:
-            return Base(uniform_in(env), UNIFORM)
-        if options.questions == PROPOSED:
-            if task.proposed is None:
-                raise UserError(f"--questions is {PROPOSED}, but {task.name} is not a recording: give {UNIFORM}")
-            return Base(task.proposed(task.environment(options.task)), PROPOSED)
-        if not offers(env, "aims"):
-            raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
-        reach = float(actions_of(env).from_unit(REACH * options.scalars.eps_deg))
-        return Base(NearAims(task.view(options.task), reach), NEAR_AIMS)
-    name = lane.name_in(source, options.task)
-    return Base(lane.policy_in(source, options.task, None), f"{source.folder.resolve().name}, {name}")
+    lane, named, questions = options.base, options.policy, options.questions
+    if named is not None and questions != UNIFORM:
+        raise UserError(f"--questions is {questions}, but the questions are about {named}: leave out one of them")
+    if source is not None:
+        name = lane.name_in(source, options.task)
+        return Base(lane.policy_in(source, options.task, None), f"{source.folder.resolve().name}, {name}")
+    if lane != Lane():
+        raise UserError("--base.… chooses a folder's lane, but no folder is given: leave it out")
+    if named is not None:
+        return Base(policy_of(code_of(named), actions_of(env)), named)
+    if questions == UNIFORM:
+        return Base(uniform_in(env), UNIFORM)
+    if questions == PROPOSED:
+        if task.proposed is None:
+            raise UserError(f"--questions is {PROPOSED}, but {task.name} is not a recording: give {UNIFORM}")
+        return Base(task.proposed(task.environment(options.task)), PROPOSED)
+    if not offers(env, "aims"):
+        raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
+    reach = float(actions_of(env).from_unit(REACH * options.scalars.eps_deg))
+    return Base(NearAims(task.view(options.task), reach), NEAR_AIMS)
 
 
-def _part(kind: type, values: Any) -> Any:
-    """Return one part of a configuration with the fields of `values`."""
-    return kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
-
-
-def _server() -> Any:
-    """Import the module that serves a page. Raises UserError if its packages are not installed."""
+def page_module(name: str) -> Any:
+    """Import a module of `labelling` that serves a page. Raises UserError if its packages are not installed."""
     try:
-        from cuelearner_jax.labelling import server
+        module = import_module(f"cuelearner_jax.labelling.{name}")
     except ImportError as error:
         raise UserError(
             f"the page needs packages that are not installed ({error.name}): run `make setup`, or "
@@ -317,7 +259,7 @@ def _server() -> Any:
         ) from error
     # Set before JAX starts: each thread's computations run in that thread, at its priority (`learner`).
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    return server
+    return module
 
 
 def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, commands: Any) -> Any:
@@ -335,15 +277,13 @@ def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, c
                 file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}">\n')
             webbrowser.open(leads_there.absolute().as_uri())
 
-    def tell(words: str) -> None:
-        console.print(f"{words} ...")
-
     def make() -> Session:
-        return Session(plan, options.out, tell)
+        return Session(plan, options.out, lambda words: console.print(f"{words} ..."))
 
-    with contextlib.ExitStack() as end:
-        end.callback(leads_there.unlink, missing_ok=True)
+    try:
         return server.serve(make, f"label {plan.task.name}", port, stopping, open_page, commands)
+    finally:
+        leads_there.unlink(missing_ok=True)
 
 
 def _following(task: Task, preset: str, config: RunConfig, options: Label, labels: int) -> str:
@@ -351,36 +291,28 @@ def _following(task: Task, preset: str, config: RunConfig, options: Label, label
 
     `config`: the preset's configuration.
     """
-    name, out, policy = typed_name(task), str(options.out), options.policy
+    name, out, policy = task.origin or task.named or task.name, str(options.out), options.policy
     if options.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
-    source = ["--labels-from", out, "--labels", str(labels)]
     if policy is None and options.questions == PROPOSED:
         return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'
     if policy is None:
-        words = ["train", name, "--preset", preset, "--guidance", options.guidance, *source]
-        parts = ("task", task.config), ("sizes", GuideSizes), ("scalars", GuideScalars)
-        for part, kind in parts:
-            words += _differing(part, kind, getattr(config, part), getattr(options, part))
-        return shlex.join(["cuelearner", *words, "--out", f"runs/{Path(out).name}"])
-    words = ["adapt", policy, *([] if shipped.is_shipped(policy) or Path(policy).exists() else ["--task", name])]
-    words += [] if options.scenario is None else ["--scenario", options.scenario]
-    words += [] if options.robot is None else ["--robot", options.robot]
-    words += [] if options.changes is None else ["--changes", options.changes]
-    words += ["--guidance", options.guidance, *source]
-    words += _differing("task", task.config, config.task, options.task)
-    return shlex.join(["cuelearner", *words, "--out", f"policies/{Path(out).name}"])
+        words, place = ["train", name, "--preset", preset], "runs"
+        parts = {"task": task.config, "sizes": GuideSizes, "scalars": GuideScalars}
+    else:
+        is_folder = shipped.is_shipped(policy) or Path(policy).exists()
+        words, place = ["adapt", policy, *([] if is_folder else ["--task", name])], "policies"
+        parts = {"task": task.config}
+        for option in ("scenario", "robot", "changes"):
+            if (value := getattr(options, option)) is not None:
+                words += [f"--{option}", value]
+    words += ["--guidance", options.guidance, "--labels-from", out, "--labels", str(labels)]
+    for part, kind in parts.items():
+        before, now = (_values(kind, getattr(of, part)) for of in (config, options))
+        words += as_options(part, {field: value for field, value in now.items() if value != before[field]})
+    return shlex.join(["cuelearner", *words, "--out", f"{place}/{Path(out).name}"])
 
 
-def _differing(part: str, kind: type, before: Any, now: Any) -> list[str]:
-    """Return the options that turn one part of a configuration into another."""
-    words = []
-    for entry in dataclasses.fields(kind):
-        value, option = getattr(now, entry.name), entry.name.replace("_", "-")
-        if value == getattr(before, entry.name):
-            continue
-        if isinstance(value, bool):
-            words.append(f"--{part}.{option}" if value else f"--{part}.no-{option}")
-        else:
-            words += [f"--{part}.{option}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return words
+def _values(kind: type, config: Any) -> dict[str, Any]:
+    """Return the values of a configuration for the fields of `kind`."""
+    return {entry.name: getattr(config, entry.name) for entry in dataclasses.fields(kind)}

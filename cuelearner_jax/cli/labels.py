@@ -20,7 +20,7 @@ from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import UNDONE, UNSURE, LabelFile
 from cuelearner_jax.storage.whole import replacing
-from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console
 
@@ -36,6 +36,22 @@ class Inspect:
     teacher: Flag[bool] = False
     """Also ask the task's teacher a page's questions (takes a while, since all situations are replayed)."""
 
+    def run(self) -> None:
+        """Print a table with a column a file."""
+        files = [comparing.read_checked(path) for path in self.files]
+        table = Table("", *(one_line(str(path)) for path in self.files))
+        told = [_facts(file) for file in files]
+        if self.teacher:
+            for path, file, facts in zip(self.files, files, told, strict=True):
+                facts["agrees with the teacher"] = _with_teacher(path, file)
+        for name in dict.fromkeys(name for facts in told for name in facts):
+            table.add_row(name, *(one_line(facts.get(name, "")) for facts in told))
+        if len(files) == 2:
+            task = registry.find(str(files[0].task.get("name")))
+            env = shape_of(task, comparing.world_of(task, files[0]))
+            table.add_row("agree with each other", str(comparing.between(files[0], files[1], env)))
+        out.print(table)
+
 
 @dataclass(frozen=True)
 class Merge:
@@ -46,6 +62,16 @@ class Merge:
     out: Path | None = None
     """New file, .parquet; an existing file is not replaced."""
 
+    def run(self) -> None:
+        """Write the file. Raises UserError for files that do not fit together."""
+        if self.out is None or self.out.suffix != ".parquet":
+            raise UserError("merge needs --out: give it a name that ends in .parquet")
+        file, left_out = comparing.merge([comparing.read_checked(path) for path in self.files])
+        sources = [f"{path.name} {label_files.digest(path)}" for path in self.files]
+        label_files.write_file(self.out, file, merged_from=sources)
+        twice = f"; {left_out} duplicates of an earlier file's labels were left out" if left_out else ""
+        out.print(f"wrote {len(file.seeds)} labels of {len(self.files)} files to {self.out}{twice}")
+
 
 @dataclass(frozen=True)
 class LabelsExport:
@@ -55,6 +81,23 @@ class LabelsExport:
     """One label file, or the folder of one."""
     out: Path | None = None
     """New file, .csv or .parquet; an existing file is not replaced."""
+
+    def run(self) -> None:
+        """Write the file. Raises UserError for several label files."""
+        if len(self.files) != 1:
+            raise UserError("export takes one label file: first join several by `cuelearner labels merge`")
+        if self.out is None or self.out.suffix not in (".csv", ".parquet"):
+            raise UserError("export needs --out: give it a name that ends in .csv or .parquet")
+        file = comparing.read_checked(self.files[0])
+        if self.out.suffix == ".parquet":
+            label_files.write_file(self.out, file)
+        else:
+            columns = _columns(file)
+            with replacing(self.out, fresh=True) as target:
+                writer = csv.writer(target)
+                writer.writerow(columns)
+                writer.writerows(zip(*columns.values(), strict=True))
+        out.print(f"wrote {len(file.seeds)} labels to {self.out}")
 
 
 Labels = (
@@ -69,31 +112,16 @@ def run(arguments: list[str]) -> None:
     options = parse(Labels, arguments, "labels")
     if not options.files:
         raise UserError(f"name a label file: cuelearner labels {arguments[0]} FILE")
-    {Inspect: _inspect, Merge: _merge, LabelsExport: _export}[type(options)](options)
+    options.run()
 
 
-# --- inspect ---------------------------------------------------------------------------------------------------------
-
-
-def _inspect(options: Inspect) -> None:
-    files = [comparing.read_checked(path) for path in options.files]
-    table = Table("", *(one_line(str(path)) for path in options.files))
-    told = [_told(path, file, options.teacher) for path, file in zip(options.files, files, strict=True)]
-    for name in dict.fromkeys(name for one in told for name in one):
-        table.add_row(name, *(one_line(one.get(name, "")) for one in told))
-    if len(files) == 2:
-        table.add_row("agree with each other", str(comparing.between(files[0], files[1], _shape(files[0]))))
-    out.print(table)
-
-
-def _told(path: Path, file: LabelFile, teacher: bool) -> dict[str, str]:
+def _facts(file: LabelFile) -> dict[str, str]:
     """Return the facts about a label file, by name."""
     world = ", ".join(f"{name} {value}" for name, value in file.task.items() if name not in ("name", "from"))
     strength = "" if file.eps is None else f", by {file.eps:g} {file.space.unit}"
     facts = {"task": f"{file.task.get('name')} ({world})", "answers": f"{file.answers}{strength}"}
-    facts["labels"] = f"{len(file.seeds)}" + (
-        f" of {len(np.unique(file.seeds))} seeds" if len(np.unique(file.seeds)) > 1 else ""
-    )
+    several = f" of {seeds} seeds" if (seeds := len(np.unique(file.seeds))) > 1 else ""
+    facts["labels"] = f"{len(file.seeds)}{several}"
     form = comparing.form_of(file)
     if form is not None and form.values is not None:
         counts = Counter(np.asarray(file.labels.answer).ravel().tolist())
@@ -101,94 +129,47 @@ def _told(path: Path, file: LabelFile, teacher: bool) -> dict[str, str]:
         values = form.values(file.space)
         facts["of each answer"] = ", ".join(f"{names.get(one, f'{one:g}')}: {counts.get(one, 0)}" for one in values)
     if file.said:
-        facts["not known"], facts["taken back"] = (str(file.said.get(name, 0)) for name in (UNSURE, UNDONE))
+        facts |= {"not known": str(file.said.get(UNSURE, 0)), "taken back": str(file.said.get(UNDONE, 0))}
     if file.session:
-        base = " ".join(str(file.session[name]) for name in ("base", "base_digest") if file.session.get(name))
         facts |= {
-            "actions of": base,
+            "actions of": " ".join(
+                str(file.session[name]) for name in ("base", "base_digest") if file.session.get(name)
+            ),
             "fitted meanwhile": str(file.session.get("guidance")),
             "seed": f"{file.session['seed']}",
         }
     if file.people is not None:
-        facts |= _pace(file.people)
-    if teacher:
-        facts["agrees with the teacher"] = str(_with_teacher(path, file))
+        seconds = np.asarray(file.people.seconds, float)
+        pace = f"{60 * len(seconds) / seconds.sum():.1f}" if seconds.sum() > 0 else ""
+        facts |= {
+            "by": ", ".join(f"{who} ({count})" for who, count in Counter(file.people.who.tolist()).items()),
+            "given": f"{min(file.people.when)} to {max(file.people.when)}",
+            "seconds a label": f"{np.median(seconds):.2f} median, {np.quantile(seconds, 0.9):.2f} for nine of ten",
+            "labels a minute": pace,
+        }
     return facts
 
 
-def _pace(people: label_files.People) -> dict[str, str]:
-    seconds = np.asarray(people.seconds, float)
-    total = seconds.sum()
-    counts = Counter(people.who.tolist())
-    return {
-        "by": ", ".join(f"{who} ({count})" for who, count in counts.items()),
-        "given": f"{min(people.when)} to {max(people.when)}",
-        "seconds a label": f"{np.median(seconds):.2f} median, {np.quantile(seconds, 0.9):.2f} for nine of ten",
-        "labels a minute": f"{60 * len(seconds) / total:.1f}" if total > 0 else "",
-    }
+def _with_teacher(path: Path, file: LabelFile) -> str:
+    """Return how often the answers are those of the task's teacher. Raises UserError where no page asked them."""
+    task, found = registry.find(str(file.task.get("name"))), label_files.found_in(path)
+    assert found is not None  # the file was read before
+    scalars = next((preset.config.scalars for preset in task.presets.values()), Scalars())
+    rows = label_files.history(found)
+    return str(comparing.with_teacher(task, file, rows, scalars, lambda words: console.print(f"{words} ...")))
 
 
-def _task(file: LabelFile) -> Task:
-    return registry.find(str(file.task.get("name")))
-
-
-def _shape(file: LabelFile) -> Any:
-    task = _task(file)
-    return shape_of(task, comparing.world_of(task, file))
-
-
-def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
-    task = _task(file)
-    found = label_files.found_in(path)
-    assert found is not None  # the file was read above
-    presets = [preset.config.scalars for preset in task.presets.values()]
-    scalars, rows = presets[0] if presets else Scalars(), label_files.history(found)
-    return comparing.with_teacher(task, file, rows, scalars, lambda words: console.print(f"{words} ..."))
-
-
-# --- merge and export ------------------------------------------------------------------------------------------------
-
-
-def _merge(options: Merge) -> None:
-    if options.out is None or options.out.suffix != ".parquet":
-        raise UserError("merge needs --out: give it a name that ends in .parquet")
-    file, left_out = comparing.merge([comparing.read_checked(path) for path in options.files])
-    sources = [f"{path.name} {label_files.digest(path)}" for path in options.files]
-    label_files.write_file(options.out, file, merged_from=sources)
-    twice = f"; {left_out} duplicates of an earlier file's labels were left out" if left_out else ""
-    out.print(f"wrote {len(file.seeds)} labels of {len(options.files)} files to {options.out}{twice}")
-
-
-def _export(options: LabelsExport) -> None:
-    if len(options.files) != 1:
-        raise UserError("export takes one label file: first join several by `cuelearner labels merge`")
-    place = options.out
-    if place is None or place.suffix not in (".csv", ".parquet"):
-        raise UserError("export needs --out: give it a name that ends in .csv or .parquet")
-    file = comparing.read_checked(options.files[0])
-    if place.suffix == ".parquet":
-        label_files.write_file(place, file)
-    else:
-        rows = _flat(file)
-        with replacing(place, fresh=True) as target:
-            writer = csv.writer(target)
-            writer.writerow(rows)
-            writer.writerows(zip(*rows.values(), strict=True))
-    out.print(f"wrote {len(file.seeds)} labels to {place}")
-
-
-def _flat(file: LabelFile) -> dict[str, list[Any]]:
+def _columns(file: LabelFile) -> dict[str, list[Any]]:
     """Return the labels as columns of plain numbers and words."""
     columns: dict[str, list[Any]] = {"seed": file.seeds.tolist()}
     if file.people is not None:
         columns |= {name: getattr(file.people, name).tolist() for name in file.people._fields}
     columns["eps"] = [file.eps] * len(file.seeds)
     layout = (file.session or {}).get("observation") or []
-    names = [f"{part['name']}[{i}]" for part in layout for i in range(part["size"])]
-    width = file.labels.obs.shape[1]
-    named = {"action": None, "answer": None, "obs": names if len(names) == width else None}
-    for kind, given in named.items():
+    names = [f"obs: {part['name']}[{i}]" for part in layout for i in range(part["size"])]
+    for kind in ("action", "answer", "obs"):
         values = np.asarray(getattr(file.labels, kind))
-        for place in range(values.shape[1]):
-            columns[f"obs: {given[place]}" if given else f"{kind}[{place}]"] = values[:, place].tolist()
+        plain = [f"{kind}[{place}]" for place in range(values.shape[1])]
+        given = names if kind == "obs" and len(names) == len(plain) else plain
+        columns |= dict(zip(given, values.T.tolist(), strict=True))
     return columns

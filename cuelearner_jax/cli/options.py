@@ -14,7 +14,6 @@ import os
 import re
 from dataclasses import dataclass, field
 from itertools import takewhile
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -22,8 +21,7 @@ from rich.console import Console
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs import trained
-from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.runs.trained import POLICIES
 from cuelearner_jax.task import PAPER, Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import PLAIN
@@ -32,7 +30,6 @@ Flag = tyro.conf.FlagCreatePairsOff
 Word = Annotated[str | None, tyro.conf.Positional]
 unprefixed = tyro.conf.arg(name="")
 Kinds = Annotated[dict[str, Any], unprefixed]  # options of kinds of guidance, named `--KIND.…`
-HELP = ("-h", "--help")
 
 
 class _Output(Console):
@@ -78,54 +75,30 @@ class Parts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finished(Outside, Parts):
-    """A finished policy's code, which is never loaded because a file names it, and its world."""
+class Changed(Outside):
+    """The world that a finished policy meets."""
 
     task: Any = field(default_factory=Unnamed)
-    code: Annotated[str | None, tyro.conf.arg(name="base")] = None
-    """Code of a policy folder's base policy: package.module:NAME."""
+    scenario: str | None = None
+    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
+    robot: str | None = None
+    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
+    policy."""
     changes: str | None = None
     """Distortions of your own that a reading of answers knows, in place of those that the world declares:
     package.module:NAME."""
-    scenario: str | None = None
-    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lane:
-    """Choice of a folder's policy, and of its lane."""
+class Finished(Changed, Parts):
+    """A finished policy's code, which is never loaded because a file names it, and its world."""
 
-    policy: str | None = None
-    """Name of the acting policy, as for evaluate (default: the agent, or the adapted policy)."""
-    guidance: str | None = None
-    """Kind of guidance of the lane (default: the run's last)."""
-    labels: int | None = None
-    """Label budget of the lane (default: the largest)."""
-    bound_deg: float | None = None
-    """Bound of a policy folder's lane (default: the largest) [deg]."""
-    seed: int | None = None
-    """Seed of the lane (default: the first)."""
-
-    @property
-    def chosen(self) -> dict[str, Any]:
-        """Return the options that were given to choose a lane, by name."""
-        lane = {"guidance": self.guidance, "labels": self.labels, "seed": self.seed, "bound_deg": self.bound_deg}
-        return {name: value for name, value in lane.items() if value is not None}
-
-    def name_in(self, source: PolicySource, world: Any) -> str:
-        """Return the policy's name. Raises UserError if the source has no such policy, or none for that world."""
-        name = self.policy or source.default_policy
-        source.check(name, world, guidance=self.guidance)
-        return name
-
-    def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:
-        """Return the single policy. Raises UserError if there is no such lane."""
-        name = self.policy or source.default_policy
-        return trained.one_policy(source, world, name, self.guidance, self.labels, self.seed, self.bound_deg, env)
+    code: Annotated[str | None, tyro.conf.arg(name="base")] = None
+    """Code of a policy folder's base policy: package.module:NAME."""
 
 
 ONE = ("task", "env", "teacher", "preset", "scenario", "agent", "arbiter", "base", "changes", "labels-from", "judge-by")
-SEVERAL = ("guidance", "compare")  # options with several words
+ONE += ("task.actions", "cues")
 
 
 class _Ahead(argparse.ArgumentParser):
@@ -142,12 +115,8 @@ def look_ahead(arguments: list[str]) -> argparse.Namespace:
     parser = _Ahead(add_help=False, allow_abbrev=False)
     for name in ONE:
         parser.add_argument(f"--{name}")
-    for name in SEVERAL:
-        parser.add_argument(f"--{name}", nargs="*")
-    for name in ("low", "high"):
-        parser.add_argument(f"--task.{name}", nargs="*", type=float)
-    parser.add_argument("--task.actions")
-    parser.add_argument("--cues")
+    for name, kind in {"guidance": str, "compare": str, "task.low": float, "task.high": float}.items():
+        parser.add_argument(f"--{name}", nargs="*", type=kind)
     ahead, rest = parser.parse_known_args(arguments)
     ahead.words = list(takewhile(lambda word: not word.startswith("-"), rest))
     return ahead
@@ -159,15 +128,10 @@ def look_ahead_of(arguments: list[str], command: str, kind: type) -> argparse.Na
     if ahead.words or ahead.task or ahead.env or len(ahead.compare or ()) > 1:
         return ahead
     tasks = ", ".join(registry.names())
-    if any(word in HELP for word in arguments):
-        about = f"{summary(kind)}\n\ntasks: {tasks}; or one of your own, as package.module:NAME\n\n"
+    if {"-h", "--help"} & {*arguments}:
+        about = f"{inspect.getdoc(kind)}\n\ntasks: {tasks}; or one of your own, as package.module:NAME\n\n"
         parse(kind, ["--help"], command, kind(), f"{about}With a task, --help lists the task's options too.")
     raise UserError(f"{command} needs a subject: name a task ({tasks}) or a folder; see cuelearner {command} --help")
-
-
-def summary(kind: type) -> str:
-    """Return a command's purpose: its options' docstring."""
-    return inspect.cleandoc(kind.__doc__ or "")
 
 
 def parse(kind: Any, arguments: list[str], command: str, default: Any = None, about: str = "") -> Any:
@@ -186,17 +150,11 @@ def parse(kind: Any, arguments: list[str], command: str, default: Any = None, ab
         lines = [re.sub("[-─]{3,}", "", line).strip("│╭╮╰╯|+ ") for line in errors.getvalue().splitlines()]
         message = re.split("For full helptext|Argument helptext", " ".join(" ".join(lines[1:]).split()))[0].strip()
         raise UserError(f"{message}; see cuelearner {command} --help") from None
-    check_out(getattr(options, "out", None))
+    if (place := getattr(options, "out", None)) is not None:
+        there = next(parent for parent in place.absolute().parents if parent.exists())
+        if not there.is_dir() or not os.access(there, os.W_OK):
+            raise UserError(f"{there} is not a folder that may be written to: give another --out")
     return options
-
-
-def check_out(place: Path | None) -> None:
-    """Raise UserError unless the folder of an output exists, or can be made, and may be written to."""
-    if place is None:
-        return
-    there = next(parent for parent in place.absolute().parents if parent.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK):
-        raise UserError(f"{there} is not a folder that may be written to: give another --out")
 
 
 def check_numbers(options: Any, **bounds: tuple[int, int]) -> None:
@@ -208,28 +166,38 @@ def check_numbers(options: Any, **bounds: tuple[int, int]) -> None:
 
 def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:
     """Return the text above a command's options: its purpose and the names to choose from. `preset`: the default."""
-    scenarios = {name: f"{one.about} ({_as_options(one.changes)})" for name, one in task.scenarios.items()}
+    scenarios = {
+        name: f"{one.about} ({' '.join(as_options('task', one.changes))})" for name, one in task.scenarios.items()
+    }
     presets = {name: f"{one.about}{f' ({one.takes})' if one.takes else ''}" for name, one in task.presets.items()}
     default = f"; {task.first_preset(preset)} where none is given" if presets else ""
     groups = {
         f"presets (--preset{default})": presets,
         "changed worlds (--scenario)": scenarios,
-        "robots (--robot)": {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {},
+        "robots (--robot)": {body.name: body.about for body in task.bodies if len(task.bodies) > 1},
         "guidance (--guidance; your own as package.module:NAME)": {
-            n: one.about for n, one in guidances.guides().items()
+            name: one.about for name, one in guidances.guides().items()
         },
-        "policies (--policy)": {name: one.about for name, one in POLICIES.items()} if policies else {},
+        "policies (--policy)": {name: one.about for name, one in POLICIES.items() if policies},
     }
     # A line that is not indented would be taken for the end of the one above: the groups stand apart.
-    return "\n\n".join([summary(kind), *(f"{title}:\n{_rows(rows)}" for title, rows in groups.items() if rows)])
+    listed = (f"{title}:\n{rows(texts)}" for title, texts in groups.items() if texts)
+    return "\n\n".join([str(inspect.getdoc(kind)), *listed])
 
 
-def _as_options(changes: dict[str, Any]) -> str:
-    """Return fields of a configuration as command-line options."""
-    several = {name: value if isinstance(value, tuple) else (value,) for name, value in changes.items()}
-    return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in several.items())
+def as_options(part: str, values: dict[str, Any]) -> list[str]:
+    """Return the words of a command line that give fields of one part of a configuration their values."""
+    words = []
+    for name, value in values.items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{part}.{option}" if value else f"--{part}.no-{option}")
+        else:
+            words += [f"--{part}.{option}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return words
 
 
-def _rows(texts: dict[str, str]) -> str:
+def rows(texts: dict[str, str]) -> str:
+    """Return names and their texts, a line each."""
     width = max(map(len, texts)) + 2
     return "\n".join(f"  {name:<{width}}{text}" for name, text in texts.items())

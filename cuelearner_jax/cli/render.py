@@ -6,9 +6,10 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from cuelearner_jax.cli.options import Finished, Flag, Lane, check_numbers, out
+from cuelearner_jax.cli.options import Finished, Flag, check_numbers, out
 from cuelearner_jax.cli.sources import source_and_options
 from cuelearner_jax.runs import filming
+from cuelearner_jax.studies.lanes import Lane
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,9 +22,6 @@ class Render(Finished, Lane):
     """Number of steps to film, over several episodes if needed."""
     episode: int = 0
     """Number of the episode to begin with, which sets its random start."""
-    robot: str | None = None
-    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
-    policy."""
     question: Flag[bool] = False
     """Draw only the episode's first situation with the policy's action, as the labelling page shows it."""
     film: str = "gif"

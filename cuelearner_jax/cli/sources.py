@@ -9,6 +9,8 @@ from typing import Any
 
 from cuelearner_jax import plugins
 from cuelearner_jax.adaptation import changes
+from cuelearner_jax.api.adaptation import world_of
+from cuelearner_jax.api.labels import labels_from_file
 from cuelearner_jax.cli.options import about, look_ahead_of, parse
 from cuelearner_jax.environment import actions_of, check_layout
 from cuelearner_jax.errors import UserError, suggestion
@@ -24,10 +26,10 @@ from cuelearner_jax.terminal import console
 
 def task_of(ahead: Namespace) -> Task:
     """Return the task named first, or by --task or --env; --teacher makes code its teacher. Raises UserError."""
-    option = _task_option(ahead)
-    if option is not None and ahead.words:
-        raise UserError(f"the task is named twice, {ahead.words[0]!r} and {option!r}: name it once")
-    return _with_teacher(registry.resolve(option or ahead.words[0]), ahead.teacher)
+    task = _task_by_option(ahead)
+    if task is not None and ahead.words:
+        raise UserError(f"the task is named twice, {ahead.words[0]!r} and {ahead.task or ahead.env!r}: name it once")
+    return _with_teacher(task or registry.resolve(ahead.words[0]), ahead.teacher)
 
 
 def recorded_or_task(ahead: Namespace) -> Task:
@@ -36,10 +38,7 @@ def recorded_or_task(ahead: Namespace) -> Task:
     if not folder or folder in registry.names() or not (Path(folder).exists() or folder != ahead.words[0]):
         return task_of(ahead)
     low, high, actions = (getattr(ahead, f"task.{name}") for name in ("low", "high", "actions"))
-
-    def note(words: str) -> None:
-        console.print(words.replace("give low and high", "give --task.low and --task.high"))
-
+    note = lambda words: console.print(words.replace("give low and high", "give --task.low and --task.high"))  # noqa: E731
     return logs.task_of(folder, ahead.cues or "", low, high, actions or "box", note=note)
 
 
@@ -66,18 +65,18 @@ def preset_of(task: Task, name: str | None, default: str = PAPER) -> tuple[str, 
     return name, task.presets[name]
 
 
-def source_of(ahead: Namespace) -> PolicySource:
+def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
     """Return the run folder, policy folder or task named first; or code, a policy of the user's own in a task.
 
     --task, or --env, makes an outside task known, and a library's environment the world of a folder. --teacher makes
-    code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code.
+    code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code. Code
+    without a task acts in the situations of --labels-from. `is_policy`: code without a task is a policy, not a task.
 
     Raises:
         UserError: the folder or task does not exist or is not available.
     """
-    named, option = ahead.words[0] if ahead.words else None, _task_option(ahead)
-    task, own = None if option is None else registry.resolve(option), None
-    code = None if ahead.base is None else code_of(ahead.base)
+    named, task, code = ahead.words[0] if ahead.words else None, _task_by_option(ahead), None
+    base = None if ahead.base is None else code_of(ahead.base)
     for name, table in PARTS.items():
         if (part := getattr(ahead, name)) is not None:
             plugins.resolve(table, part, name)
@@ -85,28 +84,50 @@ def source_of(ahead: Namespace) -> PolicySource:
         folder = shipped.folder_of(named)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
         if holds or (folder.exists() and named not in registry.names()):
-            own = None if ahead.changes is None else changes.load(ahead.changes)
-            source = _of_folder(folder, task, code, own)
+            source = source_in(folder, task, base, ahead.changes)
             return dataclasses.replace(source, task=_with_teacher(source.task, ahead.teacher))
-        if task is not None and not is_code(named):
+        if is_code(named) and (task is not None or is_policy or ahead.labels_from is not None):
+            task = task or _recorded(named, ahead.labels_from)
+            code = code_of(named)
+        elif task is not None:
             raise UserError(f"{named!r} is no run folder of the task {task.name}: give one, or code as module:NAME")
-        if task is None and ":" not in named and named not in registry.names():
+        elif ":" not in named and named not in registry.names():
             raise UserError(
                 f"{named!r} is neither a run folder nor a task ({', '.join(registry.names())}) "
                 f"nor a shipped agent ({', '.join(shipped.names())})"
             )
-        own = None if task is None else code_of(named)
-        task = task or registry.resolve(named)
-    assert task is not None  # otherwise a word was named
-    if code is not None:
+    task = task or registry.resolve(str(named))
+    if base is not None:
         raise UserError("--base names the code in a policy folder: give that folder, or leave it out")
     _, preset = preset_of(task, ahead.preset)
-    return PolicySource(_with_teacher(task, ahead.teacher), preset.config, None, Path(task.name), code=own)
+    return PolicySource(_with_teacher(task, ahead.teacher), preset.config, None, Path(task.name), code=code)
 
 
-def source_and_options(
-    arguments: list[str], command: str, kind: Any, more: str = "", **defaults: Any
-) -> tuple[PolicySource, Any]:
+def source_in(folder: Path, known: Task | None, code: Any, changed: str | None) -> PolicySource:
+    """Return the policies of a run or policy folder, for a family of tasks in the environment named beside it.
+
+    `code`, `changed`: code of a policy folder (an object, and package.module:NAME).
+
+    Raises UserError for another kind of folder, another task than named, or other observations or actions.
+    """
+
+    def find(name: str) -> Task:
+        return known if known is not None and known.name == name and not known.named else registry.find(name)
+
+    source = PolicySource.of_folder(folder, find, code, None if changed is None else changes.load(changed))
+    if known is not None and known.name != source.task.name:
+        what = "a run" if source.grid else "a policy"
+        raise UserError(f"{folder} is {what} of {source.task.name}, not of {known.name}: give one of {known.name}")
+    if known is None or not known.named:
+        return source
+    before = shape_of(known, source.config.task)
+    check_layout(f"{folder}", before.observation, actions_of(before), shape_of(known, known.plain()))
+    if getattr(known.plain(), "environment", None) == getattr(source.config.task, "environment", ""):
+        return dataclasses.replace(source, task=known)  # with the folder's settings of this environment
+    return dataclasses.replace(source, task=known, config=dataclasses.replace(source.config, task=known.plain()))
+
+
+def source_and_options(arguments: list[str], command: str, kind: Any, more: str = "") -> tuple[PolicySource, Any]:
     """Return the policies' source, with the chosen robot, and the options of a command about finished policies.
 
     `more` is added to the help's text. Raises UserError for choices that do not exist.
@@ -118,28 +139,36 @@ def source_and_options(
     world = source.config.task
     if ahead.scenario is not None:
         world = source.task.scenario(ahead.scenario).apply(world)
-    default = kind(task=world, policy=source.default_policy, **defaults)
+    default = kind(task=world, policy=source.default_policy)
     options = parse(kind, arguments, command, default, about(kind, source.task, policies=True) + more)
-    return source.on(getattr(options, "robot", None)), options
+    return source.on(options.robot), options
 
 
-def typed_name(task: Task) -> str:
-    """Return how a task is named on the command line."""
-    return task.origin or task.named or task.name
-
-
-def _task_option(ahead: Namespace) -> str | None:
+def _task_by_option(ahead: Namespace) -> Task | None:
+    """Return the task of --task or --env, where code that is no task is an environment of Gymnasium's kind."""
     if ahead.task is not None and ahead.env is not None:
         raise UserError(f"the task is named twice, {ahead.task!r} and {ahead.env!r}: name it once")
-    return ahead.task if ahead.env is None else _environment(ahead.env)
+    named = ahead.env
+    if named is None:
+        return None if ahead.task is None else registry.resolve(ahead.task)
+    is_outside = plugins.REFERENCE.fullmatch(named) and named.partition(":")[0] not in registry.FAMILIES
+    if is_outside and not isinstance(plugins.load(named, object, "an environment"), Task):
+        named = f"gymnasium:{named}"
+    return registry.resolve(named)
 
 
-def _environment(name: str) -> str:
-    """Return the name of a task; code that is no task is an environment of Gymnasium's kind."""
-    is_outside = plugins.REFERENCE.fullmatch(name) and name.partition(":")[0] not in registry.FAMILIES
-    if is_outside and not isinstance(plugins.load(name, object, "an environment"), Task):
-        return f"gymnasium:{name}"
-    return name
+def _recorded(named: str, path: str | None) -> Task:
+    """Return the situations of a label file as a task. Raises UserError unless its labels are about a recording.
+
+    `named`: the code that acts in them.
+    """
+    labels = None if path is None else labels_from_file(Path(path))
+    if labels is None or labels.task.get("name") != logs.NAME:
+        why = "" if path is None else f", since {path} does not hold labels of a recording"
+        raise UserError(
+            f"{named} needs a task to act in{why}: give one, for instance --task navigation or --env gymnasium:NAME"
+        )
+    return world_of(labels).task
 
 
 def _with_teacher(task: Task, reference: str | None) -> Task:
@@ -163,22 +192,3 @@ def is_code(named: str) -> bool:
 def code_of(reference: str) -> Any:
     """Return the policy of `package.module:NAME` or of a file in ONNX. Raises UserError if there is none."""
     return policy_of(reference if reference.endswith(FILES) else plugins.load(reference, object, "a policy"))
-
-
-def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> PolicySource:
-    """Open a run or policy folder, for a family of tasks in the environment named beside it.
-
-    Raises UserError for another kind of folder, another task than named, or other observations or actions.
-    """
-    source = PolicySource.of_folder(folder, registry.find, code, changed)
-    if known is not None and known.name != source.task.name:
-        what = "a run" if source.grid else "a policy"
-        raise UserError(f"{folder} is {what} of {source.task.name}, not of {known.name}: leave out --task")
-    if known is not None and known.named:
-        before = shape_of(known, source.config.task)
-        check_layout(f"{folder}", before.observation, actions_of(before), shape_of(known, known.plain()))
-        if getattr(known.plain(), "environment", None) == getattr(source.config.task, "environment", ""):
-            return dataclasses.replace(source, task=known)  # with the folder's settings of this environment
-        world = dataclasses.replace(source.config, task=known.plain())
-        source = dataclasses.replace(source, task=known, config=world)
-    return source

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Annotated
 
-from cuelearner_jax.cli.options import out
-from cuelearner_jax.cli.train import Training, task_and_options
+import tyro
+
+from cuelearner_jax.cli.train import Training, parse_training, suggested
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.studies import train
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,21 +24,16 @@ class Sweep(Training):
     """Number of seeds."""
     first_seed: int = 0
     """First seed; the others count up from it."""
-    shard: str | None = None
+    chosen_shard: Annotated[str | None, tyro.conf.arg(name="shard")] = None
     """Run only shard i of n, given as i/n: its share of the seeds, in a folder of its own below --out. An interrupted
     shard is continued."""
 
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
-    task, options = task_and_options(arguments, "sweep", Sweep, _of_grid)
+    task, grid, default = suggested(arguments, "sweep", Sweep)
+    seeds, first = len(grid.seeds), grid.seeds[0]
+    default = replace(default, guidance=grid.guidance, labels=grid.labels, seeds=seeds, first_seed=first)
+    options = parse_training(arguments, "sweep", task, default)
     grid = Grid(options.guidance, seeds_of(options.first_seed, options.seeds), options.labels)
-    shard = Shard.parse(options.shard) if options.shard else None
-    train.run(options.order(task, grid, shard))
-    out.print(options.done)
-
-
-def _of_grid(grid: Grid) -> dict[str, Any]:
-    """Return the options of what a preset compares."""
-    seeds = {"seeds": len(grid.seeds), "first_seed": grid.seeds[0]}
-    return {"guidance": grid.guidance, "labels": grid.labels, **seeds}
+    options.train(grid, Shard.parse(options.chosen_shard) if options.chosen_shard else None)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
+
+import tyro
 
 from cuelearner_jax import plugins
 from cuelearner_jax.cli.options import (
@@ -31,13 +32,18 @@ from cuelearner_jax.studies import train
 from cuelearner_jax.task import QUICKSTART, Task
 
 TrainingT = TypeVar("TrainingT", bound="Training")
+Settled = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]  # of the order, but no option: set after parsing
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training(Outside, Parts):
-    """Options that train and sweep share."""
+class Training(Outside, Parts, Order):
+    """Options that train and sweep share, and the order that they make."""
 
-    run: Annotated[RunConfig[Any, Any, Any, Kinds], unprefixed] = field(default_factory=lambda: RunConfig(Unnamed()))
+    task: Settled = None
+    grid: Settled = None
+    split: Settled = "validation"
+    shard: Settled = None
+    config: Annotated[RunConfig[Any, Any, Any, Kinds], unprefixed] = field(default_factory=lambda: RunConfig(Unnamed()))
     out: Path = Path("runs/NAME")
     """Folder for results and checkpoints."""
     resume: Flag[bool] = False
@@ -54,25 +60,10 @@ class Training(Outside, Parts):
     """Tracker that also gets the curves, as means over seeds: tensorboard or wandb (offline), below the run's
     folder."""
 
-    def order(self, task: Task, grid: Grid, shard: Shard | None = None) -> Order:
-        """Return the order to train a grid of a task."""
-        return Order(
-            task,
-            self.run,
-            grid,
-            self.out,
-            resume=self.resume,
-            overwrite=self.overwrite,
-            labels_from=self.labels_from,
-            shard=shard,
-            split="tuning" if self.tuning else "validation",
-            track=self.track,
-        )
-
-    @property
-    def done(self) -> str:
-        """The line printed at the end."""
-        return f"done: {self.out} (show it by: cuelearner report {self.out} --out {self.out}/report)"
+    def train(self, grid: Grid, shard: Shard | None = None) -> None:
+        """Train these lanes and print where they lie. Raises what `studies.train.run` raises."""
+        train.run(replace(self, grid=grid, shard=shard, split="tuning" if self.tuning else "validation"))
+        out.print(f"done: {self.out} (show it by: cuelearner report {self.out} --out {self.out}/report)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,19 +80,16 @@ class Train(Training):
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
-    task, options = task_and_options(
-        arguments, "train", Train, lambda grid: {"guidance": asking_kind(grid.guidance), "labels": grid.labels[0]}
-    )
-    train.run(options.order(task, Grid((options.guidance,), (options.seed,), (options.labels,))))
-    out.print(options.done)
+    task, grid, default = suggested(arguments, "train", Train)
+    default = replace(default, guidance=asking_kind(grid.guidance), labels=grid.labels[0])
+    options = parse_training(arguments, "train", task, default)
+    options.train(Grid((options.guidance,), (options.seed,), (options.labels,)))
 
 
-def task_and_options(
-    arguments: list[str], command: str, kind: type[TrainingT], of_grid: Callable[[Grid], dict[str, Any]]
-) -> tuple[Task, TrainingT]:
-    """Return the task and the options of a training command. Raises UserError for choices that do not exist.
+def suggested(arguments: list[str], command: str, kind: type[TrainingT]) -> tuple[Task, Grid, TrainingT]:
+    """Return the task of a training command, the grid of its preset, and the default options but for the grid's.
 
-    `of_grid` returns defaults from what the preset compares.
+    Raises UserError for choices that do not exist.
     """
     ahead = look_ahead_of(arguments, command, kind)
     task = task_of(ahead)
@@ -114,14 +102,19 @@ def task_and_options(
             config = replace(config, **{part: chosen()})
     used = [guidances.resolve(word) for word in ahead.guidance or request.grid.guidance]
     kinds = {one.name: config.kinds.get(one.name) or one.config() for one in used if one.config}
-    default = kind(run=replace(config, kinds=kinds), out=Path("runs") / f"{task.name}-{name}", **of_grid(request.grid))
+    place = Path("runs") / f"{task.name}-{name}"
+    return task, request.grid, kind(config=replace(config, kinds=kinds), out=place)
+
+
+def parse_training(arguments: list[str], command: str, task: Task, default: TrainingT) -> TrainingT:
+    """Return the options of a training command, for the chosen robot. Raises UserError for a folder of a robot."""
+    kind = type(default)
     options = parse(kind, arguments, command, default, about(kind, task, preset=QUICKSTART))
     if options.robot is not None and ":" in options.robot:
         raise UserError(f"--robot is {options.robot}, but training takes no folder of a robot: give its name alone")
-    return task.on(options.robot), options
+    return replace(options, task=task.on(options.robot))
 
 
 def asking_kind(kinds: tuple[str, ...]) -> str:
     """Return the first of the kinds that asks a teacher, or else the first."""
-    asking = [kind for kind in kinds if guidances.resolve(kind).asks]
-    return (asking or list(kinds))[0]
+    return next((kind for kind in kinds if guidances.resolve(kind).asks), kinds[0])

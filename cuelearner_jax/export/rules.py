@@ -170,11 +170,9 @@ def chosen(builder: Builder, which: Known, cases: list[Known], shape: Shape, kin
     return found
 
 
-one("clamp")(
-    lambda b, equation, given, shape, kind: b.add(
-        "min", [b.add("max", given[1::-1], shape, kind), given[2]], shape, kind
-    )
-)
+@one("clamp")
+def _clamp(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
+    return builder.add("min", [builder.add("max", given[1::-1], shape, kind), given[2]], shape, kind)
 
 
 @one("round")
@@ -239,13 +237,10 @@ def _split(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
 @one("pad")
 def _pad(builder: Builder, equation: Any, given: list[Known], shape: Shape, kind: str) -> Known:
     value, filling = given
-    settings = [tuple(map(int, each)) for each in equation.params["padding_config"]]
-    if any(inner for _, _, inner in settings):
-        raise NotImplementedError("padding between entries")
-    kept = [(max(-low, 0), size - max(-high, 0)) for (low, high, _), size in zip(settings, value.shape, strict=True)]
-    value = _cut(builder, value, *zip(*kept, strict=True))
-    ends = {"low": [max(low, 0) for low, _, _ in settings], "high": [max(high, 0) for _, high, _ in settings]}
-    return builder.add("pad", [value, filling], shape, kind, **ends)
+    low, high, inner = (list(map(int, each)) for each in zip(*equation.params["padding_config"], strict=True))
+    if any(inner) or min(*low, *high) < 0:
+        raise NotImplementedError("padding between entries, or by less than nothing")
+    return builder.add("pad", [value, filling], shape, kind, low=low, high=high)
 
 
 def _taken(builder: Builder, value: Known, places: Known, shape: Shape, kind: str) -> Value:
@@ -360,14 +355,9 @@ def _while(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     results = [builder.new(value.shape, value.kind) for value in carried]
     test = builder.branch(named["cond_jaxpr"], given[:of_test], carried)
     body = builder.branch(named["body_jaxpr"], given[of_test : of_test + of_body], carried)
-    attributes = {
-        "carried": [value.name for value in carried],
-        "kinds": [[value.kind, list(value.shape)] for value in carried],
-        "test": test._asdict(),
-        "body": body._asdict(),
-    }
-    names = [value.name for value in results]
-    builder.ops.append(["while", list(map(builder.name, start)), names, attributes])
+    kinds = [[value.kind, list(value.shape)] for value in carried]
+    parts = {"carried": test.inputs, "kinds": kinds, "test": test._asdict(), "body": body._asdict()}
+    builder.ops.append(["while", list(map(builder.name, start)), [value.name for value in results], parts])
     return list(results)
 
 
@@ -383,8 +373,7 @@ def _scan(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
         fixed, carried = named["num_consts"], named["num_carry"]
     consts, carry, over = given[:fixed], given[fixed:][:carried], given[fixed + carried :]
     rows: list[list[Known]] = []
-    order = range(named["length"])
-    for number in reversed(order) if named["reverse"] else order:
+    for number in range(named["length"])[:: -1 if named["reverse"] else 1]:
         now = [builder.reshaped(_part(builder, value, 0, number, number + 1), tuple(value.shape[1:])) for value in over]
         found = builder.inlined(named["jaxpr"].jaxpr, named["jaxpr"].consts, [*consts, *carry, *now])
         carry = found[:carried]

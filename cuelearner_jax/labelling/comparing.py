@@ -76,7 +76,8 @@ def with_teacher(
         )
     scalars = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
     one = jax.jit(lambda env, teacher, *question: as_teacher(form, env, scalars, teacher, *question))
-    asked = [(*situations[item], jnp.asarray(items[item][1])) for item in file.people.item]
+    guides = [(situations[item], jnp.asarray(items[item][1])) for item in file.people.item]
+    asked = [(guide.env, guide.obs, action) for guide, action in guides]
     theirs = np.stack([np.asarray(one(env, teacher, *question)) for question in asked])
     return agreement(form, env, np.asarray(file.labels.answer), theirs)
 

@@ -1,4 +1,4 @@
-"""A session's model, fitted in the background: a guide from scratch to all labels so far, or a reading of answers."""
+"""A session's model: a guide fitted from scratch to all labels so far, or a reading of answers."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ import dataclasses
 import os
 import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -25,10 +22,9 @@ from cuelearner_jax.asking import GuideState
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.feedback.answers import AnswerForm
-from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.fitting import held_out
 from cuelearner_jax.labelling.plan import Plan
-from cuelearner_jax.reading import Reading, Walk
+from cuelearner_jax.reading import Reading
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.types import EnvState, Label, Teacher
 
@@ -74,29 +70,26 @@ def as_teacher(
     return form.answer(jax.random.key(0), env, teacher, state, obs, action, scalars)[0]
 
 
-fit = jax.jit(asking.fit, static_argnums=0)  # (guidance, env, scalars, guide, lane_key, times) -> guide with a model
-
-
-@partial(jax.jit, static_argnums=0)
-def question(guidance: Guide, env: Any, scalars: Scalars, base: Any, guide: GuideState, keys: Any, bound: Any) -> Array:
+@jax.jit
+def question(of: asking.Inquiry, guide: GuideState, keys: Any) -> Array:
     """Return the action to ask about (action,)."""
-    return asking.question(asking.Inquiry(guidance, env, scalars, base, bound), guide, keys)[0]
+    return asking.question(of, guide, keys)[0]
 
 
-@partial(jax.jit, static_argnums=0)
-def refined(guidance: Guide, env: Any, scalars: Scalars, model: Any, obs: Array, action: Array) -> Array:
+@jax.jit
+def refined(of: asking.Inquiry, model: Any, obs: Array, action: Array) -> Array:
     """Return an action refined by the model (action,)."""
-    return guidance.act(model, env, obs[None], action[None], jnp.ones(1, bool), scalars).actions[0]
+    return of.guidance.act(model, of.env, obs[None], action[None], jnp.ones(1, bool), of.scalars).actions[0]
 
 
-@partial(jax.jit, static_argnums=0)
-def answers(guidance: Guide, env: Any, scalars: Scalars, model: Any, labels: Label) -> Array:
+@jax.jit
+def answers(of: asking.Inquiry, model: Any, labels: Label) -> Array:
     """Return the answers that the model predicts (labels, width)."""
 
     def one(obs: Array, action: Array) -> Array:
-        best = refined(guidance, env, scalars, model, obs, action)
+        best = refined(of, model, obs, action)
         teacher: Any = SimpleNamespace(best_action=lambda state, obs: best)
-        return as_teacher(guidance.form, env, scalars, teacher, None, obs, action)  # pyright: ignore[reportArgumentType]
+        return as_teacher(of.guidance.form, of.env, of.scalars, teacher, None, obs, action)  # pyright: ignore[reportArgumentType]
 
     return jax.vmap(one)(jnp.asarray(labels.obs), jnp.asarray(labels.action))
 
@@ -112,7 +105,7 @@ class Fitted(NamedTuple):
     lines: tuple[str, ...] = ()  # reading only: what changed, in words
 
 
-def _step_back() -> None:
+def step_back() -> None:
     """Lower this thread's priority, where the system has priorities per thread."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
@@ -120,43 +113,36 @@ def _step_back() -> None:
 
 
 class Learner:
-    """Fit whenever a full round of labels is new, one fit at a time."""
+    """The model of a session's answers: a guide fitted from scratch to all labels, or a reading of new ones."""
 
     def __init__(self, plan: Plan, env: Any, blank: GuideState, key: PRNGKeyArray) -> None:
-        """Begin to compile the fit; `blank` is a guide without labels, `key` the session's."""
-        self._plan, self._env, self._blank, self._key = plan, env, blank, key
-        self.newest = Fitted(blank.model)
-        self.running = False
-        self._lock = threading.Lock()
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="fit", initializer=_step_back)
-        self.prepare()
-
-    def prepare(self) -> None:
-        """Begin to compile the fit, for which the first question need not wait."""
-        bound = self._plan.bound_deg
-        self._bound = None if bound is None else actions_of(self._env).from_unit(bound)
-        self._fit = self._pool.submit(self._compiled)
-
-    def _compiled(self) -> Any:
+        """`blank`: a guide without labels; `key`: the session's."""
+        self._plan, self._blank, self._key = plan, blank, key
+        space, bound = actions_of(env), plan.bound_deg
+        within = None if bound is None else space.from_unit(bound)
+        self._of = asking.Inquiry(plan.guidance, env, plan.config.scalars, plan.base.policy, within)
+        self._reads = plan.guidance.by_evidence
+        self._read: list[np.ndarray] = []  # reading: observations, actions and answers that the newest model has read
+        self.newest = Fitted(self._unread() if self._reads else blank.model)
         options: Any = ALONE if jax.default_backend() == "cpu" else None
-        arguments = self._arguments(self._blank.labels, 0)
-        return fit.lower(self._plan.guidance, *arguments).compile(compiler_options=options)
+        self._fit = jax.jit(asking.fit, static_argnums=0, compiler_options=options)
 
-    def _arguments(self, labels: Label, count: int) -> tuple[Any, ...]:
-        guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels), model=self.newest.model)
-        rounds = jnp.asarray(count // self._plan.config.sizes.labels_per_round, jnp.int32)
-        return self._env, self._plan.config.scalars, guide, self._key, rounds
+    def _unread(self) -> Reading:
+        plan, env = self._plan, self._of.env
+        eps = plan.config.scalars.eps_deg
+        return Reading(plan.base.policy, plan.family, actions_of(env), eps, plan.labels, env.observation)
 
     def question(self, guide: GuideState, keys: Any) -> Float[np.ndarray, " action"]:
         """Return the action to ask about in a situation."""
-        plan, guide = self._plan, guide.replace(model=self.newest.model)
-        asked = plan.guidance, self._env, plan.config.scalars, plan.base.policy, guide, keys, self._bound
-        return np.asarray(question(*asked))
+        if self._reads:
+            return self.newest.model.questions(np.asarray(guide.obs)[None], 1, keys.question)[1][0]
+        return np.asarray(question(self._of, guide.replace(model=self.newest.model), keys))
 
     def refined(self, obs: Float[Array, " obs"], action: np.ndarray) -> Float[np.ndarray, " action"]:
-        """Return an action refined by the newest model."""
-        model, scalars = self.newest.model, self._plan.config.scalars
-        return np.asarray(refined(self._plan.guidance, self._env, scalars, model, obs, jnp.asarray(action)))
+        """Return an action refined by the newest model; of a reading the corrected policy's action."""
+        if self._reads:
+            return np.asarray(self.newest.model.act(jnp.asarray(obs)[None]))[0]
+        return np.asarray(refined(self._of, self.newest.model, obs, jnp.asarray(action)))
 
     def padded(self, rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Label:
         """Put observations, actions and answers into a padded `Label` of the session's size."""
@@ -165,89 +151,41 @@ class Learner:
             blank.obs[slot], blank.action[slot], blank.answer[slot], blank.valid[slot] = obs, action, answer, True
         return blank
 
-    def fit(self, labels: Label) -> None:
-        """Fit to these labels now; return when the fit is done."""
-        if not (count := int(labels.valid.sum())):
-            return
-        plan = self._plan
-        model = jax.block_until_ready(self._fit.result()(*self._arguments(labels, count)).model)
-        if not all_finite(model):
-            self.newest = self.newest._replace(labels=count, problem="the last fit diverged")
-            return
-        predicted = np.asarray(answers(plan.guidance, self._env, plan.config.scalars, model, labels))
-        apart = np.asarray(labels.valid) & held_out(len(labels.valid))
-        quality = agreement(plan.form, self._env, predicted[apart], np.asarray(labels.answer)[apart])
-        self.newest = Fitted(model, count, self.newest.number + 1, quality if quality.count else None)
-
-    def fit_later(self, labels: Callable[[], Label], count: int, done: Callable[[], None]) -> bool:
-        """Start a background fit if due; return whether one started.
-
-        The thread fits to what `labels` then returns, and calls `done` afterwards.
-        """
+    def is_due(self, count: int) -> bool:
+        """Return whether a full round of labels is new."""
         every = self._plan.config.sizes.labels_per_round
-        with self._lock:
-            if self.running or count // every <= self.newest.labels // every:
-                return False
-            self.running = True
-
-        def work() -> None:
-            try:
-                self.fit(labels())
-            except Exception as error:  # labels are still saved, whatever happens to the model
-                problem = f"the last fit failed ({type(error).__name__}: {error})"
-                self.newest = self.newest._replace(labels=count, problem=problem)
-            finally:
-                with self._lock:
-                    self.running = False
-            done()
-
-        self._pool.submit(work)
-        return True
-
-    def close(self) -> None:
-        """Wait for a running fit, then stop the thread."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-
-class EvidenceLearner(Learner):
-    """Read the answers whenever a full round of labels is new; the model is a `Reading`."""
-
-    def prepare(self) -> None:
-        """Compile the programs of a question; those of a fit are compiled by the thread."""
-        self._rows: list[tuple[np.ndarray, ...]] = []
-        self.newest = Fitted(self._fresh())
-        walk = Walk(self._env, None, self._plan.config.scalars)  # pyright: ignore[reportArgumentType]  # no teacher
-        obs = np.asarray(walk.situations(self._key, self._plan.base.policy, 1)[1])
-        self.newest.model.questions(obs[:1], 1, self._key)
-
-    def _fresh(self) -> Reading:
-        plan, eps = self._plan, self._plan.config.scalars.eps_deg
-        space, layout = actions_of(self._env), self._env.observation
-        return Reading(plan.base.policy, plan.family, space, eps, plan.labels, layout)
-
-    def question(self, guide: GuideState, keys: Any) -> Float[np.ndarray, " action"]:
-        """Return the action to ask about in a situation."""
-        return self.newest.model.questions(np.asarray(guide.obs)[None], 1, keys.question)[1][0]
-
-    def refined(self, obs: Float[Array, " obs"], action: np.ndarray) -> Float[np.ndarray, " action"]:
-        """Return the corrected policy's action."""
-        return np.asarray(self.newest.model.act(jnp.asarray(obs)[None]))[0]
+        return count // every > self.newest.labels // every
 
     def fit(self, labels: Label) -> None:
-        """Read the new answers; all answers again if earlier ones were taken back."""
-        valid = np.flatnonzero(labels.valid)
-        columns = [np.asarray(part)[valid] for part in (labels.obs, labels.action, labels.answer)]
-        before, rows = self._rows, list(zip(*columns, strict=True))
-        if not rows:
-            return
-        both = zip(before, rows, strict=False)
-        alike = all(np.array_equal(*pair) for old, new in both for pair in zip(old, new, strict=True))
-        if before and alike and len(rows) >= len(before):
+        """Fit to these labels."""
+        if (count := int(labels.valid.sum())) and self._reads:
+            self.newest = self._reading_of(
+                [np.asarray(part)[:count] for part in (labels.obs, labels.action, labels.answer)]
+            )
+        elif count:
+            self.newest = self._model_of(labels, count)
+
+    def _model_of(self, labels: Label, count: int) -> Fitted:
+        of, plan = self._of, self._plan
+        guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels), model=self.newest.model)
+        rounds = jnp.asarray(count // plan.config.sizes.labels_per_round, jnp.int32)
+        model = jax.block_until_ready(self._fit(of.guidance, of.env, of.scalars, guide, self._key, rounds).model)
+        if not all_finite(model):
+            return self.newest._replace(labels=count, problem="the last fit diverged")
+        apart = np.asarray(labels.valid) & held_out(len(labels.valid))
+        predicted = np.asarray(answers(of, model, labels))[apart]
+        quality = agreement(plan.form, of.env, predicted, np.asarray(labels.answer)[apart])
+        return Fitted(model, count, self.newest.number + 1, quality if quality.count else None)
+
+    def _reading_of(self, rows: list[np.ndarray]) -> Fitted:
+        """Read what is new in `rows`; all of it again if earlier answers were taken back."""
+        done = len(self._read[0]) if self._read else 0
+        if done and all(np.array_equal(old, new[:done]) for old, new in zip(self._read, rows, strict=True)):
             # a copy learns, so that questions in the meantime are asked by what was known before
             reading = copy.copy(self.newest.model)
-            reading.learn(*(column[len(before) :] for column in columns))
+            reading.learn(*(part[done:] for part in rows))
         else:
-            reading = self._fresh()
-            reading.read_in_batches(*columns)
-        self._rows = rows
-        self.newest = Fitted(reading, len(rows), self.newest.number + 1, lines=tuple(reading.result().words()))
+            reading = self._unread()
+            reading.read_in_batches(*rows)
+        self._read = rows
+        return Fitted(reading, len(rows[0]), self.newest.number + 1, lines=tuple(reading.result().words()))

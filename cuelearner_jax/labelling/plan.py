@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax import asking
+from cuelearner_jax.asking import GuideState
 from cuelearner_jax.config import to_json
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.feedback.answers import AnswerForm
@@ -21,7 +22,6 @@ from cuelearner_jax.policies import Policy
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Task
-from cuelearner_jax.types import EnvState
 
 APART = ("env", "teacher")  # fields of policies that describe the world; the label file records them separately
 SAME = 1e-5  # largest difference of a replayed observation from the recorded one
@@ -107,29 +107,25 @@ def keys_of(seed: int) -> Keys:
     return Keys(*jax.random.split(jax.random.key(seed), 3))
 
 
-@jax.jit
-def begin(env: Environment, key: PRNGKeyArray) -> tuple[EnvState, jax.Array]:
-    """Return the first situation of an episode: (state, observation)."""
-    return env.reset(key)
+proceed = jax.jit(asking.proceed)
 
 
 @jax.jit
-def advance(env: Environment, key: PRNGKeyArray, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
-    """Return the situation after an action: (state, observation)."""
-    after, step = env.step(key, state, action)
-    return after, step.obs
+def begin(env: Environment, key: PRNGKeyArray) -> GuideState:
+    """Return a guide without model and labels in the first situation of an episode."""
+    return GuideState(None, None, None, None, *env.reset(key))  # pyright: ignore[reportArgumentType]
 
 
-def replay(env: Environment, keys: Keys, rows: Iterable[Any]) -> Iterator[tuple[EnvState, jax.Array]]:
-    """Replay recorded items; yield the situation (state, observation) before each item, and after the last.
+def replay(env: Environment, keys: Keys, rows: Iterable[Any]) -> Iterator[GuideState]:
+    """Replay recorded items; yield the situation before each item, and after the last.
 
     `rows` holds the items' observations and actions. The replay ends early, before the first item whose observation
     differs from the recorded one (a program of another version).
     """
-    state, obs = begin(env, keys.start)
+    guide = begin(env, keys.start)
     for number, (recorded, action) in enumerate(rows):
-        if recorded.shape != obs.shape or not np.allclose(np.asarray(obs), recorded, atol=SAME):
+        if recorded.shape != guide.obs.shape or not np.allclose(np.asarray(guide.obs), recorded, atol=SAME):
             return
-        yield state, obs
-        state, obs = advance(env, asking.question_keys(keys.session, number).env, state, jnp.asarray(action))
-    yield state, obs
+        yield guide
+        guide = proceed(env, guide, jnp.asarray(action), asking.question_keys(keys.session, number))
+    yield guide

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,17 +11,17 @@ from cuelearner_jax import asking, user_code
 from cuelearner_jax.asking import GuideState
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.labelling import controls
-from cuelearner_jax.labelling.learner import EvidenceLearner, Learner
-from cuelearner_jax.labelling.plan import Plan, advance, keys_of
+from cuelearner_jax.labelling.learner import Learner
+from cuelearner_jax.labelling.plan import Plan, keys_of, proceed
 from cuelearner_jax.policies import policy_name
-from cuelearner_jax.types import EnvState, Reel, Sketch
+from cuelearner_jax.types import Reel, Sketch
 
 
 class Item(NamedTuple):
     """A question: a situation and an action in it."""
 
     number: int  # from 0
-    guide: GuideState  # the guide's state in that situation
+    guide: GuideState  # the situation
     action: np.ndarray  # (action,)
     sketch: Sketch | None = None  # None: not needed yet
     refined: np.ndarray | None = None  # the action refined by the newest model; None: no model yet
@@ -34,22 +33,17 @@ class Questions:
     """Makes items, and holds the model that later items are asked by."""
 
     def __init__(self, plan: Plan, env: Any) -> None:
-        """Begin to compile the model's fit."""
+        """Make the model that later items are asked by."""
         self.plan, self.env, self.pictures, self.space = plan, env, plan.task.pictures(), actions_of(env)
         self.keys = keys_of(plan.seed)
         slots = asking.label_slots(plan.labels, plan.config.sizes)
-        self._blank = asking.start(plan.guidance, env, slots, plan.labels, self.keys.model, self.keys.start)
-        kind = EvidenceLearner if plan.guidance.by_evidence else Learner
-        self.learner = kind(plan, env, self._blank, self.keys.session)
-
-    def guide_in(self, state: EnvState, obs: jax.Array) -> GuideState:
-        """Return a guide without labels in a situation."""
-        return self._blank.replace(env=state, obs=obs)
+        blank = asking.start(plan.guidance, env, slots, plan.labels, self.keys.model, self.keys.start)
+        self.learner = Learner(plan, env, blank, self.keys.session)
 
     def after(self, item: Item) -> GuideState:
-        """Return the guide in the situation that follows an item's action."""
-        key = asking.question_keys(self.keys.session, item.number).env
-        return self.guide_in(*advance(self.env, key, item.guide.env, jnp.asarray(item.action)))
+        """Return the situation that follows an item's action."""
+        keys = asking.question_keys(self.keys.session, item.number)
+        return proceed(self.env, item.guide, jnp.asarray(item.action), keys)
 
     def ask(self, number: int, guide: GuideState) -> Item:
         """Choose the action to ask about in a situation. Raises UserError for a policy without valid actions."""

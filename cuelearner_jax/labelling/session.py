@@ -20,7 +20,7 @@ import numpy as np
 
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.labelling.learner import Fitted
+from cuelearner_jax.labelling.learner import Fitted, step_back
 from cuelearner_jax.labelling.plan import Plan, begin, replay
 from cuelearner_jax.labelling.questions import Item, Questions
 from cuelearner_jax.storage import label_files
@@ -119,7 +119,7 @@ class Session:
     """Asks questions, saves answers and fits models. Its methods may be called from any thread."""
 
     def __init__(self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None) -> None:
-        """Open the label file and prepare the first questions; only the thread that fits may still compile then.
+        """Open the label file and prepare the first questions.
 
         Args:
             plan: the session's settings.
@@ -138,10 +138,11 @@ class Session:
         # answers are handled one at a time; whoever waits for an item holds no other lock
         self._acting, self._lock = threading.Lock(), threading.RLock()
         self._ahead = ThreadPoolExecutor(1, thread_name_prefix="ahead")  # the only thread that makes items
+        self._fits = ThreadPoolExecutor(1, thread_name_prefix="fit", initializer=step_back)
         self._listeners: list[Callable[[], object]] = []
         self._items: dict[int, Item] = {}
         self._finished: Path | None = None
-        self.number = self._furthest = 0  # the current question, and the last one that was shown
+        self.number = 0  # of the current question
         self._replay(tell)
         tell("preparing questions")
         self._prepare(self.number)
@@ -162,11 +163,10 @@ class Session:
             situations = [begin(questions.env, jax.random.fold_in(questions.keys.start, count))]
         else:
             pairs = enumerate(zip(situations, rows, strict=False))
-            self._items = {n: Item(n, questions.guide_in(*at), row.action) for n, (at, row) in pairs}
+            self._items = {n: Item(n, at, row.action) for n, (at, row) in pairs}
         self.number = min((number for number in self._items if rows[number].said == UNDONE), default=count)
-        self._furthest = count
         self._learner.fit(self._labels())
-        self._items[count] = questions.ask(count, questions.guide_in(*situations[-1]))
+        self._items[count] = questions.ask(count, situations[-1])
 
     # --- question ----------------------------------------------------------------------------------------------------
 
@@ -181,22 +181,29 @@ class Session:
         """Move to an item that is ready, and start preparing the next one."""
         with self._lock:
             self.number, self._since = number, time.monotonic()
-            self._furthest = max(self._furthest, number)
             if passed := self._items.get(number - KEPT):
                 self._items[passed.number] = passed._replace(sketch=None, trails=None)
             self._next = self._ahead.submit(self._prepare, number + 1)
 
-    def _renew(self) -> None:
-        """Update items for the newest model: remake prepared questions, refine the shown ones again."""
-        coming, shown, questions = self._items.get(self._furthest + 1), self._items.get(self.number), self.questions
-        anew = coming and questions.refine(questions.ask(coming.number, coming.guide)._replace(sketch=coming.sketch))
-        again = shown and questions.refine(shown)
-        with self._lock:
-            if anew and self._furthest < anew.number:
-                self._items[anew.number] = anew
-            if again:
-                self._items[again.number] = again
-        self._notify()
+    def _fit(self) -> None:
+        """Fit the model to the answers so far, if that is still due."""
+        labels = self._labels()
+        if not self._learner.is_due(count := int(labels.valid.sum())):
+            return
+        try:
+            self._learner.fit(labels)
+        except Exception as error:  # labels are still saved, whatever happens to the model
+            problem = f"the last fit failed ({type(error).__name__}: {error})"
+            self._learner.newest = self._learner.newest._replace(labels=count, problem=problem)
+        self._ahead.submit(self._use_fit)
+
+    def _use_fit(self) -> None:
+        """Show what the newest model makes of the questions that are ready."""
+        for number in (self.number, self.number + 1):
+            if number in self._items:
+                self._items[number] = self.questions.refine(self._items[number])
+        for heard in list(self._listeners):
+            heard()
 
     @property
     def item(self) -> Item | None:
@@ -232,8 +239,9 @@ class Session:
                 self._save(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
             self._next.result()
             self._show(number + 1)
-        self._fit_if_due()
-        return True
+            if self._learner.is_due(self.record.count(ANSWERED)):
+                self._fits.submit(self._fit)
+            return True
 
     def _save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
         self.record.save(item.number, Response(said, np.asarray(item.guide.obs), item.action, answer, seconds))
@@ -242,14 +250,6 @@ class Session:
         """Return the answers in the order of their items, as a padded `Label`."""
         rows = [(row.obs, row.action, row.answer) for row in self.record.in_order() if row.answer is not None]
         return self._learner.padded(rows)
-
-    def _fit_if_due(self) -> None:
-        if self._learner.fit_later(self._labels, self.record.count(ANSWERED), self._use_fit):
-            self._notify()
-
-    def _use_fit(self) -> None:
-        self._ahead.submit(self._renew)
-        self._fit_if_due()
 
     def undo(self, number: int) -> bool:
         """Take back the answer before this question and ask it again.
@@ -282,23 +282,19 @@ class Session:
         answered, pace = self.record.count(ANSWERED), self.record.per_minute()
         counts = answered, self.record.count(UNSURE), self.plan.labels
         left = (self.plan.labels - answered) / pace if pace else None
-        return Status(*counts, pace, left, self._learner.running, self._learner.newest, self.record.trouble)
+        return Status(*counts, pace, left, self._learner.is_due(answered), self._learner.newest, self.record.trouble)
 
     def listen(self, heard: Callable[[], object]) -> Callable[[], None]:
-        """Register a function that is called, from any thread, when a fit begins or a new model is in use.
+        """Register a function that is called, from any thread, when a new model is in use.
 
         Returns a function that ends the registration.
         """
         self._listeners.append(heard)
         return lambda: self._listeners.remove(heard)
 
-    def _notify(self) -> None:
-        for heard in list(self._listeners):
-            heard()
-
     def close(self) -> None:
         """Close the file and stop the threads, after any running fit."""
-        self._learner.close()
+        self._fits.shutdown(wait=True, cancel_futures=True)
         self._ahead.shutdown(wait=True, cancel_futures=True)
         self.record.close()
 

@@ -67,6 +67,11 @@ class Result(NamedTuple):
             lines.append(f"{self.wrong:.0%} of the answers seem to be about something else")
         return lines
 
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values, without the policy."""
+        values = {name: value for name, value in self._asdict().items() if name != "policy"}
+        return {**values, "estimates": [one._asdict() for one in self.estimates]}
+
 
 def describe_fit(
     fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity], met: Float[Floats, "m z"]

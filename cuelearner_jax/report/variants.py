@@ -81,7 +81,7 @@ def read_groups(folders: Sequence[PathLike], metric: str, split: str, by_run: bo
         groups.append(Group(name, *_select(results.read(own), metric, split), guides))
     tasks = sorted({group.table["task"][0].as_py() for group in groups})
     if len(tasks) > 1:
-        raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: choose one of them")
+        raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: give folders of one of them")
     return groups
 
 

@@ -11,16 +11,17 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import by_reading, serialization
+from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.policies import Common, lanes_in, layers
 from cuelearner_jax.runs.grid import world_of
-from cuelearner_jax.storage import formats, label_files, policy_folders, results
-from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage import formats, label_files, policy_folders
+from cuelearner_jax.storage.checkpoint import Checkpoints, digest
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
@@ -63,22 +64,24 @@ class AdaptedLanes:
 
     def policy(self, env: Any) -> Any:
         """Return a block of the lanes' policies. Raises UserError if they cannot be read."""
-        values, arrays = self.values["policy"], self._arrays(env)
-        base = serialization.from_json(values["base"], arrays["base"], env, self.code, self.changes)
-        base = Common(base) if self.rows is None else base.lane(self.lanes.base)
-        made = serialization.from_json({**values, "base": {"policy": "uniform"}}, arrays, env, changes=self.changes)
-        return replace(made, base=base)
+        policy = serialization.from_json(self.values["policy"], env, self.code, self.changes)
+        like = _with_rows(serialization.arrays_of(policy), self.lanes.number)
+        like["base"] = _with_rows(serialization.arrays_of(policy.base), self.rows)
+        place, remedy = self.folder / policy_folders.ARRAYS, "restore it, or adapt the policy anew"
+        if not place.is_dir():
+            raise UserError(f"{place} is missing: {remedy}")
+        with Checkpoints(place, read_only=True, remedy=remedy) as saved:
+            arrays = saved.restore({"policy": like})["policy"]
+        if digest(arrays) != self.values.get("arrays"):
+            raise UserError(f"{place} holds the arrays of another policy: {remedy}")
+        policy = serialization.with_arrays(policy, arrays)
+        return policy.replace(base=Common(policy.base) if self.rows is None else policy.base.lane(self.lanes.base))
 
-    def base(self, env: Any) -> Any:
-        """Return the base policies, one per lane, or as `Common`. Raises UserError as `policy`."""
-        return self.policy(env).base
 
-    def _arrays(self, env: Any) -> Any:
-        values = self.values["policy"]
-        alone = {**values, "base": {"policy": "uniform"}}
-        lanes = serialization.shapes_of(alone, env, self.lanes.number, self.changes)
-        like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows, self.changes)}
-        return policy_folders.read_arrays(self.folder, like, self.values)
+def _with_rows(arrays: Any, rows: int | None) -> Any:
+    """Return the shapes of arrays that have a row for each of several policies; None: one policy."""
+    leading = () if rows is None else (rows,)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape), leaf.dtype), arrays)
 
 
 def open_folder(
@@ -147,26 +150,21 @@ def write(
             "difference": [_plain(ends) for ends in judged.difference],
             "rewarded_steps": judged.rewarded_steps.tolist(),
         },
-        **({"reading": by_reading.to_json(adapted.results)} if adapted.results else {}),
+        **({"reading": [one.to_json() for one in adapted.results]} if adapted.results else {}),
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,
         **provenance(),
     }
     with place.writing() as folder:
-        policy_folders.write(folder, described, arrays)
+        with Checkpoints(folder / policy_folders.ARRAYS) as saved:
+            saved.save(0, {"policy": arrays})
+        formats.write("policy", folder / policy_folders.POLICY, {**described, "arrays": digest(arrays)})
         _write_labels(folder, adapted, task, world)
-        _write_curve(folder, place.folder.name, adapted, task)
 
 
 def _plain(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
-
-
-def labels_name(lanes: Lanes, bound_deg: float) -> str:
-    """Return the name of the label file of the lanes with a bound."""
-    several = len(np.unique(lanes.bound_deg)) > 1
-    return f"labels-{bound_deg:g}deg.parquet" if several else label_files.PARQUET
 
 
 def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: Any) -> None:
@@ -175,39 +173,9 @@ def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: An
     form: AnswerForm | None = of.guidance.form
     assert form is not None
     told, space = {"name": task.name, **configuration.to_json(world)}, actions_of(of.env)
-    rows: Label = adapted.labels
-    largest = lanes.budget == lanes.budget.max()
-    for bound in np.unique(lanes.bound_deg):
+    eps, largest = of.scalars.eps_deg if form.by_eps else None, lanes.budget == lanes.budget.max()
+    for bound in (bounds := np.unique(lanes.bound_deg)):
         own = np.flatnonzero(largest & (lanes.bound_deg == bound))
-        eps = of.scalars.eps_deg if form.by_eps else None
-        sets = jax.tree.map(lambda leaf, own=own: leaf[own], rows)
-        file = folder / labels_name(lanes, float(bound))
+        sets: Label = jax.tree.map(lambda leaf, own=own: leaf[own], adapted.labels)
+        file = folder / (label_files.PARQUET if len(bounds) == 1 else f"labels-{bound:g}deg.parquet")
         label_files.write(file, told, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
-
-
-def _write_curve(folder: Path, name: str, adapted: AdaptationResult, task: Task) -> None:
-    """Write the policies' performance by number of labels, as runs do for their guides."""
-    of = adapted.of
-    if not adapted.curve:
-        return
-    constants = {
-        "run": name,
-        "task": task.name,
-        "guidance": of.guidance.name,
-        "split": SPLIT,
-        "config_hash": "",
-        **provenance(),
-    }
-    lanes = {"seed": adapted.lanes.seed, "labels": adapted.lanes.budget, "bound_deg": adapted.lanes.bound_deg}
-    with tables.TableWriter(folder, results.GUIDES, constants) as writer:
-        done = np.full(adapted.lanes.number, -1)
-        for row in adapted.curve:
-            new = row["asked"] > done  # a lane that has used up its budget does not change any more
-            done = row["asked"]
-            metrics = {f"guide_{metric}": row[metric] for metric in row if metric not in ("asked", "failed")}
-            columns = {**lanes, "asked": row["asked"], "failed": row["failed"].astype(float), **metrics}
-            number = -(-int(row["asked"].max()) // of.sizes.labels_per_round)
-            chosen = {column: np.asarray(values)[new] for column, values in columns.items()}
-            if new.any():
-                writer.append(round=number, step=0, wall_s=0.0, **chosen)
-    tables.finish(folder, results.GUIDES)

@@ -39,7 +39,7 @@ def summary(table: pa.Table) -> str:
 
 
 def without_failed(loaded: Sequence[Any]) -> list[Any]:
-    """Drop the failed lanes of trained lanes (`trained.Block`) and name them on the console.
+    """Drop the failed lanes of trained lanes (`run_folders.RunLanes`) and name them on the console.
 
     Raises UserError if no lane is left.
     """

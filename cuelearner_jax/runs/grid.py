@@ -11,8 +11,6 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
@@ -37,8 +35,8 @@ class Grid:
     def lanes(self, guidance: Guide | type[Guide]) -> tuple[np.ndarray, np.ndarray]:
         """Return (seeds, budgets) of the lanes of one kind, each (lanes,)."""
         budgets = self.labels if guidance.asks else (0,)
-        pairs = [(seed, budget) for budget in budgets for seed in self.seeds]
-        return np.array([p[0] for p in pairs], np.int32), np.array([p[1] for p in pairs], np.int32)
+        seeds = np.array(self.seeds, np.int32)
+        return np.tile(seeds, len(budgets)), np.repeat(np.array(budgets, np.int32), len(seeds))
 
 
 def seeds_of(first: int, count: int) -> tuple[int, ...]:
@@ -58,12 +56,12 @@ def check_grid(grid: Grid, adapts: bool = False) -> None:
     for kind in kinds:
         if kind.adapts_only and not adapts:
             raise UserError(f"guidance {kind.name!r} corrects a finished policy: use it with `cuelearner adapt` only")
-    if not grid.guidance or len(set(grid.guidance)) < len(grid.guidance):
+    if not _is_set(grid.guidance):
         raise UserError("--guidance: give each kind once, and at least one")
-    if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < LARGEST_SEED for s in grid.seeds):
+    if not _is_set(grid.seeds) or not all(0 <= seed < LARGEST_SEED for seed in grid.seeds):
         raise UserError(f"seeds must be different numbers from 0 to {LARGEST_SEED - 1}, at least one")
     if any(kind.asks for kind in kinds):
-        if not grid.labels or len(set(grid.labels)) < len(grid.labels):
+        if not _is_set(grid.labels):
             raise UserError("--labels: give each budget once, and at least one")
         if min(grid.labels) < 1:
             raise UserError(
@@ -74,15 +72,12 @@ def check_grid(grid: Grid, adapts: bool = False) -> None:
             raise UserError(f"a label budget of {max(grid.labels)} cannot be counted: give less than {LARGEST_BUDGET}")
 
 
-def describe(
-    task: Task,
-    config: RunConfig,
-    grid: Grid,
-    split: str,
-    labels_from: Path | None = None,
-    shard: dict[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Return the contents of config.json; `shard` describes a shard of a sweep."""
+def _is_set(values: tuple[Any, ...]) -> bool:
+    return 0 < len(values) == len(set(values))
+
+
+def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from: Path | None = None) -> dict[str, Any]:
+    """Return the contents of config.json, but for a shard's entry."""
     origin = {"from": task.origin} if task.origin else {}  # "from" is a Python keyword, so no field has this name
     return {
         "format": formats.FORMATS["config"],
@@ -94,14 +89,7 @@ def describe(
         "split": split,
         "labels_from": f"{labels_from.name} {label_files.digest(labels_from)}" if labels_from else None,
         "total_steps": config.schedule.total_steps,
-        **({"shard": shard} if shard else {}),
     }
-
-
-def defaults(task: Task) -> dict[str, Any]:
-    """Return the default of every field, for config.json files written before the field existed."""
-    groups = {"task": task.config, **run_config.GROUPS, "agent": ddqn.Config, "arbiter": Episodes}
-    return {name: configuration.defaults(kind) for name, kind in groups.items()}
 
 
 def config_hash(described: dict[str, Any]) -> str:

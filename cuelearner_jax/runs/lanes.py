@@ -38,7 +38,9 @@ class LaneGroup:
         self.seeds, self.budgets = grid.lanes(guidance)
         self.largest_budget = int(self.budgets.max())
         self.mesh = mesh or lane_mesh()  # by default all local devices
-        self.lanes_per_block = config.sizes.lanes_per_block or self._fitting_lanes()
+        # By default all lanes at once; on one CPU an equal share for each core.
+        takers = CORES if jax.default_backend() == "cpu" and self.mesh.size == 1 else 1
+        self.lanes_per_block = config.sizes.lanes_per_block or -(-len(self.seeds) // takers)
         self.program: Program = make_program(
             config, guidance, env, self.largest_budget, self.mesh, lanes=self.cut.shape[1] // self.mesh.size
         )
@@ -79,12 +81,6 @@ class LaneGroup:
             joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *blocks)
             blocks = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], joined) for rows in self.cut]
         return [place(self.mesh, block, BY_LANE) for block in blocks]
-
-    def _fitting_lanes(self) -> int:
-        """Return the lanes per block: all on accelerators, an equal share per core on one CPU device."""
-        if jax.default_backend() != "cpu" or self.mesh.size > 1:
-            return len(self.seeds)
-        return -(-len(self.seeds) // CORES)
 
     def each(self, work: Callable[..., T], *blocks: list[Any]) -> list[T]:
         """Apply `work` to every block; a CPU works on as many blocks at once as it has cores."""

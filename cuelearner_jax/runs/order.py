@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
@@ -17,7 +16,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.grid import Grid, check_grid, defaults, describe
+from cuelearner_jax.runs.grid import Grid, check_grid, describe
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import label_files, tracking
 from cuelearner_jax.storage.folders import CONFIG, check_folder
@@ -48,8 +47,7 @@ class Order(TrainRequest):
     track: str | None = None  # tracker to write to, see `storage.tracking`
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """A validated order; nothing has been written."""
 
     order: Order  # of this shard: its seeds and its folder
@@ -62,7 +60,7 @@ def resolve_request(request: RequestT) -> RequestT:
     run_config.check(request.config)
     # loads the code of kinds from outside
     names = tuple(guidances.resolve(kind).name for kind in request.grid.guidance)
-    request = dataclasses.replace(request, grid=dataclasses.replace(request.grid, guidance=names))
+    request = replace(request, grid=replace(request.grid, guidance=names))
     check_grid(request.grid)
     request.task.check_evaluations(request.config)
     return request
@@ -81,39 +79,22 @@ def labels_of(request: TrainRequest) -> label_files.LabelFile | None:
 def make_plan(order: Order) -> Plan:
     """Check what `run` would refuse, except for memory; return the plan. Raises UserError."""
     tracking.check(order.track)
-    order = resolve_request(order)
-    piece, sweep = None, order.out
-    if order.shard:
-        piece = order.shard.described(order.grid.seeds)
-        folder = order.shard.folder(order.out)
+    order, sweep = resolve_request(order), order
+    if shard := order.shard:
+        folder = shard.folder(order.out)
         begun = not order.overwrite and (folder / CONFIG).is_file()
-        grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
-        order = dataclasses.replace(order, grid=grid, out=folder, resume=order.resume or begun)
+        grid = replace(order.grid, seeds=shard.seeds(order.grid.seeds))
+        order = replace(order, grid=grid, out=folder, resume=order.resume or begun)
     env = shape_of(order.task, order.config.task)
     for kind in order.grid.guidance:
         order.config.guide_in(env, kind)
     labels = labels_of(order)
-    described = describe(order.task, order.config, order.grid, order.split, order.labels_from, piece)
-    if order.shard:
-        order.shard.check_sweep(sweep, described, defaults(order.task))
-    check_folder(order.out, described, order.resume, order.overwrite, defaults(order.task))
+    described = describe(order.task, order.config, order.grid, order.split, order.labels_from)
+    if shard:
+        described["shard"] = {**shard._asdict(), "seeds": list(sweep.grid.seeds)}
+        shard.check_sweep(sweep.out, described)
+    check_folder(order.out, described, order.resume, order.overwrite)
     return Plan(order, described, labels)
-
-
-def check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> None:
-    """Raise UserError unless labels belong to a run's task and, in all that labels depend on, to its world."""
-    if told.get("name") != task.name:
-        name = told.get("name")
-        raise UserError(f"{path} holds labels of {name}, but this run trains {task.name}: give labels of the same task")
-    values = {name: value for name, value in told.items() if name not in ("name", "from")}
-    theirs = configuration.to_json(configuration.from_json(task.config, values))
-    ours = configuration.to_json(world)
-    apart = [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]
-    if apart:
-        raise UserError(
-            f"{path} holds labels of a world with another task.{apart[0]} ({theirs[apart[0]]}; this run has "
-            f"{ours[apart[0]]}): give labels of the same world"
-        )
 
 
 def read_labels(
@@ -122,27 +103,39 @@ def read_labels(
     """Read a label file for a task's world (a configuration) and a grid. Raises UserError if it does not fit."""
     file = label_files.read(path)
     env = shape_of(task, world)
-    check_world(path, file.task, task, world)
-    made = [guidances.find(kind) for kind in grid.guidance]
-    asking = [guidance for guidance in made if guidance.form is not None]
+    _check_world(path, file.task, task, world)
+    asking = [kind for kind in map(guidances.find, grid.guidance) if kind.form is not None]
     if not asking:
         fitting = [kind.name for kind in guidances.guides().values() if kind.form and kind.form.name == file.answers]
         raise UserError(f"--labels-from needs a guidance that uses labels: add --guidance {' or '.join(fitting)}")
-    for guidance in asking:
-        assert guidance.form is not None
-        if guidance.form.name != file.answers:
+    for kind in asking:
+        assert kind.form is not None
+        if kind.form.name != file.answers:
             raise UserError(
-                f"{path} holds {file.answers} answers, but guidance {guidance.name} needs "
-                f"{guidance.form.name} answers: "
+                f"{path} holds {file.answers} answers, but guidance {kind.name} needs {kind.form.name} answers: "
                 "give fitting labels"
             )
-        external_labels.check_file(file, spaces_of(env), guidance.form, str(path))
+        external_labels.check_file(file, spaces_of(env), kind.form, str(path))
     if file.eps is not None and not math.isclose(file.eps, scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
             f"{path} holds labels of {file.eps:g} {file.space.unit}, the run expects {scalars.eps_deg:g}: "
             f"give --scalars.eps-deg {file.eps:g}, or other labels"
         )
-    for guidance in asking:
-        seeds, budgets = grid.lanes(guidance)
+    for kind in asking:
+        seeds, budgets = grid.lanes(kind)
         label_files.for_lanes(file, seeds, budgets, label_slots(int(budgets.max()), sizes))
     return file
+
+
+def _check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> None:
+    """Raise UserError unless labels belong to a run's task and, in all that labels depend on, to its world."""
+    if (name := told.get("name")) != task.name:
+        raise UserError(f"{path} holds labels of {name}, but this run trains {task.name}: give labels of the same task")
+    values = {name: value for name, value in told.items() if name not in ("name", "from")}
+    theirs, ours = configuration.to_json(configuration.from_json(task.config, values)), configuration.to_json(world)
+    apart = [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]
+    if apart:
+        raise UserError(
+            f"{path} holds labels of a world with another task.{apart[0]} ({theirs[apart[0]]}; this run has "
+            f"{ours[apart[0]]}): give labels of the same world"
+        )

@@ -16,9 +16,10 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
-from cuelearner_jax.runs.grid import Grid, defaults, load, run_key
-from cuelearner_jax.runs.lane_checkpoints import restore_policies
+from cuelearner_jax.runs.grid import Grid, load, run_key
+from cuelearner_jax.runs.training import restore_clock
 from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
@@ -38,7 +39,7 @@ class RunLanes:
     guidance: Guide
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
-    policies: Any  # what they act with, see `lane_checkpoints.items`, leading axis: lanes
+    policies: Any  # "params" and "guidance", which they act with, and "failed"; leading axis: lanes
     step: int
 
 
@@ -49,34 +50,31 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
 
     Raises UserError for a folder without runs, an unknown task, or shards of different sweeps.
     """
-    files = [] if (folder / CONFIG).exists() else sorted(folder.glob(f"shard-*-of-*/{CONFIG}"))
-    if not files:
-        task, config, grid = load(folder, find)
-        return task, config, grid, (Piece(folder, grid),)
-    described = [formats.read("config", file) for file in files]
-    loaded = [load(file.parent, find) for file in files]
-    task, config, first = loaded[0]
-    for file, other in zip(files, described, strict=True):
-        if found := shards.differing_options(described[0], other, defaults(task)):
-            raise UserError(
-                f"{files[0].parent} and {file.parent} are shards of different sweeps (they differ "
-                f"in {found}): give the "
-                "folder of one of them"
-            )
-    pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
-    folders: dict[int, Path] = {}
+    whole = (folder / CONFIG).exists()
+    folders = [] if whole else sorted(file.parent for file in folder.glob(f"shard-*-of-*/{CONFIG}"))
+    loaded = [load(one, find) for one in folders or [folder]]
+    pieces = tuple(Piece(one, grid) for one, (_, _, grid) in zip(folders or [folder], loaded, strict=True))
+    first, of_seed = formats.read("config", pieces[0].folder / CONFIG), {}
     for piece in pieces:
+        if found := shards.differing_options(first, formats.read("config", piece.folder / CONFIG)):
+            raise UserError(
+                f"{pieces[0].folder} and {piece.folder} are shards of different sweeps (they differ in {found}): "
+                "give the folder of one of them"
+            )
         for seed in piece.grid.seeds:
-            if (other := folders.setdefault(seed, piece.folder)) != piece.folder:
+            if (other := of_seed.setdefault(seed, piece.folder)) != piece.folder:
                 raise UserError(f"{other} and {piece.folder} both hold seed {seed}: delete the one that is a copy")
-    return task, config, Grid(first.guidance, tuple(folders), first.labels), pieces
+    task, config, grid = loaded[0]
+    return task, config, Grid(grid.guidance, tuple(of_seed), grid.labels), pieces
 
 
 def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:
     """Return the lanes of one kind of guidance, grouped by step, the furthest step first.
 
-    Missing or unfinished shards are named on the console, one line each. `sweep`: whether these are a sweep's shards,
-    some of which may not have begun. Raises UserError if there is no checkpoint, or one is damaged.
+    A failed lane is restored at its last finite state. Missing or unfinished shards are named on the console, one line
+    each. `sweep`: whether these are a sweep's shards, some of which may not have begun.
+
+    Raises UserError if there is no checkpoint, or one is damaged.
     """
     env = shape_of(task, config.task)
     guidance = config.guide_in(env, kind)
@@ -88,21 +86,30 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     found: dict[int, list[RunLanes]] = {}
     told = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
     for folder, grid in pieces:
-        if sweep and not (folder / kind / "checkpoints").is_dir():
+        if not (folder / kind / "checkpoints").is_dir():
             told.append(f"{folder}: no checkpoint of {kind} guidance, left out")
             continue
         seeds, budgets = grid.lanes(guidance)
-        policies, step = restore_policies(
-            folder / kind, like, len(seeds), run_key(formats.read("config", folder / CONFIG), kind)
-        )
+        key = run_key(formats.read("config", folder / CONFIG), kind)
+        with Checkpoints(folder / kind / "checkpoints", read_only=True, run=key) as saved:
+            policies, step = _restored(saved, like, len(seeds))
         found.setdefault(step, []).append(RunLanes(guidance, seeds, budgets, policies, step))
         if step < config.schedule.total_steps:
             told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")
-    for line in told:
-        console.print(line)
     if not found:
         raise UserError(f"there is no checkpoint of {kind} guidance: train first, or choose another --guidance")
+    for line in told:
+        console.print(line)
     return [_joined(found[step]) for step in sorted(found, reverse=True)]
+
+
+def _restored(saved: Checkpoints, like: Any, lanes: int) -> tuple[dict[str, Any], int]:
+    """Return what lanes act with (one lane: shapes `like`) and whether each has failed, and their training step."""
+    clock, _, count, size = restore_clock(saved)
+    block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), like)
+    found = saved.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})
+    blocks = [{**policy, "failed": failed} for policy, failed in zip(found["policy"], found["failed"], strict=True)]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:lanes], *blocks), int(clock.step)
 
 
 def _joined(parts: list[RunLanes]) -> RunLanes:

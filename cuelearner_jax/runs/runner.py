@@ -13,13 +13,12 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.runs.failures import named
 from cuelearner_jax.runs.grid import config_hash, run_key
-from cuelearner_jax.runs.lane_checkpoints import items, restore_blocks
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
-from cuelearner_jax.runs.training import Training, mean_of_finite
+from cuelearner_jax.runs.training import Training, items, mean_of_finite
 from cuelearner_jax.storage import label_files, provenance, results, tracking
 from cuelearner_jax.storage import table as tables
-from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.storage.table import TableWriter
 from cuelearner_jax.terminal import Interrupted, console
 from cuelearner_jax.types import Teacher
@@ -62,13 +61,15 @@ class Runner:
             return
         asks = self.group.guidance.asks
         self._bar = self.bars.add_task(self.name, total=self.group.config.schedule.total_steps, note="preparing")
-        with checkpoints(self.folder / "checkpoints", run=self.key) as saved:
+        with Checkpoints(self.folder / "checkpoints", run=self.key) as saved:
             self._restore(saved)
-            constants, about = self._constants(), {"run": self.key}
+            about, order = {"run": self.key}, self.order
+            constants = {"run": order.out.name, "task": order.task.name, "guidance": self.name, "split": order.split}
+            constants |= {"config_hash": config_hash(self.described), **provenance.provenance()}
             with (
                 TableWriter(self.folder, results.SCHEMA, constants, about) as writer,
                 TableWriter(self.folder, results.GUIDES, constants, about) if asks else nullcontext() as guides,
-                tracking.open_tracker(self.order.track, self.folder, self.described, self.training.step) as tracker,
+                tracking.open_tracker(order.track, self.folder, self.described, self.training.step) as tracker,
             ):
                 if guides is not None:
                     self._label(saved, guides, teacher, labels)
@@ -77,23 +78,13 @@ class Runner:
             tables.finish(self.folder, results.GUIDES)
         tables.finish(self.folder, results.SCHEMA)  # last, since a kind with finished results counts as finished
 
-    def _constants(self) -> dict[str, Any]:
-        return {
-            "run": self.order.out.name,
-            "task": self.order.task.name,
-            "guidance": self.name,
-            "split": self.order.split,
-            "config_hash": config_hash(self.described),
-            **provenance.provenance(),
-        }
-
     def _restore(self, saved: Checkpoints) -> None:
         """Restore the newest checkpoint, or start afresh; drop the rows after it."""
         last_step = last_round = -1
         if saved.latest() is None:
             self.training.begin()
         else:
-            self.training.go_on(*restore_blocks(self.group, saved))
+            self.training.restore(saved)
             self.failed = self.training.failed
             last_step = self.training.step or -1  # a checkpoint of labels alone precedes the rows of step 0
             last_round = self.training.round
@@ -143,25 +134,21 @@ class Runner:
             if labels is not None:
                 now.take(labels)
                 self._tell_failed("after its labels")
-                self._examine(guides, before=0)
+                if row := now.guides(before=0):
+                    guides.append(**row)
             else:
                 assert teacher is not None  # `teacher` may be None only where a file was given
                 for done in now.label_rounds(teacher):
                     self.bars.update(bar, completed=done)
                     self._tell_failed(f"after {done * self.group.config.sizes.labels_per_round} labels")
-                    self._examine(guides, before=done - 1)
+                    if row := now.guides(before=done - 1):
+                        guides.append(**row)
                     if done % ROUNDS_A_CHUNK == 0:
                         self._save(saved)
                     self._stop_if_asked(saved)
         self._write_labels()
         if asks:
             self._save(saved)
-
-    def _examine(self, guides: TableWriter, before: int) -> None:
-        """Write the evaluations of guides that are due after the rounds since `before`."""
-        row = self.training.guides(before)
-        if row is not None:
-            guides.append(**row)
 
     def _write_labels(self) -> None:
         form, config = self.group.guidance.form, self.group.config

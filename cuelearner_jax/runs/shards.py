@@ -35,11 +35,10 @@ class Shard(NamedTuple):
         """Return the shard's folder below the sweep's folder."""
         return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
 
-    def check_sweep(self, out: Path, described: dict[str, Any], defaults: dict[str, Any]) -> None:
+    def check_sweep(self, out: Path, described: dict[str, Any]) -> None:
         """Check that the shard, with `described` as its config.json, belongs to the sweep in the folder `out`.
 
-        `defaults`: see `differences`. Raises UserError if the folder holds a whole run, shards of another number, or
-        shards of a sweep with other settings.
+        Raises UserError if the folder holds a whole run, shards of another number, or of a sweep with other settings.
         """
         if out.exists() and not out.is_dir():
             raise UserError(f"{out} is not a folder: give another --out")
@@ -53,15 +52,11 @@ class Shard(NamedTuple):
                 )
             if folder == self.folder(out) or not (folder / CONFIG).is_file():
                 continue
-            if found := differing_options(formats.read("config", folder / CONFIG), described, defaults):
+            if found := differing_options(formats.read("config", folder / CONFIG), described):
                 raise UserError(
                     f"{folder} is a shard of a sweep with another {found}: give the same options for all shards, or "
                     "another --out"
                 )
-
-    def described(self, seeds: tuple[int, ...]) -> dict[str, Any]:
-        """Return the shard's entry in config.json: its number, and the seeds of all shards."""
-        return {**self._asdict(), "seeds": list(seeds)}
 
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shard's share of a sweep's seeds; shares differ by at most one seed.
@@ -75,9 +70,9 @@ class Shard(NamedTuple):
         return tuple(int(seed) for seed in np.array_split(np.array(seeds), self.count)[self.index - 1])
 
 
-def differing_options(before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any]) -> str:
+def differing_options(before: dict[str, Any], now: dict[str, Any]) -> str:
     """Return at most four options in which the sweeps of two descriptions differ, see `folders.differences`."""
-    return ", ".join(sorted({*differences(before, now, defaults)} - set(OWN))[:4])
+    return ", ".join(sorted({*differences(before, now)} - set(OWN))[:4])
 
 
 def missing(configurations: list[Path]) -> list[str]:

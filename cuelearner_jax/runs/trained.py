@@ -64,44 +64,16 @@ POLICIES: dict[str, Named] = {
 }
 
 
-def make(
-    name: str,
-    config: RunConfig,
-    view: Any,
-    teacher: Teacher | None = None,
-    lanes: RunLanes | None = None,
-    adapted: AdaptedLanes | None = None,
-    code: Any = None,
-) -> Policy:
-    """Return a policy by its name, or a block of its lanes.
+class Block(NamedTuple):
+    """Lanes of one kind of guidance at one step, and the policies that they act with."""
 
-    Args:
-        name: one of `POLICIES`.
-        config: the configuration that it was trained with.
-        view: view of the world it acts in.
-        teacher: that world's teacher, where the policy asks one.
-        lanes: a run's lanes, for a trained policy.
-        adapted: a policy folder's lanes, for an adapted policy.
-        code: a policy of the user's own.
-    """
-    alone = {"uniform": uniform_in, "heuristic": Heuristic, "own": lambda view: policy_of(code, actions_of(view))}
-    if name in alone:
-        return alone[name](view)
-    if name == "teacher":
-        assert teacher is not None
-        return Taught(teacher)
-    if POLICIES[name].adapted:
-        assert adapted is not None
-        return adapted.policy(view) if name == "adapted" else adapted.base(view)
-    assert lanes is not None
-    agent = Agent(lanes.policies["params"], config.agent_in(view), view)
-    if name == "agent":
-        return agent
-    if name == "corrected":
-        assert teacher is not None
-        return Corrected(agent, teacher, config.scalars, actions_of(view))
-    base = asked_from(view, config.sizes) if name == "guide" else agent
-    return Guided(base, lanes.policies["guidance"], view, config.scalars, lanes.guidance)
+    guidance: str
+    seeds: np.ndarray  # (lanes,)
+    budgets: np.ndarray  # (lanes,)
+    bounds: np.ndarray  # (lanes,), in the space's unit; 0: no bound
+    step: int
+    policy: Any  # a block, or `Common`
+    failed: np.ndarray  # (lanes,) bool
 
 
 @dataclass(frozen=True)
@@ -117,24 +89,19 @@ class PolicySource:
     code: Any = None  # a policy of the user's own
 
     @classmethod
-    def of_run(cls, folder: Path, find: Callable[[str], Task]) -> PolicySource:
-        """Return the policies of a run, or of a sweep in shards; see `run_folders.open_run`."""
-        task, config, grid, pieces = open_run(folder, find)
-        return cls(task, config, grid, folder, pieces)
-
-    @classmethod
     def of_folder(
         cls, folder: Path, find: Callable[[str], Task], code: Any = None, changes: Any = None
     ) -> PolicySource:
-        """Return the policies of a run or of a policy folder. `code`, `changes`: the latter's code (`open_folder`).
+        """Return the policies of a run, whole or in shards (`open_run`), or of a policy folder (`open_folder`).
 
-        Raises UserError if the folder is neither, cannot be read, or needs no code where some is given.
+        `code`, `changes`: the code that a policy folder names. Raises UserError if the folder is neither, cannot be
+        read, or needs no code where some is given.
         """
         if not policy_folders.is_one(folder):
-            run = cls.of_run(folder, find)
+            task, config, grid, pieces = open_run(folder, find)
             if code is not None:
                 raise UserError(f"{folder} is a run, without code in its policies: leave out --base")
-            return run
+            return cls(task, config, grid, folder, pieces)
         task, world, lanes = open_folder(folder, find, code, changes)
         scalars = plain_scalars(actions_of(shape_of(task, world)))
         return cls(_with_labels(task, folder), RunConfig(world, scalars=scalars), None, folder, adapted=lanes)
@@ -204,6 +171,48 @@ class PolicySource:
             loaded += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
         return loaded
 
+    def alone(self, name: str, view: Any, teacher: Teacher | None = None) -> Policy:
+        """Return a policy that belongs to no lane, in a view of a world; `teacher`: that world's."""
+        if name == "own":
+            return policy_of(self.code, actions_of(view))
+        if name == "teacher":
+            assert teacher is not None
+            return Taught(teacher)
+        return Heuristic(view) if name == "heuristic" else uniform_in(view)
+
+    def blocks(
+        self, name: str, view: Any, teacher: Teacher | None, kinds: tuple[str, ...], failed_too: bool = False
+    ) -> list[Block]:
+        """Return a policy of the folder, in blocks of lanes of some kinds of guidance (none named: all).
+
+        `view`, `teacher`: those of the world that it acts in. Raises UserError if it is not available.
+        """
+        if (kept := self.adapted) is not None:
+            if kinds and kept.guidance not in kinds:
+                raise UserError(f"{self.folder} was adapted by {kept.guidance} guidance: leave out --guidance")
+            policy = kept.policy(view)
+            policy = policy if name == "adapted" else policy.base
+            columns = (kept.lanes.seed, kept.lanes.budget, kept.bounds_deg)
+            return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
+        loaded, blocks = self.load(kinds), []
+        for lanes in loaded if failed_too else without_failed(loaded):
+            policy, failed = self._acting(name, lanes, view, teacher), np.asarray(lanes.policies["failed"])
+            columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
+            blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, failed))
+        return blocks
+
+    def _acting(self, name: str, lanes: RunLanes, view: Any, teacher: Teacher | None) -> Policy:
+        """Return a trained policy of a run's lanes, as a block."""
+        config = self.config
+        agent = Agent(lanes.policies["params"], config.agent_in(view), view)
+        if name == "agent":
+            return agent
+        if name == "corrected":
+            assert teacher is not None
+            return Corrected(agent, teacher, config.scalars, actions_of(view))
+        base = asked_from(view, config.sizes) if name == "guide" else agent
+        return Guided(base, lanes.policies["guidance"], view, config.scalars, lanes.guidance)
+
 
 def _with_labels(task: Task, folder: Path) -> Task:
     """Return a policy folder's task; without recorded situations in its configuration, those of its labels are used."""
@@ -218,43 +227,6 @@ def _with_labels(task: Task, folder: Path) -> Task:
         return body.filled(config, rows.obs, rows.action)  # pyright: ignore[reportOptionalCall]
 
     return replace(task, bodies=(replace(body, environment=environment), *task.bodies[1:]))
-
-
-class Block(NamedTuple):
-    """Lanes of one kind of guidance at one step, and the policies that they act with."""
-
-    guidance: str
-    seeds: np.ndarray  # (lanes,)
-    budgets: np.ndarray  # (lanes,)
-    bounds: np.ndarray  # (lanes,), in the space's unit; 0: no bound
-    step: int
-    policy: Any  # a block, or `Common`
-    failed: np.ndarray  # (lanes,) bool
-
-
-def blocks_of(
-    source: PolicySource,
-    name: str,
-    view: Any,
-    teacher: Teacher | None,
-    kinds: tuple[str, ...],
-    failed_too: bool = False,
-) -> list[Block]:
-    """Return a folder's policy of a name, in blocks under `kinds` of guidance. Raises UserError if unavailable."""
-    if source.adapted is not None:
-        kept = source.adapted
-        if kinds and kept.guidance not in kinds:
-            raise UserError(f"{source.folder} was adapted by {kept.guidance} guidance: leave out --guidance")
-        columns = (kept.lanes.seed, kept.lanes.budget, kept.bounds_deg)
-        policy = make(name, source.config, view, teacher, adapted=kept)
-        return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
-    loaded = source.load(kinds)
-    blocks = []
-    for lanes in loaded if failed_too else without_failed(loaded):
-        policy = make(name, source.config, view, teacher, lanes)
-        columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
-        blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, np.asarray(lanes.policies["failed"])))
-    return blocks
 
 
 def check_no_lane(policy: str, *choices: Any) -> None:
@@ -312,9 +284,9 @@ def several(
     view = source.task.view(world) if env is None else view_of(env)
     if not named.kept:
         check_no_lane(name, kind, labels, seeds, bound_deg)
-        return [make(name, source.config, view, teacher, code=source.code)], (0,)
+        return [source.alone(name, view, teacher)], (0,)
     kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
-    blocks = blocks_of(source, name, view, teacher, kinds, failed_too=True)
+    blocks = source.blocks(name, view, teacher, kinds, failed_too=True)
     budget = int(max(block.budgets.max() for block in blocks)) if labels is None else labels
     bound = float(max(block.bounds.max() for block in blocks)) if bound_deg is None else bound_deg
     seeds = seeds or (int(blocks[0].seeds[0]),)

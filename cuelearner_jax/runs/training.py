@@ -1,4 +1,4 @@
-"""Training of one kind of guidance, from the first label to the last step, without disk access."""
+"""Training of one kind of guidance, from the first label to the last step; and what a checkpoint holds of it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,32 @@ from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import Agent, Guided, PolicyNode, asked_from
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.types import Label, Params, Teacher
+
+
+def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
+    """Return a run's state as checkpoint items; acting needs only the first, the last gives the cut of lanes."""
+    return {
+        "policy": [{"params": block.agent.params, "guidance": block.guide.model} for block in blocks],
+        "rest": [
+            block.replace(agent=block.agent.replace(params=None), guide=block.guide.replace(model=None), failed=None)
+            for block in blocks
+        ],
+        "failed": [block.failed for block in blocks],
+        "clock": {
+            "clock": clock,
+            "wall_s": np.float32(wall),
+            "cut": np.array([len(blocks), blocks[0].key.shape[0]], np.int32),
+        },
+    }
+
+
+def restore_clock(saved: Checkpoints) -> tuple[Clock, float, int, int]:
+    """Return the newest checkpoint's clock, seconds of training, number of blocks and lanes of a block."""
+    like = {"clock": jax.eval_shape(start_clock), "wall_s": np.float32(0), "cut": np.zeros(2, np.int32)}
+    found = saved.restore({"clock": like})["clock"]
+    return found["clock"], float(found["wall_s"]), *found["cut"].tolist()
 
 
 class Training:
@@ -39,17 +64,27 @@ class Training:
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
         self.wall = 0.0  # seconds of labelling and training so far
-        # round of the newest evaluation of guides, and its result
-        self._guides: tuple[int, dict[str, np.ndarray]] | None = None
 
     def begin(self) -> None:
         """Start fresh lanes."""
         self.blocks = self.group.start()
 
-    def go_on(self, blocks: list[TrainState], clock: Clock, wall: float) -> None:
-        """Continue from a saved state."""
-        self.blocks, self.wall = blocks, wall
-        self.clock = place(self.group.mesh, clock, SHARED)
+    def restore(self, saved: Checkpoints) -> None:
+        """Continue from the newest checkpoint, in this group's cut of the lanes. Raises as `Checkpoints.restore`."""
+        group, (clock, self.wall, count, size) = self.group, restore_clock(saved)
+        self.clock = place(group.mesh, clock, SHARED)
+        cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
+        shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
+        found = saved.restore({name: shapes[name] for name in ("policy", "rest", "failed")})
+        blocks = [
+            rest.replace(
+                agent=rest.agent.replace(params=policy["params"]),
+                guide=rest.guide.replace(model=policy["guidance"]),
+                failed=failed,
+            )
+            for policy, rest, failed in zip(found["policy"], found["rest"], found["failed"], strict=True)
+        ]
+        self.blocks = group.recut(blocks)
 
     @property
     def step(self) -> int:
@@ -65,11 +100,6 @@ class Training:
     def labelled(self) -> bool:
         """Whether all questions have been asked."""
         return not self.group.guidance.asks or self.round >= self.group.rounds
-
-    @property
-    def done(self) -> bool:
-        """Whether training is finished."""
-        return self.step >= self.group.config.schedule.total_steps
 
     @property
     def failed(self) -> np.ndarray:
@@ -98,15 +128,15 @@ class Training:
         taken = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
         self.clock = place(group.mesh, taken, SHARED)
 
-    def guides(self, before: int) -> dict[str, Any] | None:
-        """Return the columns of an evaluation of the guides alone after the rounds since `before`; None: none is due.
+    def guides(self, before: int) -> dict[str, Any]:
+        """Return the columns of an evaluation of the guides alone after the rounds since `before`.
 
-        Scalars, or one entry for each lane whose guide is due, see `LaneGroup.examined`.
+        Scalars, or one entry for each lane whose guide is due, see `LaneGroup.examined`. Empty: none is due.
         """
         group, rounds = self.group, self.round
         due = group.examined(rounds, before)
         if not due.any():
-            return None
+            return {}
         own = {"round": rounds, "step": self.step, "wall_s": self.wall}
         each = {"seed": group.seeds, "labels": group.budgets, "asked": group.asked(rounds)}
         each |= {"failed": self.failed.astype(float), **self.guide_alone()}
@@ -129,7 +159,7 @@ class Training:
         if self.step == 0:
             yield {**self.evaluation(), **self.guide_alone()}
         iterations = schedule.eval_every // group.config.sizes.num_envs
-        while not self.done:
+        while self.step < schedule.total_steps:
             started = time.perf_counter()
             self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
             self.wall += time.perf_counter() - started
@@ -153,15 +183,7 @@ class Training:
         return Agent(params, self.group.config.agent_in(view), view)
 
     def guide_alone(self) -> dict[str, np.ndarray]:
-        """Return metrics (lanes,) of the actions that questions begin with, under guidance; without it that is chance.
-
-        Guides change only in label rounds, so one evaluation per round is enough.
-        """
-        if self._guides is None or self._guides[0] != self.round:
-            self._guides = self.round, self._of_guides()
-        return self._guides[1]
-
-    def _of_guides(self) -> dict[str, np.ndarray]:
+        """Return metrics (lanes,) of the actions that questions begin with, under guidance; without that, of chance."""
         group, base = self.group, asked_from(self.group.env, self.group.config.sizes)
 
         def guide(lane: TrainState) -> PolicyNode:
@@ -170,11 +192,9 @@ class Training:
         return {f"guide_{name}": values for name, values in self._measured(guide).items()}
 
     def _measured(self, policy_of: Any) -> dict[str, np.ndarray]:
-        schedule = self.group.config.schedule
-        key = episodes(self.split)
+        schedule, key = self.group.config.schedule, episodes(self.split)
         size = (schedule.eval_envs, schedule.eval_steps)
-        found = self.group.evaluate(policy_of, self.examined, key, *size, self.blocks)
-        return self._of_finite(found)
+        return self._of_finite(self.group.evaluate(policy_of, self.examined, key, *size, self.blocks))
 
     def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Replace failed lanes' metrics (lanes,) by NaN, so that they never enter a mean unnoticed."""

@@ -13,7 +13,7 @@ import json
 import logging
 import re
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from jax.tree_util import keystr, tree_leaves_with_path, tree_map_with_path
 
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, first_line
 
 KEPT = 2  # number of checkpoints of a run that stay on disk
 DIGESTS = "digests"
@@ -37,18 +38,10 @@ def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _words(leaf: Any) -> Any:
-    """Return an array or its shape; of random keys the raw words."""
-    if not _is_key(leaf):
-        return leaf
-    is_shape = isinstance(leaf, jax.ShapeDtypeStruct)
-    return jax.eval_shape(jax.random.key_data, leaf) if is_shape else jax.random.key_data(leaf)
-
-
 def _flat(tree: Any) -> dict[str, Any]:
     """Return a tree's leaves by path, as Orbax takes them: keys as raw words, without empty leaves."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path): _words(leaf) for path, leaf in leaves if 0 not in leaf.shape}
+    words = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, tree)
+    return {keystr(path): leaf for path, leaf in tree_leaves_with_path(words) if 0 not in leaf.shape}
 
 
 def _unflat(flat: dict[str, Any], like: Any) -> Any:
@@ -57,22 +50,21 @@ def _unflat(flat: dict[str, Any], like: Any) -> Any:
     def leaf(path: Any, kind: Any) -> Any:
         if 0 in kind.shape:
             return jnp.zeros(kind.shape, kind.dtype)
-        stored = flat[jax.tree_util.keystr(path)]
-        return jax.random.wrap_key_data(stored) if _is_key(kind) else stored
+        return jax.random.wrap_key_data(flat[keystr(path)]) if _is_key(kind) else flat[keystr(path)]
 
-    return jax.tree_util.tree_map_with_path(leaf, like)
-
-
-def _digest(leaf: Any) -> str:
-    """Return the SHA-256 of an array's shape, type and values."""
-    found = hashlib.sha256(f"{leaf.shape} {leaf.dtype}".encode())
-    found.update(np.ascontiguousarray(leaf).data)
-    return found.hexdigest()
+    return tree_map_with_path(leaf, like)
 
 
 def _digests(flat: dict[str, Any]) -> dict[str, str]:
+    """Return the SHA-256 of each array's shape, type and values."""
+
+    def sha256(leaf: Any) -> str:
+        found = hashlib.sha256(f"{leaf.shape} {leaf.dtype}".encode())
+        found.update(np.ascontiguousarray(leaf).data)
+        return found.hexdigest()
+
     with ThreadPoolExecutor() as pool:  # hashing releases the interpreter lock
-        return dict(zip(flat, pool.map(_digest, flat.values()), strict=True))
+        return dict(zip(flat, pool.map(sha256, flat.values()), strict=True))
 
 
 def digest(tree: Any) -> str:
@@ -80,11 +72,18 @@ def digest(tree: Any) -> str:
     return hashlib.sha256(json.dumps(_digests(_flat(tree)), sort_keys=True).encode()).hexdigest()[:12]
 
 
-class Checkpoints:
-    """The checkpoints of one program's run in one folder."""
+class Checkpoints(AbstractContextManager):
+    """The checkpoints in one folder, as a context."""
 
-    def __init__(self, folder: Path, read_only: bool, remedy: str, run: str) -> None:
-        """Open a folder of checkpoints, see `checkpoints`."""
+    def __init__(self, folder: Path, read_only: bool = False, remedy: str = REMEDY, run: str = "") -> None:
+        """Open a folder of checkpoints.
+
+        Args:
+            folder: the folder of the checkpoints.
+            read_only: change nothing on disk.
+            remedy: the remedy in the message about a checkpoint that cannot be read.
+            run: the key of the run that the checkpoints belong to (`grid.run_key`); empty: of none.
+        """
         self._remedy, self._run, self._folder = remedy, run, folder.resolve()
         for name in ("absl", "asyncio"):  # what Orbax's threads log is raised anyway
             logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -114,10 +113,10 @@ class Checkpoints:
         if number is None:
             raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first checkpoint")
         device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-        shape = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)  # noqa: E731
-        wanted = {name: jax.tree.map(shape, _flat(item)) for name, item in like.items()}
-        args: dict[str, Any] = {name: ocp.args.StandardRestore(item) for name, item in wanted.items()}
-        args[DIGESTS] = ocp.args.JsonRestore()
+        args: dict[str, Any] = {DIGESTS: ocp.args.JsonRestore()}
+        for name, item in like.items():
+            shape = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)  # noqa: E731
+            args[name] = ocp.args.StandardRestore(jax.tree.map(shape, jax.eval_shape(_flat, item)))
         try:
             restored = self._manager.restore(number, args=ocp.args.Composite(**args))
             recorded = restored[DIGESTS]
@@ -130,23 +129,8 @@ class Checkpoints:
         except Exception as error:  # Orbax and TensorStore raise many exception types for damaged files
             # Orbax prints the method in place of TensorStore's details.
             words = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
-            reason = words.splitlines()[0][:160] if words else type(error).__name__
-            raise UserError(
-                f"checkpoint {number} in {self._folder} cannot be read ({reason}): {self._remedy}"
-            ) from error
+            why = first_line(words) or type(error).__name__
+            raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({why}): {self._remedy}") from error
 
-    def close(self) -> None:
-        """Release Orbax's threads."""
+    def __exit__(self, *_: object) -> None:
         self._manager.close()
-
-
-def checkpoints(folder: Path, read_only: bool = False, remedy: str = REMEDY, run: str = "") -> closing[Checkpoints]:
-    """Open `Checkpoints` for the duration of a context.
-
-    Args:
-        folder: the folder of the checkpoints.
-        read_only: change nothing on disk.
-        remedy: the remedy in the message about a checkpoint that cannot be read.
-        run: the key of the run that the checkpoints belong to (`grid.run_key`); empty: of none.
-    """
-    return closing(Checkpoints(folder, read_only, remedy, run))

@@ -34,53 +34,30 @@ def in_use(out: Path) -> bool:
     return any(entry.name != LOCK and not entry.name.startswith(f".{CONFIG}.") for entry in out.iterdir())
 
 
-def check_folder(
-    out: Path, described: dict[str, Any], resume: bool, overwrite: bool, defaults: dict[str, Any] | None = None
-) -> None:
-    """Raise UserError unless `out` may be resumed, overwritten or begun with `described` as its config.json.
-
-    `defaults`: see `differences`.
-    """
+def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: bool) -> None:
+    """Raise UserError unless `out` may be resumed, overwritten or begun with `described` as its config.json."""
     if resume and overwrite:
         raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
-    used = in_use(out)
-    ours = (out / CONFIG).is_file()
+    used, ours = in_use(out), (out / CONFIG).is_file()
     if resume:
         if not ours:
             raise UserError(f"nothing to resume in {out}: give the --out of an interrupted run, or leave out --resume")
-        differing = sorted(differences(formats.read("config", out / CONFIG), described, defaults))
-        if differing:
-            raise UserError(
-                f"{out} was run with other values of {', '.join(differing[:4])}: give the same "
-                f"options, or another --out"
-            )
+        if differing := sorted(differences(formats.read("config", out / CONFIG), described)):
+            named = ", ".join(differing[:4])
+            raise UserError(f"{out} was run with other values of {named}: give the same options, or another --out")
     elif used and not overwrite:
         raise UserError(f"{out} is not empty: give --resume to go on, --overwrite to delete it, or another --out")
     elif used and not ours:
         raise UserError(f"{out} is not a run folder, so --overwrite will not delete it: give another --out")
 
 
-def differences(
-    before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any] | None = None, prefix: str = ""
-) -> Iterator[str]:
-    """Yield the names, as `part.field`, in which two descriptions of runs differ.
-
-    Args:
-        before, now: the descriptions.
-        defaults: the value of a field, by part and field, where a description lacks it: a program without the field
-            behaved as the default does.
-        prefix: the part, prefixed to names.
-    """
-    defaults = defaults or {}
+def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yield the names, as `part.field`, in which two descriptions of runs differ; `prefix`: the part, with a dot."""
     for name in {**before, **now}:
-        if f"{prefix}{name}" == "task.from":  # where a task's code lies has no effect on the run
-            continue
-        default = defaults.get(name)
-        within, value = (default, None) if isinstance(default, dict) else (None, default)
-        old, new = before.get(name, value), now.get(name, value)
+        old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
-            yield from differences(old, new, within, f"{prefix}{name}.")
-        elif old != new:
+            yield from differences(old, new, f"{prefix}{name}.")
+        elif old != new and f"{prefix}{name}" != "task.from":  # where a task's code lies has no effect on the run
             yield prefix + name
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, first_line
 from cuelearner_jax.storage.whole import replacing
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
@@ -37,8 +37,7 @@ Values = dict[str, Any]
 
 def damaged(kind: str, path: Path, reason: object = "") -> UserError:
     """Return the error for a file that cannot be parsed; `reason` says why, where known."""
-    why = (str(reason).splitlines() or [""])[0][:200]
-    return UserError(f"{path} {REMEDIES[kind]}{f' ({why})' if why else ''}")
+    return UserError(f"{path} {REMEDIES[kind]}{f' ({why})' if (why := first_line(reason)) else ''}")
 
 
 def read(kind: str, path: Path) -> Values:

@@ -82,7 +82,6 @@ class LabelFile(NamedTuple):
     people: People | None = None  # None: the labels of a simulated teacher, or a merge that includes such labels
     session: dict[str, Any] | None = None  # settings of the page that asked, see `labelling.session`
     said: dict[str, int] | None = None  # number of rows of each kind in `SAID`, all rows counted
-    run: str | None = None  # the key of the run that wrote the file (`grid.run_key`)
 
     @property
     def budget(self) -> int:
@@ -116,9 +115,7 @@ class LabelWriter(tables.TableWriter):
             UserError: the folder holds labels of another kind, or unreadable ones; nothing has been changed.
         """
         about = _about(task, answers, space, eps, meaning, session)
-        there = found_in(folder)
-        before = None if there is None else _table_and_head(there)[1]
-        if before is not None:
+        if (there := found_in(folder)) and (before := _table_and_head(there)[1]):
             old, new = ({name: head.get(name) for name in SHARED} for head in (before, about))
             if (differing := next(differences(old, new), None)) is not None:
                 raise UserError(f"{there} holds labels of another {differing}: give the same, or another --out")
@@ -220,8 +217,8 @@ def read(path: Path) -> LabelFile:
     people = None
     if "item" in columns and not (columns["item"] < 0).any():
         people = People(*(columns[name] for name in People._fields))
-    rest = {"session": head.get("session"), "said": said, "run": head.get("run")}
-    return LabelFile(**about, eps=eps, seeds=columns["seed"], labels=labels, people=people, **rest)
+    rest = {"people": people, "session": head.get("session"), "said": said}
+    return LabelFile(**about, eps=eps, seeds=columns["seed"], labels=labels, **rest)
 
 
 def _standing(table: pa.Table) -> pa.Table:
@@ -230,7 +227,7 @@ def _standing(table: pa.Table) -> pa.Table:
         return table
     last: dict[Any, int] = {}
     for row, (seed, item) in enumerate(zip(*(table[name].to_pylist() for name in ("seed", "item")), strict=True)):
-        last[(seed, row, None) if item is None else (seed, item, "item")] = row
+        last[seed, row if item is None else item, item is None] = row
     said = table["said"].to_pylist()
     kept = [row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if said[row] in (None, ANSWERED)]
     return table.take(pa.array(kept, pa.int64()))

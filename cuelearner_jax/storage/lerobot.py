@@ -25,22 +25,49 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from cuelearner_jax.errors import UserError, format_value
-from cuelearner_jax.storage.picture_files import Picture, inside, read_picture
 
 INFO = Path("meta/info.json")
 VERSION = "v3.0"  # of the format
 VIDEO = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
 OBSERVATION, ACTION = "observation", "action"
+KINDS = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".gif": "image/gif",
+    ".mp4": "video/mp4",
+}
 
 
-class Recording(NamedTuple):
-    """The frames of a dataset, in the order of its files."""
+class Picture(NamedTuple):
+    """A picture or a short clip as stored in a file."""
 
-    observations: Float[np.ndarray, "n obs"]
-    actions: Float[np.ndarray, "n action"]
-    observation_entries: tuple[str, ...]  # empty: the dataset names none
-    action_entries: tuple[str, ...]
-    frames: Callable[[int], Picture] | None  # row -> the first camera's picture; None: no camera
+    data: bytes
+    kind: str  # media type, one of `KINDS`
+
+
+def inside(folder: Path, name: str, what: str) -> Path:
+    """Return the path of a file below a folder. Raises UserError for a name that leads out of the folder.
+
+    Links are followed: datasets lie in the hub's cache as links to files elsewhere.
+    """
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise UserError(f"{what} {format_value(name)} leads out of {folder}: give the name of a file in that folder")
+    return folder / name
+
+
+def read_picture(folder: Path, name: str) -> Picture:
+    """Read a picture below a folder. Raises UserError for a name that leads out of it, or that is not a picture's."""
+    path = inside(folder, name, "picture")
+    if (kind := KINDS.get(path.suffix.lower())) is None:
+        raise UserError(f"{format_value(name)} is no picture's file that the page shows: give {', '.join(KINDS)}")
+    try:
+        return Picture(path.read_bytes(), kind)
+    except (OSError, ValueError) as error:
+        raise UserError(f"picture {path} cannot be read ({error}): put it there") from error
+
+
+Frames = Callable[[int], Picture]  # row -> its picture
 
 
 def is_dataset(path: Path) -> bool:
@@ -48,11 +75,13 @@ def is_dataset(path: Path) -> bool:
     return (path / INFO).is_file()
 
 
-def read(path: Path) -> Recording:
-    """Read a dataset's rows; pictures are read on demand.
+def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str, ...], Frames | None]:
+    """Read a dataset's rows, in the order of its files; pictures are read on demand.
 
-    Raises:
-        UserError: the dataset has another version of the format, is damaged, or lacks vector observations or actions.
+    Returns observations (n, obs) and actions (n, action); the names of the entries of each, empty where the dataset
+    names none; and a function from a row to the first camera's picture, None without a camera.
+
+    Raises UserError if the dataset has another version of the format, is damaged, or lacks vectors of either.
     """
     features = _features(path)
     parts = [_parts(path, features, name) for name in (OBSERVATION, ACTION)]
@@ -63,12 +92,11 @@ def read(path: Path) -> Recording:
         raise _damaged(path / "data", "no frames")
     columns = [*parts[0], *parts[1], "episode_index", "timestamp", *stored]
     table = pa.concat_tables([_parquet(file, columns) for file in files], promote_options="permissive")
-    vectors = [
+    observations, actions = (
         np.concatenate([_vectors(path, table, key, features[key]["shape"][0]) for key in keys], -1) for keys in parts
-    ]
-    entries = [_entries(features, keys) for keys in parts]
-    frames = _frames(path, features, table, cameras[0]) if cameras else None
-    return Recording(vectors[0], vectors[1], entries[0], entries[1], frames)
+    )
+    names, entries = (_entries(features, keys) for keys in parts)
+    return observations, actions, names, entries, _frames(path, features, table, cameras[0]) if cameras else None
 
 
 def _damaged(path: Path, why: object) -> UserError:
@@ -146,7 +174,7 @@ def _flat(names: Any) -> list[str]:
     return [] if names is None else [str(names)]
 
 
-def _frames(path: Path, features: dict[str, Any], table: pa.Table, key: str) -> Callable[[int], Picture]:
+def _frames(path: Path, features: dict[str, Any], table: pa.Table, key: str) -> Frames:
     """Return a function from a row to its camera picture."""
     if features[key]["dtype"] == "image":
         return lambda row: _embedded(path, key, table[key][row].as_py())

@@ -3,7 +3,6 @@
     policy.json       the policy's parts, where it was adapted, how it was evaluated
     arrays/           networks and bounds, as a checkpoint with digests
     labels.parquet    the answers; labels-60deg.parquet and so on where lanes differ in their bounds
-    guide.parquet     the policy's performance by number of labels
 
 The folder appears atomically, once all of it is written (`whole.Place`). It names code but never contains any.
 """
@@ -12,11 +11,9 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.storage import formats, whole
-from cuelearner_jax.storage.checkpoint import checkpoints, digest
+from cuelearner_jax.storage import whole
 from cuelearner_jax.storage.whole import Place, is_used
 
 POLICY, ARRAYS = "policy.json", "arrays"
@@ -40,26 +37,3 @@ def check_free(folder: Path, overwrite: bool) -> None:
 def place_of(folder: Path, overwrite: bool) -> AbstractContextManager[Place]:
     """Claim the place of a policy folder for this process (`whole.place_of`). Raises UserError as `check_free`."""
     return whole.place_of(folder, lambda there: check_free(there, overwrite), overwrite)
-
-
-def write(folder: Path, described: dict[str, Any], arrays: Any) -> None:
-    """Write a policy's description (plain JSON values) and its arrays into a folder."""
-    (folder / ARRAYS).mkdir()
-    with checkpoints(folder / ARRAYS) as saved:
-        saved.save(0, {"policy": arrays})
-    formats.write("policy", folder / POLICY, {**described, "arrays": digest(arrays)})
-
-
-def read_arrays(folder: Path, like: Any, described: dict[str, Any]) -> Any:
-    """Read the arrays of a policy, a tree of the shapes `like`; `described`: the contents of its policy.json.
-
-    Raises UserError if the arrays cannot be read, are damaged, or belong to another policy.
-    """
-    place, remedy = folder / ARRAYS, "restore it, or adapt the policy anew"
-    if not place.is_dir():
-        raise UserError(f"{place} is missing: {remedy}")
-    with checkpoints(place, read_only=True, remedy=remedy) as saved:
-        found = saved.restore({"policy": like})["policy"]
-    if digest(found) != described.get("arrays"):
-        raise UserError(f"{place} holds the arrays of another policy: {remedy}")
-    return found

@@ -62,7 +62,6 @@ GUIDES = tables.Schema(
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
 FAILED = "failed"  # column that marks the rows of failed lanes
 LANE = ("guidance", "labels", "seed")  # columns that identify a lane of a run
-LaneKey = tuple[str, int, int]
 
 
 def check_complete(folder: Path, step: int, count: int, run: str) -> None:
@@ -102,12 +101,11 @@ def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
     return list(found.values())
 
 
-def read(paths: PathLike | Sequence[PathLike], task: str | None = None, schema: tables.Schema = SCHEMA) -> pa.Table:
-    """Read the results of any number of runs, finished or not, into one table.
+def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> pa.Table:
+    """Read the results of any number of runs of one task, finished or not, into one table.
 
     Args:
         paths: results files, run folders, or folders at any height above them.
-        task: keeps only this task's rows; needed where the runs are of several tasks.
         schema: that of the wanted tables.
 
     Returns:
@@ -125,22 +123,16 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None, schema: 
     table = pa.concat_tables(parts, promote_options="permissive")
     if table.num_rows == 0:
         raise UserError(f"no rows yet in {', '.join(map(str, files))}: wait for the first evaluation")
-    tasks = sorted(set(table["task"].to_pylist()))
-    if task is not None:
-        if task not in tasks:
-            raise UserError(f"no results of the task {task!r}: there are results of {', '.join(tasks)}")
-        table = table.filter(pc.field("task") == task)
-    elif len(tasks) > 1:
-        raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: choose one of them")
+    if len(tasks := sorted(set(table["task"].to_pylist()))) > 1:
+        raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: give folders of one of them")
     return table
 
 
-def read_guides(paths: Sequence[PathLike], task: str | None = None) -> pa.Table | None:
+def read_guides(paths: Sequence[PathLike]) -> pa.Table | None:
     """Read the tables of guides' own performance, as `read`; None where no run asked for labels."""
-    there = [
-        path for path in paths if any(next(Path(path).rglob(name), None) for name in (GUIDES.jsonl, GUIDES.parquet))
-    ]
-    return read(there, task, GUIDES) if there else None
+    names = (GUIDES.jsonl, GUIDES.parquet)
+    there = [path for path in paths if any(next(Path(path).rglob(name), None) for name in names)]
+    return read(there, GUIDES) if there else None
 
 
 def metrics(table: pa.Table) -> list[str]:
@@ -149,15 +141,13 @@ def metrics(table: pa.Table) -> list[str]:
     return [name for name in table.column_names if name not in others]
 
 
-def failures(table: pa.Table) -> dict[LaneKey, int]:
+def failures(table: pa.Table) -> dict[tuple[str, int, int], int]:
     """Return the failed lanes of a results table, each with the first step marked as failed, in order."""
     if FAILED not in table.column_names:
         return {}
     marked = table.filter(pc.field(FAILED) == 1.0)
-    first: dict[LaneKey, int] = {}
-    for row in marked.select([*LANE, "step"]).sort_by("step").to_pylist():
-        first.setdefault((row["guidance"], row["labels"], row["seed"]), row["step"])
-    return dict(sorted(first.items()))
+    first = marked.group_by(list(LANE)).aggregate([("step", "min")]).to_pylist()
+    return dict(sorted((tuple(row[name] for name in LANE), row["step_min"]) for row in first))
 
 
 def lanes(table: pa.Table) -> int:

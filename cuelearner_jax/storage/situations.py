@@ -31,7 +31,7 @@ from pyarrow import csv
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError, format_numbers, format_value
 from cuelearner_jax.storage import lerobot
-from cuelearner_jax.storage.picture_files import Picture, read_picture
+from cuelearner_jax.storage.lerobot import Picture, read_picture
 
 STEM = "situations"
 SUFFIXES = (".parquet", ".csv", ".npz")
@@ -59,9 +59,7 @@ def read(path: Path) -> Situations:
         UserError: nothing to read, missing columns, sizes that do not fit, or a number that is not finite.
     """
     if lerobot.is_dataset(path):
-        found = lerobot.read(path)
-        names = found.observation_entries, found.action_entries
-        return _checked(path, found.observations, found.actions, *names, found.frames)
+        return _checked(path, *lerobot.read(path))
     table = _table_in(path)
     columns = _columns(table)
     known = (OBSERVATION, ACTION, PICTURE)
@@ -98,7 +96,10 @@ def _checked(
             raise UserError(
                 f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave these rows out"
             )
-    slices = named_slices(names, observations.shape[1])
+    size = observations.shape[1]
+    slices = (Quantity(OBSERVATION, size, "1", "as recorded"),)
+    if len(names) == size <= MOST_NAMED:
+        slices = tuple(Quantity(name, 1, "1", "as recorded") for name in names)
     contents = hashlib.sha256()
     for rows in (observations, actions):
         contents.update(str(rows.shape).encode() + np.ascontiguousarray(rows).tobytes())
@@ -106,13 +107,6 @@ def _checked(
     digest = contents.hexdigest()[:12]
     none: Callable[[int], Picture | None] = lambda row: None  # noqa: E731
     return Situations(observations, actions, slices, entries, digest, picture is not None, picture or none)
-
-
-def named_slices(entries: tuple[str, ...], size: int) -> tuple[Quantity, ...]:
-    """Return an observation's slices: one per entry where entries are named and few, else a single one."""
-    if len(entries) == size and size <= MOST_NAMED:
-        return tuple(Quantity(name, 1, "1", "as recorded") for name in entries)
-    return (Quantity(OBSERVATION, size, "1", "as recorded"),)
 
 
 def _table_in(path: Path) -> Path:

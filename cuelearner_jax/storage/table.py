@@ -26,7 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, first_line
 from cuelearner_jax.storage.whole import replacing
 
 META = b"cuelearner"  # Parquet metadata key of the table's description
@@ -70,6 +70,10 @@ class Schema:
             return pa.int64()
         return pa.list_(pa.float32()) if name in self.lists else pa.float64()
 
+    def typed(self, table: pa.Table, metadata: dict[bytes, bytes] | None = None) -> pa.Table:
+        """Return a table with the columns' types and other metadata."""
+        return table.cast(pa.schema([(name, self.type(name)) for name in table.column_names], metadata))
+
 
 class TableWriter(contextlib.AbstractContextManager):
     """Appends rows to the JSONL file of one table; each append is on disk when the call returns.
@@ -90,13 +94,11 @@ class TableWriter(contextlib.AbstractContextManager):
         """
         self.path, self._schema = Path(folder) / schema.jsonl, schema
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        rows = _reopened(self.path, schema)
+        lines = _reopened(self.path, schema)
         self._file = self.path.open("ab", buffering=0)
-        self._file.truncate(self.path.read_bytes().rfind(b"\n") + 1)
-        if about is not None and not any("about" in row for row in rows):
+        if about is not None and not any("about" in line for line in lines):
             self._put([{"about": about}])
-        last = next((row["constants"] for row in reversed(rows) if "constants" in row), None)
-        if constants is not None and (constants := _plain(constants)) != last:
+        if constants is not None:
             self._put([{"constants": constants}])
 
     def append(self, **columns: Any) -> None:
@@ -113,10 +115,9 @@ class TableWriter(contextlib.AbstractContextManager):
         many = {name for name, array in arrays.items() if array.ndim > (name in self._schema.lists)}
         (count,) = {len(arrays[name]) for name in many} or {1}
         # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
-        values = {name: array.tolist() for name, array in arrays.items()}
+        values = {name: _plain(array.tolist()) for name, array in arrays.items()}
         self._put(
-            {name: _plain(value[row] if name in many else value) for name, value in values.items()}
-            for row in range(count)
+            {name: value[row] if name in many else value for name, value in values.items()} for row in range(count)
         )
 
     def _put(self, rows: Iterable[Row]) -> None:
@@ -142,8 +143,8 @@ class TableWriter(contextlib.AbstractContextManager):
 def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
     """Drop a folder's rows for which `keep` is false, and a torn last line; do nothing without a table."""
     path = Path(folder) / schema.jsonl
-    if rows := _reopened(path, schema):
-        _rewrite(path, [row for row in rows if row.keys() & HEADS or keep(row)])
+    if lines := _reopened(path, schema):
+        _rewrite(path, [line for line in lines if line.keys() & HEADS or keep(line)])
 
 
 def finish(folder: PathLike, schema: Schema) -> Path:
@@ -165,16 +166,15 @@ def finish(folder: PathLike, schema: Schema) -> Path:
 
 def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None, fresh: bool = False) -> None:
     """Write a whole table as Parquet, atomically. `about`: its description. `fresh`: see `whole.replacing`."""
-    described = {} if about is None else {META: json.dumps(about).encode()}
-    table = _typed(table, schema)
-    sealed = {**described, DIGEST: digest(table, described.get(META, b"")).encode()}
+    table = schema.typed(table, _metadata(about))
+    table = table.replace_schema_metadata({**(table.schema.metadata or {}), DIGEST: digest(table)})
     with replacing(path, "wb", fresh) as file:
-        pq.write_table(table.replace_schema_metadata(sealed), file, compression="zstd", write_page_checksum=True)
+        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
 
 
-def digest(table: pa.Table, about: bytes = b"") -> str:
+def digest(table: pa.Table) -> str:
     """Return the SHA-256 of a table's column names, types and values, in order, and of its description."""
-    found = hashlib.sha256(about)
+    found = hashlib.sha256((table.schema.metadata or {}).get(META, b""))
     for name in table.column_names:
         column = table[name].combine_chunks()
         found.update(json.dumps([name, str(column.type), len(column)]).encode())
@@ -196,11 +196,18 @@ def read(path: Path, schema: Schema) -> pa.Table:
     Raises UserError if the file is damaged or is not a table of this schema.
     """
     try:
-        table = _growing(path, schema) if path.suffix == ".jsonl" else _finished(path, schema)
-    except (KeyError, TypeError, ValueError, OverflowError, pa.ArrowException, OSError) as error:
+        if path.suffix == ".jsonl":
+            table = _growing(path, schema)
+        else:
+            with path.open("rb") as file:
+                stored = pq.ParquetFile(file).read()
+            table = schema.typed(stored, stored.schema.metadata)
+            if (table.schema.metadata or {}).get(DIGEST, b"").decode() != digest(table):
+                raise ValueError("its contents are not those that were written")
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException, OSError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # not one of Arrow's own
             raise
-        raise _damaged(path, schema, error) from error
+        raise UserError(f"{path} {schema.remedy} ({first_line(error)})") from error
     missing = [name for name in schema.required if name not in table.column_names]
     if missing and table.num_rows:
         raise UserError(
@@ -215,33 +222,14 @@ def about_of(table: pa.Table) -> Row | None:
     return None if described is None else json.loads(described)
 
 
-def _damaged(path: Path, schema: Schema, reason: object) -> UserError:
-    return UserError(f"{path} {schema.remedy} ({(str(reason).splitlines() or [''])[0][:200]})")
-
-
-def _typed(table: pa.Table, schema: Schema) -> pa.Table:
-    """Cast the columns to their types, without metadata."""
-    return table.cast(pa.schema([(name, schema.type(name)) for name in table.column_names]))
-
-
-def _finished(path: Path, schema: Schema) -> pa.Table:
-    """Read the table of a Parquet file. Raises ValueError if it differs from what was written."""
-    with path.open("rb") as file:
-        stored = pq.ParquetFile(file).read()
-    table, metadata = _typed(stored, schema), stored.schema.metadata or {}
-    described = metadata.get(META)
-    if metadata.get(DIGEST, b"").decode() != digest(table, described or b""):
-        raise ValueError("its contents are not those that were written")
-    return table if described is None else table.replace_schema_metadata({META: described})
+def _metadata(about: Row | None) -> dict[bytes, bytes]:
+    return {} if about is None else {META: json.dumps(about).encode()}
 
 
 def _plain(value: Any) -> Any:
     """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
-    if isinstance(value, dict):
-        return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, list):
         return [_plain(entry) for entry in value]
-    value = value.item() if isinstance(value, np.generic) else value
     value = float(value) if isinstance(value, bool) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
@@ -250,16 +238,10 @@ def _text(rows: Iterable[Row]) -> bytes:
     return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
 
 
-def _lines(path: Path, schema: Schema) -> list[Row]:
-    """Return the parsed whole lines of a JSONL file. Raises UserError if the file is damaged."""
+def _lines(path: Path) -> list[Row]:
+    """Return the whole lines of a JSONL file; without the last if a crash tore it."""
     *lines, _torn = path.read_bytes().split(b"\n")
-    try:
-        rows = [json.loads(line) for line in lines]
-    except ValueError as error:
-        raise _damaged(path, schema, error) from error
-    if not all(isinstance(row, dict) for row in rows):
-        raise _damaged(path, schema, "a line is no row")
-    return rows
+    return [json.loads(line) for line in lines]
 
 
 def _rewrite(path: Path, rows: Iterable[Row]) -> None:
@@ -268,14 +250,17 @@ def _rewrite(path: Path, rows: Iterable[Row]) -> None:
 
 
 def _reopened(path: Path, schema: Schema) -> list[Row]:
-    """Return a table's lines; convert a finished table back to JSONL, so that it can be continued."""
+    """Return a table's lines, to be continued: a finished table becomes JSONL again, a torn last line is cut off."""
     whole = path.with_name(schema.parquet)
     if whole.exists() and not path.exists():
         table = read(whole, schema)
         head = [] if (about := about_of(table)) is None else [{"about": about}]
         _rewrite(path, [*head, *({k: v for k, v in row.items() if v is not None} for row in table.to_pylist())])
     whole.unlink(missing_ok=True)
-    return _lines(path, schema) if path.exists() else []
+    if not path.exists():
+        return []
+    os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
+    return _lines(path)
 
 
 def _growing(path: Path, schema: Schema) -> pa.Table:
@@ -283,7 +268,7 @@ def _growing(path: Path, schema: Schema) -> pa.Table:
     about: Row | None = None
     constants: Row = {}
     rows = []
-    for line in _lines(path, schema):
+    for line in _lines(path):
         about, constants = line.get("about", about), line.get("constants", constants)
         if not line.keys() & HEADS:
             rows.append(constants | line)
@@ -291,5 +276,5 @@ def _growing(path: Path, schema: Schema) -> pa.Table:
     columns = {name: [row.get(name) for row in rows] for name in names}
     # Integers are cast last, since Arrow would truncate a fractional value.
     types = {name: None if name in schema.integers else schema.type(name) for name in names}
-    table = _typed(pa.table({name: pa.array(column, types[name]) for name, column in columns.items()}), schema)
-    return table if about is None else table.replace_schema_metadata({META: json.dumps(about).encode()})
+    table = pa.table({name: pa.array(column, types[name]) for name, column in columns.items()})
+    return schema.typed(table, _metadata(about))

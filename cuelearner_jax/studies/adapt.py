@@ -16,12 +16,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import by_model, by_reading, changes, judging, serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.by_reading import ReadingAdaptation
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, product, side_by_side
+from cuelearner_jax.adaptation.person import Person, Prefer
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.devices import release_programs
@@ -41,6 +41,7 @@ from cuelearner_jax.runs.order import read_labels
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
+from cuelearner_jax.studies.lanes import BaseLanes
 from cuelearner_jax.task import Scenario, Task
 from cuelearner_jax.types import Label, Teacher
 
@@ -49,22 +50,6 @@ KindsT = TypeVar("KindsT")
 
 MOST_ENVS = 100_000  # more do not fit into memory
 AS_IT_IS = Scenario("the world as it is", {})
-
-
-@dataclass(frozen=True)
-class BaseLanes:
-    """Choice of the lanes of the folder to adapt."""
-
-    policy: str = "agent"
-    """Which of its policies."""
-    guidance: str | None = None
-    """Kind of guidance of the lanes to adapt (default: the run's last)."""
-    labels: int | None = None
-    """Label budget of the lanes to adapt (default: the largest)."""
-    bound_deg: float | None = None
-    """Bound of the lanes to adapt, for a policy folder (default: the largest) [deg]."""
-    seeds: tuple[int, ...] = ()
-    """Seeds of the lanes to adapt, each with labels of its own (default: the first lane)."""
 
 
 class Subject(NamedTuple):
@@ -79,32 +64,30 @@ class Subject(NamedTuple):
     rows: Label | None = None  # labels (labels, ...) in place of questions; None: ask
     changes: Any = None  # what may have changed, as `changes.family_of` takes it; None: what the world declares
     changes_named: str = "code"  # package.module:NAME of `changes`
+    prefer: Prefer | None = None  # who judges, where a person does
 
 
-def subject_of(
-    source: PolicySource, world: Any, base: BaseLanes, policy: Any = None, named: str | None = None
-) -> Subject:
-    """Return policies of a folder, or the code `policy`, in a world of the source's task.
+def subject_of(source: PolicySource, world: Any, base: BaseLanes, named: str | None = None) -> Subject:
+    """Return the source's policies, or its code, in a world of its task.
 
-    `named`: package.module:NAME of the code. Raises UserError if the policies cannot act there.
+    `named`: package.module:NAME of code that acts or is in the folder. Raises UserError if the policies cannot act
+    there.
     """
     env = source.task.environment(world)
-    if policy is not None:
-        if base != BaseLanes(policy=source.default_policy):
+    if source.code is not None:
+        if base != BaseLanes():
             raise UserError(f"--base.… chooses among the lanes of a folder, but {named} is not a folder: leave it out")
-        policy = policy_of(policy, actions_of(env))
-        user_code.acts_in(named or "policy", policy, env)
+        policy = policy_of(source.code, actions_of(env))
         return Subject(env, Common(policy), origin={"code": named}, task=source.task)
-    source.check(base.policy, world, base.guidance)
-    if trained.POLICIES[base.policy].taught:
-        raise UserError(f"policy {base.policy!r} asks the teacher, so there is nothing to adapt: choose another")
+    name = base.name_in(source, world)
+    if trained.POLICIES[name].taught:
+        raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
     if len(set(base.seeds)) < len(base.seeds):
         raise UserError("--base.seeds: give each seed once")
-    policies, seeds = trained.several(
-        source, world, base.policy, base.guidance, base.labels, base.seeds, base.bound_deg, env
-    )
-    chosen = {name: value for name, value in dataclasses.asdict(base).items() if value not in (None, ())}
-    origin = {"folder": source.folder.name, **chosen, "seeds": list(seeds), **({"code": named} if named else {})}
+    policies, seeds = trained.several(source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env)
+    chosen = {option: value for option, value in dataclasses.asdict(base).items() if value not in (None, ())}
+    origin = {"folder": source.folder.name, **chosen, "policy": name, "seeds": list(seeds)}
+    origin |= {"code": named} if named else {}
     bases = Common(policies[0]) if len(policies) == 1 else side_by_side(policies)
     return Subject(env, bases, seeds, origin, source.task)
 
@@ -125,20 +108,13 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     """First seed; the others count up from it."""
     guidance: str = Reading.name
     """Kind of guidance: what is asked, and what a model makes of the answers."""
-    scenario: str | None = None
-    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
-    robot: str | None = None
-    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
-    policy."""
     labels_from: Path | None = None
     """Label file to use instead of asking the teacher."""
     judge_by: str = "reward"
-    """What decides whether the correction is used: a metric on tuning episodes, or held-out answers (labels). A model
-    that is not shown to make the policy better is not used."""
+    """What decides whether the correction is used: a metric on tuning episodes, held-out answers (labels), or you, by
+    films of both policies side by side (person). A model that is not shown to make the policy better is not used."""
     judge_episodes: int = 50
     """Largest number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
-    judge_every: int = 0
-    """Measure the policy each time this many labels are new, into guide.parquet (0: only at the end)."""
     judge_bounds: tuple[float, ...] = ()
     """Also try the model within these shares of its bound, for instance 0.5 0.25, and use the bound that scores best on
     the tuning episodes."""
@@ -182,16 +158,11 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         if labels_from is not None:
             file = label_files.read(labels_from)
             eps_deg, labels = file.eps if eps_deg is None else eps_deg, (file.budget,)
-        settling, frame = by_model.settling, {"frame": config.sizes.frame}
-        if kind.by_evidence:
-            settling, frame = by_reading.settling, {}
         if scalars is None:
             eps_deg = rules.eps_deg if eps_deg is None else eps_deg
-            scalars = replace(settling(config.scalars, eps_deg), **rules.scalars)
-        elif not kind.by_evidence:
-            scalars = settling(scalars, eps_deg)
-        elif eps_deg is not None:
-            scalars = replace(scalars, eps_deg=eps_deg)
+            scalars = replace(by_model.settling(config.scalars, eps_deg), **rules.scalars)
+        else:
+            scalars = by_model.settling(scalars, eps_deg)
         by = judging.LABELS if kind.by_evidence else task.judge_by(config.task) if task else cls.judge_by
         own = config.kinds.get(kind.name) or (kind.config and kind.config())
         kinds: Any = {kind.name: replace(own, **rules.options)} if own else {}
@@ -201,11 +172,10 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             labels=labels,
             bound_deg=() if rules.bound_deg is None else (rules.bound_deg,),
             guidance=kind.name,
-            scenario=scenario,
             labels_from=labels_from,
             judge_by=judge_by or rules.judge_by or by,
             judge_bounds=() if judge_by == judging.LABELS else rules.judge_bounds,
-            sizes=replace(by_model.SIZES, **{**frame, **rules.sizes}),
+            sizes=replace(by_model.SIZES, **{"frame": config.sizes.frame, **rules.sizes}),
             scalars=scalars,
             kinds=kinds,
         )
@@ -224,9 +194,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         kind = guidances.resolve(self.guidance)
         if not kind.asks:
             raise UserError(f"guidance {kind.name!r} asks no questions, so nothing is learned: choose another kind")
-        if kind.by_evidence:
-            by_reading.check_unused(sizes, scalars, judge_bounds=self.judge_bounds)
-        elif subject.changes is not None:
+        if subject.changes is not None and not kind.by_evidence:
             raise UserError(f"changes is given, but guidance {kind.name!r} does not use it: give guidance reading")
         guidance = guidances.make(kind.name, sizes, env, kinds.get(kind.name))
         shared = lanes_in(bases) is None
@@ -240,6 +208,8 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             by_model.check_amounts(actions_of(env), bounds, scalars)
         lanes = product(1, seeds, grid.labels, bounds, one_each=not shared)
         how = self._judging(subject)
+        if how.by == judging.PERSON and lanes.number > 1:
+            raise UserError("a person judges one policy: give one seed, one number of labels and one bound")
         rows, teacher = None, subject.teacher
         if file is not None:
             slots = label_slots(int(lanes.budget.max()), sizes)
@@ -302,26 +272,31 @@ class AdaptRequest(Generic[TaskT, KindsT]):
 
     def _judging(self, subject: Subject) -> Judging:
         """Return how policies are judged. Raises UserError for invalid settings."""
-        by, task, shares, unit = self.judge_by, subject.task, self.judge_bounds, self.sizes.labels_per_round
+        by, task, shares = self.judge_by, subject.task, self.judge_bounds
         if not 1 <= self.judge_episodes <= MOST_ENVS:
             raise UserError(f"judge_episodes is {self.judge_episodes}: give a number from 1 to {MOST_ENVS:,}")
-        if self.judge_every < 0 or self.judge_every % unit:
-            raise UserError(f"judge_every is {self.judge_every}: give a multiple of sizes.labels_per_round ({unit})")
         if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
             given = " ".join(f"{share:g}" for share in shares)
             raise UserError(f"judge_bounds is {given}: give shares of the bound above 0 and below 1, each once")
-        if shares and by == judging.LABELS:
+        if shares and by in (judging.LABELS, judging.PERSON):
             raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
-        known = [*judging.metrics_of(subject.env), judging.LABELS]
+        known = [*judging.metrics_of(subject.env), judging.LABELS, judging.PERSON]
         if by not in known:
             name = task.name if task else "this environment"
             raise UserError(f"judge_by is {by!r}, which is not a metric of {name}{suggestion(by, known)}")
-        steps, tuned = judging.STEPS, None
+        steps, tuned, person = judging.STEPS, None, None
         if task and task.longest:
             steps = task.longest(self.task)
-        if by != judging.LABELS or self.judge_every:
+        if by != judging.LABELS:
             tuned = task.environment(self.task, judging.SPLIT) if task else subject.env
-        return Judging(tuned, self.judge_episodes, steps, by, self.judge_every, bounds=shares)
+        if by == judging.PERSON:
+            if task is None or subject.prefer is None:
+                raise UserError("a person compares films: give a world of cl.make or cl.from_gymnasium, and judge_by=")
+            pictures = task.pictures("judge by a metric")
+            if pictures.check is not None:
+                pictures.check(tuned)
+            person = Person(subject.prefer, pictures)
+        return Judging(tuned, self.judge_episodes, steps, by, person, shares)
 
 
 class AdaptedStudy(NamedTuple):
@@ -335,5 +310,5 @@ class AdaptedStudy(NamedTuple):
         """Write the policy folder. Raises UserError if the policy cannot be kept."""
         path, task = self.request.labels_from, self.subject.task
         assert task is not None  # a folder names it
-        used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": self.request.robot}
+        used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": task.robot or None}
         adapted.write(place, self.found, task, self.request.task, self.subject.origin, used)

@@ -23,7 +23,7 @@ from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, mean_interv
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
-from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource, blocks_of, make
+from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource
 from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Label
@@ -103,7 +103,6 @@ def run(
     source: PolicySource,
     asked: EvaluateRequest[Any],
     watch: Callable[[str], Tell] = lambda kind: ignore_progress,
-    policy: Any = None,
 ) -> list[Measured]:
     """Return metrics of a policy on validation episodes of a world, for each guidance and budget.
 
@@ -111,7 +110,6 @@ def run(
         source: the policy's origin.
         asked: the request, whose `task` is the world (a configuration).
         watch: given a kind of guidance, returns the function that reports the progress of its lanes.
-        policy: a policy in place of one of the source's; None: use the source's.
     """
     release_programs()
     task, world, name = source.task, asked.task, asked.policy
@@ -119,11 +117,11 @@ def run(
     engine, key = task.engine(asked.engine), episodes()
     env = task.environment(world, "validation")
     named, unit = POLICIES[name], actions_of(env).unit.replace("degrees", "deg")
-    teacher = task.make_teacher(world, env) if policy is None and named.taught else None
-    if policy is None and named.kept:
-        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
+    teacher = task.make_teacher(world, env) if named.taught else None
+    if named.kept:
+        blocks = source.blocks(name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
     else:
-        policy = make(name, source.config, view_of(env), teacher, code=source.code) if policy is None else policy
+        policy = source.alone(name, view_of(env), teacher)
         none = np.zeros(1, int)
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
     rows = []

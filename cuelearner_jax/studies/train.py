@@ -21,7 +21,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
-from cuelearner_jax.runs.grid import Grid, defaults, seeds_of
+from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
@@ -82,7 +82,7 @@ def run(order: Order) -> None:
         examined = task.environment(world, order.split)
         with claimed(order.out), interruptible() as stopping:
             # Nobody else can change it any more.
-            check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(task))
+            check_folder(order.out, plan.described, order.resume, order.overwrite)
             prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
             # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
             described = formats.read("config", order.out / CONFIG)

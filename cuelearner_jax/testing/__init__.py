@@ -1,6 +1,7 @@
 """Conformance checks for parts of your own. Each raises AssertionError with one line that says what to fix.
 
-A check compiles once or twice and takes seconds; call it from a test, with a world as small as there is.
+An exception of a part keeps its own traceback. A check compiles once or twice and takes seconds; call it from a test,
+with a world as small as there is.
 """
 
 from cuelearner_jax.testing.environments import check_environment

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from cuelearner_jax.environment import Aims, Environment, actions_of, offers, symmetries_of
-from cuelearner_jax.testing.laws import TRACED, Laws, change_floats, counted_jit, shapes_of
+from cuelearner_jax.testing.laws import Laws, change_floats, counted_jit, shapes_of
 
 COMPARED = 8  # steps of the roll-out that are taken again in one batch, and actions that features are asked about
 
@@ -33,9 +33,8 @@ def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None
     _check_shapes(laws, env)
     key = jax.random.key(0) if key is None else key
     walk, traces = counted_jit(lambda env, key: _walk(env, key, steps))
-    with laws.attempted("a compiled roll-out", TRACED):
-        met = jax.device_get(walk(env, key))
-        walk(change_floats(env), key)
+    met = jax.device_get(walk(env, key))
+    walk(change_floats(env), key)
     laws.hold(len(traces) == 1, "other values of its floats are traced anew: keep them out of static fields")
     _check_steps(laws, env, met, steps)
     if offers(env, "heuristic"):
@@ -51,18 +50,16 @@ def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None
 def _check_shapes(laws: Laws, env: Environment) -> None:
     """Check shapes and types by tracing only."""
     key, action = jax.random.key(0), jax.ShapeDtypeStruct((actions_of(env).size,), jnp.float32)
-    with laws.attempted("tracing `reset` and `step`", TRACED):
-        state, obs = jax.eval_shape(env.reset, key)
-        after, step = jax.eval_shape(env.step, key, state, action)
-        programs = [
-            jax.make_jaxpr(lambda action: (env.reset(key), env.step(key, env.reset(key)[0], action)))(action)
-            for _ in range(2)
-        ]
+    state, obs = jax.eval_shape(env.reset, key)
+    after, step = jax.eval_shape(env.step, key, state, action)
+    programs = [
+        jax.make_jaxpr(lambda action: (env.reset(key), env.step(key, env.reset(key)[0], action)))(action)
+        for _ in range(2)
+    ]
     laws.hold(shapes_of(after) == shapes_of(state), "`step` returns a state of other fields, shapes or types")
-    with laws.attempted("tracing `remember` and `recall`", "derive WholeObservations, or write both and `recall_next`"):
-        memory = jax.eval_shape(env.remember, state, obs)
-        recalled = jax.eval_shape(env.recall, memory)
-        following = jax.eval_shape(env.recall_next, memory, action, step.aftermath)
+    memory = jax.eval_shape(env.remember, state, obs)
+    recalled = jax.eval_shape(env.recall, memory)
+    following = jax.eval_shape(env.recall_next, memory, action, step.aftermath)
     observations = {"observation": obs, "Step.obs": step.obs, "Step.final_obs": step.final_obs}
     observations |= {"what `recall` gives": recalled, "what `recall_next` gives": following}
     flags = {"Step.terminated": step.terminated, "Step.truncated": step.truncated}

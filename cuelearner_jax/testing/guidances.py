@@ -44,21 +44,18 @@ def check_guidance(kind: type[Guide], env: Environment, sizes: GuideSizes = SMAL
     laws = Laws(f"guidance {kind.name}", tolerance)
     for need in kind.needs:
         laws.hold(offers(env, need), f"it needs a {need}, which {type(env).__name__} lacks: check it in another one")
-    with laws.attempted("making it", "its class inherits Guide, and its `config` has defaults"):
-        guide = kind(sizes, spaces_of(env))
-        model = guide.init(key := jax.random.key(0))
+    guide = kind(sizes, spaces_of(env))
+    model = guide.init(key := jax.random.key(0))
     states, obs = jax.vmap(env.reset)(jax.random.split(key, ROWS))
     actions = actions_of(env).sample(key, (ROWS,))
     fitted = _fitted(laws, guide, env, model, _labels(laws, guide, env, states, obs, actions)) if guide.form else model
     _check_act(laws, guide, env, model, fitted, obs, actions)
-    with laws.attempted("`question` under jit", "it gets one situation and the base policy's action there"):
-        asked = jax.jit(guide.question)(jax.random.key(3), fitted, env, obs[0], actions[0], SCALARS)
+    asked = jax.jit(guide.question)(jax.random.key(3), fitted, env, obs[0], actions[0], SCALARS)
     laws.hold(asked.shape == actions[0].shape, f"`question` returns shape {asked.shape}: ask about one action")
     laws.actions(actions_of(env), asked, "what `question` asks about")
     if guide.form is not None:
         members = kind(dataclasses.replace(sizes, ensemble=2), spaces_of(env))
-        with laws.attempted("`disagreement` under jit", "it gets a model and a batch of situations and actions"):
-            apart = jax.jit(members.disagreement)(members.init(jax.random.key(4)), env, obs, actions)
+        apart = jax.jit(members.disagreement)(members.init(jax.random.key(4)), env, obs, actions)
         sound = apart.shape == (ROWS,) and np.isfinite(apart).all() and (apart >= 0).all()
         laws.hold(sound, f"`disagreement` of {ROWS} rows is {apart}: give a number of each, at least 0")
 
@@ -72,13 +69,11 @@ def _labels(laws: Laws, guide: Guide, env: Any, states: Any, obs: Array, actions
     def each(key: Array, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
         return form.answer(key, env, teacher, state, obs, action, Scalars())
 
-    with laws.attempted("its form's `answer`", "it returns (answer, answered), in jax.numpy"):
-        answers, answered = jax.jit(jax.vmap(each))(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)
+    answers, answered = jax.jit(jax.vmap(each))(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)
     laws.hold(answers.shape == (ROWS, width), f"an answer has shape {answers.shape[1:]}: its form says ({width},)")
     laws.hold(answered.shape == (ROWS,) and answered.dtype == bool, "`answered` is no bool: say whether it answered")
     labels = Label(obs, actions, answers, answered, base=actions if guide.sees_base else None)
-    with laws.attempted("`target` under vmap", "it gets one Label and GuideScalars, and returns a vector"):
-        targets = jax.vmap(lambda label: guide.target(label, SCALARS))(labels)
+    targets = jax.vmap(lambda label: guide.target(label, SCALARS))(labels)
     sound = targets.ndim == 2 and np.isfinite(targets).all()
     laws.hold(sound, f"`target` of one label has shape {targets.shape[1:]} or is not finite: return one finite vector")
     return labels
@@ -89,8 +84,7 @@ def _fitted(laws: Laws, guide: Guide, env: Any, model: GuidanceModel, labels: La
     lanes, former = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (labels, model))
     lanes = lanes.replace(valid=lanes.valid.at[1].set(False))
     fit = jax.jit(jax.vmap(guide.fit, (0, None, 0, 0, None)))
-    with laws.attempted("`fit` under jit and vmap", "it is one lane's: no Python branch may look at a value"):
-        fits = fit(jax.random.split(jax.random.key(2), 2), env, lanes, former, SCALARS)
+    fits = fit(jax.random.split(jax.random.key(2), 2), env, lanes, former, SCALARS)
     laws.hold(shapes_of(fits) == shapes_of(former), "`fit` returns a model of other fields or shapes than `init`")
     laws.hold(fits.fitted[0], "`fit` of valid labels returns an unfitted model: set `fitted`")
     laws.hold(not fits.fitted[1], "`fit` without a valid label returns a fitted model: `fitted` must be False there")
@@ -105,10 +99,9 @@ def _check_act(
 ) -> None:
     """Check the changes to a batch of actions."""
     active, (act, traces) = jnp.arange(ROWS) % 2 == 0, counted_jit(guide.act)
-    with laws.attempted("`act` under jit", "it gets a batch of rows and returns Refinement(actions, passes)"):
-        moved, passes = act(fitted, env, obs, actions, active, SCALARS)
-        act(fitted, env, obs, actions, active, change_floats(SCALARS))
-        alone = act(unfitted, env, obs, actions, jnp.ones(ROWS, bool), SCALARS).actions
+    moved, passes = act(fitted, env, obs, actions, active, SCALARS)
+    act(fitted, env, obs, actions, active, change_floats(SCALARS))
+    alone = act(unfitted, env, obs, actions, jnp.ones(ROWS, bool), SCALARS).actions
     laws.hold(len(traces) == 1, "`act` is traced anew for other scalars: no Python branch may look at them")
     laws.hold(moved.shape == actions.shape, f"`act` returns actions of shape {moved.shape}")
     laws.actions(actions_of(env), moved, "an action that `act` returns")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,10 +13,6 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.policies import BY_LANE, SHARED
 from cuelearner_jax.spaces import Space, from_json
 
-TRACED = (
-    "what depends on traced values must be jax.numpy, with jnp.where and lax.cond in place of if; a part is a pytree "
-    "(flax.struct.PyTreeNode), its fields are numbers, or static (pytree_node=False) and hashable"
-)
 DRAWN = 64  # actions of a check of a space
 ROWS = 9  # situations of a check of a policy
 
@@ -33,17 +28,6 @@ class Laws:
         """Raise AssertionError with the broken law and how to fix it, unless the law holds."""
         if not law:
             raise AssertionError(f"{self.subject}: {broken}")
-
-    @contextmanager
-    def attempted(self, deed: str, mend: str) -> Iterator[None]:
-        """Raise AssertionError in one line in place of any exception of the subject's code."""
-        try:
-            yield
-        except AssertionError:
-            raise
-        except Exception as error:
-            why = (str(error).strip().splitlines() or [""])[0][:160]
-            raise AssertionError(f"{self.subject}: {deed} fails ({type(error).__name__}: {why}): {mend}") from error
 
     def same(self, one: Any, other: Any) -> bool:
         """Return whether two trees of arrays are equal, within the tolerance. Keys are compared by their words."""
@@ -91,14 +75,12 @@ def _numbers(leaf: Any) -> np.ndarray:
 def check_space(space: Space, tolerance: float = 1e-5) -> None:
     """Check an action space on actions that it draws. Raises AssertionError for the first law that is broken."""
     laws = Laws(space, tolerance)
-    with laws.attempted("reading its description", "derive a frozen dataclass; see `to_json` and `of_json`"):
-        hash(space)
-        laws.hold(from_json(space.to_json()) == space, "its description gives another space: see `to_json`, `of_json`")
-    with laws.attempted("drawing and comparing actions", "every method takes any leading axes, under jit too"):
-        one, other = (space.sample(jax.random.key(seed), (DRAWN,)) for seed in (0, 1))
-        change = jax.jit(space.log)(one, other)
-        moved, retracted = jax.jit(space.exp)(one, change), space.retract(one)
-        spread = space.spread(DRAWN)
+    hash(space)
+    laws.hold(from_json(space.to_json()) == space, "its description gives another space: see `to_json`, `of_json`")
+    one, other = (space.sample(jax.random.key(seed), (DRAWN,)) for seed in (0, 1))
+    change = jax.jit(space.log)(one, other)
+    moved, retracted = jax.jit(space.exp)(one, change), space.retract(one)
+    spread = space.spread(DRAWN)
     laws.hold(change.shape == (DRAWN, len(space.cues)), f"`log` has shape {change.shape}: give one number a cue")
     for function, actions in (("sample", one), ("exp", moved), ("spread", spread)):
         laws.actions(space, actions, f"what `{function}` gives")
@@ -123,16 +105,13 @@ def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None
     keys = jax.random.split(jax.random.key(0), ROWS)
     states, obs = jax.vmap(env.reset)(keys)
     act, traces = counted_jit(lambda policy, key, states, obs: policy.act(key, states, obs))
-    with laws.attempted("`act` under jit", f"it gets a key, states and observations (n, obs), all traced; {TRACED}"):
-        actions, again, other = (act(policy, keys[number], states, obs) for number in (0, 0, 1))
-        act(change_floats(policy), keys[0], states, obs)
+    actions, again, other = (act(policy, keys[number], states, obs) for number in (0, 0, 1))
+    act(change_floats(policy), keys[0], states, obs)
     laws.hold(len(traces) == 1, "other values of its floats are traced anew: keep them out of static fields")
-    with laws.attempted("`axes`", "give the policy with BY_LANE or SHARED in place of its fields: self.replace(...)"):
-        axes = jax.tree.leaves(policy.axes, is_leaf=lambda leaf: leaf is None)
+    axes = jax.tree.leaves(policy.axes, is_leaf=lambda leaf: leaf is None)
     broken = "`axes` holds something else than BY_LANE and SHARED: replace every field"
     laws.hold(all(axis is SHARED or axis == BY_LANE for axis in axes), broken)
-    with laws.attempted("`act` of one observation", "n may be 1"):
-        alone = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[:1], states), obs[:1])
+    alone = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[:1], states), obs[:1])
     for rows, found in ((ROWS, actions), (1, alone)):
         shape = np.shape(found)
         laws.hold(shape == (rows, space.size), f"`act` returns shape {shape} for {rows} observations")

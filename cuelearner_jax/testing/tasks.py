@@ -38,19 +38,15 @@ def check_task(
     """
     laws = Laws(f"task {task.name}", tolerance)
     for name, preset in task.presets.items():
-        with laws.attempted(f"preset {name!r}", "its values must pass cuelearner_jax.config.check"):
-            check(preset.config)
-            task.check_evaluations(preset.config)
-            check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
-        with laws.attempted(f"the environments of preset {name!r}", f"make those of training and of {[*SPLITS]}"):
-            env = shape_of(task, preset.config.task)
-            sizes = {
-                other: shape_of(task, one.apply(preset.config.task)).obs_size for other, one in task.scenarios.items()
-            }
-            splits = [
-                jax.eval_shape(lambda split=split: task.environment(preset.config.task, split))  # noqa: B023
-                for split in ("training", *SPLITS)
-            ]
+        check(preset.config)
+        task.check_evaluations(preset.config)
+        check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
+        env = shape_of(task, preset.config.task)
+        sizes = {other: shape_of(task, one.apply(preset.config.task)).obs_size for other, one in task.scenarios.items()}
+        splits = [
+            jax.eval_shape(lambda split=split: task.environment(preset.config.task, split))  # noqa: B023
+            for split in ("training", *SPLITS)
+        ]
         possible = registry.possible(env, taught=task.teacher is not None)
         odd = [kind for kind in preset.guidance if registry.resolve(kind).name not in possible]
         laws.hold(not odd, f"preset {name!r} compares guidance {odd[:1]}, which it cannot have: of {list(possible)}")
@@ -86,8 +82,7 @@ def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
             return best
         return {**best, "nearest good action": teacher.nearest_good(state, obs, best["best action"], 0.0, 1.0)}
 
-    with laws.attempted("its teacher's best_action", "it gets one state and its observation, in jax.numpy"):
-        actions = answers(env)
+    actions = answers(env)
     for name, one in actions.items():
         laws.hold(one.ndim == 1, f"its teacher's {name} has shape {one.shape}: give one action")
         laws.actions(actions_of(env), one, f"its teacher's {name}")
@@ -95,11 +90,10 @@ def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
 
 def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
     """Check a film, a still and a question of a few random steps."""
-    with laws.attempted("drawing", "see cuelearner_jax.task.Pictures for what each of its functions gets"):
-        drawn, env = task.pictures(), task.environment(config, "validation")
-        files = filming.files(folder, task.name, "gif")
-        rewards = filming.film(drawn, env, uniform_in(env), 0, FILMED, files)
-        filming.question(drawn, env, uniform_in(env), 0, files.question)
+    drawn, env = task.pictures(), task.environment(config, "validation")
+    files = filming.files(folder, task.name, "gif")
+    rewards = filming.film(drawn, env, uniform_in(env), 0, FILMED, files)
+    filming.question(drawn, env, uniform_in(env), 0, files.question)
     laws.hold(len(rewards) == FILMED, f"`record` returns {len(rewards)} rewards of {FILMED} steps: one a step")
     for file in files:
         laws.hold(file.is_file() and file.stat().st_size, f"{file.name} was not written: write the file that is named")

@@ -1,4 +1,4 @@
-"""Adaptation on the bandit, whose best direction is known: bounds, recovery, label files, judging, opaque functions."""
+"""Adaptation on the bandit, whose best direction is known: bounds, recovery, label files, judging."""
 
 import dataclasses
 from functools import cache
@@ -17,7 +17,7 @@ from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import BY_LANE, Common, Opaque, PolicyNode, policy_of
+from cuelearner_jax.policies import BY_LANE, Common, PolicyNode
 from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
@@ -56,8 +56,8 @@ def of(bases=BASES):
 
 @cache
 def found():
-    """All lanes, measured on the way."""
-    return by_model.adapt(of(), LANES, dataclasses.replace(JUDGING, every=10), EXPERT, mesh=MESH)
+    """All lanes."""
+    return by_model.adapt(of(), LANES, JUDGING, EXPERT, mesh=MESH)
 
 
 # In one program each, as all lanes have the same shapes.
@@ -145,14 +145,6 @@ def test_budgets_are_masks_and_lanes_do_not_know_each_other():
     chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[0], alone.guide.model), kept)
 
 
-def test_the_curve_says_what_policies_were_worth_on_the_way():
-    curve = found().curve
-    assert [row["asked"].max() for row in curve] == list(range(0, 90, 10))
-    np.testing.assert_array_equal(curve[0]["reward"], found().judged.before)
-    np.testing.assert_allclose(curve[-1]["reward"], found().judged.after, atol=0.1)  # on other episodes
-    assert curve[-1]["asked"].tolist() == LANES.budget.tolist()
-
-
 def test_given_labels_lead_where_asking_for_them_did():
     labels = found().labels
     given = by_model.adapt(of(), LANES, JUDGING, labels=labels, mesh=MESH)
@@ -205,34 +197,6 @@ def test_a_bound_is_narrowed_where_that_is_worth_more():
     spent = narrow.judged.rewarded_steps[0], wide.judged.rewarded_steps[0]
     assert spent == tuple(count * JUDGING.steps for count in episodes)
     assert errors(narrow.policy(ENV), 0) == pytest.approx(5.0, abs=0.01)
-
-
-def quarter(obs):
-    """A quarter turn, exact in any arithmetic."""
-    return (jnp if isinstance(obs, jax.Array) else np).stack([-obs[:, 1], obs[:, 0]], -1)
-
-
-@pytest.mark.long
-def test_an_opaque_function_gives_what_the_same_in_jax_gives():
-    lanes = product(1, (0,), (30,), (60.0,))
-    policies = [policy_of(quarter), policy_of(jax.jit(quarter))]
-    assert [policy.on_host for policy in policies] == [True, False]
-    blocks = [begin(of(), lanes)] * 2
-    for _ in range(rounds(lanes, SIZES)):
-        blocks = [
-            ask_round(of(Common(policy)), EXPERT, block, MESH) for policy, block in zip(policies, blocks, strict=True)
-        ]
-    assert blocks[0].guide.labels.valid.sum() == 30
-    chex.assert_trees_all_equal(*blocks)
-
-
-def test_what_is_a_policy():
-    shifted = Shifted(jnp.array(1.0))
-    assert policy_of(shifted) is shifted
-    assert isinstance(policy_of(lambda: shifted), Shifted)
-    assert isinstance(policy_of(quarter), Opaque)
-    with pytest.raises(UserError, match="42 is no policy"):
-        policy_of(42)
 
 
 @pytest.mark.parametrize(

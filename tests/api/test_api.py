@@ -91,9 +91,15 @@ def test_a_world_by_name():
             bad()
 
 
-def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(tmp_path):
-    folder = tmp_path / "run"
-    train.run(Order(TASK, probes.CONFIG, Grid(("none",), (3, 5), ()), folder))
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A run of the command, of two seeds."""
+    folder = tmp_path_factory.mktemp("api") / "run"
+    train.run(Order(TASK, probes.CONFIG, Grid(("relative",), (3, 5), (10,)), folder))
+    return folder
+
+
+def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(folder):
     loaded = cl.load_policy(folder, seed=5, task=TASK)
     many = loaded(SEEN)
     np.testing.assert_allclose(np.linalg.norm(many, axis=-1), 1, atol=1e-6)
@@ -144,7 +150,6 @@ WRONG = [
     (lambda: correct(changed(obs=np.ma.masked_array(SEEN, SEEN > 0))), "masked"),
     (lambda: correct(own_labels(), scalars=WILD), "the fit of the feedback model diverged"),
     (lambda: cl.adapt(OF_BILLIARDS, WORLD, TEACHER), "this world has 2: give the world"),
-    (lambda: cl.adapt(policy, WORLD, cl.teacher_of(OF_BILLIARDS)), "teacher"),
     (lambda: cl.adapt(policy, WORLD, TEACHER, scalars=Scalars(eps_deg=float("nan"))), "scalars.eps_deg is nan"),
     (lambda: cl.adapt(policy, WORLD, TEACHER, labels=5), "labels is 5: give at least 20"),
     (lambda: cl.adapt(policy, WORLD, TEACHER, guidance="none"), "asks no questions"),
@@ -191,13 +196,13 @@ def rows_of(rows, columns):
     return sorted(tuple(str(row[name]) for name in columns) for row in rows)
 
 
-def test_training_from_python_gives_what_the_command_gives(tmp_path):
+COLUMNS = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
+
+
+def test_training_from_python_gives_what_the_command_gives(folder):
     how = {"guidance": ["relative"], "labels": [10], "seeds": [3, 5], "progress": False}
     run = cl.train(WORLD, TEACHER, probes.CONFIG, **how)
-    grid = Grid(("relative",), (3, 5), (10,))
-    train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
-    columns = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
-    assert rows_of(run.results.to_pylist(), columns) == rows_of(results.read(tmp_path / "run").to_pylist(), columns)
+    assert rows_of(run.results.to_pylist(), COLUMNS) == rows_of(results.read(folder).to_pylist(), COLUMNS)
     assert run.policy(guidance="relative", seed=5)(SEEN).shape == (200, 2)
     with pytest.raises(cl.UserError, match="no lane with seed 9"):
         run.policy(seed=9)
@@ -226,12 +231,9 @@ def test_what_is_left_out_of_a_training_is_as_the_preset_has_it(monkeypatch):
     assert all(request.config == dataclasses.replace(preset.config, task=world.config) for request in asked)
 
 
-def test_a_label_file_answers_in_place_of_a_teacher(tmp_path):
+def test_a_label_file_answers_in_place_of_a_teacher(folder, tmp_path):
     """Trained on the labels of a run, an agent is what the command makes of `--labels-from`."""
-    grid = Grid(("relative",), (3,), (10,))
-    train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "asked"))
-    path = tmp_path / "asked" / "relative" / "labels.parquet"
-    train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "given", labels_from=path))
+    path = folder / "relative" / "labels.parquet"
+    train.run(Order(TASK, probes.CONFIG, Grid(("relative",), (3,), (10,)), tmp_path / "given", labels_from=path))
     run = cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], labels=path, seeds=[3], progress=False)
-    columns = ("labels", "step", "reward", "train_loss")
-    assert rows_of(run.results.to_pylist(), columns) == rows_of(results.read(tmp_path / "given").to_pylist(), columns)
+    assert rows_of(run.results.to_pylist(), COLUMNS) == rows_of(results.read(tmp_path / "given").to_pylist(), COLUMNS)

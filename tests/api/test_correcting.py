@@ -11,7 +11,7 @@ import cuelearner_jax as cl
 from cuelearner_jax.api.labels import rows_of
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.feedback.answers import relative_feedback
-from cuelearner_jax.spaces import DIRECTIONS, Box, cues_from
+from cuelearner_jax.spaces import Box, cues_from
 from cuelearner_jax.storage import label_files
 
 LOW, HIGH = (-0.1, -0.1, -1.0), (0.1, 0.1, 1.0)
@@ -153,18 +153,6 @@ def test_labels_of_a_file_say_their_own_space_and_strength(better, tmp_path):
     with pytest.raises(cl.UserError, match="leave out eps"):
         cl.correct(off, tmp_path, eps=0.2)
     assert cl.agreement(off, tmp_path).labels == 150
-
-
-@pytest.mark.long
-def test_directions_are_corrected_too():
-    random = np.random.default_rng(0)
-    obs = random.normal(size=(60, 2)).astype(np.float32)
-    ahead = lambda obs: obs / np.linalg.norm(obs, axis=-1, keepdims=True)  # noqa: E731
-    actions = ahead(obs)
-    labels = cl.Labels(obs, actions, np.ones(60, np.float32))
-    found = cl.correct(ahead, labels, space=DIRECTIONS, bound=30.0, eps=5.0, **NETWORK)
-    turned = np.asarray(DIRECTIONS.log(jnp.asarray(actions), jnp.asarray(found(obs))))
-    assert turned.mean() > 0.05
 
 
 def test_bounds_that_are_not_given_are_told():

@@ -124,8 +124,8 @@ class Failing:
 
 
 def test_what_raises_while_it_is_compiled_keeps_its_own_traceback():
-    error = one_line(lambda: adapted(Scaled(1.0), Failing.Teacher()), "^teacher cannot answer in this world.*KeyError")
-    assert isinstance(error.__cause__, KeyError)
+    with pytest.raises(KeyError):
+        adapted(Scaled(1.0), Failing.Teacher())
     with pytest.raises(TypeError):
         cl.CallablePolicy(Failing.Policy())(SEEN)
     with pytest.raises(ZeroDivisionError, match="no floor"):

@@ -1,6 +1,7 @@
 """One tiny run that the tests of the command line share."""
 
 import fcntl
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from small_runs import SWEEP, listing
 
 from cuelearner_jax import terminal
 from cuelearner_jax.cli import main
+from cuelearner_jax.tasks import registry
 
 
 @pytest.fixture(autouse=True)
@@ -43,3 +45,32 @@ def refused(capsys):
         assert listing(folder) == before
 
     return run
+
+
+@pytest.fixture(scope="module")
+def home(request, tmp_path_factory):
+    """A folder with the code of a user's own that a file of tests has as OWN, in the module that it has as NAME."""
+    folder = tmp_path_factory.mktemp("home")
+    (folder / f"{request.module.NAME}.py").write_text(request.module.OWN)
+    return folder
+
+
+@pytest.fixture
+def forget(request):
+    """Makes the process one that has not met the user's own task."""
+
+    def forgetting():
+        registry._registered.clear()
+        sys.modules.pop(request.module.NAME, None)
+
+    return forgetting
+
+
+@pytest.fixture
+def there(home, forget, monkeypatch):
+    """In that folder, in a process that has not met the user's own task."""
+    monkeypatch.chdir(home)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    forget()
+    yield home
+    forget()

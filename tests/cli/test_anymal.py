@@ -13,7 +13,6 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 
 AGENT = Path(__file__).parents[2] / "docs" / "data" / "navigation_agent"
-FEW = ["--episodes", "3", "--task.worlds", "8", "--task.max-steps", "4"]
 
 REFUSED = [
     (["evaluate", "billiards", "--robot", "anymal"], "billiards has no robots to choose from: leave out --robot"),
@@ -33,19 +32,6 @@ REFUSED = [
 def test_bad_combinations_are_refused(refused, tmp_path, monkeypatch, command, says):
     monkeypatch.chdir(tmp_path)
     refused(command, says, tmp_path)
-
-
-@pytest.mark.long
-def test_an_agent_of_the_simple_robot_walks_in_c_mujoco(tmp_path, capsys):
-    out = tmp_path / "measured.json"
-    command = ["evaluate", str(AGENT), "--robot", "anymal", "--engine", "mujoco", *FEW]
-    assert main([*command, "--out", str(out)]) == 0
-    measured = json.loads(out.read_text())
-    assert (measured["robot"], measured["engine"]) == ("anymal", "mujoco")
-    (row,) = measured["rows"]
-    assert row["finished"] == [1.0]
-    assert sum(row[name][0] for name in ("success", "collision", "fall", "timeout")) == pytest.approx(1)
-    assert "fall" in capsys.readouterr().out
 
 
 def test_it_walks_by_a_policy_of_the_users_own(tmp_path):
@@ -85,13 +71,6 @@ def test_its_episodes_are_filmed_from_above_and_from_the_side(opengl, tmp_path):
     for half in np.split(pictures[0][..., :3], 2, axis=1):
         assert half.std() > 10
     assert imageio.imread(tmp_path / "navigation_agent-anymal-agent.png").std() > 10
-
-
-@pytest.mark.long
-def test_a_question_about_it_is_drawn_from_above_without_opengl(tmp_path):
-    command = ["render", "navigation", "--robot", "anymal", "--question", "--task.worlds", "8", "--out", str(tmp_path)]
-    assert main(command) == 0
-    assert imageio.imread(tmp_path / "navigation-anymal-heuristic-question.png").std() > 10
 
 
 def test_where_nothing_can_be_rendered_one_line_says_what_to_install(monkeypatch):

@@ -3,7 +3,6 @@ import re
 import subprocess
 import sys
 from io import StringIO
-from pathlib import Path
 from xml.etree import ElementTree
 
 import imageio.v2 as imageio
@@ -14,8 +13,6 @@ from small_runs import SMALL
 from cuelearner_jax import terminal
 from cuelearner_jax.cli import dispatch, evaluate, main
 from cuelearner_jax.storage import results
-
-ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 
 
 def test_a_sweep_leaves_a_complete_folder(run_folder):
@@ -75,19 +72,6 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     assert capsys.readouterr().out.count("difference over seeds") == 3  # a table for each kind and budget
 
 
-@pytest.mark.long
-def test_each_label_is_about_the_situation_that_members_disagree_on(tmp_path):
-    out, task = tmp_path / "run", "examples.reach:TASK"
-    command = ["train", task, "--preset", "quickstart", "--guidance", "relative", "--labels", "25"]
-    command += ["--schedule.total-steps", "1000", "--agent.q-layers", "8", "--sizes.feedback-layers", "8"]
-    command += ["--sizes.fit-steps", "20"]
-    command += ["--schedule.guide-eval-every", "10"]
-    assert main([*command, "--sizes.ensemble", "2", "--sizes.candidates", "3", "--out", str(out)]) == 0
-    found = results.read_guides([out])
-    assert found is not None
-    assert [(row["asked"], row["step"]) for row in found.to_pylist()] == [(10, 0), (20, 0), (25, 0)]
-
-
 def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, capsys):
     """What needs no training fits whatever the world shows."""
     table = ["billiards", "--task.table", "one_ball"]
@@ -134,18 +118,19 @@ def test_the_overview_has_a_line_for_each_command(capsys):
         assert re.search(rf"^  {name} +[A-Z].*\.$", told, re.MULTILINE), name
 
 
-@pytest.mark.parametrize("option", ["--help", "--version"])
-def test_what_needs_no_jax_does_not_load_it(option):
-    code = f"""
+def test_what_needs_no_jax_does_not_load_it():
+    code = """
 import sys
 from cuelearner_jax.cli import main
-assert main([{option!r}]) == 0
-slow = {{"jax", "numpy", "tyro", "rich", "cuelearner_envs"}}
-print(*sorted(slow & {{name.partition(".")[0] for name in sys.modules}}))
+assert main(["--help"]) == main(["--version"]) == 0
+slow = {"jax", "numpy", "tyro", "rich", "cuelearner_envs"}
+print(*sorted(slow & {name.partition(".")[0] for name in sys.modules}))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert re.match(r"usage: cuelearner COMMAND|cuelearner \d+\.\d+\.\d+\n", done.stdout)
-    assert done.stdout.splitlines()[-1] == ""
+    first, *_, version, loaded = done.stdout.split("\n")[:-1]
+    assert first == "usage: cuelearner COMMAND ..."
+    assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+", version)
+    assert loaded == ""
 
 
 def test_the_task_may_be_named_by_an_option(run_folder, tmp_path):
@@ -185,7 +170,3 @@ def test_help_lists_options_and_what_a_task_has_to_choose_from(command, subject,
         assert "--task.table {one_ball,easy,regulation}" in out
     else:
         assert "tasks: arm, billiards, " in " ".join(out.split())
-
-
-def test_an_option_that_does_not_exist_is_refused_in_one_line(refused, tmp_path):
-    refused(["sweep", "billiards", "--seedz", "3", "--out", tmp_path / "x"], "Perhaps you meant: --seeds", tmp_path)

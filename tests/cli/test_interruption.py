@@ -1,4 +1,3 @@
-import re
 import signal
 import subprocess
 import sys
@@ -16,8 +15,8 @@ LONG = [*SMALL, "--schedule.total-steps", str(STEPS), "--guidance", "none", "--s
 COMMAND = ["sweep", "billiards", "--preset", "quickstart", *LONG]
 
 
-def start_and_wait_for(folder, step, *options):
-    process = subprocess.Popen([*ENTRY, *COMMAND, "--out", str(folder), *options], stderr=subprocess.PIPE, text=True)
+def start_and_wait_for(folder, step):
+    process = subprocess.Popen([*ENTRY, *COMMAND, "--out", str(folder)], stderr=subprocess.PIPE, text=True)
     for _ in range(1200):
         file = folder / "none" / "results.jsonl"
         if file.exists() and f'"step": {step}' in file.read_text():
@@ -28,52 +27,37 @@ def start_and_wait_for(folder, step, *options):
     raise AssertionError(process.communicate()[1])
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("whole") / "run"
-    assert main([*COMMAND, "--out", str(folder)]) == 0
-    return rows(folder)
-
-
-STOPS = [(200, signal.SIGINT), (600, signal.SIGTERM, "--resume")]
-
-
-@pytest.mark.parametrize("stops", [STOPS[:1], pytest.param(STOPS, marks=pytest.mark.long)], ids=["once", "twice"])
-def test_ctrl_c_and_sigterm_save_and_resume_goes_on_as_if_never_stopped(tmp_path, uninterrupted, stops):
+def test_ctrl_c_saves_and_resume_goes_on(tmp_path):
+    """To the bits of a run that was never stopped: tests/runs/test_resume.py and tests/test_frozen.py."""
     folder = tmp_path / "run"
-    for step, number, *options in stops:
-        process = start_and_wait_for(folder, step, *options)
-        process.send_signal(number)
-        told = process.communicate(timeout=120)[1]
-        assert process.returncode == 128 + number
-        assert "--resume" in told.splitlines()[-1]
-        reached = max(row["step"] for row in rows(folder))
-        assert str(reached) in {path.name for path in (folder / "none" / "checkpoints").iterdir()}
-        assert reached < STEPS
+    process = start_and_wait_for(folder, 200)
+    process.send_signal(signal.SIGINT)
+    told = process.communicate(timeout=120)[1]
+    assert process.returncode == 128 + signal.SIGINT
+    assert "--resume" in told.splitlines()[-1]
+    reached = max(row["step"] for row in rows(folder))
+    assert str(reached) in {path.name for path in (folder / "none" / "checkpoints").iterdir()}
+    assert reached < STEPS
     assert main([*COMMAND, "--out", str(folder), "--resume"]) == 0
-    assert rows(folder) == uninterrupted
+    steps = [row["step"] for row in rows(folder)]
+    assert steps == 2 * list(range(0, STEPS + 1, 100))
 
 
-@pytest.mark.parametrize(
-    ("seconds", "number"), [(0.3, signal.SIGTERM), pytest.param(6.0, signal.SIGINT, marks=pytest.mark.long)]
-)
-def test_an_evaluation_ends_at_once_in_one_line(seconds, number):
-    """While modules are loaded, and while something is compiled or computed."""
+def test_an_evaluation_ends_at_once_in_one_line():
+    """While modules are loaded."""
     begun = "import sys; from cuelearner_jax.cli import main; print('begun', flush=True); sys.exit(main())"
     command = [sys.executable, "-c", begun, "evaluate", "billiards", "--policy", "teacher", "--steps", "2000000"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     process.stdout.readline()
-    time.sleep(seconds)
-    process.send_signal(number)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGTERM)
     try:
         told = process.communicate(timeout=30)[1]
     finally:
         process.kill()
-    assert process.returncode == 128 + number
-    *progress, last = told.splitlines()
-    assert last == "stopped at once; what was saved before is safe"
-    assert all(re.fullmatch(r".+; after \d+ s", line) for line in progress)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert told == "stopped at once; what was saved before is safe\n"
 
 
 @pytest.mark.long

@@ -1,7 +1,5 @@
 """Labels of a recording on the command line: a policy corrected, judged and exported without a task or a simulator."""
 
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +15,8 @@ from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import logs
 from cuelearner_jax.types import Label
 
-CODE = """
+NAME = "own_arm"
+OWN = """
 import numpy as np
 
 def policy(obs):
@@ -32,16 +31,15 @@ SMALL = ("--guidance", "relative", *SIZES)
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """A folder with a policy's code, recorded situations, and labels that ask for more of each entry."""
-    folder = tmp_path_factory.mktemp("logs")
-    (folder / "own_arm.py").write_text(CODE)
+def place(home):
+    """Where recorded situations lie, and labels that ask for more of each entry."""
+    folder = home
     recorded.write(folder / "situations", pictures=False)
     task = logs.task_of(folder / "situations", "left,right;up,down;open,close", recorded.LOW, recorded.HIGH)
     space, random = logs.space_of(task.plain()), np.random.default_rng(0)
     obs = random.uniform(-1, 1, (40, 4)).astype(np.float32)
     namespace = {}
-    exec(CODE, namespace)
+    exec(OWN, namespace)
     actions = namespace["policy"](obs).astype(np.float32)
     best = np.clip(actions + 0.1, recorded.LOW, recorded.HIGH).astype(np.float32)
     told = jax.vmap(lambda action, best: relative_feedback(space, action, best, EPS))
@@ -53,15 +51,10 @@ def place(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def there(place, monkeypatch):
-    """That folder as the current one."""
-    monkeypatch.chdir(place)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    return place
+pytestmark = pytest.mark.usefixtures("place", "there")
 
 
-def test_a_policy_of_code_is_corrected_judged_and_exported(there, capsys):
+def test_a_policy_of_code_is_corrected_judged_and_exported(capsys):
     adapt = ["adapt", "own_arm:policy", "--labels-from", "labels", "--bound-deg", "0.2", *SMALL]
     assert main([*adapt, "--out", "policies/arm"]) == 0
     told = capsys.readouterr().out
@@ -89,7 +82,7 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(there, capsys):
         (["adapt", "own_arm:policy", "--out", "p"], "needs a task to act in: give one"),
         (["adapt", "own_arm:policy", "--labels-from", "absent", "--out", "p"], "no label file at absent"),
         (["adapt", "own_arm:narrow", "--labels-from", "labels", "--out", "p", *SMALL], "returned actions of shape"),
-        (["evaluate", "own_arm:policy", "--labels-from", "labels", "--steps", "5"], "leave out the other options"),
+        (["evaluate", "own_arm:policy", "--labels-from", "labels", "--steps", "5"], "leave out --steps"),
         (["evaluate", "logs:absent"], "there is no folder of situations at absent"),
         (
             ["export", "logs:situations", "--policy", "uniform", "--only-correction", "--out", "p"],

@@ -9,6 +9,7 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.storage import results
 from cuelearner_jax.tasks import registry
 
+NAME = "own_window"
 OWN = """
 import dataclasses
 import jax.numpy as jnp
@@ -29,30 +30,11 @@ def ahead(obs):
 EVALUATE = ["--policy", "uniform", "--steps", "20", "--envs", "10"]
 
 
-def forget():
-    registry._registered.clear()
-    sys.modules.pop("own_window", None)
-
-
-@pytest.fixture(scope="module")
-def home(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("home")
-    (folder / "own_window.py").write_text(OWN)
-    return folder
-
-
-@pytest.fixture(autouse=True)
-def there(home, monkeypatch):
-    """In the folder of the file, in a process that has not met the task."""
-    monkeypatch.chdir(home)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    forget()
-    yield
-    forget()
+pytestmark = pytest.mark.usefixtures("there")
 
 
 @pytest.fixture
-def run(home):
+def run(home, forget):
     """A finished run of the task."""
     out = home / "run"
     if not out.exists():
@@ -95,7 +77,7 @@ def test_a_policy_of_code_is_measured_in_a_task(refused, capsys, tmp_path):
     refused(["evaluate", *measure, "--policy", "own"], "policy 'own' is code: name it first", tmp_path)
 
 
-def test_what_cannot_be_is_refused(run, refused, tmp_path):
+def test_what_cannot_be_is_refused(run, forget, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
     refused(["render", "own_window:TASK", "--policy", "uniform", *new], "window has no pictures of point", tmp_path)
     refused(["train", "own_window:MUTE", "--guidance", "relative", *new], "mute has no teacher to ask", tmp_path)
@@ -104,4 +86,4 @@ def test_what_cannot_be_is_refused(run, refused, tmp_path):
     forget()
     refused(["evaluate", run, "--task", "own_window:MUTE"], "add --task own_window:TASK", run)
     registry.resolve("own_window:TASK")
-    refused(["evaluate", run, "--task", "own_window:MUTE"], "is a run of window, not of mute: leave out --task", run)
+    refused(["evaluate", run, "--task", "own_window:MUTE"], "is a run of window, not of mute: give one of mute", run)

@@ -1,30 +1,51 @@
-"""Sweeps in pieces: each alone gives what the whole gives, begun twice, killed, or on a full disk."""
+"""Sweeps in pieces: together they are the whole; begun twice, stopped, on a full disk, and with a piece missing."""
 
-import os
+import json
+import resource
 import shutil
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
+import jax
 import pytest
-from small_runs import SMALL, rows
+from probes import edit_json
+from small_runs import SMALL, listing, rows, stopping_at
 
 from cuelearner_jax.cli import main
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.shards import Shard
 
-ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]
 SWEEP += ["--guidance", "none"]
-TESTS = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("whole") / "run"
-    assert main([*SWEEP, "--out", str(folder)]) == 0
-    return rows(folder)
+def sweeps(tmp_path_factory):
+    """A sweep of three seeds, whole and in two pieces."""
+    folder = tmp_path_factory.mktemp("sweeps")
+    assert main([*SWEEP, "--out", str(folder / "whole")]) == 0
+    for piece in ("1/2", "2/2"):
+        assert main([*SWEEP, "--shard", piece, "--out", str(folder / "pieces")]) == 0
+    return folder
+
+
+@pytest.fixture
+def pieces(sweeps, tmp_path):
+    return shutil.copytree(sweeps / "pieces", tmp_path / "pieces")
+
+
+@pytest.fixture
+def measured(tmp_path, capsys):
+    """Evaluates a folder: its rows, and what was told beside them."""
+
+    def evaluate(folder):
+        out = tmp_path / "measured.json"
+        out.unlink(missing_ok=True)
+        capsys.readouterr()
+        assert main(["evaluate", str(folder), "--steps", "100", "--envs", "20", "--out", str(out)]) == 0
+        return json.loads(out.read_text())["rows"], capsys.readouterr().err
+
+    return evaluate
 
 
 def test_pieces_are_equal_shares_that_make_the_whole():
@@ -33,84 +54,101 @@ def test_pieces_are_equal_shares_that_make_the_whole():
     assert sum(shares, ()) == seeds
     assert sorted(len(share) for share in shares) == [2, 3, 3, 3]
     assert Shard.parse("3/12").folder(Path("runs")) == Path("runs/shard-03-of-12")
+    for text in ("0/4", "5/4", "3", "a/b", "1/0", "-1/2", "1/2/3"):
+        with pytest.raises(UserError, match="give i/n with i from 1 to n"):
+            Shard.parse(text)
 
 
-@pytest.mark.parametrize("text", ["0/4", "5/4", "3", "a/b", "1/0", "-1/2", "1/2/3"])
-def test_what_is_no_piece_is_refused(refused, tmp_path, text):
-    refused([*SWEEP, f"--shard={text}", "--out", tmp_path / "run"], "give i/n with i from 1 to n", tmp_path)
-
-
-def test_more_pieces_than_seeds_are_refused(refused, tmp_path):
-    refused([*SWEEP, "--shard", "1/4", "--out", tmp_path / "run"], "3 seeds cannot be divided into 4 shards", tmp_path)
-
-
-def test_pieces_give_what_the_whole_gives_and_a_report_says_which_are_missing(whole, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert main([*SWEEP, "--shard", "1/2", "--out", str(out)]) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["shard-1-of-2"]
-    assert main(["report", str(out), "--out", str(tmp_path / "half")]) == 0
-    assert "shards not begun, of 2: 2" in (tmp_path / "half" / "report.md").read_text()
-    assert main([*SWEEP, "--shard", "2/2", "--out", str(out)]) == 0
-    assert rows(out) == whole
-    assert main(["report", str(out), "--out", str(tmp_path / "both")]) == 0
-    text = (tmp_path / "both" / "report.md").read_text()
+def test_pieces_are_trained_evaluated_and_reported_as_the_whole(sweeps, measured, tmp_path, capsys):
+    pieces, whole = sweeps / "pieces", sweeps / "whole"
+    assert sorted(path.name for path in pieces.iterdir()) == ["shard-1-of-2", "shard-2-of-2"]
+    assert rows(pieces) == rows(whole)
+    found, told = measured(whole)
+    assert (found[0]["seeds"], told) == ([7, 8, 9], "")
+    assert measured(pieces) == (found, "")
+    assert main(["report", str(pieces), "--out", str(tmp_path / "report")]) == 0
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "| none | 0 | 3 |" in text
     assert "not begun" not in text
     assert "differ in more than" not in text
-    assert "| none | 0 | 3 |" in text
-    before = {path: path.stat().st_mtime_ns for path in out.rglob("results.parquet")}
-    assert main([*SWEEP, "--shard", "2/2", "--out", str(out)]) == 0  # finished: left as it is
+    before = listing(pieces)
+    assert main([*SWEEP, "--shard", "2/2", "--out", str(pieces)]) == 0  # finished: left as it is
     assert "finished before" in capsys.readouterr().err
-    assert {path: path.stat().st_mtime_ns for path in out.rglob("results.parquet")} == before
+    assert listing(pieces) == before
 
 
-def test_a_piece_that_was_copied_over_another_is_not_counted_twice(whole, refused, tmp_path):
-    out = tmp_path / "run"
-    assert main([*SWEEP, "--shard", "1/2", "--out", str(out)]) == 0
-    shutil.copytree(out / "shard-1-of-2", out / "shard-2-of-2")
-    refused(["evaluate", out, "--guidance", "none"], "both hold seed 7: delete the one that is a copy", out)
-
-
-def test_other_options_for_a_piece_that_has_begun_are_refused(refused, tmp_path):
-    command = [*SWEEP, "--shard", "3/3", "--out", tmp_path / "run"]
-    assert main([str(part) for part in command]) == 0
-    refused([*command, "--scalars.eps-deg", "3"], "was run with other values of scalars.eps_deg", tmp_path)
-    second = [*SWEEP, "--shard", "2/3", "--out", tmp_path / "run"]
-    refused([*second, "--scalars.eps-deg", "3"], "is a shard of a sweep with another scalars.eps_deg", tmp_path)
-    refused([*second, "--seeds", "4"], "is a shard of a sweep with another shard.seeds: give the same", tmp_path)
+def test_a_piece_that_is_missing_is_named(pieces, measured, tmp_path):
+    second = pieces / "shard-2-of-2"
+    whole, _ = measured(pieces)
+    shutil.rmtree(second / "none" / "checkpoints" / "200")
+    found, told = measured(pieces)  # of other steps: not averaged
+    assert [(row["trained_steps"], row["seeds"]) for row in found] == [(200, [7, 8]), (100, [9])]
+    assert told == f"{second}: none guidance at step 100 of 200\n"
+    shutil.rmtree(second / "none" / "checkpoints")
+    found, told = measured(pieces)
+    assert told == f"{second}: no checkpoint of none guidance, left out\n"
+    assert (found[0]["seeds"], found[0]["reward"]) == ([7, 8], whole[0]["reward"][:2])
+    shutil.rmtree(second)
+    found, told = measured(pieces)
+    assert (found[0]["seeds"], told) == ([7, 8], f"{pieces}: shards not begun, of 2: 2\n")
+    assert main(["report", str(pieces), "--out", str(tmp_path / "report")]) == 0
+    assert "shards not begun, of 2: 2" in (tmp_path / "report" / "report.md").read_text()
+    assert main(["render", str(pieces), "--seed", "9", "--out", str(tmp_path / "film")]) == 2
+    shutil.rmtree(pieces / "shard-1-of-2" / "none" / "checkpoints")
+    assert main(["evaluate", str(pieces)]) == 2
 
 
 @pytest.mark.long
-def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path, capsys):
-    command = [*SWEEP, "--schedule.total-steps", "1000", "--shard", "1/2"]
-    calm, killed = tmp_path / "calm", tmp_path / "killed"
-    assert main([*command, "--out", str(calm)]) == 0
-    process = subprocess.Popen([*ENTRY, *command, "--out", str(killed)], stderr=subprocess.DEVNULL)
-    written = killed / "shard-1-of-2" / "none" / "results.jsonl"
-    for _ in range(1200):
-        if written.exists() and '"step": 300' in written.read_text():
-            break
-        time.sleep(0.05)
-    process.send_signal(signal.SIGSTOP)  # it lives, and holds its folder
-    capsys.readouterr()
-    twice = main([*command, "--out", str(killed)])
-    process.send_signal(signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
-    assert twice == 2
-    assert "is being written by another process" in capsys.readouterr().err
-    assert main([*command, "--out", str(killed)]) == 0
-    assert rows(killed) == rows(calm)
+def test_a_piece_that_was_stopped_goes_on_with_the_same_command(sweeps, tmp_path):
+    command = [*SWEEP, "--shard", "1/2", "--out", str(tmp_path)]
+    with stopping_at(1):
+        assert main(command) == 130
+    assert main(command) == 0
+    assert rows(tmp_path) == [row for row in rows(sweeps / "whole") if row["seed"] < 9]
 
 
-def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path):
-    # Every file but the shortest is too large for this process.
-    script = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000));"
-    script += "from cuelearner_jax.cli import main; sys.exit(main(sys.argv[1:]))"
+@pytest.mark.long
+def test_pieces_are_of_one_sweep_though_one_was_begun_before_a_field_existed(pieces, refused):
+    """By the command line: evaluated together, and a piece that is finished is found so."""
+    for file in (pieces / "shard-2-of-2").rglob("digests/metadata"):  # checkpoints did not name their run then
+        edit_json(file, lambda told: told.pop("run"))
+    for group, name in (("sizes", "frame"), ("agent", "polyak"), ("scalars", "answer"), ("task", "mirrors")):
+        edit_json(pieces / "shard-2-of-2" / "config.json", lambda told, group=group, name=name: told[group].pop(name))
+    assert main(["evaluate", str(pieces), "--steps", "20", "--envs", "20"]) == 0
+    assert main([*SWEEP, "--shard", "1/2", "--out", str(pieces)]) == 0
+    edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["sizes"].update(frame="action"))
+    refused([*SWEEP, "--shard", "1/2", "--out", pieces], "is a shard of a sweep with another sizes.frame", pieces)
+
+
+def test_pieces_that_do_not_fit_together_are_refused(pieces, refused, tmp_path):
+    refused([*SWEEP, "--shard", "1/4", "--out", tmp_path / "run"], "3 seeds cannot be divided into 4 shards", tmp_path)
+    other = ["--scalars.eps-deg", "3"]
+    first, second = ([*SWEEP, "--shard", piece, "--out", pieces] for piece in ("1/2", "2/2"))
+    shutil.rmtree(pieces / "shard-2-of-2")
+    refused([*first, *other], "was run with other values of scalars.eps_deg", pieces)
+    refused([*second, *other], "is a shard of a sweep with another scalars.eps_deg", pieces)
+    refused([*second, "--seeds", "4"], "is a shard of a sweep with another shard.seeds: give the same", pieces)
+    shutil.copytree(pieces / "shard-1-of-2", pieces / "shard-2-of-2")
+    says = "both hold seed 7: delete the one that is a copy"
+    refused(["evaluate", pieces, "--guidance", "none"], says, pieces)
+    edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["scalars"].update(eps_deg=3.0))
+    says = "are shards of different sweeps (they differ in scalars.eps_deg): give the folder"
+    refused(["evaluate", pieces], says, pieces)
+
+
+def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path, capsys, monkeypatch):
+    """Every file but the shortest is too large for this process."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module that was cut would stay for later imports
     bandit = ["sweep", "page_task:TASK", "--guidance", "none", "--seeds", "2"]  # whose programs are soon compiled
-    command = [sys.executable, "-c", script, *bandit, "--out", str(tmp_path / "run")]
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path])}
-    env["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # JAX warns of programs that it can't keep
-    env["PYTHONDONTWRITEBYTECODE"] = "1"  # Python keeps a compiled module that was cut, for all who import it later
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
-    assert done.returncode == 1
+    jax.config.update("jax_enable_compilation_cache", False)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, hard))
+    try:
+        status = main([*bandit, "--out", str(tmp_path / "run")])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        jax.config.update("jax_enable_compilation_cache", True)
+    assert status == 1
     # Orbax's threads may complain beside it.
-    assert "error: the disk is full: free some, then go on with the same command and --resume" in done.stderr
+    says = "error: the disk is full: free some, then go on with the same command and --resume"
+    assert says in capsys.readouterr().err

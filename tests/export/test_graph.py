@@ -39,7 +39,7 @@ def scanned(obs):
 FUNCTIONS = {
     "shapes": lambda o: jnp.flip(o.reshape(3, 4).T, 0)[::2, 1:] + jnp.broadcast_to(o[:2], (2, 2)),
     "parts": lambda o: jnp.concatenate([*jnp.split(o, 3), jnp.roll(o, 5), jnp.stack([o, o], 1).ravel()]),
-    "padding": lambda o: lax.pad(o.reshape(3, 4), o[0], ((1, -1, 0), (-1, 2, 0))),
+    "padding": lambda o: lax.pad(o.reshape(3, 4), o[0], ((1, 0, 0), (0, 2, 0))),
     "index": lambda o: jnp.asarray(TABLE)[places(o[0]), 1, places(o[1:4])] + o[places(o[:3])],
     "slices": lambda o: lax.dynamic_slice(jnp.asarray(TABLE), (places(o[0]), 0, places(o[1])), (2, 3, 2)) + o[0],
     "slices of rows": lambda o: jax.vmap(lambda n: lax.dynamic_slice(o, (n,), (5,)))(places(o[:4])),

@@ -15,8 +15,7 @@ from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.fitting import ensemble
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.spaces import DIRECTIONS, directions
-from cuelearner_jax.types import Label
+from cuelearner_jax.spaces import directions
 
 ENV = probes.Aimed()
 OBS = directions.evenly_spaced(5)
@@ -118,23 +117,6 @@ def test_rounds_of_chosen_questions_fill_the_budget_and_fit_each_member_from_num
     chex.assert_tree_shape_prefix(guide.model.params, (4,))
     for kernel in (leaf for leaf in jax.tree.leaves(guide.model.params) if leaf.ndim == 3):
         assert all(not np.array_equal(kernel[i], kernel[j]) for i in range(4) for j in range(i))
-
-
-@pytest.mark.long
-def test_members_of_deep_coach_are_corrected_each_as_one_alone_is_from_its_own_numbers():
-    single, several = (registry.make("dcoach", sizes, ENV) for sizes in (ONE, dataclasses.replace(ONE, ensemble=2)))
-    obs, asked = OBS[:4], BASE[:4]
-    labels = Label(obs, asked, jnp.sign(DIRECTIONS.log(asked, jax.vmap(ENV.best)(obs))), jnp.arange(4) < 3)
-    fit = lambda bundle, key, former: jax.jit(bundle.fit)(key, ENV, labels, former, probes.SCALARS)  # noqa: E731
-    former, key = several.init(jax.random.key(5)), jax.random.key(6)
-    assert several.disagreement(former, ENV, OBS, BASE).min() > 1e-6
-    both = fit(several, key, former)
-    assert both.params.learned.tolist() == [3, 3]
-    assert both.fitted.shape == ()
-    for number, own in enumerate(jax.random.split(key, 2)):
-        one = jax.tree.map(lambda leaf, number=number: leaf[number], (former.params, both.params))
-        alone = fit(single, own, former.replace(params=one[0]))
-        chex.assert_trees_all_close(alone.params, one[1], rtol=1e-4, atol=1e-6)
 
 
 def test_every_candidate_is_asked_about_at_once_within_the_budget():

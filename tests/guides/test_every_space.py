@@ -17,7 +17,7 @@ from cuelearner_jax.environment import Quantity, Spaces, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import human_answer
 from cuelearner_jax.guides import registry
-from cuelearner_jax.guides.fitting import examples, fit_least_squares, squared_errors
+from cuelearner_jax.guides.fitting import examples, squared_errors
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.spaces import UNSAID, Box, Choices, Cue
 from cuelearner_jax.types import Label
@@ -145,23 +145,6 @@ def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
     np.testing.assert_allclose(found, [0.1**2, 0.1**2], rtol=1e-3)
     np.testing.assert_array_equal(gradient == 0, [[False, True, True], [True, False, True]])
     np.testing.assert_allclose(gradient[0, 0], 2 * 0.2 / 2**2, rtol=1e-3)  # d/dx (x / range)^2
-
-
-def test_what_a_network_predicts_of_an_unsaid_cue_changes_no_fit():
-    space, scalars = SPACES["3"], scalars_of(SPACES["3"], says="one")
-    rows = jax.jit(Relative(SIZES, Spaces(2, space)).examples)(told(space, scalars, "relative", 20), scalars)
-    other = rows.replace(target=jnp.where(rows.said, rows.target, 99.0))
-    fit = jax.jit(
-        lambda rows: fit_least_squares(
-            KEY,
-            rows,
-            scalars,
-            init=lambda key: jax.random.normal(key, (2, 3)),
-            apply=lambda params, obs, action: obs @ params,
-            sizes=dataclasses.replace(SIZES, fit_steps=40),
-        )
-    )
-    np.testing.assert_array_equal(fit(rows).params, fit(other).params)
 
 
 def test_a_label_that_says_nothing_of_any_cue_is_none():

@@ -30,25 +30,6 @@ def made(kind, fitted=False):
     return guide, guide.init(jax.random.key(0)).replace(fitted=jnp.array(fitted))
 
 
-@pytest.mark.parametrize(("kind", "fitted"), [("none", True), ("relative", False)])
-def test_without_a_guide_or_a_fit_actions_stay(kind, fitted):
-    guide, model = made(kind, fitted)
-    result = guide.act(model, ENV, OBS, BASE, jnp.ones(6, bool), probes.SCALARS)
-    np.testing.assert_array_equal(result.actions, BASE)
-    assert result.passes.tolist() == [0] * 6
-
-
-@pytest.mark.parametrize("kind", ["heuristic", "relative"])
-def test_active_rows_alone_are_changed(kind):
-    guide, model = made(kind, fitted=True)
-    result = guide.act(model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
-    np.testing.assert_array_equal(result.actions[~ACTIVE], BASE[~ACTIVE])
-    assert np.abs(directions.difference(BASE, result.actions))[ACTIVE].min() > 0
-    np.testing.assert_array_equal(np.asarray(result.passes) > 0, ACTIVE)
-    if kind == "heuristic":
-        np.testing.assert_allclose(directions.difference(OBS, result.actions)[ACTIVE], -1.0, atol=1e-6)
-
-
 def test_a_fitted_model_turns_actions_by_what_was_told_whatever_its_strength():
     guide, former = made("relative")
     rng = np.random.default_rng(0)

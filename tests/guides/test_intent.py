@@ -2,13 +2,16 @@
 
 import dataclasses
 import math
+from functools import cache, partial
 
+import box_task
 import jax
 import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
 
+from cuelearner_jax.environment import Aims, actions_of
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides import intent, registry
 from cuelearner_jax.spaces import DIRECTIONS, directions
@@ -33,14 +36,31 @@ EVERYWHERE = jnp.ones(16, bool)
 def told(sizes, env=ENV, options=OPTIONS):
     """A bundle and its model of 40 of the expert's answers about random actions."""
     bundle = registry.make("intent", sizes, env, options)
-    keys = jax.random.split(jax.random.key(3), 40)
-    obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
-    asked = directions.uniform(jax.random.key(4), (40,))
-    tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, ENV, probes.Expert(ENV), obs, obs, a, probes.SCALARS))
-    answers, _ = tell(keys, obs, asked)
-    labels = Label(obs, asked, answers, jnp.ones(40, bool))
-    former = bundle.init(jax.random.key(0))
+    former, labels = bundle.init(jax.random.key(0)), labels_in(ENV, probes.SCALARS)
     return bundle, jax.jit(bundle.fit)(jax.random.key(1), env, labels, former, probes.SCALARS)
+
+
+@partial(jax.jit, static_argnames="count")
+def labels_in(env, scalars, count=40):
+    """The expert's answers about random actions."""
+
+    def one(key):
+        _, obs = env.reset(key)
+        asked = actions_of(env).sample(jax.random.fold_in(key, 1))
+        answer, answered = RELATIVE.answer(key, env, probes.Expert(env), obs, obs, asked, scalars)
+        return Label(obs, asked, answer, answered)
+
+    return jax.vmap(one)(jax.random.split(jax.random.key(3), count))
+
+
+@cache
+def act_in(world):
+    """A compiled `act` for each class of worlds: JAX takes classes of equal fields for one."""
+    return jax.jit(lambda bundle, *given: bundle.act(*given), static_argnums=0)
+
+
+def act(bundle, model, env, *given):
+    return act_in(type(env))(bundle, model, env, *given)
 
 
 class Shut(probes.Aimed):
@@ -54,9 +74,9 @@ def test_what_is_not_open_may_be_meant_and_is_not_followed(fitted):
     bundle, model = fitted
     bundle = dataclasses.replace(bundle, options=dataclasses.replace(OPTIONS, aim_doubt=1e9))
     scalars = dataclasses.replace(probes.SCALARS, k_max=200)
-    found = bundle.act(model, Shut(), OBS, BASE, EVERYWHERE, scalars).actions
+    found = act(bundle, model, Shut(), OBS, BASE, EVERYWHERE, scalars).actions
     second = directions.rotate(OBS, jnp.asarray(0.6))
-    meant = bundle.act(model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
+    meant = act(bundle, model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
     np.testing.assert_allclose(DIRECTIONS.distance(meant, second), 0.0, atol=1e-3)
     assert np.asarray(DIRECTIONS.distance(found, second)).min() > 0.5
 
@@ -70,7 +90,7 @@ def test_any_aim_leads_to_the_nearest_that_may_be_followed():
     bundle, obs = registry.make("any_aim", SIZES, ENV), jnp.array([[1.0, 0.0]])
     base = directions.rotate(obs, jnp.array([-0.7]))
     for env, turn in ((ENV, -1.0), (Alone(), 2.5)):
-        acted = bundle.act(bundle.init(jax.random.key(0)), env, obs, base, jnp.ones(1, bool), probes.SCALARS)
+        acted = act(bundle, bundle.init(jax.random.key(0)), env, obs, base, jnp.ones(1, bool), probes.SCALARS)
         np.testing.assert_allclose(acted.actions, directions.rotate(obs, jnp.array([turn])), atol=1e-6)
 
 
@@ -81,7 +101,7 @@ def fitted():
 
 def acted(fitted, env, base=BASE, **scalars):
     bundle, model = fitted
-    return bundle.act(model, env, OBS, base, EVERYWHERE, dataclasses.replace(probes.SCALARS, **scalars))
+    return act(bundle, model, env, OBS, base, EVERYWHERE, dataclasses.replace(probes.SCALARS, **scalars))
 
 
 def test_an_answer_makes_aims_on_its_side_likely():
@@ -111,6 +131,25 @@ def test_a_pass_goes_by_at_most_eps(fitted):
 def test_in_which_order_aims_are_told_changes_nothing(fitted):
     one, other = acted(fitted, ENV), acted(fitted, SHUFFLED)
     np.testing.assert_allclose(one.actions, other.actions, atol=1e-6)
+
+
+def test_in_a_box_answers_lead_to_the_aim_that_is_meant():
+    class Boxed(box_task.Reach):
+        """Three aims, of which the second is the goal; the features tell which they are."""
+
+        def aims(self, obs):
+            changes = jnp.array([[0.3] * 3, [0.0] * 3, [-0.25] * 3])
+            moved = jax.vmap(lambda change: self.actions.exp(self.best(obs), change))(changes)
+            return Aims(moved, jnp.eye(3), jnp.ones(3, bool))
+
+    env, scalars, key = Boxed(), box_task.SCALARS, jax.random.key(1)
+    labels, bundle = labels_in(env, scalars, 60), registry.make("intent", SIZES, env, OPTIONS)
+    model = jax.jit(bundle.fit)(key, env, labels, bundle.init(key), scalars)
+    found = act(bundle, model, env, labels.obs, labels.action, labels.valid, scalars).actions
+    assert (
+        np.median(jax.jit(jax.vmap(lambda obs, one: env.actions.distance(env.best(obs), one)))(labels.obs, found))
+        < 0.06
+    )
 
 
 def test_without_a_possible_aim_actions_stay_as_they_are(fitted):

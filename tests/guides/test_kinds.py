@@ -133,12 +133,3 @@ def test_a_correction_moves_the_policy_its_way_by_eps():
         told = fit(KEY, ENV, labels(jnp.full((40, 1), h), obs, asked), model, scalars)
         moved = directions.difference(own, act(told, ENV, OBS, OBS, everywhere, scalars).actions)[0]
         assert np.degrees(moved) == pytest.approx(20 * h, abs=2)
-
-
-def test_a_coached_policy_comes_nearer_to_what_its_coach_has_in_mind():
-    guide = taught("dcoach", 20)
-    assert int(guide.model.params.learned) == 200
-    assert errors("dcoach", guide.model).max() < 25
-    asked = np.degrees(DIRECTIONS.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
-    assert np.median(asked[:20]) > 60
-    assert np.median(asked[-20:]) < 15

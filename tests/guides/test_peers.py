@@ -6,14 +6,13 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 from box_task import SCALARS, SMALL, Reach
 
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guides import bdcoach, clic, registry
-from cuelearner_jax.spaces import DIRECTIONS, UNSAID, directions
+from cuelearner_jax.guides import clic, registry
+from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.types import Label
 
 ENV = Reach()
@@ -201,19 +200,3 @@ def test_the_human_model_is_taught_answers_and_nothing_of_other_cues():
     rows = [examples(labels(MIDDLE[None], jnp.array([answer])), SCALARS) for answer in told]
     found = [float(loss(ENV, params, row, SCALARS)) for row in rows]
     np.testing.assert_allclose(found, [1.0, 1.0, 2.0], rtol=1e-4)
-
-
-@pytest.mark.long
-def test_the_buffer_moves_the_policy_by_what_its_own_actions_would_be_told():
-    """Labels about other actions than the policy's lead it on as well: deep COACH would replay their targets."""
-    env = probes.Window()
-    sizes = dataclasses.replace(SIZES, feedback_layers=(32, 32))
-    guide = bdcoach.BatchCoach(sizes, Spaces(2, DIRECTIONS), bdcoach.Config(batch_steps=10))
-    asked = directions.evenly_spaced(24)
-    obs = jnp.tile(SEEN[:1], (24, 1))
-    best = env.best(SEEN[0])
-    given = Label(obs, asked, jnp.sign(DIRECTIONS.log(asked, best)), jnp.ones(24, bool))
-    scalars = dataclasses.replace(probes.SCALARS, eps_deg=20.0, feedback_learning_rate=1e-2)
-    model = jax.jit(guide.fit)(KEY, env, given, guide.init(KEY), scalars)
-    acted = guide.act(model, env, SEEN[:1], -SEEN[:1], jnp.ones(1, bool), scalars).actions[0]
-    assert np.degrees(DIRECTIONS.distance(acted, best)) < 20

@@ -136,37 +136,6 @@ def told(goal, eps):
     return residual
 
 
-def refined_degrees(start, goal, eps, tau_max=180.0, k_max=50):
-    first = directions.from_angle(jnp.array(start) * DEG)
-    residual = told(directions.from_angle(jnp.array(goal * DEG)), eps * DEG)
-    active = jnp.ones(len(start), bool)
-    result = refine(residual, first, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=tau_max * DEG, k_max=k_max)
-    return np.asarray(directions.to_angle(result.actions)) / DEG, result.passes.tolist()
-
-
-@pytest.mark.parametrize(
-    ("start", "goal", "limits", "end", "passes"),
-    [
-        # 47 -> 37 -> 27 -> 17 -> 7 -> -3, then one pass that moves nothing; 3 deg is right already.
-        ([47.0, -26.0, 3.0], 0.0, {}, [-3.0, 4.0, 3.0], [6, 4, 1]),
-        ([47.0, -26.0], 0.0, {"tau_max": 25.0}, [22.0, -1.0], [4, 4]),  # 26 deg: 10, 20, then 5 more to the bound
-        ([47.0], 0.0, {"k_max": 2}, [27.0], [2]),
-        ([160.0], -170.0, {}, [-170.0], [4]),  # the shorter way, over the wrap
-    ],
-)
-def test_a_perfect_model_of_feedback_by_hand(start, goal, limits, end, passes):
-    degrees, count = refined_degrees(start, goal=goal, eps=10.0, **limits)
-    np.testing.assert_allclose(degrees, end, atol=1e-3)
-    assert count == passes
-
-
-def test_a_perfect_model_ends_within_half_eps_from_anywhere():
-    degrees, passes = refined_degrees(list(np.linspace(-179, 179, 200)), goal=73.0, eps=8.0)
-    error = (degrees - 73.0 + 180) % 360 - 180
-    assert np.abs(error).max() <= 4.0 + 1e-3
-    assert max(passes) <= 180 / 8 + 2
-
-
 def test_under_vmap_each_lane_has_its_own_number_of_passes():
     goal = directions.from_angle(jnp.zeros(()))
     first = directions.from_angle(jnp.array([[47.0], [3.0]]) * DEG)

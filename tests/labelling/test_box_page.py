@@ -3,15 +3,13 @@
 import asyncio
 
 import numpy as np
-import probes
 import pytest
 from box_task import EPS, GRIPPER, SCALARS, TASK
 
 from cuelearner_jax.cli import label
-from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR
-from cuelearner_jax.labelling import controls, view
+from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.learner import agreement
 from cuelearner_jax.spaces import UNSAID, Box, Choices, Cue
 from cuelearner_jax.storage import label_files
@@ -20,9 +18,8 @@ from cuelearner_jax.storage import label_files
 def planned(**options):
     """What `cuelearner label` plans for the task."""
     config = TASK.presets["paper"].config
-    sizes, scalars = label._part(GuideSizes, config.sizes), label._part(GuideScalars, SCALARS)
     options = {"labels": 20, "guidance": "relative", **options}
-    asked = label.Label(task=config.task, sizes=sizes, scalars=scalars, out=label.Path("labels"), **options)
+    asked = label.Label(task=config.task, sizes=config.sizes, scalars=SCALARS, out=label.Path("labels"), **options)
     return label.make_plan(TASK, config, asked)
 
 
@@ -39,14 +36,6 @@ def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():
     assert "ArrowDown" in known["unsure"].keys
     assert "film" not in controls.controls(RELATIVE, GRIPPER, films=False)
     assert "film-refined" not in controls.controls(RELATIVE, GRIPPER, simulated=False)
-
-
-def test_what_is_picked_and_sent_is_the_answer_and_nothing_picked_is_no_answer():
-    picked = {0: 1.0, 2: -1.0}
-    for pressed, rest in ((controls.REST_RIGHT, 0.0), (controls.REST_UNSAID, UNSAID)):
-        np.testing.assert_array_equal(controls.answer_of(GRIPPER, pressed, None, picked), [1.0, rest, -1.0])
-    assert controls.answer_of(GRIPPER, controls.REST_UNSAID, None, {}) is None
-    assert controls.answer_of(GRIPPER, controls.UNSURE, None, picked) is None
 
 
 def test_the_page_asks_about_each_cue_and_the_file_keeps_what_was_said(tmp_path):
@@ -119,15 +108,3 @@ def test_agreement_counts_the_cues_of_which_both_say_something():
     assert str(agreement(RELATIVE, env, one, other)) == "67% of 3"
     apart = agreement(DEMONSTRATION, env, np.zeros((1, 3), np.float32), np.array([[0.0, 1.0, 0.0]], np.float32))
     assert str(apart) == "0.25 shares apart over 1"
-
-
-def test_the_picture_of_an_action_that_is_no_arrow_says_what_it_is():
-    item = view.Item(0, None, np.float32([0.5, 1.0, -1.0]), TASK.pictures().sketch(None, np.float32([1.0, 0.0])))
-    svg = view.picture(item, RELATIVE, EPS, GRIPPER)
-    assert "the action: sideways 0.5, height 1, fingers -1" in svg
-    assert view.note(item._replace(refined=item.action), RELATIVE, EPS, GRIPPER).endswith(
-        "fingers -1. The correction: as it is"
-    )
-    told = view.note(item._replace(refined=np.float32([0.1, 1.0, -0.5])), RELATIVE, EPS, GRIPPER)
-    assert told.endswith("The correction: right by 20%, open by 25% of the range")
-    assert probes.SCALARS.eps_deg != EPS

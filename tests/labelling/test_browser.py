@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-import recorded_situations as recorded
 from sessions import served
 
 from cuelearner_jax.storage import label_files
@@ -73,37 +72,6 @@ def test_every_key_is_in_the_file_once(browser, tmp_path):
     found = {row["item"]: None if row["answer"] is None else row["answer"][0] for row in rows}
     assert found == {number: values[key] for number, key in enumerate(pressed)}
     assert all(0 <= row["seconds"] < 60 for row in rows)
-
-
-def test_the_buttons_of_three_cues_lie_above_the_fold(browser, tmp_path):
-    with served(tmp_path / "labels", task="box_task:TASK") as (_, address):
-        page = entered(browser, address)
-        ends = "() => [...document.querySelectorAll('.answers button')].map(one => one.getBoundingClientRect().bottom)"
-        found = page.evaluate(ends)
-        assert len(found) == 3 * 4 + 3
-        assert max(found) <= 800
-        assert page.evaluate("() => document.querySelector('svg.scene').getBoundingClientRect().height") > 300
-
-
-def test_a_picture_has_the_width_and_words_of_six_cues_lie_beside_it(browser, tmp_path):
-    recorded.write(tmp_path / "situations")
-    cues = ["--cues", "left,right;forward,back;up,down;tilt up,tilt down;roll left,roll right;open,close"]
-    random = np.random.default_rng(0)
-    rows = {"observation": random.uniform(-1, 1, (12, 6)), "action": random.uniform(-1, 1, (12, 6))}
-    pictures = np.array([f"pictures/{row}.png" for row in range(12)])
-    (tmp_path / "situations/situations.parquet").unlink()
-    np.savez(tmp_path / "situations/situations.npz", picture=pictures, **rows)
-    with served(tmp_path / "labels", *cues, task=f"logs:{tmp_path / 'situations'}") as (_, address):
-        page = entered(browser, address, 1280)
-        box = "one => { const b = one.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; }"
-        left, _, right, bottom = page.locator("svg.scene image").evaluate(box)
-        assert right - left > 0.6 * 1280
-        assert bottom <= 800
-        buttons = page.locator(".answers button").evaluate_all(f"all => all.map({box})")
-        assert len(buttons) == 6 * 4 + 3
-        assert min(button[0] for button in buttons) > right
-        assert max(button[3] for button in buttons) <= 800
-        assert page.locator("svg.scene text").all_inner_texts().count("left") == 0
 
 
 def test_a_picture_its_arrows_and_its_film_fit_a_phone(browser, tmp_path):

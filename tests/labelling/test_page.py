@@ -94,29 +94,6 @@ def test_an_answer_names_its_item_and_when_all_is_answered_the_page_says_so(open
     shown(session, acts)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["demonstration", "scalar"])
-def test_other_forms_of_feedback_have_a_page_of_the_same_parts(opened, tmp_path, kind):
-    session = opened(kind=kind)
-
-    async def acts(user, pages):
-        (page,) = pages
-        if kind == "demonstration":
-            await user.should_see("Point at what to do instead")
-            await page._act("point", 0, {"name": "point", "item": 0, "angle": 120.0, "seconds": 0.0})
-        else:
-            await user.should_see("Is the arrow good?")
-            await press(user, "yes", lambda: session.number == 1)
-        assert session.number == 1
-
-    shown(session, acts)
-    file = label_files.read(tmp_path / "labels")
-    wanted = [-0.5, math.sqrt(0.75)] if kind == "demonstration" else [1.0]
-    np.testing.assert_allclose(file.labels.answer, [wanted], atol=1e-6)
-    assert (file.answers, file.eps) == (kind, None)
-    assert len(file.people.seconds) == 1
-
-
 def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
     five = AnswerForm("five", lambda _: 1, lambda _: "worth", lambda *told: None, lambda _: (0.0, 0.25, 0.5, 0.75, 1.0))
     for form in (RELATIVE, DEMONSTRATION, SCALAR, five):

@@ -123,26 +123,6 @@ def test_one_press_about_one_cue_says_nothing_of_the_others():
     np.testing.assert_array_equal(said["rest"], [0.0, 0.0, 0.0])
 
 
-@pytest.mark.long
-def test_one_cue_a_press_on_a_folder_of_pictures(folder, tmp_path):
-    seen = []
-
-    def ask(obs, action, page):
-        seen.append((np.asarray(obs), action, page._scene.content, "film" in page.controls))
-        return [np.array([UNSAID, UNSAID, 1.0]), np.zeros(3), np.array([-1.0, UNSAID, UNSAID])][len(seen) - 1]
-
-    command = [folder, "--cues", CUES, *BOUNDS, *SMALL, "--guidance", "relative", "--one-cue", "--labels", "3"]
-    file = label_files.read(labelled([*command, "--out", tmp_path / "labels"], ask))
-    for obs, action, svg, films in seen:
-        row = np.flatnonzero((recorded.arrays()[0] == obs).all(-1))
-        np.testing.assert_allclose(action, recorded.arrays()[1][row[0]], atol=1e-6)
-        assert 'class="photo" href="data:image/png;base64,' in svg
-        assert not films  # plain pictures have none
-    np.testing.assert_array_equal(file.labels.answer, [[UNSAID, UNSAID, 1.0], [0.0, 0.0, 0.0], [-1.0, UNSAID, UNSAID]])
-    assert [cue.words for cue in file.space.cues] == [("left", "right"), ("up", "down"), ("open", "close")]
-    assert file.session["base"] == "proposed"
-
-
 def test_a_script_labels_a_folder_by_the_command_and_labels_of_others_are_refused(folder, tmp_path, capsys):
     told = []
 
@@ -159,14 +139,9 @@ def test_a_script_labels_a_folder_by_the_command_and_labels_of_others_are_refuse
     np.testing.assert_array_equal(file.labels.answer, told)
     assert file.people.who.tolist() == ["Ada"] * 12
     assert sorted(map(tuple, np.asarray(file.labels.obs))) == sorted(map(tuple, recorded.arrays()[0]))  # each once
-    other = tmp_path / "others"
-    recorded.write(other, rows=8)
     cues = [folder, "--cues", "right,left;up,down;open,close", *command[3:]]
-    for arguments, words in (([other, *command[1:]], "another task.path"), (cues, "another task.cues")):
-        with pytest.raises(UserError, match=words) as raised:
-            label.run([*map(str, arguments)])
-        assert "\n" not in str(raised.value)
-    assert len(label_files.read(found).labels.answer) == 12
+    with pytest.raises(UserError, match=r"another task\.cues"):
+        label.run([*map(str, cues)])
 
 
 def test_the_page_shows_what_gymnasium_renders_and_films_where_an_action_leads(tmp_path, capsys):

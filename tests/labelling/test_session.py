@@ -16,7 +16,6 @@ from cuelearner_jax import asking
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.labelling import comparing
-from cuelearner_jax.labelling.learner import fit
 from cuelearner_jax.labelling.plan import Base, keys_of
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Opaque, Uniform
@@ -62,7 +61,7 @@ def test_the_first_round_is_that_of_a_simulated_teacher(opened, tmp_path):
         np.testing.assert_allclose(getattr(file.labels, name), getattr(taught.labels, name)[:10], atol=1e-6)
     # The same labels and the same step of the same stream, though the fit after the first has another number there.
     told = guide.replace(labels=taught.labels)
-    refit = fit(guidance, ENV, probes.SCALARS, told, keys.session, jnp.asarray(1))
+    refit = jax.jit(asking.fit, static_argnums=0)(guidance, ENV, probes.SCALARS, told, keys.session, jnp.asarray(1))
     chex.assert_trees_all_close(status.newest.model, refit.model, atol=1e-4)
     assert (status.newest.labels, status.newest.number, status.newest.quality.count) == (10, 1, 2)
 
@@ -71,8 +70,8 @@ def test_later_questions_are_refined_by_the_newest_model(opened):
     session = opened()
     give(session, 10)
     newest = settled(session, fits=1).newest
-    prepared = session.number  # asked before the model was there, but seen
-    give(session, 1)
+    prepared = session.number + 1  # the question on the screen and the one ready ahead were asked before the fit
+    give(session, 2)
     item = session.item
     assert item.number == prepared + 1
     keys = asking.question_keys(keys_of(0).session, item.number)

@@ -42,17 +42,6 @@ def test_a_program_is_made_for_the_lanes_that_a_device_takes_at_once(monkeypatch
     assert jax.jit(lambda x: x + 1, compiler_options=many)(1) == 2  # XLA refuses names that it does not know
 
 
-def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
-    asking = group_of(2, "relative")
-    assert list(zip(asking.seeds.tolist(), asking.budgets.tolist(), strict=True)) == [
-        (0, 10),
-        (1, 10),
-        (0, 20),
-        (1, 20),
-    ]
-    assert group_of(2, "heuristic").budgets.tolist() == [0, 0]
-
-
 def test_blocks_of_another_cut_are_cut_anew(monkeypatch):
     monkeypatch.setattr(lanes, "CORES", 1)
     before, after = group_of(5, lanes_per_block=2), group_of(5)

@@ -48,7 +48,7 @@ def rows(out):
 
 
 def policy_of(folder, seed=1):
-    source = PolicySource.of_run(folder, lambda name: TASK)
+    source = PolicySource.of_folder(folder, lambda name: TASK)
     return one_policy(source, WalkConfig(), "agent", None, None, seed)
 
 
@@ -94,7 +94,8 @@ def test_the_agent_is_exported_as_it_acts(whole, tmp_path, format):
 
 def test_a_policy_folder_can_keep_the_agent(whole):
     agent = policy_of(whole)
-    again = serialization.from_json(serialization.to_json(agent), serialization.arrays_of(agent), ENV)
+    again = serialization.from_json(serialization.to_json(agent), ENV)
+    again = serialization.with_arrays(again, serialization.arrays_of(agent))
     obs = jnp.linspace(-1.0, 1.0, 8).reshape(4, 2)
     np.testing.assert_array_equal(*(policy.act(jax.random.key(0), None, obs) for policy in (agent, again)))
 

@@ -24,7 +24,7 @@ from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.runs import grid
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files, results
-from cuelearner_jax.storage.checkpoint import checkpoints
+from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.storage.table import TableWriter, finish
 from cuelearner_jax.teachers import LearnedTeacher, init_params
 
@@ -74,12 +74,12 @@ def read_description(folder):
 
 
 def save(folder):
-    with checkpoints(folder) as saved:
+    with Checkpoints(folder) as saved:
         saved.save(5, {"policy": ARRAYS})
 
 
 def restore(folder):
-    with checkpoints(folder, read_only=True) as saved:
+    with Checkpoints(folder, read_only=True) as saved:
         return saved.restore({"policy": ARRAYS})
 
 

@@ -37,9 +37,8 @@ def test_the_digest_tells_situations_apart(tmp_path):
     assert first != other
 
 
-@pytest.mark.parametrize("video_fps", [10, 30])
-def test_a_lerobot_dataset_is_read(tmp_path, video_fps):
-    observations, actions = recorded.write_lerobot(tmp_path / "set", video_fps=video_fps)
+def test_a_lerobot_dataset_is_read(tmp_path):
+    observations, actions = recorded.write_lerobot(tmp_path / "set", video_fps=30)  # the data's rate is 10
     found = situations.read(tmp_path / "set")
     np.testing.assert_array_equal(found.observations, observations)
     np.testing.assert_array_equal(found.actions, actions)

@@ -9,7 +9,6 @@ import pytest
 from flax import struct
 from probes import CONFIG, Aimed, Chain, Expert, Window, WindowConfig, long_but, make_task
 
-from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Features, Quantity
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import Refinement
@@ -57,11 +56,6 @@ def altered_step(**changes):
     return stepping(lambda state, after, step: (after, change(step)))
 
 
-class Branching(Window):
-    def step(self, key, state, action):
-        return super().step(key, state, -action if action[0] > 0 else action)
-
-
 class Outside(Window):
     def reset(self, key):
         state, obs = super().reset(key)
@@ -75,7 +69,6 @@ def mirrored(image):
 
 ENVIRONMENTS = {
     "sizes": (other(observation=(Quantity("a", 3, "1"),)), "observation is float32 of shape (2,): make it"),
-    "an if": (Branching(), "with jnp.where and lax.cond in place of if"),
     "random numbers": (Outside(), "draw all random numbers from the key alone"),
     "no end": (
         stepping(lambda state, after, step: (state, step.replace(obs=state, terminated=jnp.array(False)))),
@@ -100,7 +93,7 @@ ENVIRONMENTS = {
 }
 
 
-@pytest.mark.parametrize("law", long_but(("sizes", "an if", "random numbers", "no reset", "recall"), ENVIRONMENTS))
+@pytest.mark.parametrize("law", long_but(("sizes", "random numbers", "no reset", "recall"), ENVIRONMENTS))
 def test_a_broken_law_of_environments_is_found(law):
     env, message = ENVIRONMENTS[law]
     breaks(check_environment, message, env)
@@ -130,10 +123,6 @@ def long_answers(form):
     return form._replace(answer=answer)
 
 
-def in_python(act):
-    return lambda *given: act(*given) if float(given[-1].eps_deg) > 1 else None
-
-
 def unfitted_too(act):
     def guided(self, model, env, obs, actions, active, scalars):
         return Refinement(jnp.where(active[:, None], -actions, actions), active.astype(jnp.int32))
@@ -148,7 +137,6 @@ GUIDANCES = {
         guide(fit=result(lambda model: model.replace(fitted=jnp.array(False)))),
         "`fit` of valid labels returns an unfitted model",
     ),
-    "a branch": (guide(act=in_python), "`act` under jit fails"),
     "an unfitted guide": (guide(act=unfitted_too), "`act` of an unfitted model changes actions"),
 }
 
@@ -194,7 +182,6 @@ def hidden_noise(key, actions):
 
 
 POLICIES = {
-    "an if": (Turned(change=lambda key, actions: actions if actions[0, 0] > 0 else -actions), "`act` under jit fails"),
     "a length": (Turned(change=lambda key, actions: 2.0 * actions), "is not an action of the space"),
     "neighbours": (Turned(change=lambda key, actions: retract(actions + actions[:1])), "depends on the others"),
     "hidden noise": (Turned(change=hidden_noise), "the same key gives other actions"),
@@ -254,13 +241,8 @@ def write(*given):
 
 
 DRAWN = Pictures(lambda env, policy, key, steps: ([None] * steps, [0.0] * steps), write, write, write)
-FAST = dataclasses.replace(CONFIG, scalars=Scalars(discount=2.0))
 BY_WIDTH = with_environment(lambda config, split: Window() if config.half_width_deg > 10 else Wider())
 TASKS = {
-    "a discount of 2": (
-        dataclasses.replace(PROBE, presets={"fast": Preset("", FAST)}),
-        "preset 'fast' fails (UserError: scalars.discount is 2.0",
-    ),
     "nobody to ask": (
         dataclasses.replace(with_preset(guidance=("none", "relative")), teacher=None),
         "preset 'small' compares guidance ['relative'], which it cannot have",

@@ -1,0 +1,64 @@
+"""A person as the judge: films of both policies from the same starts, without names."""
+
+import numpy as np
+import pytest
+from gymnasium_worlds import Adder
+from PIL import Image, ImageSequence
+
+import cuelearner_jax as cl
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*labels.*")
+
+
+@pytest.fixture(scope="module")
+def world():
+    return cl.from_gymnasium(Adder, num_envs=4, processes=1)
+
+
+def slow(obs):
+    return np.full((len(obs), 1), 0.2, np.float32)
+
+
+def fast(obs):
+    return np.ones((len(obs), 1), np.float32)
+
+
+def seconds(file):
+    return sum(frame.info["duration"] for frame in ImageSequence.Iterator(Image.open(file)))
+
+
+def adapted(world, judge_by, **more):
+    return cl.adapt(slow, world, fast, labels=20, judge_by=judge_by, **more)
+
+
+def test_seven_clear_preferences_decide_and_films_change_sides(world):
+    sides = []
+
+    def sooner(left, right):
+        """Adder ends as soon as the sum is large enough, so the better film is the shorter one."""
+        sides.append(np.sign(seconds(left) - seconds(right)))
+        return int(sides[-1])
+
+    better = adapted(world, sooner)
+    assert better.used
+    assert better.judged == ("person", 0.0, 1.0)
+    assert better.rewarded_steps == 0
+    # mean over the stakes of (1 + stake)**n reaches 20 with the seventh
+    assert len(sides) == 7
+    assert set(sides) == {-1, 1}
+    assert "a person preferred the policy as it was in 0%, the corrected in 100%" in better.words[-1]
+
+
+def test_without_a_difference_the_policy_stays_as_it_was(world):
+    with pytest.warns(UserWarning, match="not shown to be better"):
+        same = adapted(world, lambda left, right: 0, judge_episodes=3)
+    assert not same.used
+
+
+def test_another_answer_and_a_world_without_films_are_refused(world):
+    with pytest.raises(cl.UserError, match=r"judge_by gave 'left': give -1 \(left\), 0"):
+        adapted(world, lambda left, right: "left")
+    with pytest.raises(cl.UserError, match="a person compares films"):
+        adapted(world.env, lambda left, right: 0)
+    with pytest.raises(cl.UserError, match="a person compares films"):
+        adapted(world, "person")
