@@ -1,10 +1,10 @@
 """Peers on the robots of the zoo: the same worlds, teachers and budgets of labels, learned by other kinds of guidance.
 
-    python experiments/zoo_peers.py --kind relative --cues 3 --tuning                # compares all settings
-    python experiments/zoo_peers.py --kind relative --cues 3 --setting 4 --seeds 4   # with the best of these
+    python experiments/zoo_peers.py --kind relative --groups 3 --robots 29 --seeds 4
+    python experiments/zoo_peers.py --table runs/zoo_peers --beside docs/data   # and the reading on the same cells
 
 A kind asks its own questions, as its method says, about what it has made of the policy's actions so far. `SETTINGS` are
-to be compared on tuning robots, and the best to be measured on held-out ones.
+compared on as many tuning robots, and the best of them is measured on held-out ones.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ import _residual
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow.parquet as pq
 import zoo as study
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -48,7 +48,11 @@ KINDS: Mapping[str, type[Guide]] = {
     "clic": _energy.CorrectingEnergy,
 }
 # strength of an answer and largest correction [half of a cue's range; 90 degrees], rate of learning
-SETTINGS = tuple(product((0.1, 0.3), (0.6, 1.2), (1e-3, 3e-3)))
+SETTINGS = tuple(
+    (strength, most, rate)
+    for strength, most in ((0.05, 0.15), (0.1, 0.3), (0.1, 0.6), (0.1, 1.2), (0.3, 0.6), (0.3, 1.2))
+    for rate in (1e-3, 3e-3)
+)
 
 
 class Even(WholeObservations, struct.PyTreeNode):
@@ -155,29 +159,63 @@ def cells_of(robots: int, seeds: int) -> list[study.Cell]:
     return [cell for cell in study.cells_of(robots, seeds) if not study.FAULTS[cell.fault][1]]
 
 
+def compare(kind: str, cues: int, options: argparse.Namespace) -> None:
+    """Choose the setting that brings back most on tuning robots, and measure it on held-out ones."""
+    mean = []
+    for split in ("tuning", "held_out"):
+        seeds = 1 if split == "tuning" else options.seeds
+        robots, cells = study.group(cues, options.robots, split), cells_of(options.robots, seeds)
+        chosen = SETTINGS if split == "tuning" else (SETTINGS[int(np.argmax(mean))],)
+        for number, setting in enumerate(chosen):
+            name = f"{kind}_{split}_{cues}{f'_{number}' if split == 'tuning' else ''}.parquet"
+            one = partial(measure, robots, kind=kind, setting=setting, labels=options.labels)
+            rows = study.measured(options.out / name, cells, options.at_once, one)
+            back = study.shares(rows, lambda row: True)
+            mean.append(np.clip(back, -1, 1).mean())
+            print(
+                kind, cues, split, setting, f"loss back: mean {mean[-1]:.3f}, median {np.median(back):.3f}", flush=True
+            )
+
+
+def table(peers: Path, beside: Path) -> None:
+    """Print what each kind brings back on held-out robots, and the reading on the same cells without any judgement."""
+    place = lambda row: tuple(row[name] for name in ("cues", "robot", "error", "fault", "seed"))  # noqa: E731
+    read = {place(row): row for row in pq.read_table(beside / "zoo.parquet").to_pylist()}
+    print("kind           cells  success before, after   loss back: median, worst tenth   worse   reading on these")
+    for kind in KINDS:
+        files = sorted(peers.glob(f"{kind}_held_out_*.parquet"))
+        rows = [row for file in files for row in pq.read_table(file).to_pylist() if place(row) in read]
+        if not rows:
+            continue
+        shown = []
+        for own in (rows, [read[place(row)] for row in rows]):
+            back = study.shares(own, lambda row: True)
+            ends = [np.mean([row[f"{end} success"] for row in own]) for end in ("before", "after")]
+            worse = np.mean([study.is_worse(row) for row in own])
+            shown.append(
+                f"{ends[0]:.2f} {ends[1]:.2f}  {np.median(back):.2f} {np.quantile(back, 0.1):.2f}  {worse:.3f}"
+            )
+        print(f"{kind:<15}{len(rows):>5}  {shown[0]}   reading {shown[1]}")
+
+
 def main() -> None:
-    """Measure one kind on one group of robots."""
+    """Measure one kind on groups of robots, or print the table of what was measured."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kind", choices=tuple(KINDS), default="relative")
-    parser.add_argument("--cues", type=int, choices=range(1, 8), default=3, help="group of robots; 1: directions")
-    parser.add_argument("--robots", type=int, default=28)
+    parser.add_argument("--groups", type=int, nargs="+", choices=range(1, 8), default=[3], help="by number of cues")
+    parser.add_argument("--robots", type=int, default=29)
     parser.add_argument("--seeds", type=int, default=4, help="of labels")
     parser.add_argument("--labels", type=int, default=100)
-    parser.add_argument("--tuning", action="store_true", help="compare settings on tuning robots")
-    parser.add_argument("--setting", type=int, choices=range(len(SETTINGS)), help="number of one of SETTINGS")
-    parser.add_argument("--at-once", type=int, default=392, help="cells side by side")
+    parser.add_argument("--at-once", type=int, default=377, help="cells side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/zoo_peers"), help="folder for Parquet files")
+    parser.add_argument("--table", type=Path, help="print the table of this folder, and measure nothing")
+    parser.add_argument("--beside", type=Path, default=study.DATA, help="with --table: folder of the reading's data")
     options = parser.parse_args()
-    split = "tuning" if options.tuning else "held_out"
-    robots, cells = study.group(options.cues, options.robots, split), cells_of(options.robots, options.seeds)
-    if options.tuning == (options.setting is not None):
-        parser.error("give --tuning, or --setting with the best setting of tuning robots")
-    for number, setting in enumerate(SETTINGS if options.tuning else (SETTINGS[options.setting],)):
-        file = options.out / f"{options.kind}_{split}_{options.cues}{f'_{number}' if options.tuning else ''}.parquet"
-        one = partial(measure, kind=options.kind, setting=setting, labels=options.labels)
-        rows = study.measured(file, cells, options.at_once, lambda part, one=one: one(robots, part))
-        back = study.shares(rows, lambda row: True)
-        print(options.kind, setting, f"loss back: mean {np.clip(back, -1, 1).mean():.3f}, median {np.median(back):.3f}")
+    if options.table:
+        table(options.table, options.beside)
+        return
+    for cues in options.groups:
+        compare(options.kind, cues, options)
 
 
 if __name__ == "__main__":
