@@ -1,7 +1,7 @@
 """Peers on the robots of the zoo: the same worlds, teachers and budgets of labels, learned by other kinds of guidance.
 
     python experiments/zoo_peers.py --kind relative --groups 3 --robots 29 --seeds 4
-    python experiments/zoo_peers.py --table runs/zoo_peers --beside docs/data   # and the reading on the same cells
+    python experiments/zoo_peers.py --table docs/data/zoo_peers.parquet   # beside the reading
 
 A kind asks its own questions, as its method says, about what it has made of the policy's actions so far. `SETTINGS` are
 compared on as many tuning robots, and the best of them is measured on held-out ones.
@@ -172,9 +172,7 @@ def compare(kind: str, cues: int, options: argparse.Namespace) -> None:
             rows = study.measured(options.out / name, cells, options.at_once, one)
             back = study.shares(rows, lambda row: True)
             mean.append(np.clip(back, -1, 1).mean())
-            print(
-                kind, cues, split, setting, f"loss back: mean {mean[-1]:.3f}, median {np.median(back):.3f}", flush=True
-            )
+            print(kind, cues, split, setting, f"mean {mean[-1]:.3f}, median {np.median(back):.3f}", flush=True)
 
 
 def table(peers: Path, beside: Path) -> None:
@@ -182,20 +180,16 @@ def table(peers: Path, beside: Path) -> None:
     place = lambda row: tuple(row[name] for name in ("cues", "robot", "error", "fault", "seed"))  # noqa: E731
     read = {place(row): row for row in pq.read_table(beside / "zoo.parquet").to_pylist()}
     print("kind           cells  success before, after   loss back: median, worst tenth   worse   reading on these")
-    for kind in KINDS:
-        files = sorted(peers.glob(f"{kind}_held_out_*.parquet"))
-        rows = [row for file in files for row in pq.read_table(file).to_pylist() if place(row) in read]
-        if not rows:
-            continue
-        shown = []
-        for own in (rows, [read[place(row)] for row in rows]):
+    rows = [row for row in pq.read_table(peers).to_pylist() if place(row) in read]
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        chosen = [row for row in rows if row["kind"] == kind]
+        shown = ""
+        for own in (chosen, [read[place(row)] for row in chosen]):
             back = study.shares(own, lambda row: True)
             ends = [np.mean([row[f"{end} success"] for row in own]) for end in ("before", "after")]
-            worse = np.mean([study.is_worse(row) for row in own])
-            shown.append(
-                f"{ends[0]:.2f} {ends[1]:.2f}  {np.median(back):.2f} {np.quantile(back, 0.1):.2f}  {worse:.3f}"
-            )
-        print(f"{kind:<15}{len(rows):>5}  {shown[0]}   reading {shown[1]}")
+            ends += [np.median(back), np.quantile(back, 0.1), np.mean([study.is_worse(row) for row in own])]
+            shown += "    " + "  ".join(f"{end:.3f}" for end in ends)
+        print(f"{kind:<15}{len(chosen):>5}{shown}")
 
 
 def main() -> None:
@@ -208,7 +202,7 @@ def main() -> None:
     parser.add_argument("--labels", type=int, default=100)
     parser.add_argument("--at-once", type=int, default=377, help="cells side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/zoo_peers"), help="folder for Parquet files")
-    parser.add_argument("--table", type=Path, help="print the table of this folder, and measure nothing")
+    parser.add_argument("--table", type=Path, help="print the table of this file, and measure nothing")
     parser.add_argument("--beside", type=Path, default=study.DATA, help="with --table: folder of the reading's data")
     options = parser.parse_args()
     if options.table:

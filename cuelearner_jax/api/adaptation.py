@@ -150,9 +150,9 @@ def adapt(
         sizes: sizes of the network, of its fitting, and of a round of labels.
         scalars: settings of fitting, of refinement and of the teacher's faults.
         seed: seed of all random numbers.
-        judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones (default: the
-            scenario's or the task's; of a reading "labels"); or a function of two film files (.gif) of the same start
-            that returns -1 where the left one is better, 1 where the right one is, and else 0.
+        judge_by: the metric by which it is judged, or "labels": by predictions of answers (default: the scenario's or
+            the task's; of a reading "labels"). Or a function of two film files (.gif) of the same start, which returns
+            -1 where the left one is better, 1 where the right one is, else 0.
         judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
