@@ -23,6 +23,8 @@ from cuelearner_jax.task import PAPER, Preset, Task, shape_of
 from cuelearner_jax.tasks import logs, registry, shipped
 from cuelearner_jax.terminal import console
 
+PROPOSED = "the proposed actions"
+
 
 def task_of(ahead: Namespace) -> Task:
     """Return the task named first, or by --task or --env; --teacher makes code its teacher. Raises UserError."""
@@ -70,12 +72,15 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
 
     --task, or --env, makes an outside task known, and a library's environment the world of a folder. --teacher makes
     code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code. Code
-    without a task acts in the situations of --labels-from. `is_policy`: code without a task is a policy, not a task.
+    without a task acts in the situations of --labels-from; without code their proposed actions are the policy.
+    `is_policy`: code without a task is a policy, not a task.
 
     Raises:
         UserError: the folder or task does not exist or is not available.
     """
     named, task, code = ahead.words[0] if ahead.words else None, _task_by_option(ahead), None
+    if named is task is None and ahead.labels_from is not None:
+        task = _recorded(PROPOSED, ahead.labels_from)
     base = None if ahead.base is None else code_of(ahead.base)
     for name, table in PARTS.items():
         if (part := getattr(ahead, name)) is not None:
