@@ -12,8 +12,8 @@ too, see `storage.lerobot`. Columns of the table:
 | phase       | float, 0 to 1               | optional: the action's place in the chunk that its policy proposed  |
 
 With `phase`, the policy cannot be asked again: what it depends on, such as pictures, is not in the table. Observations
-then end with the phase and a slice `BASE`, the proposed action. The metadata `cuelearner` of a Parquet file may have the
-bounds of the actions, `low` and `high`.
+then end with the phase and a slice `BASE`, the proposed action. The metadata `cuelearner` of a Parquet file may have
+the bounds of the actions, `low` and `high`.
 In place of a list there may be one column per entry, `observation.NAME` or `action.NAME`, which names the entries.
 Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
 """

@@ -15,6 +15,8 @@ from torch import Tensor
 VERSION = 1  # of the arrays
 LARGEST = 5.0  # standard deviations at which inputs are cut
 ARRAYS = ("low", "high", "mean", "deviation", "known", "alpha", "length", "beta", "scale", "bound")
+GOLDEN = ("golden_obs", "golden_action")  # observations (cases, obs), and the actions that JAX decided on
+TOLERANCE = 1e-4  # largest difference of a golden case, as a share of each entry's range
 
 
 class Correction:
@@ -34,6 +36,7 @@ class Correction:
         if self.arrays["known"].shape[1] != len(self.arrays["mean"]) + self.action_size or self.state_size < 0:
             raise ValueError("the correction's arrays do not fit together: export the correction again")
         self._set(torch.device("cpu"))
+        self._replay({name: arrays[name].float() for name in GOLDEN if name in arrays})
 
     def _set(self, device: torch.device) -> None:
         """Put the arrays on a device, with what does not depend on the input computed."""
@@ -43,6 +46,19 @@ class Correction:
         self.known, self.alpha = own["known"] / own["length"], own["alpha"] * own["scale"]
         self.shift, self.gain = own["beta"][:, 0] * own["scale"], own["beta"][:, 1:].T * own["scale"]
         self.square, self.bound, self.device = (self.known**2).sum(-1), own["bound"], device
+
+    def _replay(self, golden: dict[str, Tensor]) -> None:
+        """Decide the golden cases again. Raises ValueError for other actions."""
+        if len(golden) < len(GOLDEN):
+            raise ValueError("the correction has no golden cases: export it again")
+        self.arrays |= golden
+        obs, expected = (golden[name] for name in GOLDEN)
+        state, phase, proposed = obs.split([self.state_size, 1, self.action_size], -1)
+        apart = float(((self(state, phase[:, 0], proposed) - expected) / self.range).abs().max())
+        if not apart <= TOLERANCE:
+            raise ValueError(
+                f"the correction decides golden cases otherwise, by {apart:.1e} of a range: export it again"
+            )
 
     @torch.no_grad()
     def __call__(self, state: Tensor, phase: Tensor, proposed: Tensor) -> Tensor:

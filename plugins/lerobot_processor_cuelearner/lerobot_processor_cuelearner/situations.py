@@ -14,13 +14,13 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.lerobot_types import TransitionKey
 from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.processor import RelativeActionsProcessorStep
 from lerobot.utils.constants import ACTION, OBS_STATE
 from PIL import Image
 
 from lerobot_processor_cuelearner.steps import PlaceStep
 
 LEAST_RANGE = 1e-6  # of an entry of the action that counts as moving
-RELATIVE = ("RelativeActionsProcessorStep", "MapTensorToDeltaActionDictStep")
 
 
 def write(checkpoint: str, dataset: Path, out: Path, count: int, seed: int = 0) -> int:
@@ -75,8 +75,8 @@ def _load(checkpoint: str, data: LeRobotDataset) -> tuple[Any, Any, Any, Any]:
     policy = make_policy(config, ds_meta=data.meta).eval()
     overrides = {"device_processor": {"device": str(config.device)}}
     pre, post = make_pre_post_processors(config, pretrained_path=checkpoint, preprocessor_overrides=overrides)
-    if any(type(step).__name__ in RELATIVE and getattr(step, "enabled", True) for step in pre.steps):
-        raise SystemExit(f"{checkpoint} has relative actions, which cannot be corrected: give one with absolute actions")
+    if any(isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in pre.steps):
+        raise SystemExit(f"{checkpoint} has relative actions: give a policy of absolute actions")
     return policy, config, pre, post
 
 

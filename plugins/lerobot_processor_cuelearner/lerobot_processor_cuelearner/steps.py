@@ -1,4 +1,4 @@
-"""Processor steps of a corrected checkpoint: two remember what the policy saw and where in its chunk it is, one corrects.
+"""Processor steps of a corrected checkpoint: two remember the robot's state and the place in the chunk, one corrects.
 
     policy_preprocessor.json    ..., StateStep, normalizer_processor, ...
     policy_postprocessor.json   PlaceStep, unnormalizer_processor, CorrectStep, ...
@@ -98,7 +98,7 @@ class CorrectStep(_Step):
         """Find the pair. Raises ValueError for arrays of another version."""
         super().__post_init__()
         if self.version != VERSION:
-            raise ValueError(f"the correction has version {self.version}, this package reads {VERSION}: export it again")
+            raise ValueError(f"the correction has version {self.version}, not {VERSION}: export it again")
         self._state = _newest.get((self.pair, StateStep.__name__))
         self._place = _newest.get((self.pair, PlaceStep.__name__))
 
