@@ -23,8 +23,6 @@ from cuelearner_jax.task import PAPER, Preset, Task, shape_of
 from cuelearner_jax.tasks import logs, registry, shipped
 from cuelearner_jax.terminal import console
 
-PROPOSED = "the proposed actions"
-
 
 def task_of(ahead: Namespace) -> Task:
     """Return the task named first, or by --task or --env; --teacher makes code its teacher. Raises UserError."""
@@ -80,7 +78,7 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
     """
     named, task, code = ahead.words[0] if ahead.words else None, _task_by_option(ahead), None
     if named is task is None and ahead.labels_from is not None:
-        task = _recorded(PROPOSED, ahead.labels_from)
+        task = _recorded("a recording's proposed actions", ahead.labels_from)
     base = None if ahead.base is None else code_of(ahead.base)
     for name, table in PARTS.items():
         if (part := getattr(ahead, name)) is not None:
