@@ -48,7 +48,8 @@ def with_cues(task: Task, config: Any, cues: str) -> Any:
     if not {"cues", "cue_names"} <= fields:
         raise UserError(f"--cues names cues, and {task.name} has its own: leave it out")
     own = {"keys": ()} if "keys" in fields else {}  # the recorded keys belong to the replaced words
-    changed = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in cues_from(cues)), **own)
+    named = cues_from(cues, config.cue_names if "=" in cues else ())
+    changed = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in named), **own)
     shape_of(task, changed)  # reports cues that do not fit
     return changed
 
