@@ -107,7 +107,7 @@ class Reading:
         else:
             base, spread = self._reader.act(self.fit, rows), self._reader.spread(self.fit, rows)
         asked = jnp.array([cue.is_asked for cue in self.space.cues])
-        return index, np.asarray(_near(self.space, k_action, base, asked * jnp.maximum(spread, self.eps / 2)))
+        return index, np.asarray(_near(self.space, k_action, base, asked[None] * jnp.maximum(spread, self.eps / 2)))
 
     def learn(
         self,

@@ -13,7 +13,7 @@ too, see `storage.lerobot`. Columns of the table:
 
 With `phase`, the policy cannot be asked again: what it depends on, such as pictures, is not in the table. Observations
 then end with the phase and a slice `BASE`, the proposed action. The metadata `cuelearner` of a Parquet file may have
-the bounds of the actions, `low` and `high`.
+the bounds of the actions, `low` and `high`. Of a LeRobot dataset with pictures alone, observations are the actions.
 In place of a list there may be one column per entry, `observation.NAME` or `action.NAME`, which names the entries.
 Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
 """
@@ -101,9 +101,10 @@ def _checked(
     phase: Float[np.ndarray, " n"] | None = None,
 ) -> Situations:
     """Build `Situations`. Raises UserError if there are none or a number is not finite."""
-    own = len(observations[0]) if len(observations) else 0
-    if phase is not None:
-        observations = np.concatenate([observations, phase[:, None], actions], -1)
+    own, is_proposed = observations.shape[-1], phase is not None or observations.shape[-1] == 0 < len(observations)
+    if is_proposed:
+        parts = [observations, *([] if phase is None else [phase[:, None]]), actions]
+        observations = np.concatenate(parts, -1)
     for name, rows in ((OBSERVATION, observations), (ACTION, actions)):
         if not rows.size:
             raise UserError(f"{path} holds no {name}s: record some situations first")
@@ -114,8 +115,9 @@ def _checked(
     slices = (Quantity(OBSERVATION, own, "1", "as recorded"),)
     if len(names) == own <= MOST_NAMED:
         slices = tuple(Quantity(name, 1, "1", "as recorded") for name in names)
-    if phase is not None:
-        slices += (Quantity(PHASE, 1, "1"), Quantity(BASE, actions.shape[1], "1", kind=PROPOSED))
+    if is_proposed:
+        places = () if phase is None else (Quantity(PHASE, 1, "1", "place in the chunk"),)
+        slices = (*slices, *places, Quantity(BASE, actions.shape[1], "1", "as recorded", PROPOSED))
     contents = hashlib.sha256()
     for rows in (observations, actions):
         contents.update(str(rows.shape).encode() + np.ascontiguousarray(rows).tobytes())

@@ -19,8 +19,8 @@ MOVED = np.array([40.0, -20.0])  # the executed action is this far off [pixels]
 TRAIN = (
     "--policy.type=act --policy.push_to_hub=false --policy.device=cpu --policy.chunk_size=8 --policy.n_action_steps=5 "
     "--policy.dim_model=32 --policy.n_heads=2 --policy.dim_feedforward=32 --policy.n_encoder_layers=1 "
-    "--policy.n_vae_encoder_layers=1 --policy.pretrained_backbone_weights=null --batch_size=4 --steps=20 --save_freq=20 "
-    "--num_workers=0 --wandb.enable=false"
+    "--policy.n_vae_encoder_layers=1 --policy.pretrained_backbone_weights=null --batch_size=4 --steps=20 "
+    "--save_freq=20 --num_workers=0 --wandb.enable=false"
 )
 EVALUATE = "--env.type=pusht --env.episode_length=12 --eval.n_episodes=2 --eval.batch_size=1 --policy.device=cpu"
 pytestmark = pytest.mark.skipif(not PYTHON, reason="LEROBOT_PYTHON names no Python with LeRobot")
