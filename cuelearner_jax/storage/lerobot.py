@@ -79,8 +79,9 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str
     """Read a dataset's rows, in the order of its files; pictures are read on demand.
 
     Rows in which a person intervened are left out: their actions are not the policy's. Returns observations (n, obs),
-    with no entries where the dataset has pictures alone, and actions (n, action); the names of the entries of each,
-    empty where the dataset names none; and a function from a row to the first camera's picture, None without a camera.
+    without entries where the dataset has pictures alone, and actions (n, action); and the names of the entries of each,
+    empty where the dataset names none. Last comes a function from a row to the first camera's picture, None without a
+    camera.
 
     Raises UserError if the dataset has another version of the format, is damaged, or lacks vectors of either.
     """
