@@ -104,10 +104,10 @@ def test_proposed_actions_are_corrected_by_their_labels_alone(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     observations, actions = recorded.arrays(40)
     phase = np.linspace(0, 1, 40)
-    (tmp_path / "situations").mkdir()
+    (tmp_path / "proposed").mkdir()
     columns = {"observation": list(observations), "action": list(actions), "phase": phase}
-    pq.write_table(pa.table(columns), tmp_path / "situations/situations.parquet")
-    task = logs.task_of("situations", "left,right;up,down;open,close", recorded.LOW, recorded.HIGH)
+    pq.write_table(pa.table(columns), tmp_path / "proposed/situations.parquet")
+    task = logs.task_of("proposed", "left,right;up,down;open,close", recorded.LOW, recorded.HIGH)
     env = task.environment(task.plain())
     obs, asked = np.asarray(env.rows), np.asarray(env.recorded)
     more = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (40, 1))
