@@ -6,7 +6,7 @@ UV := $(BIN)/python -m uv
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart gallery smoke test test-all test-quick test-foreign durations lint format docs bench release constraints clean
+.PHONY: help setup quickstart gallery smoke test test-all test-quick test-foreign test-lerobot durations lint format docs bench release constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make gallery      the films of docs/gallery.md"
@@ -14,6 +14,7 @@ help:
 	@echo "make test-all     these, and what checks the same at length"
 	@echo "make test-quick   those in files that take little of that (under 3 minutes)"
 	@echo "make test-foreign those of PyTorch, Stable-Baselines3, onnxruntime and Meta-World, which it installs"
+	@echo "make test-lerobot the chain with LeRobot, in an environment of its own (PYTHON312=python3.12; some minutes)"
 	@echo "make durations    make test, and tests/durations.txt: the seconds of each file"
 	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
 	@echo "make lint         ruff and pyright"
@@ -72,6 +73,17 @@ test-quick: $(VENV)/.tested
 test-foreign: $(VENV)/.foreign
 	$(PYTEST) tests/foreign
 
+PYTHON312 ?= python3.12
+LEROBOT := .venv-lerobot
+$(LEROBOT)/.installed: $(BIN)/uv plugins/lerobot_processor_cuelearner/pyproject.toml
+	$(PYTHON312) -m venv $(LEROBOT)
+	$(UV) pip install --python $(LEROBOT)/bin/python "lerobot[training,evaluation,pusht]==0.6.1" \
+		--editable plugins/lerobot_processor_cuelearner
+	@touch $@
+
+test-lerobot: $(VENV)/.tested $(LEROBOT)/.installed
+	LEROBOT_PYTHON=$(abspath $(LEROBOT)/bin/python) $(PYTEST) tests/lerobot_chain
+
 durations: $(VENV)/.tested
 	$(PYTEST) -m "not long" --durations-to tests/durations.txt
 
@@ -104,4 +116,4 @@ constraints: $(BIN)/uv
 		--no-emit-index-url --no-emit-find-links pyproject.toml --output-file constraints.txt
 
 clean:
-	rm -rf $(VENV) .jax_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(LEROBOT) .jax_cache .pytest_cache .ruff_cache

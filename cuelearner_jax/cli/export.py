@@ -9,9 +9,10 @@ from cuelearner_jax.cli.options import Finished, Flag, out, parse, rows
 from cuelearner_jax.cli.sources import source_and_options
 from cuelearner_jax.config import digest, to_json
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.export import contract, correction, decisions
+from cuelearner_jax.export import contract, correction, decisions, lerobot
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.runs import trained
+from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.studies.lanes import Lane
 
 
@@ -19,10 +20,10 @@ from cuelearner_jax.studies.lanes import Lane
 class Export(Finished, Lane):
     """Write a policy as a file for a robot, with a contract; --check FOLDER replays one.
 
-    The contract tells what goes in and comes out."""
+    The contract tells what goes in and comes out. For --format lerobot, --policy is the folder of a checkpoint."""
 
     format: str = "stablehlo"
-    """stablehlo, onnx or numpy."""
+    """stablehlo, onnx, numpy or lerobot."""
     out: Path = Path("exported")
     """Folder for the exported decision; a new or an empty one."""
     only_correction: Flag[bool] = False
@@ -40,8 +41,10 @@ def run(arguments: list[str]) -> None:
         difference = contract.replay_golden_cases(folder)
         out.print(f"{folder} is unchanged since its export; golden cases replayed, largest difference {difference:.1e}")
         return
-    more = f"\n\nformats (--format):\n{rows(contract.FORMATS)}"
+    more = f"\n\nformats (--format):\n{rows({**contract.FORMATS, lerobot.NAME: lerobot.ABOUT})}"
     source, options = source_and_options(arguments, "export", Export, more)
+    if options.format == lerobot.NAME:
+        return _into_checkpoint(source, options)
     name = options.name_in(source, options.task)
     if trained.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who needs the true state: choose another policy")
@@ -67,4 +70,21 @@ def run(arguments: list[str]) -> None:
     out.print(
         f"{golden['cases']} golden cases replayed, largest difference {written['difference']:.1e} "
         f"({golden['steady']} of {golden['drawn']} decisions are insensitive to rounding); wrote {options.out}"
+    )
+
+
+def _into_checkpoint(source: PolicySource, options: Export) -> None:
+    """Write a LeRobot checkpoint with a correction. Raises UserError for a policy or checkpoint that does not fit."""
+    if source.adapted is None or options.policy in (None, source.default_policy):
+        raise UserError(
+            "--format lerobot is for a policy folder and a checkpoint: give both, the checkpoint by --policy"
+        )
+    env = source.task.environment(options.task)
+    policy = replace(options, policy=None).policy_in(source, options.task, env)
+    names = tuple(getattr(options.task, "cue_names", ()))
+    written = lerobot.write(policy, env, names, Path(options.policy), options.out)
+    out.print(
+        f"wrote {written}; run it with LeRobot, where the package lerobot_processor_cuelearner is installed: "
+        f"lerobot-eval --policy.path={written}",
+        soft_wrap=True,
     )

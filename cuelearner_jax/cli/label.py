@@ -33,7 +33,7 @@ from cuelearner_jax.cli.options import (
 from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, source_in, with_cues
 from cuelearner_jax.cli.train import asking_kind
 from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import actions_of, offers
+from cuelearner_jax.environment import PROPOSED, actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Reading
@@ -53,7 +53,7 @@ from cuelearner_jax.task import PAPER, QUICKSTART, Preset, Task, shape_of
 from cuelearner_jax.tasks import shipped
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
-UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
+UNIFORM, NEAR_AIMS = "uniform", "near_aims"
 REACH = 1.5  # distance of questions from an aim, in turns by eps
 MOST_LABELS = 100_000
 UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch`, or choose another --robot"
@@ -133,7 +133,8 @@ def run(arguments: list[str]) -> None:
 def _suggested(task: Task, preset: Preset, source: PolicySource | None, ahead: Namespace, named: str | None) -> Label:
     """Return the default options; labels that are to correct a policy are asked for as `adapt` corrects it."""
     config = source.config if source else preset.config
-    kind = asking_kind(preset_kinds(task, preset)) if named is None else Reading.name
+    reads = named is not None or _is_proposed(task, config.task)
+    kind = Reading.name if reads else asking_kind(preset_kinds(task, preset))
     questions, adapts = UNIFORM, named is not None or task.proposed is not None
     if named is None:
         questions = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
@@ -184,7 +185,8 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
         raise UserError("--one-cue is for relative answers about several cues: leave it out")
     family: Any = ()
     if guidance.by_evidence:
-        if options.policy is None or options.again is not None:
+        is_proposed = options.questions == PROPOSED and _is_proposed(task, options.task)
+        if (options.policy is None and not is_proposed) or options.again is not None:
             raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
         if options.bound_deg is not None:
             raise UserError("bound_deg is given, but guidance reading asks without a bound: leave bound_deg out")
@@ -194,6 +196,11 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
     base = _base(task, options, source, env) if options.again is None else Base(uniform_in(env), "")
     plan = Plan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
     return plan if options.again is None else _second(plan, options, options.again)
+
+
+def _is_proposed(task: Task, config: Any) -> bool:
+    """Return whether observations hold the action that a policy elsewhere proposes."""
+    return any(part.kind == PROPOSED for part in getattr(shape_of(task, config), "observation", ()))
 
 
 def _robot(task: Task, name: str | None) -> str:
@@ -294,6 +301,8 @@ def _following(task: Task, preset: str, config: RunConfig, options: Label, label
     name, out, policy = task.origin or task.named or task.name, str(options.out), options.policy
     if options.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
+    if policy is None and options.questions == PROPOSED and _is_proposed(task, options.task):
+        return shlex.join(["cuelearner", "adapt", "--labels-from", out, "--out", f"policies/{Path(out).name}"])
     if policy is None and options.questions == PROPOSED:
         return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'
     if policy is None:

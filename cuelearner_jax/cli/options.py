@@ -125,7 +125,8 @@ def look_ahead(arguments: list[str]) -> argparse.Namespace:
 def look_ahead_of(arguments: list[str], command: str, kind: type) -> argparse.Namespace:
     """Return `look_ahead`'s options. Where nothing is named, print help (SystemExit) or raise UserError."""
     ahead = look_ahead(arguments)
-    if ahead.words or ahead.task or ahead.env or len(ahead.compare or ()) > 1:
+    alone = command == "adapt" and ahead.labels_from is not None  # labels about proposed actions name their task
+    if alone or ahead.words or ahead.task or ahead.env or len(ahead.compare or ()) > 1:
         return ahead
     tasks = ", ".join(registry.names())
     if {"-h", "--help"} & {*arguments}:

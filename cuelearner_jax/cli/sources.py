@@ -48,7 +48,8 @@ def with_cues(task: Task, config: Any, cues: str) -> Any:
     if not {"cues", "cue_names"} <= fields:
         raise UserError(f"--cues names cues, and {task.name} has its own: leave it out")
     own = {"keys": ()} if "keys" in fields else {}  # the recorded keys belong to the replaced words
-    changed = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in cues_from(cues)), **own)
+    named = cues_from(cues, config.cue_names if "=" in cues else ())
+    changed = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in named), **own)
     shape_of(task, changed)  # reports cues that do not fit
     return changed
 
@@ -70,12 +71,15 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
 
     --task, or --env, makes an outside task known, and a library's environment the world of a folder. --teacher makes
     code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code. Code
-    without a task acts in the situations of --labels-from. `is_policy`: code without a task is a policy, not a task.
+    without a task acts in the situations of --labels-from; without code their proposed actions are the policy.
+    `is_policy`: code without a task is a policy, not a task.
 
     Raises:
         UserError: the folder or task does not exist or is not available.
     """
     named, task, code = ahead.words[0] if ahead.words else None, _task_by_option(ahead), None
+    if named is task is None and ahead.labels_from is not None:
+        task = _recorded("a recording's proposed actions", ahead.labels_from)
     base = None if ahead.base is None else code_of(ahead.base)
     for name, table in PARTS.items():
         if (part := getattr(ahead, name)) is not None:

@@ -14,14 +14,12 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.environment import Quantity, action_of, actions_of
+from cuelearner_jax.environment import BASE, Quantity, action_of, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import decisions
 from cuelearner_jax.policies import PolicyNode, describe, uniform_in
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import EnvState
-
-BASE = "base action"  # the last slice of such a decision's observation
 
 
 class Given(PolicyNode):

@@ -201,7 +201,7 @@ def _slips(
 
 def _way(space: Space) -> str:
     """Return the words for -1 and +1, for a file and for messages."""
-    ways = [f"+1 {cue.words[0]}, -1 {cue.words[1]}" for cue in space.cues]
+    ways = [f"+1 {cue.words[0]}, -1 {cue.words[1]}" if cue.is_asked else "not asked" for cue in space.cues]
     if len(ways) == 1:
         return f"h: {ways[0]}, 0 already right, by eps"
     each = "; ".join(f"{cue.name}: {way}" for cue, way in zip(space.cues, ways, strict=True))

@@ -102,7 +102,8 @@ def answers(form: AnswerForm, space: Space, one_cue: bool = False) -> tuple[Cont
         right = AS_IT_IS._replace(keys=_spare(space, AS_IT_IS.keys))
         return Control("+1", words[0], more, (1.0,), "left"), right, Control("-1", words[1], less, (-1.0,), "right")
     if form.by_eps:
-        about_cues = (control for number in range(len(space.cues)) for control in _of_cue(number, space, one_cue))
+        asked = [number for number, cue in enumerate(space.cues) if cue.is_asked]
+        about_cues = (control for number in asked for control in _of_cue(number, space, one_cue))
         whole = (ALL_RIGHT,) if one_cue else (REST_RIGHT, REST_UNSAID)
         return (*about_cues, *(control._replace(keys=_spare(space, control.keys)) for control in whole))
     if form.values is None:
@@ -193,7 +194,8 @@ def answer_of(
         return None
     if pressed.name not in (REST_RIGHT.name, REST_UNSAID.name):  # these two complete the parts chosen so far
         return np.asarray(pressed.answer, np.float32)
-    answer = np.array([parts.get(number, *pressed.answer) for number in range(len(space.cues))], np.float32)
+    rest = [pressed.answer[0] if cue.is_asked else UNSAID for cue in space.cues]
+    answer = np.array([parts.get(number, value) for number, value in enumerate(rest)], np.float32)
     return None if (answer == UNSAID).all() else answer
 
 

@@ -49,7 +49,7 @@ class Page:
         script = (HERE / "page.js").read_text() + f"cue.keys = {json.dumps(keys)}; cue.again = {json.dumps(again)};"
         script = script.replace("</", "<\\/")  # an unescaped "</" would end the script
         ui.add_head_html(f"<script>{script}</script>")
-        rows = len(self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0  # of cues to choose from
+        rows = sum(cue.is_asked for cue in self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0
         with ui.element("main").classes("label-page many" if rows else "label-page").style(f"--rows: {rows}"):
             with ui.column().classes("asking w-full gap-2"):
                 ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")

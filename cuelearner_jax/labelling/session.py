@@ -113,6 +113,7 @@ class Status(NamedTuple):
     fitting: bool
     newest: Fitted
     trouble: str  # why the last answer is not saved; empty: no problem
+    seconds: float  # that all answers took
 
 
 class Session:
@@ -282,7 +283,9 @@ class Session:
         answered, pace = self.record.count(ANSWERED), self.record.per_minute()
         counts = answered, self.record.count(UNSURE), self.plan.labels
         left = (self.plan.labels - answered) / pace if pace else None
-        return Status(*counts, pace, left, self._learner.is_due(answered), self._learner.newest, self.record.trouble)
+        seconds = sum(row.seconds for row in self.record.in_order())
+        due, newest = self._learner.is_due(answered), self._learner.newest
+        return Status(*counts, pace, left, due, newest, self.record.trouble, seconds)
 
     def listen(self, heard: Callable[[], object]) -> Callable[[], None]:
         """Register a function that is called, from any thread, when a new model is in use.

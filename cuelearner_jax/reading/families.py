@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cuelearner_jax.environment import Quantity
+from cuelearner_jax.environment import PROPOSED, Quantity
 from cuelearner_jax.errors import UserError
 
 AXES = ("x", "y", "z")
@@ -47,6 +47,7 @@ class Distortion(NamedTuple):
 
 
 Family = tuple[Distortion, ...]
+ACTIONS_ALONE: Family = (Distortion("actions", ()),)  # without unknowns: shift, gain and process of the actions
 
 
 def unknowns_of(family: Family) -> tuple[Unknown, ...]:
@@ -114,8 +115,10 @@ def declared_distortions(env: Any) -> Family:
 
     Slices in metres or radians of the same size shift together, and those in metres may be scaled. Beams at equal
     angles roll. Directions turn, and places with an `origin` turn about that. A change of the actions needs no
-    declaration.
+    declaration. Of actions that are proposed elsewhere nothing is seen aside: they alone may have changed.
     """
+    if any(quantity.kind == PROPOSED for quantity in env.observation):
+        return ACTIONS_ALONE
     places = _places(env.observation)
     distortions: list[Distortion] = []
     for (unit, size), slices in _alike(places).items():

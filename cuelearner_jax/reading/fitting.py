@@ -270,7 +270,7 @@ def _moves(family: Family, frame: Frame, change: Change) -> Change:
     size = len(frame.step)
     entries = jnp.arange(size) if family else frame.mixed
     each = jnp.eye(size)[entries] * frame.step[None]
-    several = (jnp.array(TRIED)[:, None, None] * each[None]).reshape(-1, size)
+    several = (jnp.array(TRIED)[:, None, None] * each[None]).reshape(len(TRIED) * len(entries), size)
     moves = jnp.concatenate([jnp.zeros((1, size)), several])
     return jax.vmap(lambda move: change.replace(theta=change.theta + move))(moves)
 

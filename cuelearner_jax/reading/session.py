@@ -106,7 +106,8 @@ class Reading:
             base, spread = self._acts(rows), jnp.full((count, len(self.space.cues)), FIRST * self.eps)
         else:
             base, spread = self._reader.act(self.fit, rows), self._reader.spread(self.fit, rows)
-        return index, np.asarray(_near(self.space, k_action, base, jnp.maximum(spread, self.eps / 2)))
+        asked = jnp.array([cue.is_asked for cue in self.space.cues])
+        return index, np.asarray(_near(self.space, k_action, base, asked[None] * jnp.maximum(spread, self.eps / 2)))
 
     def learn(
         self,

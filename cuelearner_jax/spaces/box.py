@@ -136,6 +136,7 @@ def plain_cues(names: Sequence[str]) -> tuple[Cue, ...]:
 
 
 LONGEST = 40  # characters of a word
+UNASKED = ("", "")  # words of an entry that people are not asked about
 ARROWS = {"left": "ArrowLeft", "right": "ArrowRight", "up": "ArrowUp", "down": "ArrowDown"}
 HELD = {"left": "a", "right": "d"}  # letter keys that stand for these arrows too
 
@@ -148,7 +149,7 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
 
     Args:
         words: "left,right;up,down", or pairs of words; the first of a pair asks for more of an entry, the second for
-            less.
+            less. With "NAME=open,close", people are asked about the named entries alone.
         names: names of the cues (default: "left or right" and so on).
         unit: unit of a change.
     """
@@ -158,10 +159,13 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
             for part in (words.split(";") if isinstance(words, str) else words)
         ]
         pairs = [tuple(" ".join(word.split()) for word in pair) for pair in pairs]
+        pairs = _by_name(pairs, names) if pairs and "=" in pairs[0][0] else pairs
     except (TypeError, AttributeError):
         pairs = []
     sound = (len({*pair}) == len(pair) == 2 and all(0 < len(word) <= LONGEST for word in pair) for pair in pairs)
-    if not pairs or not all(sound):
+    if not any(map(any, pairs)) or not all(
+        is_sound or pair == UNASKED for is_sound, pair in zip(sound, pairs, strict=True)
+    ):
         raise UserError(
             f'cues is {format_value(words)}: give two words for each entry of an action, as "left,right;up,down"'
         )
@@ -173,7 +177,7 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
     cues = []
     for number, pair in enumerate(pairs):
         keys = []
-        for word, spare in zip(pair, KEYS[number % len(KEYS)], strict=True):
+        for word, spare in zip(pair, KEYS[number % len(KEYS)], strict=True) if any(pair) else ():
             key = ARROWS.get(word.lower())
             if key is None or key in taken:
                 letters = (letter for letter in word.lower() if letter.isascii() and letter.isalpha())
@@ -183,3 +187,13 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
         name = names[number] if names else " or ".join(pair)
         cues.append(Cue(name, (pair[0], pair[1]), tuple(keys) if all(keys) else (), unit))
     return tuple(cues)
+
+
+def _by_name(pairs: list[tuple[str, ...]], names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return a pair of words for each of `names`; `pairs` start with "NAME=". Raises UserError for unknown names."""
+    parts = [(first.partition("="), *rest) for first, *rest in pairs]
+    known = {name.strip(): (word.strip(), *rest) for (name, _, word), *rest in parts}
+    if not known.keys() <= {*names} or len(known) < len(pairs):
+        there = ", ".join(names) or "no names"
+        raise UserError(f"cues name {', '.join(known)}, but the entries of an action are {there}: name each once")
+    return [known.get(name, UNASKED) for name in names]

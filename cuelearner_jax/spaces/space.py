@@ -30,6 +30,11 @@ class Cue:
     keys: tuple[str, ...]
     unit: str  # unit of a change in options and files: "degrees", "shares" (of the cue's range), "steps"
 
+    @property
+    def is_asked(self) -> bool:
+        """Whether people are asked about the cue: it has words."""
+        return bool(self.words[0])
+
 
 KNOWN: dict[str, type[Space]] = {}  # registered spaces by their names in files
 

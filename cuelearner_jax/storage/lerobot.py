@@ -29,7 +29,7 @@ from cuelearner_jax.errors import UserError, format_value
 INFO = Path("meta/info.json")
 VERSION = "v3.0"  # of the format
 VIDEO = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
-OBSERVATION, ACTION = "observation", "action"
+OBSERVATION, ACTION, INTERVENTION = "observation", "action", "intervention"
 KINDS = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
@@ -78,22 +78,29 @@ def is_dataset(path: Path) -> bool:
 def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str, ...], Frames | None]:
     """Read a dataset's rows, in the order of its files; pictures are read on demand.
 
-    Returns observations (n, obs) and actions (n, action); the names of the entries of each, empty where the dataset
-    names none; and a function from a row to the first camera's picture, None without a camera.
+    Rows in which a person intervened are left out: their actions are not the policy's. Returns observations (n, obs),
+    without entries where the dataset has pictures alone, and actions (n, action); and the names of the entries of each,
+    empty where the dataset names none. Last comes a function from a row to the first camera's picture, None without a
+    camera.
 
     Raises UserError if the dataset has another version of the format, is damaged, or lacks vectors of either.
     """
     features = _features(path)
-    parts = [_parts(path, features, name) for name in (OBSERVATION, ACTION)]
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
+    parts = [_parts(path, features, name, cameras) for name in (OBSERVATION, ACTION)]
+    intervened = [INTERVENTION] if INTERVENTION in features else []
     stored = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
     files = sorted((path / "data").glob("chunk-*/file-*.parquet"))
     if not files:
         raise _damaged(path / "data", "no frames")
-    columns = [*parts[0], *parts[1], "episode_index", "timestamp", *stored]
+    columns = [*parts[0], *parts[1], "episode_index", "timestamp", *stored, *intervened]
     table = pa.concat_tables([_parquet(file, columns) for file in files], promote_options="permissive")
+    for name in intervened:
+        table = table.filter(pa.array(_vectors(path, table, name, 1)[:, 0] == 0))
+    none = np.zeros((len(table), 0), np.float32)
     observations, actions = (
-        np.concatenate([_vectors(path, table, key, features[key]["shape"][0]) for key in keys], -1) for keys in parts
+        np.concatenate([none, *(_vectors(path, table, key, features[key]["shape"][0]) for key in keys)], -1)
+        for keys in parts
     )
     names, entries = (_entries(features, keys) for keys in parts)
     return observations, actions, names, entries, _frames(path, features, table, cameras[0]) if cameras else None
@@ -103,11 +110,15 @@ def _damaged(path: Path, why: object) -> UserError:
     return UserError(f"{path} cannot be read ({why}): restore it from where the dataset came from")
 
 
-def _parts(path: Path, features: dict[str, Any], name: str) -> list[str]:
-    """Return the features of numbers called `name` or `name.PART`. Raises UserError if there are none."""
+def _parts(path: Path, features: dict[str, Any], name: str, cameras: list[str]) -> list[str]:
+    """Return the features of numbers called `name` or `name.PART`; none for observations by `cameras` alone.
+
+    Raises UserError if there are none.
+    """
     vectors = [key for key, feature in features.items() if _is_vector(feature)]
     parts = [name] if name in vectors else [key for key in vectors if key.startswith(f"{name}.")]
-    if not parts:
+    others = {key for key in features if key.startswith(name)} - {*cameras}
+    if not parts and (name != OBSERVATION or others or not cameras):
         there = ", ".join(features)
         raise UserError(
             f"{path} has no feature {name} or {name}.PART of numbers (it has {there}): give a dataset with one"

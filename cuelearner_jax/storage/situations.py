@@ -8,7 +8,12 @@ too, see `storage.lerobot`. Columns of the table:
 | observation | list of floats (obs,)       | the policy's input; in CSV numbers separated by spaces             |
 | action      | list of floats (action,)    | the proposed or executed action                                     |
 | picture     | string                      | optional: a file in the folder, PNG or JPEG, or a clip, GIF or MP4  |
+| text        | string                      | optional: what the robot was told to do                             |
+| phase       | float, 0 to 1               | optional: the action's place in the chunk that its policy proposed  |
 
+With `phase`, the policy cannot be asked again: what it depends on, such as pictures, is not in the table. Observations
+then end with the phase and a slice `BASE`, the proposed action. The metadata `cuelearner` of a Parquet file may have
+the bounds of the actions, `low` and `high`. Of a LeRobot dataset with pictures alone, observations are the actions.
 In place of a list there may be one column per entry, `observation.NAME` or `action.NAME`, which names the entries.
 Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
 """
@@ -16,6 +21,7 @@ Nothing in such a folder is executed: no pickles, and no path that leads out of 
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import zipfile
 from collections.abc import Callable
@@ -28,14 +34,14 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 from pyarrow import csv
 
-from cuelearner_jax.environment import Quantity
+from cuelearner_jax.environment import BASE, PROPOSED, Quantity
 from cuelearner_jax.errors import UserError, format_numbers, format_value
 from cuelearner_jax.storage import lerobot
 from cuelearner_jax.storage.lerobot import Picture, read_picture
 
 STEM = "situations"
 SUFFIXES = (".parquet", ".csv", ".npz")
-OBSERVATION, ACTION, PICTURE = "observation", "action", "picture"
+OBSERVATION, ACTION, PICTURE, TEXT, PHASE = "observation", "action", "picture", "text", "phase"
 MOST_NAMED = 64  # largest number of observation entries that each get a slice of their own
 
 
@@ -50,6 +56,8 @@ class Situations(NamedTuple):
     has_pictures: bool
     # row -> its picture; None: that row has none. Raises UserError for a picture that cannot be read.
     picture: Callable[[int], Picture | None]
+    text: Callable[[int], str] = lambda row: ""  # row -> what the robot was told to do
+    bounds: tuple[list[float], list[float]] | None = None  # low and high of the actions; None: the table has none
 
 
 def read(path: Path) -> Situations:
@@ -62,7 +70,7 @@ def read(path: Path) -> Situations:
         return _checked(path, *lerobot.read(path))
     table = _table_in(path)
     columns = _columns(table)
-    known = (OBSERVATION, ACTION, PICTURE)
+    known = (OBSERVATION, ACTION, PICTURE, TEXT, PHASE)
     if strange := [name for name in columns if name not in known and name.partition(".")[0] not in known[:2]]:
         raise UserError(
             f"{table} has an unknown column {format_value(strange[0])}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
@@ -70,14 +78,17 @@ def read(path: Path) -> Situations:
         )
     observations, names = _matrix(table, columns, OBSERVATION)
     actions, entries = _matrix(table, columns, ACTION)
-    files = columns.get(PICTURE)
-    if len({len(observations), len(actions), len(observations if files is None else files)}) > 1:
+    files, texts = columns.get(PICTURE), columns.get(TEXT)
+    if len({len(observations), len(actions), *(len(columns[name]) for name in known[2:] if name in columns)}) > 1:
         raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
 
     def picture(row: int) -> Picture | None:
         return read_picture(table.parent, str(files[row])) if files is not None and files[row] else None
 
-    return _checked(table, observations, actions, names, entries, None if files is None else picture)
+    phase = _numbers(table, PHASE, columns[PHASE], 1) if PHASE in columns else None
+    read = _checked(table, observations, actions, names, entries, None if files is None else picture, phase)
+    text: Callable[[int], str] = lambda row: str(texts[row] or "") if texts is not None else ""  # noqa: E731
+    return read._replace(text=text, bounds=_bounds(table, actions.shape[1]))
 
 
 def _checked(
@@ -87,8 +98,13 @@ def _checked(
     names: tuple[str, ...],
     entries: tuple[str, ...],
     picture: Callable[[int], Picture | None] | None,
+    phase: Float[np.ndarray, " n"] | None = None,
 ) -> Situations:
     """Build `Situations`. Raises UserError if there are none or a number is not finite."""
+    own, is_proposed = observations.shape[-1], phase is not None or observations.shape[-1] == 0 < len(observations)
+    if is_proposed:
+        parts = [observations, *([] if phase is None else [phase[:, None]]), actions]
+        observations = np.concatenate(parts, -1)
     for name, rows in ((OBSERVATION, observations), (ACTION, actions)):
         if not rows.size:
             raise UserError(f"{path} holds no {name}s: record some situations first")
@@ -96,10 +112,12 @@ def _checked(
             raise UserError(
                 f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave these rows out"
             )
-    size = observations.shape[1]
-    slices = (Quantity(OBSERVATION, size, "1", "as recorded"),)
-    if len(names) == size <= MOST_NAMED:
+    slices = (Quantity(OBSERVATION, own, "1", "as recorded"),)
+    if len(names) == own <= MOST_NAMED:
         slices = tuple(Quantity(name, 1, "1", "as recorded") for name in names)
+    if is_proposed:
+        places = () if phase is None else (Quantity(PHASE, 1, "1", "place in the chunk"),)
+        slices = (*slices, *places, Quantity(BASE, actions.shape[1], "1", "as recorded", PROPOSED))
     contents = hashlib.sha256()
     for rows in (observations, actions):
         contents.update(str(rows.shape).encode() + np.ascontiguousarray(rows).tobytes())
@@ -107,6 +125,19 @@ def _checked(
     digest = contents.hexdigest()[:12]
     none: Callable[[int], Picture | None] = lambda row: None  # noqa: E731
     return Situations(observations, actions, slices, entries, digest, picture is not None, picture or none)
+
+
+def _bounds(table: Path, size: int) -> tuple[list[float], list[float]] | None:
+    """Return the bounds in a table's metadata. Raises UserError where they do not fit its actions."""
+    stored = (pq.read_schema(table).metadata or {}).get(b"cuelearner") if table.suffix == ".parquet" else None
+    if stored is None:
+        return None
+    try:
+        bounds = json.loads(stored)
+        low, high = (np.asarray(bounds[name], float).reshape(size).tolist() for name in ("low", "high"))
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{table} has metadata that tell no bounds of {size} entries: write the table anew") from error
+    return low, high
 
 
 def _table_in(path: Path) -> Path:

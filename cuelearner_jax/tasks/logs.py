@@ -27,10 +27,10 @@ from cuelearner_jax import pictures
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.config import Sizes
-from cuelearner_jax.environment import Features, Quantity, WholeObservations
+from cuelearner_jax.environment import BASE, PROPOSED, Features, Quantity, WholeObservations, offers
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.guides.relative import Relative
-from cuelearner_jax.policies import PolicyNode
+from cuelearner_jax.policies import Heuristic, PolicyNode
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS, Box, Choices, Space, cues_from
 from cuelearner_jax.spaces.box import SHARE
@@ -132,6 +132,13 @@ class Logs(WholeObservations, struct.PyTreeNode):
         middle = jnp.broadcast_to(self.actions.spread(1)[0], jnp.shape(actions))
         return Features(own, 2 * self.actions.log(middle, actions))
 
+    @property
+    def heuristic(self) -> Callable[[Float[Array, " obs"]], Float[Array, " action"]] | None:
+        """The proposed action of an observation that holds it; None where observations hold none."""
+        if not self.observation or self.observation[-1].kind != PROPOSED:
+            return None
+        return lambda obs: self.actions.retract(obs[-self.actions.size :])
+
     def reset(self, key: PRNGKeyArray) -> tuple[Place, Float[Array, " obs"]]:
         """Return a random situation."""
         row = jax.random.randint(key, (), 0, len(self.rows))
@@ -189,6 +196,8 @@ def task_of(
     size, names = recording.actions.shape[1], ()
     bounds: Any = (0.0,) * size, (1.0,) * size
     if actions == "box":
+        if recording.bounds is not None and low is None and high is None:
+            low, high = recording.bounds
         names, bounds = recording.entries, bounds_of(recording.actions, low, high, recording.entries, note)
     elif low is not None or high is not None:
         raise UserError(f"low and high are bounds of a box, but actions are {actions}: leave them out")
@@ -282,7 +291,9 @@ def filled(config: LogsConfig, observations: Any = None, actions: Any = None) ->
         raise UserError(
             "task.names, entries, rows, centre or spread do not describe situations: give the folder by logs:FOLDER"
         )
-    slices = (Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True))
+    slices = [Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True)]
+    if slices[-1].name == BASE and slices[-1].size == space.size:
+        slices[-1] = slices[-1]._replace(kind=PROPOSED)
     if observations is None:
         observations, actions = jnp.zeros((config.rows, size)), jnp.zeros((config.rows, space.size))
     centre = jnp.asarray(config.centre or (0.0,) * size, jnp.float32)
@@ -335,7 +346,8 @@ def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
 
 def _sketch(env: Logs, state: Place) -> Sketch:
     frames, place = _frames(env, state.row)
-    return pictures.sketch(frames[0], f"situation {place}")
+    text = _read(Path(env.path)).text(place)
+    return pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
 
 
 def _reel(env: Logs, state: Place, action: Any) -> Reel | None:
@@ -363,7 +375,7 @@ LOGS = Task(
     about="recorded situations, without a simulator: name their folder, as logs:FOLDER",
     config=LogsConfig,
     bodies=(BODY,),
-    proposed=Recorded,
+    proposed=lambda env: Heuristic(env.view()) if offers(env, "heuristic") else Recorded(env),
     # A label depends on what was seen and proposed, wherever the files lie now.
     labels_hold=("path", "digest", "rows", "order", "cues", "cue_names", "keys", "centre", "spread"),
     files=lambda config: {"path": config.digest} if config.path else {},

@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import recorded_situations as recorded
 from small_runs import next_command
@@ -96,3 +98,26 @@ def test_what_cannot_be_is_told_in_one_line(command, told, there, capsys):
     assert len(lines) == 1, lines
     assert told in lines[0]
     assert not (there / "p").exists()
+
+
+def test_proposed_actions_are_corrected_by_their_labels_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    observations, actions = recorded.arrays(40)
+    phase = np.linspace(0, 1, 40)
+    (tmp_path / "proposed").mkdir()
+    columns = {"observation": list(observations), "action": list(actions), "phase": phase}
+    pq.write_table(pa.table(columns), tmp_path / "proposed/situations.parquet")
+    task = logs.task_of("proposed", "left,right;up,down;open,close", recorded.LOW, recorded.HIGH)
+    env = task.environment(task.plain())
+    obs, asked = np.asarray(env.rows), np.asarray(env.recorded)
+    more = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (40, 1))
+    of = {"name": "logs", **configuration.to_json(task.plain())}
+    rows = Label(obs, asked, more, np.ones(40, bool))
+    file = label_files.LabelFile(of, "relative", env.actions, EPS, np.zeros(40), rows)
+    (tmp_path / "labels").mkdir()
+    label_files.write_file(tmp_path / "labels/labels.parquet", file, "more")
+    assert main(["adapt", "--labels-from", "labels", "--out", "better"]) == 0
+    assert "action: " in capsys.readouterr().out
+    moved = np.asarray(cl.load_policy("better")(obs)) - asked
+    assert np.median(moved[:, 0]) > EPS
+    np.testing.assert_allclose(moved[:, 1:], 0, atol=0.02)

@@ -2,6 +2,7 @@
 
 import re
 
+import jax
 import numpy as np
 import pytest
 import recorded_situations as recorded
@@ -14,6 +15,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.labelling import controls, view
 from cuelearner_jax.labelling.questions import Item
+from cuelearner_jax.reading import Reading
 from cuelearner_jax.spaces import UNSAID, Box, cues_from
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import fetch_layout
@@ -121,6 +123,23 @@ def test_one_press_about_one_cue_says_nothing_of_the_others():
     assert said.keys() == {f"only-{cue}-{way}" for cue in range(3) for way in ("more", "less")} | {"rest"}
     np.testing.assert_array_equal(said["only-1-less"], [UNSAID, -1.0, UNSAID])
     np.testing.assert_array_equal(said["rest"], [0.0, 0.0, 0.0])
+
+
+def test_entries_that_no_cue_names_are_not_asked_about():
+    cues = cues_from("grip=open,close", ("pan", "lift", "grip"))
+    space = Box((-1.0,) * 3, (1.0,) * 3, cues)
+    known = controls.controls(RELATIVE, space)
+    assert {one.cue for one in known.values()} == {None, 2}
+    more = known["pick-2-more"].answer[0]
+    np.testing.assert_array_equal(controls.answer_of(space, known["rest"], None, {2: more}), [UNSAID, UNSAID, 1.0])
+    np.testing.assert_array_equal(controls.answer_of(space, known["rest"], None, {}), [UNSAID, UNSAID, 0.0])
+    reading = Reading(lambda obs: obs, (), space, 0.1, 20)
+    rows = np.zeros((8, 3), np.float32)
+    asked = reading.questions(rows, 8, jax.random.key(0))[1]
+    assert (asked[:, :2] == 0).all()
+    assert (asked[:, 2] != 0).all()
+    with pytest.raises(UserError, match="cues name jaw, but the entries of an action are pan, lift, grip"):
+        cues_from("jaw=open,close", ("pan", "lift", "grip"))
 
 
 def test_a_script_labels_a_folder_by_the_command_and_labels_of_others_are_refused(folder, tmp_path, capsys):

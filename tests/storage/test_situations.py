@@ -11,6 +11,7 @@ import pytest
 import recorded_situations as recorded
 from PIL import Image
 
+from cuelearner_jax.environment import BASE, PROPOSED
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import situations
 
@@ -68,6 +69,39 @@ def test_parts_nested_names_and_booleans_of_a_lerobot_dataset_are_read(tmp_path)
     assert found.entries == ("left: x", "left: grip", "open: open")
     np.testing.assert_array_equal(found.actions, np.c_[actions[:, :2], actions[:, 2] > 0])
     np.testing.assert_array_equal(found.observations, observations)
+
+
+def test_pictures_alone_are_read_as_proposed_actions_and_interventions_left_out(tmp_path):
+    _, actions = recorded.write_lerobot(tmp_path / "set")
+    path = tmp_path / "set/meta/info.json"
+    info = json.loads(path.read_text())
+    del info["features"]["observation.state"]
+    info["features"]["intervention"] = {"dtype": "bool", "shape": [1], "names": None}
+    path.write_text(json.dumps(info))
+    for file in (tmp_path / "set/data/chunk-000").iterdir():
+        stored = pq.read_table(file)
+        took_over = pa.array([frame == 2 for frame in stored["frame_index"].to_pylist()])
+        pq.write_table(stored.append_column("intervention", took_over), file)
+    found = situations.read(tmp_path / "set")
+    rows = [row for row in range(12) if row not in (2, 7)]
+    np.testing.assert_array_equal(found.actions, actions[rows])
+    np.testing.assert_array_equal(found.observations, found.actions)
+    assert [(one.name, one.kind) for one in found.slices] == [(BASE, PROPOSED)]
+    shade = np.asarray(Image.open(io.BytesIO(found.picture(6).data)).convert("L")).mean()
+    assert shade == pytest.approx(20 * rows[6], abs=4)
+
+
+def test_proposed_actions_are_part_of_what_is_observed(tmp_path):
+    bounds = json.dumps({"low": [-1.0], "high": [2.0]})
+    columns = GOOD | {"phase": [0.0, 0.5], "text": ["pick", ""]}
+    (tmp_path / "there").mkdir()
+    pq.write_table(
+        pa.table(columns).replace_schema_metadata({"cuelearner": bounds}), tmp_path / "there/situations.parquet"
+    )
+    found = situations.read(tmp_path / "there")
+    np.testing.assert_array_equal(found.observations, [[0.0, 1.0, 0.0, 0.5], [2.0, 3.0, 0.5, 0.25]])
+    assert [(one.name, one.size) for one in found.slices] == [("observation", 2), ("phase", 1), (BASE, 1)]
+    assert (found.bounds, found.text(0)) == (([-1.0], [2.0]), "pick")
 
 
 def table(folder, **columns):

@@ -1,0 +1,182 @@
+"""Export a correction of proposed actions into a copy of a LeRobot checkpoint, as steps of its processors.
+
+The steps are those of the small package `lerobot_processor_cuelearner`, which needs no JAX. Their state holds the
+correction's arrays and golden cases, which are replayed whenever the checkpoint is loaded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import struct
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax.environment import BASE, actions_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import Heuristic
+from cuelearner_jax.reading import Read
+from cuelearner_jax.reading.families import ACTIONS_ALONE
+from cuelearner_jax.spaces import Box
+from cuelearner_jax.storage.situations import PHASE
+from cuelearner_jax.storage.whole import is_used, place_of
+
+NAME = "lerobot"
+ABOUT = "for LeRobot: the checkpoint of --policy with the correction in its processors"
+VERSION = 1  # of the arrays, as the steps read them
+STEPS = "lerobot_processor_cuelearner.steps"
+STATE_FILE = "policy_postprocessor_cuelearner.safetensors"
+PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
+RELATIVE, NORMALIZER, UNNORMALIZER = "relative_actions_processor", "normalizer_processor", "unnormalizer_processor"
+CASES = 64
+Arrays = dict[str, np.ndarray]
+
+
+def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: Path) -> Path:
+    """Write a checkpoint with the correction; the folder appears completely or not at all. Return its path.
+
+    Args:
+        policy: a corrected policy of proposed actions.
+        env: its situations.
+        names: names of the action's entries; empty: none are known.
+        checkpoint: the folder with the checkpoint's `config.json` and processors.
+        out: the folder to write.
+
+    Raises:
+        UserError: a policy without such a correction, a checkpoint of another robot, or of relative actions.
+    """
+    with place_of(out, _check_unused) as place:
+        space, arrays = actions_of(env), arrays_of(policy, env)
+        config, pre, post = (_read(checkpoint / name) for name in ("config.json", PRE, POST))
+        state_size = env.obs_size - 1 - space.size
+        _check(checkpoint, config, {"observation.state": state_size, "action": space.size}, names)
+        _check_steps(checkpoint, pre, post)
+        digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays.values())).hexdigest()[:16]
+        more = {"chunk": int(config.get("n_action_steps") or 1), "version": VERSION}
+        pre["steps"].insert(_place(pre, NORMALIZER), _step("StateStep", digest))
+        post["steps"].insert(_place(post, UNNORMALIZER) + 1, _step("CorrectStep", digest, more))
+        post["steps"][_place(post, UNNORMALIZER) + 1]["state_file"] = STATE_FILE
+        post["steps"].insert(0, _step("PlaceStep", digest))
+        with place.writing() as folder:
+            shutil.copytree(checkpoint, folder, dirs_exist_ok=True)
+            for name, contents in ((PRE, pre), (POST, post)):
+                (folder / name).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
+            (folder / STATE_FILE).write_bytes(safetensors(arrays))
+        return out
+
+
+def arrays_of(policy: Any, env: Any) -> Arrays:
+    """Return the arrays of a correction and its golden cases, as the steps read them.
+
+    Raises UserError for a policy that is no correction of proposed actions, or that changes nothing.
+    """
+    space = actions_of(env)
+    sound = isinstance(policy, Read) and isinstance(policy.base, Heuristic) and policy.family == ACTIONS_ALONE
+    if not sound or not isinstance(space, Box) or [part.name for part in env.observation[-2:]] != [PHASE, BASE]:
+        raise UserError(
+            "this policy is no correction of proposed actions: label situations that the package "
+            "lerobot_processor_cuelearner wrote, and adapt by --labels-from alone"
+        )
+    own = policy.correction
+    known, alpha = (np.asarray(part) for part in (own.known, own.alpha))
+    used = np.abs(alpha).max(-1, initial=0) > 0
+    if not used.any() and not np.any(np.asarray(own.change.action)):
+        raise UserError("the answers asked for no change that was used, so there is nothing to export: ask for more")
+    obs = golden_observations(env)
+    act = jax.jit(lambda obs: policy.act(jax.random.key(0), None, obs))
+    arrays = {
+        "low": space.low,
+        "high": space.high,
+        "mean": own.frame.mean,
+        "deviation": jnp.where(own.frame.varies > 0, own.frame.deviation, jnp.inf),
+        "known": known[used],
+        "alpha": alpha[used],
+        "length": own.length,
+        "beta": own.change.action,
+        "scale": own.scale,
+        "bound": policy.bound,
+        "golden_obs": obs,
+        "golden_action": act(jnp.asarray(obs)),
+    }
+    return {name: np.asarray(array, np.float32) for name, array in arrays.items()}
+
+
+def golden_observations(env: Any) -> np.ndarray:
+    """Return labelled situations, and as many with other phases and actions (cases, obs)."""
+    space, rows = actions_of(env), np.asarray(env.rows, np.float32)
+    rows = rows[:: max(1, len(rows) // (CASES // 2))][: CASES // 2]
+    k_phase, k_action = jax.random.split(jax.random.key(0))
+    others = rows.copy()
+    others[:, -1 - space.size] = np.asarray(jax.random.uniform(k_phase, (len(rows),)))
+    others[:, -space.size :] = np.asarray(space.sample(k_action, (len(rows),)))
+    return np.concatenate([rows, others])
+
+
+def safetensors(arrays: Arrays) -> bytes:
+    """Return 32-bit arrays as the contents of a safetensors file."""
+    head, end = {}, 0
+    for name, array in arrays.items():
+        start, end = end, end + array.nbytes
+        head[name] = {"dtype": "F32", "shape": list(array.shape), "data_offsets": [start, end]}
+    text = json.dumps(head).encode()
+    text += b" " * (-len(text) % 8)
+    return struct.pack("<Q", len(text)) + text + b"".join(array.tobytes() for array in arrays.values())
+
+
+def _check_unused(out: Path) -> None:
+    if is_used(out):
+        raise UserError(f"{out} is not empty: give another --out")
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{path} cannot be read: give --policy a LeRobot checkpoint, a folder pretrained_model"
+        ) from error
+
+
+def _check(checkpoint: Path, config: dict[str, Any], sizes: dict[str, int], names: tuple[str, ...]) -> None:
+    """Raise UserError for the checkpoint of another robot."""
+    features = {**config.get("input_features", {}), **config.get("output_features", {})}
+    for name, size in sizes.items():
+        if (shape := features.get(name, {}).get("shape")) != [size]:
+            own = f"has {shape[0]} entries" if shape else "is missing"
+            raise UserError(
+                f"{name} {own} in {checkpoint}, and {size} in the correction: give the checkpoint whose actions were "
+                "labelled"
+            )
+    own = tuple(config.get("action_feature_names") or ())
+    if own and names and own != names:
+        raise UserError(
+            f"{checkpoint} moves {', '.join(own)}, the correction {', '.join(names)}: give the labelled one"
+        )
+
+
+def _check_steps(checkpoint: Path, pre: dict[str, Any], post: dict[str, Any]) -> None:
+    """Raise UserError for processors that a correction cannot join."""
+    steps = [*pre["steps"], *post["steps"]]
+    if any(step.get("registry_name") == RELATIVE and step.get("config", {}).get("enabled") for step in steps):
+        raise UserError(
+            f"{checkpoint} has relative actions, whose chunks a correction would lead astray: give a policy of "
+            "absolute actions"
+        )
+    if any(step.get("class", "").startswith(STEPS) for step in steps):
+        raise UserError(f"{checkpoint} holds a correction already: give the checkpoint that it was made from")
+    for name, of, wanted in ((PRE, pre, NORMALIZER), (POST, post, UNNORMALIZER)):
+        if wanted not in [step.get("registry_name") for step in of["steps"]]:
+            raise UserError(f"{checkpoint / name} has no {wanted}, beside which a correction acts: give another policy")
+
+
+def _place(pipeline: dict[str, Any], name: str) -> int:
+    return [step.get("registry_name") for step in pipeline["steps"]].index(name)
+
+
+def _step(name: str, pair: str, more: dict[str, Any] | None = None) -> dict[str, Any]:
+    return {"class": f"{STEPS}.{name}", "config": {"pair": pair, **(more or {})}}

@@ -1,0 +1,124 @@
+"""A correction of proposed actions in a copy of a LeRobot checkpoint: its files, its golden cases, what is refused."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_jax.environment import BASE
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.export import lerobot
+from cuelearner_jax.policies import Heuristic
+from cuelearner_jax.reading import Read
+from cuelearner_jax.reading.families import ACTIONS_ALONE
+from cuelearner_jax.reading.policy import unread
+from cuelearner_jax.tasks import logs
+
+PLUGIN = Path(__file__).parents[2] / "plugins/lerobot_processor_cuelearner/lerobot_processor_cuelearner"
+CONFIG = logs.LogsConfig(
+    names=("x", "y", "phase", BASE), entries=(1, 1, 1, 2), low=(-1.0, 0.0), high=(1.0, 4.0), rows=20
+)
+ROBOT = {
+    "input_features": {"observation.state": {"type": "STATE", "shape": [2]}},
+    "output_features": {"action": {"type": "ACTION", "shape": [2]}},
+    "n_action_steps": 5,
+}
+
+
+def step(name, **config):
+    return {"registry_name": name, "config": config}
+
+
+def checkpoint(folder, robot=ROBOT, more=()):
+    """Write the parts of a checkpoint that matter here."""
+    folder.mkdir()
+    pre = [step("to_batch_processor"), *more, step("normalizer_processor")]
+    post = [step("unnormalizer_processor"), step("device_processor")]
+    for name, contents in (
+        ("config", robot),
+        ("policy_preprocessor", {"steps": pre}),
+        ("policy_postprocessor", {"steps": post}),
+    ):
+        (folder / f"{name}.json").write_text(json.dumps(contents))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def env():
+    random = np.random.default_rng(0)
+    actions = random.uniform(CONFIG.low, CONFIG.high, (20, 2))
+    rows = np.concatenate([random.uniform(0, 9, (20, 2)), random.uniform(0, 1, (20, 1)), actions], 1)
+    return logs.filled(CONFIG, rows.astype(np.float32), actions.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def policy(env) -> Read:
+    """A correction with a shift, gains and a process of the state and the phase; one entry never changed."""
+    read = unread(Heuristic(env.view()), env.actions, ACTIONS_ALONE, env.obs_size, labels=6)
+    random = lambda number, *shape: jax.random.normal(jax.random.key(number), shape)  # noqa: E731
+    change = read.correction.change.replace(action=0.3 * random(0, 2, 3))
+    frame = read.correction.frame.replace(
+        mean=jnp.full(5, 2.0), deviation=jnp.full(5, 3.0), varies=jnp.ones(5).at[1].set(0.0)
+    )
+    own = {"known": random(1, 6, 7), "alpha": random(2, 6, 2), "length": jnp.full(7, 1.5), "scale": jnp.float32(0.1)}
+    correction = read.correction.replace(change=change, frame=frame, **own)
+    return read.replace(correction=correction, bound=jnp.float32(0.2))
+
+
+def test_a_checkpoint_gets_the_steps_the_arrays_and_the_golden_cases(env, policy, tmp_path):
+    lerobot.write(policy, env, (), checkpoint(tmp_path / "before"), tmp_path / "after")
+    pre, post = (json.loads((tmp_path / "after" / name).read_text())["steps"] for name in (lerobot.PRE, lerobot.POST))
+    named = lambda steps: [one.get("registry_name") or one["class"].rpartition(".")[2] for one in steps]  # noqa: E731
+    assert named(pre) == ["to_batch_processor", "StateStep", "normalizer_processor"]
+    assert named(post) == ["PlaceStep", "unnormalizer_processor", "CorrectStep", "device_processor"]
+    assert post[2]["config"] == {"pair": pre[1]["config"]["pair"], "chunk": 5, "version": lerobot.VERSION}
+
+
+def test_the_steps_decide_as_jax_does(env, policy, tmp_path):
+    torch = pytest.importorskip("torch")
+    spec = importlib.util.spec_from_file_location("correction", PLUGIN / "correction.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    arrays = {name: torch.tensor(array) for name, array in lerobot.arrays_of(policy, env).items()}
+    decide = module.Correction(arrays)  # replays the golden cases
+    beyond = torch.tensor([[-3.0, -2.0], [-3.0, -2.0], [0.5, 2.0]])
+    moved = decide(torch.zeros(3, 2), torch.tensor([0.0, 1.0, 1.0]), beyond) - beyond
+    at_bound = decide(torch.zeros(1, 2), torch.tensor([1.0]), torch.tensor([[-1.0, 0.0]])) - torch.tensor([[-1.0, 0.0]])
+    assert torch.allclose(moved[1], at_bound[0], atol=1e-6)  # as far as the action at the bounds
+    assert not torch.allclose(moved[0], moved[1], atol=1e-3)  # the phase matters
+    with pytest.raises(ValueError, match="decides golden cases otherwise"):
+        module.Correction(arrays | {"beta": arrays["beta"] + 0.1})
+    with pytest.raises(ValueError, match="state and action have 3 and 2 entries"):
+        decide(torch.zeros(1, 3), torch.zeros(1), beyond[:1])
+
+
+@pytest.mark.parametrize(
+    ("robot", "more", "told"),
+    [
+        ({"input_features": {"observation.state": {"shape": [6]}}}, (), "observation.state has 6 entries"),
+        ({"output_features": {"action": {"shape": [7]}}}, (), "action has 7 entries"),
+        ({"input_features": {}}, (), "observation.state is missing"),
+        ({"action_feature_names": ["pan", "lift"]}, (), "moves pan, lift, the correction x, y"),
+        ({}, (step("relative_actions_processor", enabled=True),), "has relative actions"),
+        ({}, ({"class": f"{lerobot.STEPS}.StateStep", "config": {}},), "holds a correction already"),
+    ],
+)
+def test_a_checkpoint_of_another_robot_is_refused(robot, more, told, env, policy, tmp_path):
+    before = checkpoint(tmp_path / "before", ROBOT | robot, more)
+    with pytest.raises(UserError, match=told):
+        lerobot.write(policy, env, ("x", "y"), before, tmp_path / "after")
+    assert not (tmp_path / "after").exists()
+
+
+def test_what_is_no_correction_of_proposed_actions_is_refused(env, policy):
+    for other, told in (
+        (policy.replace(family=()), "is no correction of proposed actions"),
+        (policy.base, "is no correction of proposed actions"),
+        (unread(policy.base, env.actions, ACTIONS_ALONE, env.obs_size), "asked for no change"),
+    ):
+        with pytest.raises(UserError, match=told):
+            lerobot.arrays_of(other, env)
