@@ -2,7 +2,7 @@
 
     python experiments/zoo.py --cues 3 --robots 28 --seeds 4 --out runs/zoo        # one group of robots
     python experiments/zoo.py --table runs/zoo --seeds 4                            # of all groups there
-    python experiments/zoo.py --table docs/data --seeds 1 --record                  # what the page shows
+    python experiments/zoo.py --table docs/data/zoo.parquet --seeds 1 --record      # what the page shows
 
 Each robot meets every error of `cuelearner_envs.zoo.ERRORS`, and a teacher who errs or speaks of one cue alone. Base
 and corrected policy then play `JUDGED` episodes for the sequential test, and others that are reported. Nothing is
@@ -367,12 +367,11 @@ def main() -> None:
     parser.add_argument("--split", choices=("tuning", "held_out"), default="held_out")
     parser.add_argument("--at-once", type=int, default=420, help="cells side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/zoo"), help="folder for a Parquet file a group")
-    parser.add_argument("--table", type=Path, help="print the table of this folder, and measure nothing")
+    parser.add_argument("--table", type=Path, help="print the table of this file or folder, and measure nothing")
     parser.add_argument("--record", action="store_true", help="with --table: write the figure's numbers")
     options = parser.parse_args()
     if options.table:
-        tables = [pq.read_table(file) for file in sorted(options.table.glob("*.parquet"))]
-        rows = [row for part in tables for row in part.to_pylist() if row["seed"] < options.seeds]
+        rows = [row for row in pq.read_table(options.table).to_pylist() if row["seed"] < options.seeds]
         table(rows)
         if options.record:
             record(rows)
