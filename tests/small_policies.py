@@ -7,7 +7,7 @@ import numpy as np
 import probes
 
 from cuelearner_jax.adaptation.by_model import AdaptationResult
-from cuelearner_jax.adaptation.by_reading import Evidence, ReadingAdaptation
+from cuelearner_jax.adaptation.by_reading import ReadingAdaptation, ReadingLanes
 from cuelearner_jax.adaptation.judging import Judgement
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, begin
 from cuelearner_jax.config import GuideSizes
@@ -51,7 +51,7 @@ def write(folder, overwrite=False, origin="run", read=False):
         nothing = unread(None, actions_of(ENV), of.family, ENV.obs_size).correction
         both = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), nothing)
         yes = np.ones(2, bool)
-        block = Evidence(LANES.base, both, block.labels, block.bound, yes, np.zeros(2), yes, ~yes)
+        block = ReadingLanes(LANES.base, both, block.labels, block.bound, yes, np.zeros(2), yes, ~yes)
     found = AdaptationResult(of, LANES, block, judged)
     with policy_folders.place_of(folder, overwrite) as place:
         adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})

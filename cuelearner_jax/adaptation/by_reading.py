@@ -59,7 +59,7 @@ class ReadingAdaptation(Adaptation):
         return unread(base, actions_of(self.env), self.family, self.env.obs_size, labels, mixed)
 
 
-class Evidence(struct.PyTreeNode):
+class ReadingLanes(struct.PyTreeNode):
     """A block of lanes with their answers and corrections."""
 
     base: Int[Array, " lanes"]
@@ -99,7 +99,7 @@ def adapt(
         results.append(reading.result())
         asked += budget
         tell(asked, total)
-    block = Evidence(
+    block = ReadingLanes(
         base=jnp.asarray(lanes.base),
         correction=_stacked([one.policy.correction for one in results]),
         labels=_padded(rows) if labels is None else labels,

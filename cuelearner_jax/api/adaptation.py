@@ -31,7 +31,7 @@ from cuelearner_jax.environment import Environment, Spaces, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Reading
+from cuelearner_jax.guides.base import ReadingGuide
 from cuelearner_jax.policies import ONNX, Common, policy_of
 from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
@@ -215,7 +215,7 @@ def correct(
     *,
     bound: float | None = None,
     eps: float | None = None,
-    guidance: str = Reading.name,
+    guidance: str = ReadingGuide.name,
     cues: str | Sequence[Any] = "",
     low: Sequence[float] | np.ndarray | None = None,
     high: Sequence[float] | np.ndarray | None = None,

@@ -25,7 +25,7 @@ from cuelearner_jax.types import Step
 Heuristic = Callable[[Float[Array, " obs"]], Float[Array, " action"]]
 
 
-class Running(struct.PyTreeNode):
+class SimulatorState(struct.PyTreeNode):
     """State of a `JaxEnvironment` between steps."""
 
     state: Any  # the simulator's state
@@ -46,15 +46,17 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     actions: Space = struct.field(pytree_node=False)
     heuristic: Heuristic | None = struct.field(pytree_node=False, default=None)
 
-    def reset(self, key: PRNGKeyArray) -> tuple[Running, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[SimulatorState, Float[Array, " obs"]]:
         """Start an episode."""
         state = jax.tree.map(jnp.asarray, self.simulator().reset(jax.random.key_data(key)))
-        return Running(state, jnp.zeros((), jnp.int32)), flat(state.obs)
+        return SimulatorState(state, jnp.zeros((), jnp.int32)), flat(state.obs)
 
-    def step(self, key: PRNGKeyArray, state: Running, action: Float[Array, " action"]) -> tuple[Running, Step]:
+    def step(
+        self, key: PRNGKeyArray, state: SimulatorState, action: Float[Array, " action"]
+    ) -> tuple[SimulatorState, Step]:
         """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
         before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into their input dictionaries
-        after = Running(jax.tree.map(jnp.asarray, self.simulator().step(before, action)), state.steps + 1)
+        after = SimulatorState(jax.tree.map(jnp.asarray, self.simulator().step(before, action)), state.steps + 1)
         stopped = jnp.asarray(after.state.info.get("truncation", 0)) > 0
         terminated = (after.state.done > 0) & ~stopped
         truncated = (stopped | (after.steps >= self.max_steps)) & ~terminated
@@ -76,7 +78,7 @@ class FixedSimulator(NamedTuple):
         return self.simulator
 
 
-class Layout(NamedTuple):
+class Interface(NamedTuple):
     """The sizes and names of a simulator's observations and actions, as policies need them."""
 
     slices: tuple[str, ...]  # names of an observation's slices, in their order
@@ -94,7 +96,7 @@ class Layout(NamedTuple):
         return Box((-1.0,) * size, (1.0,) * size, tuple(cues) or box.plain_cues(self.entries))
 
 
-def layout_of(simulator: Any, name: str) -> Layout:
+def layout_of(simulator: Any, name: str) -> Interface:
     """Return the layout of a simulator without compiling. `name`: the simulator's, for messages.
 
     Raises UserError for a batch of several, a hidden end of episodes, or images.
@@ -110,7 +112,7 @@ def layout_of(simulator: Any, name: str) -> Layout:
         if len(shape) > 1 or part.startswith("pixels"):
             raise UserError(f"{name}: the observation {part!r} is an image {shape}: give numbers (n,), as its state")
     parts, sizes = tuple(part for part, _ in slices), tuple(math.prod(shape) for _, shape in slices)
-    return Layout(parts, sizes, _entries_of(simulator, int(simulator.action_size)))
+    return Interface(parts, sizes, _entries_of(simulator, int(simulator.action_size)))
 
 
 def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:

@@ -13,11 +13,11 @@ from cuelearner_jax.export import contract, correction, decisions, lerobot
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.runs import trained
 from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.studies.lanes import Lane
+from cuelearner_jax.studies.lanes import LaneChoice
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Finished, Lane):
+class Export(Finished, LaneChoice):
     """Write a policy as a file for a robot, with a contract; --check FOLDER replays one.
 
     The contract tells what goes in and comes out. For --format lerobot, --policy is the folder of a checkpoint."""

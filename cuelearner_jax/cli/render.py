@@ -9,11 +9,11 @@ from pathlib import Path
 from cuelearner_jax.cli.options import Finished, Flag, check_numbers, out
 from cuelearner_jax.cli.sources import source_and_options
 from cuelearner_jax.runs import filming
-from cuelearner_jax.studies.lanes import Lane
+from cuelearner_jax.studies.lanes import LaneChoice
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Finished, Lane):
+class Render(Finished, LaneChoice):
     """Draw a still and a film of a policy at work, or the picture of a question."""
 
     out: Path = Path("pictures")

@@ -243,7 +243,7 @@ class AnyAim(NoGuide):
         return replaced(goals, actions, active & has_aim)
 
 
-class Reading(NoGuide):
+class ReadingGuide(NoGuide):
     """Answers as intervals for the right action, which say what changed in the world.
 
     No network is fitted and no action refined: `cuelearner_jax.reading` reads the answers, outside compiled programs.

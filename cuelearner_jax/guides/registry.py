@@ -14,7 +14,7 @@ from cuelearner_jax import plugins
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides.base import AnyAim, Guide, HeuristicGuide, NoGuide, Reading
+from cuelearner_jax.guides.base import AnyAim, Guide, HeuristicGuide, NoGuide, ReadingGuide
 from cuelearner_jax.guides.bdcoach import BatchCoach
 from cuelearner_jax.guides.clic import Clic, ClicShown
 from cuelearner_jax.guides.dcoach import DeepCoach
@@ -26,7 +26,7 @@ from cuelearner_jax.guides.scalar import Scalar
 ENTRY_POINTS = "cuelearner.guidances"
 BUILT_IN: tuple[type[Guide], ...] = (
     *(NoGuide, Relative, Intent, HeuristicGuide, AnyAim, Demonstration, Scalar),
-    *(DeepCoach, Reading, BatchCoach, Clic, ClicShown),
+    *(DeepCoach, ReadingGuide, BatchCoach, Clic, ClicShown),
 )
 
 

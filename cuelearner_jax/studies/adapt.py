@@ -31,7 +31,7 @@ from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import Guide, Reading
+from cuelearner_jax.guides.base import Guide, ReadingGuide
 from cuelearner_jax.policies import Common, lanes_in, policy_of
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
@@ -106,7 +106,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     """Number of seeds. Several base policies are each adapted with their own seed, so leave this out then."""
     first_seed: int = 0
     """First seed; the others count up from it."""
-    guidance: str = Reading.name
+    guidance: str = ReadingGuide.name
     """Kind of guidance: what is asked, and what a model makes of the answers."""
     labels_from: Path | None = None
     """Label file to use instead of asking the teacher."""
@@ -149,7 +149,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             scalars: complete values in place of the defaults.
         """
         rules = task.scenario(scenario) if task and scenario else AS_IT_IS
-        kind = guidances.resolve(guidance or rules.guidance or Reading.name)
+        kind = guidances.resolve(guidance or rules.guidance or ReadingGuide.name)
         if kind.name != rules.guidance:
             rules = replace(rules, sizes={}, scalars={}, options={})  # these apply to the suggested kind
             if kind.by_evidence:

@@ -10,7 +10,7 @@ from cuelearner_jax.runs.trained import PolicySource
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lanes:
+class LanesChoice:
     """Choice of a folder's policy, and of its lanes but for their seeds."""
 
     policy: str | None = None
@@ -30,7 +30,7 @@ class Lanes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lane(Lanes):
+class LaneChoice(LanesChoice):
     """Choice of a folder's policy, and of its lane."""
 
     seed: int | None = None
@@ -43,7 +43,7 @@ class Lane(Lanes):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaseLanes(Lanes):
+class BaseLanes(LanesChoice):
     """Choice of the lanes of the folder to adapt."""
 
     seeds: tuple[int, ...] = ()

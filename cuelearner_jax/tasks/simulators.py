@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number, check_word
-from cuelearner_jax.bridges.brax import JaxEnvironment, Layout, layout_of
+from cuelearner_jax.bridges.brax import Interface, JaxEnvironment, layout_of
 from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
 from cuelearner_jax.tasks.presets import quickstart
@@ -58,7 +58,7 @@ class Simulator(NamedTuple):
     family: str
     environment: str
     backend: str
-    layout: Layout
+    layout: Interface
 
     def __call__(self) -> Any:
         """Return the simulator. Raises UserError if its library has none, or one of another layout."""
@@ -120,7 +120,7 @@ def make_environment(family: str, config: Any, split: str = "training") -> JaxEn
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     if backend := getattr(config, "backend", ""):
         check_word("backend", backend, get_args(Backend))
-    layout = Layout(config.slices, config.slice_sizes, config.entries)
+    layout = Interface(config.slices, config.slice_sizes, config.entries)
     whole = config.environment and layout.entries and len(layout.slices) == len(layout.sizes)
     if not whole or min(layout.sizes, default=0) < 1:
         raise UserError(

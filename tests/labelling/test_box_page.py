@@ -19,7 +19,9 @@ def planned(**options):
     """What `cuelearner label` plans for the task."""
     config = TASK.presets["paper"].config
     options = {"labels": 20, "guidance": "relative", **options}
-    asked = label.Label(task=config.task, sizes=config.sizes, scalars=SCALARS, out=label.Path("labels"), **options)
+    asked = label.LabelOptions(
+        task=config.task, sizes=config.sizes, scalars=SCALARS, out=label.Path("labels"), **options
+    )
     return label.make_plan(TASK, config, asked)
 
 

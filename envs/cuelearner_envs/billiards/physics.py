@@ -48,7 +48,7 @@ class Trajectory:
     pocketed: Bool[Array, "knots balls"]
 
 
-class Motion(NamedTuple):
+class ShotState(NamedTuple):
     """State of a shot between two events. Velocities are per unit of warped time."""
 
     x: Float[Array, "balls"]  # [m]
@@ -100,7 +100,7 @@ def slice_length(table: Table) -> Float[Array, ""]:
     return jnp.where(strength > 0.0, jnp.sqrt(8.0 * BEND / jnp.where(strength > 0.0, strength, 1.0)), 1.0)
 
 
-def next_contact(table: Table, motion: Motion) -> Contact:
+def next_contact(table: Table, motion: ShotState) -> Contact:
     """The earliest among all contacts of balls with each other and with the table's edge."""
     n, out = table.balls, motion.pocketed
     pairs = [(i, j) for i in range(n) for j in range(i + 1, n)]
@@ -121,7 +121,7 @@ def next_contact(table: Table, motion: Motion) -> Contact:
     return Contact(wait, a, b, of(edge.centre_x, a), of(edge.centre_y, a), jnp.any(edge.falls & a) & ~jnp.any(b))
 
 
-def time_to_stop(table: Table, motion: Motion, unseen: Scalar) -> Float[Array, ""]:
+def time_to_stop(table: Table, motion: ShotState, unseen: Scalar) -> Float[Array, ""]:
     """Return the warped time until every ball is slower than the stop speed; exact if no ball changes direction.
 
     Along its direction a ball obeys dv/dt = a - lambda v, `unseen` being the kick due since the last one applied.
@@ -142,7 +142,7 @@ def of(value: Float[Array, "balls"], ball: Bool[Array, "balls"]) -> Float[Array,
     return jnp.sum(jnp.where(ball, value, 0.0))
 
 
-def impact(table: Table, motion: Motion, contact: Contact, unseen: Scalar) -> Motion:
+def impact(table: Table, motion: ShotState, contact: Contact, unseen: Scalar) -> ShotState:
     """Apply the impulses of a contact that is now, between balls a and b or between a and a cushion."""
     a, b, paired = contact.a, contact.b, jnp.any(contact.b)
     discs = jnp.where(paired, 2.0, 1.0)
@@ -167,7 +167,7 @@ def impact(table: Table, motion: Motion, contact: Contact, unseen: Scalar) -> Mo
     )
 
 
-def step(table: Table, motion: Motion) -> Motion:
+def step(table: Table, motion: ShotState) -> ShotState:
     """Fly to the next event and apply it: a contact, a kick or the stop. Nothing changes once the shot is over."""
     rate, slice_ = drag(table), slice_length(table)
     gx, gy = table.acceleration[0], table.acceleration[1]
@@ -195,7 +195,7 @@ def step(table: Table, motion: Motion) -> Motion:
     pocketed = motion.pocketed | falling
     flying = ~pocketed & ~stops
     place_x, place_y = parking_place(table, jnp.arange(table.balls))
-    return Motion(
+    return ShotState(
         x=jnp.where(falling, place_x, hit.x),
         y=jnp.where(falling, place_y, hit.y),
         ux=jnp.where(flying, hit.ux + gx * gain, 0.0),
@@ -214,7 +214,7 @@ def strike(
     positions: Float[Array, "balls 2"],
     pocketed: Bool[Array, "balls"],
     angle: Float[Array, ""],
-) -> Motion:
+) -> ShotState:
     """The cue ball leaves without spin in the direction `angle`; every ball has had the first half kick."""
     rest, zero = jnp.zeros_like(positions[:, 0]), jnp.zeros_like(angle)
     struck = jnp.arange(table.balls) == 0
@@ -222,7 +222,7 @@ def strike(
     gx, gy = table.acceleration[0] * half, table.acceleration[1] * half
     place_x, place_y = parking_place(table, jnp.arange(table.balls))
     count = jnp.zeros((), jnp.int32)
-    return Motion(
+    return ShotState(
         x=jnp.where(pocketed, place_x, positions[:, 0]),
         y=jnp.where(pocketed, place_y, positions[:, 1]),
         ux=jnp.where(pocketed, 0.0, gx + jnp.where(struck, table.strike_speed * jnp.cos(angle), 0.0)),
@@ -291,7 +291,7 @@ def trace(
     table = as_arrays(table, positions.dtype)
     start = strike(table, positions, jnp.asarray(pocketed, bool), jnp.asarray(angle, positions.dtype))
 
-    def keep(motion: Motion, _: None) -> tuple[Motion, Motion]:
+    def keep(motion: ShotState, _: None) -> tuple[ShotState, ShotState]:
         after = step(table, motion)
         return after, after
 

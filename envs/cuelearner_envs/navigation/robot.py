@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.navigation.geometry import clearance
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import NavigationWorld
 from cuelearner_jax.spaces.directions import from_angle, rotate, to_angle
 
 Scalar = float | Float[Array, ""]
@@ -73,7 +73,7 @@ def discs(robot: Robot, pose: Float[Array, "3"]) -> Float[Array, "3 2"]:
     return pose[None, :2] + along[:, None] * from_angle(pose[2])[None]
 
 
-def collides(robot: Robot, world: World, pose: Float[Array, "3"]) -> Bool[Array, ""]:
+def collides(robot: Robot, world: NavigationWorld, pose: Float[Array, "3"]) -> Bool[Array, ""]:
     """Whether the body touches a solid, or stands outside the walls."""
     centres = discs(robot, pose)
     touching = jax.vmap(lambda centre: clearance(world, centre))(centres) < robot.disc_radius

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_envs.zoo.robots import Robot, decode, dimensions, draw, network, policy, run_network, script
+from cuelearner_envs.zoo.robots import ZooRobot, decode, dimensions, draw, network, policy, run_network, script
 from cuelearner_envs.zoo.worlds import STEPS, rollout, unchanged
 
 SPLITS = {"tuning": 0, "held_out": 1}
@@ -20,7 +20,9 @@ BATCH = 256
 ENOUGH = 0.8  # success from which a network is used
 
 
-def robots(key: PRNGKeyArray, cues: int, count: int, split: str = "tuning", first: int | Int[Array, ""] = 0) -> Robot:
+def robots(
+    key: PRNGKeyArray, cues: int, count: int, split: str = "tuning", first: int | Int[Array, ""] = 0
+) -> ZooRobot:
     """Draw the robots `first`, ..., `first + count - 1` of a group. Leading axis of the result: count.
 
     The policies of odd robots are networks, unless a network succeeds in fewer than `ENOUGH` of the episodes. A robot
@@ -43,7 +45,7 @@ def robots(key: PRNGKeyArray, cues: int, count: int, split: str = "tuning", firs
     return jax.tree.map(lambda leaf, new: leaf.at[1::2].set(new), each, taught)
 
 
-def distil(key: PRNGKeyArray, robot: Robot) -> Robot:
+def distil(key: PRNGKeyArray, robot: ZooRobot) -> ZooRobot:
     """Return the robot with a network in place of its script, or the robot itself where the network succeeds less."""
     size, n = robot.unit.shape[0], dimensions(robot.cues)
     k_first, k_net, k_rounds, k_test = jax.random.split(key, 4)
@@ -82,7 +84,7 @@ def distil(key: PRNGKeyArray, robot: Robot) -> Robot:
     return jax.tree.map(lambda new, old: jnp.where(succeeds.mean() >= ENOUGH, new, old), pupil, robot)
 
 
-def _play(key: PRNGKeyArray, robot: Robot, episodes: int) -> tuple[Float[Array, "episodes steps obs"], Array]:
+def _play(key: PRNGKeyArray, robot: ZooRobot, episodes: int) -> tuple[Float[Array, "episodes steps obs"], Array]:
     """Return the observations and successes of a robot's policy where nothing is wrong."""
     act = lambda obs: policy(robot, obs)  # noqa: E731
     obs, _, _, done = jax.vmap(lambda key: rollout(key, unchanged(robot), act))(jax.random.split(key, episodes))

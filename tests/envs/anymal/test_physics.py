@@ -10,7 +10,7 @@ import pytest
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.locomotion import Locomotion, Trial, random_command
-from cuelearner_envs.anymal.physics import Ground
+from cuelearner_envs.anymal.physics import AnymalGround
 from cuelearner_envs.anymal.policy import OBS
 
 ROBOTS = 8
@@ -37,7 +37,7 @@ def scenes(env):
     qpos[5, :7] = [0, 0, 0.6, np.cos(0.7), np.sin(0.7), 0, 0]
     qpos[6, 2] = 0.25
     qvel[7, 0] = np.nan
-    ground = Ground(
+    ground = AnymalGround(
         friction=jnp.array([0.8, 0.8, 0.8, 0.3, 0.8, 0.8, 0.8, 0.8]), payload=jnp.array([0, 0, 0, 0, 6.0, 0, 0, 0])
     )
     walk = state.pipeline_state

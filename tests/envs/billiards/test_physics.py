@@ -58,7 +58,7 @@ def random_collisions(table, count, seed=0):
     u = np.where((closing < 0)[:, None, None], u[:, ::-1], u)  # ball a approaches b
     x = np.stack([a, a + 2 * r * n], 1)
     zero = jnp.zeros(count)
-    motion = physics.Motion(
+    motion = physics.ShotState(
         *(jnp.asarray(v) for v in (x[..., 0], x[..., 1], u[..., 0], u[..., 1], rng.normal(0, 0.2, (count, 2)))),
         pocketed=jnp.zeros((count, 2), bool), warped=zero, kicks=zero, events=zero, done=zero > 0,
     )  # fmt: skip
