@@ -74,9 +74,9 @@ def _print_measured(source: PolicySource, options: Evaluate, rows: list[Measured
         measurements.write(options.out, source, options.task, options.policy, envs, steps, rows, described, both)
     shares = f"{envs:,} episodes" if source.task.longest else f"{envs:,} environments of {steps // envs:,} steps"
     if compared is None:
-        out.print(_measurements(rows, title, shares))
+        out.print_table(_measurements(rows, title, shares))
     for difference in compared or ():
-        out.print(_comparison(difference, other, title, shares))
+        out.print_table(_comparison(difference, other, title, shares))
         out.print(_verdict(difference))
     if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in [*rows, *others]):
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
@@ -99,7 +99,7 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
     table = Table("", "share of answers", "95% interval", title=title)
     for row, share in found.rows():
         table.add_row(row, f"{share[0]:.3f}", "{1:.3f} to {2:.3f}".format(*share))
-    out.print(table)
+    out.print_table(table)
 
 
 def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
@@ -150,7 +150,7 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
         columns.pop("within", None)
     over = {
         "episodes": f"one policy: mean and bootstrap over {episodes}",
-        "seeds": "several seeds: interquartile mean and bootstrap over seeds",
+        "seeds": f"several seeds: interquartile mean and bootstrap over seeds and {episodes}",
     }
     caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, found))
     table = _table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
@@ -172,7 +172,7 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
     """Return a table of two policies side by side, with their difference."""
     mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
-    over = f"{episodes}, paired" if difference.over == "episodes" else "seeds (interquartile means)"
+    over = f"{episodes}, paired" if difference.over == "episodes" else f"seeds and {episodes} (interquartile means)"
     named = " against ".join(name + (f" ({told})" if told else "") for name, told in ((title, mine), (other, its)))
     caption = f"mean [95% bootstrap interval]; of the difference over {over}"
     table = _table("metric", "policy", "against", "difference", title=named, caption=caption, padding=0)

@@ -50,7 +50,7 @@ class Inspect:
             task = registry.find(str(files[0].task.get("name")))
             env = shape_of(task, comparing.world_of(task, files[0]))
             table.add_row("agree with each other", str(comparing.between(files[0], files[1], env)))
-        out.print(table)
+        out.print_table(table)
 
 
 @dataclass(frozen=True)

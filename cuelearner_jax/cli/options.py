@@ -18,6 +18,7 @@ from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
+from rich.table import Table
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -38,6 +39,16 @@ class _Output(Console):
     def on_broken_pipe(self) -> None:
         """Raise BrokenPipeError: the reader of the output has gone."""
         raise BrokenPipeError
+
+    def print_table(self, table: Table) -> None:
+        """Print a table whole: plain, a row a line, where there is no terminal or the table is wider than it."""
+        width = self.measure(table, options=self.options.update(max_width=10_000)).maximum
+        if not self.is_terminal or width > self.width:
+            table.box, table.caption, below = None, None, table.caption
+            self.print(table, width=max(width, 80))
+            self.print(below or "", end="\n" if below else "")
+        else:
+            self.print(table)
 
 
 out = _Output(**PLAIN)

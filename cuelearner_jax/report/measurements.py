@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.stats
 
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import mean_interval
-from cuelearner_jax.report.statistics import RESAMPLES, Interval, interquartile_mean, interval, resampled
+from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import replacing
@@ -31,10 +32,18 @@ def over(*rows: Measured) -> str:
 
 
 def spread(row: Measured, metric: str) -> Interval | None:
-    """Return one policy's mean over episodes, or the interquartile mean over seeds; None if a value is not finite."""
+    """Return one policy's mean over episodes, or the interquartile mean over seeds; None if a value is not finite.
+
+    The interval of several seeds draws seeds and episodes. Where all episodes succeed, or all fail, resampling has no
+    spread: the interval is then that of a share by Jeffreys' prior.
+    """
     if not np.isfinite(row.metrics[metric]).all():
         return None
-    return Interval(*mean_interval(row.each[metric][0])) if is_single(row) else interval(row.metrics[metric])
+    each = row.each[metric]
+    if each.min() == each.max() and each.min() in (0, 1) and each.size > 1:
+        certain = float(scipy.stats.beta.ppf(0.05, each.size + 0.5, 0.5))
+        return Interval(*map(np.asarray, (1.0, certain, 1.0) if each.min() else (0.0, 0.0, 1 - certain)))
+    return Interval(*mean_interval(each[0])) if is_single(row) else interval(row.metrics[metric], each=each)
 
 
 class Difference(NamedTuple):
@@ -79,12 +88,14 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
 def _less(row: Measured, other: Measured, name: str) -> Interval:
     if is_single(row) and is_single(other):
         return Interval(*mean_interval(row.each[name][0] - other.each[name][0]))
-    mine, its = row.metrics[name], other.metrics[name]
+    mine, its = row.each[name], other.each[name]
     if is_single(row) or is_single(other) or np.array_equal(row.seeds, other.seeds):
         mine, its = (values[:1] if is_single(of) else values for of, values in ((row, mine), (other, its)))
-        return interval(mine - its)
-    drawn = resampled(mine, RESAMPLES, seed=0) - resampled(its, RESAMPLES, seed=1)
-    return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(drawn, [0.025, 0.975]))
+        less = mine - its if mine.shape[1] == its.shape[1] else None
+        return interval(mine.mean(1) - its.mean(1), each=less)
+    drawn = resampled(mine.mean(1), each=mine) - resampled(its.mean(1), seed=1, each=its)
+    middle = interquartile_mean(mine.mean(1)) - interquartile_mean(its.mean(1))
+    return Interval(middle, *np.quantile(drawn, [0.025, 0.975]))
 
 
 def _plain(values: Sequence[Any] | np.ndarray | None) -> list[float | None] | None:

@@ -46,7 +46,7 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     told = capsys.readouterr().out
     assert "reward" in told
     trained = policy in ("agent", "guide", "guided")
-    assert ("trained steps" in told) == ("interquartile mean and bootstrap over seeds" in told) == trained
+    assert ("trained steps" in told) == ("bootstrap over seeds and 10 environments" in told) == trained
     assert ("mean and bootstrap over 10 environments of 2 steps" in told) == (not trained)
     rows = json.loads(out.read_text())["rows"]
     lanes = {("none", 0), ("relative", 10), ("relative", 20)}
@@ -69,7 +69,9 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     less = recorded["rows"][0]["reward"][0] - found["less"]["reward"][0]
     assert found["difference"]["reward"][0] == pytest.approx(less)
     assert main(["evaluate", "--compare", str(run_folder), "heuristic", *few]) == 0
-    assert capsys.readouterr().out.count("difference over seeds") == 3  # a table for each kind and budget
+    assert (
+        capsys.readouterr().out.count("difference over seeds and 10 environments") == 3
+    )  # a table for each kind and budget
 
 
 def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, capsys):
