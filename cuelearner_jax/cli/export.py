@@ -58,6 +58,10 @@ def run(arguments: list[str]) -> None:
         policy, seen = correction.correction_of(policy, env)
         drawn = lambda: correction.cases(env)  # noqa: E731
     lane = {option: getattr(options, option) for option in ("guidance", "labels", "seed", "bound_deg")}
+    if source.grid and trained.POLICIES[name].trained:
+        lane |= source.lane(options.guidance, options.labels, options.seed)
+        words = ", ".join(f"{option} {lane[option]}" for option in ("guidance", "labels", "seed"))
+        out.print(f"the run's lane of {words}; choose by --guidance, --labels and --seed")
     origin = {
         "subject": source.folder.name,
         "policy": name,

@@ -171,6 +171,14 @@ class PolicySource:
             loaded += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
         return loaded
 
+    def lane(self, guidance: str | None, labels: int | None, seed: int | None) -> dict[str, Any]:
+        """Return guidance, labels and seed of a run's lane, by default the last kind, largest budget and first seed."""
+        assert self.grid is not None
+        name = guidances.kind_name(guidance) if guidance else self.grid.guidance[-1]
+        seeds, budgets = self.grid.lanes(guidances.find(name))
+        most, first = int(budgets.max()), int(seeds[0])
+        return {"guidance": name, "labels": most if labels is None else labels, "seed": first if seed is None else seed}
+
     def alone(self, name: str, view: Any, teacher: Teacher | None = None) -> Policy:
         """Return a policy that belongs to no lane, in a view of a world; `teacher`: that world's."""
         if name == "own":

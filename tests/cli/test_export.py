@@ -14,11 +14,14 @@ from cuelearner_jax.policies import layers
 def test_a_runs_agent_is_exported_and_checked(run_folder, refused, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(contract, "golden_cases", partial(decisions.golden_cases, most=6))  # NumPy takes a second each
     out = tmp_path / "new" / "decision"
-    export = ["export", str(run_folder), "--guidance", "relative", "--labels", "20", "--seed", "2001"]
+    export = ["export", str(run_folder), "--seed", "2001"]
     assert main([*export, "--format", "numpy", "--out", str(out)]) == 0
-    assert "golden cases replayed" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "golden cases replayed" in said
+    assert "lane of guidance relative, labels 20, seed 2001" in said  # by default the last kind, the largest budget
     told = json.loads((out / runner.CONTRACT).read_text())
-    assert told["source"]["policy"] == "agent"
+    lane = {name: told["source"][name] for name in ("policy", "guidance", "labels", "seed")}
+    assert lane == {"policy": "agent", "guidance": "relative", "labels": 20, "seed": 2001}
     assert told["source"]["world"]["name"] == "billiards"
     assert [each["policy"] for each in layers(told["policy"])] == ["agent"]
     assert [each["unit"] for each in told["observation"]["slices"][:2]] == ["m", "1"]
