@@ -1,6 +1,6 @@
 """The reading on robots drawn by chance: how much of the loss comes back after 100 labels, and what becomes worse.
 
-    python experiments/zoo.py --cues 3 --robots 28 --seeds 4 --out runs/zoo        # one group of robots
+    python experiments/zoo.py --cues 3 --robots 29 --seeds 4 --out runs/zoo        # one group of robots
     python experiments/zoo.py --table runs/zoo --seeds 4                            # of all groups there
     python experiments/zoo.py --table docs/data/zoo.parquet --seeds 1 --record      # what the page shows
 
