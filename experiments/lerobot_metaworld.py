@@ -5,11 +5,11 @@
     python experiments/lerobot_metaworld.py evaluate --task reach-v3                # before, labels, after
     python experiments/lerobot_metaworld.py table
 
-`all` does the first three. 50 episodes of the script with pictures become a LeRobot dataset (v3.0), which `lerobot-train`
-reads. The camera is moved, or the motion is changed; 100 situations, of failed episodes where there are any, are
-labelled in four rounds by a program that knows the script, with a person's slips. The correction acts beside the
-policy, on the hand's state, the proposed action and the phase in the chunk. Labels alone decide whether it is used. A
-control has answers drawn by chance about the same actions. Each task has a file, which grows with each cell.
+`all` does the first three. 50 episodes of the script with pictures become a LeRobot dataset (v3.0), which
+`lerobot-train` reads. The camera is moved, or the motion is changed. 100 situations, of failed episodes where there are
+any, are labelled in four rounds by a program that knows the script, with a person's slips. The correction acts beside
+the policy, on the hand's state, the proposed action and the phase in the chunk. Labels alone decide whether it is used.
+A control has answers drawn by chance about the same actions. Each task has a file, which grows with each cell.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ def fine_tune(cells: Cells, folder: Path, options: argparse.Namespace, sizes: di
         if time.time() + options.tune + 30 > options.until:
             return
         place = folder / change.replace(" ", "_")
-        collect(cells.robots, shutil_new(place / "dataset"), change, 500_000, 5)
+        collect(cells.robots, emptied(place / "dataset"), change, 500_000, 5)
         train(place / "dataset", place / "act", options.tune, sizes | {"save": 100}, checkpoint(folder / "act"))
         cells.plan = planner(checkpoint(place / "act"), options.device)
         after = float(np.mean([one.success for one in cells.played(change)]))
@@ -236,7 +236,7 @@ def fine_tune(cells: Cells, folder: Path, options: argparse.Namespace, sizes: di
         pq.write_table(pa.Table.from_pylist(cells.rows), cells.file, compression="zstd")
 
 
-def shutil_new(folder: Path) -> Path:
+def emptied(folder: Path) -> Path:
     """Return a folder's path with nothing there."""
     shutil.rmtree(folder, ignore_errors=True)
     return folder
@@ -260,9 +260,8 @@ def table(out: Path) -> None:
     for kind in ("camera", "gain", "motion"):
         own = [r for r in rows if r["labels"] == "labels" and r["change"].startswith(kind)]
         loss, back = (sum(r[a] - r[b] for r in own) for a, b in (("unchanged", "before"), ("after", "before")))
-        print(
-            f"{kind}: share of the lost success that comes back {back / loss if loss > 0 else np.nan:.2f}, {len(own)} cells"
-        )
+        share = back / loss if loss > 0 else np.nan
+        print(f"{kind}: share of the lost success that comes back {share:.2f}, {len(own)} cells")
     if rows:
         pq.write_table(pa.Table.from_pylist(rows), out / "lerobot_metaworld.parquet", compression="zstd")
 
