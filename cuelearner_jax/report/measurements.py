@@ -12,8 +12,8 @@ import numpy as np
 
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import mean_interval
-from cuelearner_jax.report.statistics import RESAMPLES, Interval, interquartile_mean, interval, resampled
+from cuelearner_jax.evaluate import group_means, mean_interval
+from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import replacing
@@ -34,7 +34,9 @@ def spread(row: Measured, metric: str) -> Interval | None:
     """Return one policy's mean over episodes, or the interquartile mean over seeds; None if a value is not finite."""
     if not np.isfinite(row.metrics[metric]).all():
         return None
-    return Interval(*mean_interval(row.each[metric][0])) if is_single(row) else interval(row.metrics[metric])
+    if is_single(row):
+        return Interval(*mean_interval(row.each[metric][0]))
+    return interval(row.metrics[metric], group_means(row.each[metric]))
 
 
 class Difference(NamedTuple):
@@ -57,7 +59,7 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
     """Return the difference of each row from the other row of its variant, or from the only other row.
 
     Two single policies are paired by episode, and rows of equal seeds by seed. A single policy is subtracted from each
-    seed of several. Rows of different seeds are resampled independently.
+    seed of several. Of rows with different seeds these are resampled independently, the episodes alike.
 
     Raises UserError for a row without a counterpart.
     """
@@ -79,11 +81,12 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
 def _less(row: Measured, other: Measured, name: str) -> Interval:
     if is_single(row) and is_single(other):
         return Interval(*mean_interval(row.each[name][0] - other.each[name][0]))
-    mine, its = row.metrics[name], other.metrics[name]
+    both = [slice(0, 1) if is_single(one) else slice(None) for one in (row, other)]
+    mine, its = (one.metrics[name][rows] for one, rows in zip((row, other), both, strict=True))
+    groups = [group_means(one.each[name][rows]) for one, rows in zip((row, other), both, strict=True)]
     if is_single(row) or is_single(other) or np.array_equal(row.seeds, other.seeds):
-        mine, its = (values[:1] if is_single(of) else values for of, values in ((row, mine), (other, its)))
-        return interval(mine - its)
-    drawn = resampled(mine, RESAMPLES, seed=0) - resampled(its, RESAMPLES, seed=1)
+        return interval(mine - its, groups[0] - groups[1])
+    drawn = resampled(groups[0], seed=0) - resampled(groups[1], seed=1)
     return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(drawn, [0.025, 0.975]))
 
 
