@@ -160,6 +160,14 @@ def mean_interval(
     return np.stack([mean, *np.quantile(np.concatenate(means), [0.025, 0.975], axis=0)])
 
 
+GROUPS = 20  # most groups of episodes whose means an evaluation keeps
+
+
+def group_means(values: Float[np.ndarray, "*lanes envs"]) -> Float[np.ndarray, "*lanes groups"]:
+    """Return means over up to `GROUPS` groups of environments, equal in size within one."""
+    return np.stack([part.mean(-1) for part in np.array_split(values, min(GROUPS, values.shape[-1]), axis=-1)], -1)
+
+
 MOST_STRETCHES = 25  # most stretches of a roll-out with progress
 
 Tell = Callable[[int, int], None]  # (done, of how many): called between stretches; what it raises ends the evaluation

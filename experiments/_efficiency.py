@@ -1,9 +1,10 @@
 """Label efficiency: steps to a level, areas under the curve, and the labels that buy either, with intervals.
 
-Intervals are 95% percentile bootstraps over seeds: the seeds of every variant are drawn with replacement, independently
-of those of others, 2,000 times; what is computed of the interquartile means of the real seeds is computed of each
-draw's. A level is held fixed. A curve that ends below the level is right-censored (`Bounds`): its steps are "more than
-the last", which ratios and intervals carry on as a bound, never as a number.
+The steps to a level are the interquartile mean over seeds of the step from which a seed stays at the level or above.
+Intervals are 95% percentile bootstraps over seeds and episodes (`statistics.resampled`), 2,000 draws; the seeds of a
+variant are drawn independently of those of others. A level is held fixed. A curve that ends below the level is
+right-censored (`Bounds`): its steps are "more than the last", which ratios and intervals carry on as a bound, never as
+a number.
 
 Samples lead with the estimate of the real seeds; the draws follow.
 """
@@ -11,7 +12,7 @@ Samples lead with the estimate of the real seeds; the draws follow.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -67,53 +68,28 @@ class Drawn:
 
     def __init__(self, variant: Variant, sign: float, shared: int) -> None:
         """Draw nothing yet; the area is taken to the step `shared`."""
-        self.variant, self.steps, self.values = variant, variant.curve.steps, sign * variant.values
-        until = max(1, int(np.searchsorted(self.steps, shared, side="right")))
-        self.seed_areas = statistics.mean_over_curve(self.steps[:until], variant.values[:, :until])
+        self.variant, self.steps, self.sign = variant, variant.curve.steps, sign
+        self.until = max(1, int(np.searchsorted(self.steps, shared, side="right")))
+        self._steps: dict[float, Bounds] = {}
         # Its own stream, whatever other variants there are.
         self.stream = zlib.crc32(f"{variant.run}/{variant.guidance}/{variant.labels}".encode())
 
     @cached_property
-    def curves(self) -> Float[np.ndarray, "samples steps"]:
-        """The interquartile mean of the seeds' curves."""
-        return self._samples(self.values)
-
-    @cached_property
     def areas(self) -> Samples:
-        """The interquartile mean of the seeds' means over the curve; the draws are those of `curves`."""
-        return self._samples(self.seed_areas)
+        """The interquartile mean of the seeds' means over the curve."""
+        steps, until = self.steps[: self.until], self.until
+        return self._samples(lambda curves: statistics.mean_over_curve(steps, curves[..., :until]))
 
-    def _samples(self, values: np.ndarray) -> np.ndarray:
-        own = statistics.interquartile_mean(values)
-        return np.concatenate([np.asarray(own)[None], statistics.resampled(values, seed=self.stream)])
+    def _samples(self, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        own = statistics.interquartile_mean(of(self.variant.values))
+        return np.concatenate([own[None], statistics.resampled(self.variant.groups, seed=self.stream, of=of)])
 
     def steps_to(self, level: float) -> Bounds:
-        """Steps to a (signed) level."""
-        return censored(step_at_level(self.steps, self.curves, level), float(self.steps[-1]))
-
-
-def step_at_level(
-    steps: Float[np.ndarray, "steps"] | Int[np.ndarray, "steps"],
-    curves: Float[np.ndarray, "samples steps"],
-    level: Samples | float,
-) -> Samples:
-    """Return the step at which each curve first reaches its level, by linear interpolation; infinity if never.
-
-    A curve that begins at its level or above gives the first step, so it may have reached it earlier.
-    """
-    steps, level = np.asarray(steps, float), np.broadcast_to(np.asarray(level, float), curves.shape[:-1])
-    reached = curves >= level[..., None]
-    place = reached.argmax(axis=-1)  # 0 where it begins there, and where it never gets there
-    before = np.maximum(place - 1, 0)
-    low, high = (np.take_along_axis(curves, at[..., None], axis=-1)[..., 0] for at in (before, place))
-    share = np.divide(level - low, high - low, out=np.zeros(level.shape), where=high > low)
-    found = steps[before] + share * (steps[place] - steps[before])
-    return np.where(reached.any(axis=-1), found, np.inf)
-
-
-def censored(found: Samples, last: float) -> Bounds:
-    """Steps to a level of which those that are infinite are only known to be more than `last`."""
-    return Bounds(np.where(np.isinf(found), last, found), found)
+        """Steps to a (signed) level; the draws are those of `areas`."""
+        if level not in self._steps:
+            bounds = lambda curves: statistics.steps_to_level(self.steps, self.sign * curves, level)  # noqa: E731
+            self._steps[level] = Bounds(*self._samples(bounds).T)
+        return self._steps[level]
 
 
 def ratio_bounds(above: Bounds, below: Bounds) -> Bounds:
@@ -136,22 +112,19 @@ def labels_for(
     known is that more than the largest are needed, or no more than the smallest.
     """
     first = areas[:, 0] >= wanted
-    exact = np.where(first, float(budgets[0]), np.exp(step_at_level(np.log(budgets), areas, wanted)))
-    return Bounds(np.where(first, 0.0, censored(exact, float(budgets[-1])).lower), exact)
+    exact = np.where(first, float(budgets[0]), np.exp(statistics.step_at_level(np.log(budgets), areas, wanted)))
+    return Bounds(np.where(first, 0.0, np.minimum(exact, float(budgets[-1]))), exact)
 
 
 def columns(name: str, samples: Bounds, *drawn: Drawn) -> Row:
     """Return the table columns of an estimate with its interval; without one for a variant with a single seed.
 
-    The column `name` is empty where only `name_above` or `name_below` is known. The interval is wide enough for all
-    that the draws' bounds allow. Its ends are values of draws, never between two, so that infinity ("never") keeps its
-    meaning.
+    The column `name` is empty where only `name_above` or `name_below` is known.
     """
     low, high = float(samples.lower[0]), float(samples.upper[0])
     ends = (np.nan, np.nan)
     if all(len(each.variant.seeds) > 1 for each in drawn):
-        last = len(samples.lower) - 2
-        ends = np.sort(samples.lower[1:])[int(0.025 * last)], np.sort(samples.upper[1:])[int(np.ceil(0.975 * last))]
+        ends = statistics.censored_interval(np.stack(samples, -1)[1:])
     row = interval_columns(name, (low if low == high else np.nan, *ends))
     exact = low == high or np.isnan(low)
     return row | {f"{name}_above": "" if exact else low, f"{name}_below": "" if exact else high}
@@ -188,7 +161,7 @@ def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_bett
     rows, to_level, equal = [], [], []
     for variant in variants:
         own, unguided = drawn[id(variant)], unguided_of(variant, variants)
-        if variant.guidance == "none" and sign * level <= own.curves[0, 0]:
+        if variant.guidance == "none" and sign * (level - variant.curve.estimate[0]) <= 0:
             raise UserError(
                 f"the level {level:.3g} is no better than what {variant.name} begins with "
                 f"({variant.curve.estimate[0]:.3g}): give another --level or a later --level-at"
@@ -262,7 +235,7 @@ def _labels_to_level(own: Sequence[Drawn], unguided: Drawn, level: float, within
     limit = within * unguided.steps_to(level).lower
     in_time = np.stack([each.steps_to(level).upper <= limit for each in own])
     smallest = np.where(in_time.any(axis=0), budgets[in_time.argmax(axis=0)], np.inf)
-    row = columns("labels", censored(smallest, budgets[-1]), unguided, *own)
+    row = columns("labels", Bounds(np.minimum(smallest, budgets[-1]), smallest), unguided, *own)
     return row | {"reached": float(np.isfinite(smallest[1:]).mean())}
 
 

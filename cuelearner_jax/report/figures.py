@@ -55,7 +55,8 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
         axes.set_ylabel(axis_name(metric))
         axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
         axes.set_title(one_line(title), fontweight="bold", fontsize=11, pad=20)
-        note = "interquartile mean over seeds, band: its 95% bootstrap interval"
+        note = "interquartile mean over seeds, band: its 95% bootstrap interval over seeds"
+        note += " and episodes" if all(variant.episodes for variant in variants) else ""
         axes.text(0, 1.025, note, transform=axes.transAxes, color="#595959", fontsize=9)
         figure.legend(loc="outside right upper", fontsize=9 if len(variants) < 20 else 6)
     return figure

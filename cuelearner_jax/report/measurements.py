@@ -13,7 +13,7 @@ import scipy.stats
 
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import mean_interval
+from cuelearner_jax.evaluate import group_means, mean_interval
 from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
@@ -43,7 +43,7 @@ def spread(row: Measured, metric: str) -> Interval | None:
     if each.min() == each.max() and each.min() in (0, 1) and each.size > 1:
         certain = float(scipy.stats.beta.ppf(0.05, each.size + 0.5, 0.5))
         return Interval(*map(np.asarray, (1.0, certain, 1.0) if each.min() else (0.0, 0.0, 1 - certain)))
-    return Interval(*mean_interval(each[0])) if is_single(row) else interval(row.metrics[metric], each=each)
+    return Interval(*mean_interval(each[0])) if is_single(row) else interval(row.metrics[metric], group_means(each))
 
 
 class Difference(NamedTuple):
@@ -66,7 +66,7 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
     """Return the difference of each row from the other row of its variant, or from the only other row.
 
     Two single policies are paired by episode, and rows of equal seeds by seed. A single policy is subtracted from each
-    seed of several. Rows of different seeds are resampled independently.
+    seed of several. Of rows with different seeds these are resampled independently, the episodes alike.
 
     Raises UserError for a row without a counterpart.
     """
@@ -88,14 +88,13 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
 def _less(row: Measured, other: Measured, name: str) -> Interval:
     if is_single(row) and is_single(other):
         return Interval(*mean_interval(row.each[name][0] - other.each[name][0]))
-    mine, its = row.each[name], other.each[name]
+    both = [slice(0, 1) if is_single(one) else slice(None) for one in (row, other)]
+    mine, its = (one.metrics[name][rows] for one, rows in zip((row, other), both, strict=True))
+    groups = [group_means(one.each[name][rows]) for one, rows in zip((row, other), both, strict=True)]
     if is_single(row) or is_single(other) or np.array_equal(row.seeds, other.seeds):
-        mine, its = (values[:1] if is_single(of) else values for of, values in ((row, mine), (other, its)))
-        less = mine - its if mine.shape[1] == its.shape[1] else None
-        return interval(mine.mean(1) - its.mean(1), each=less)
-    drawn = resampled(mine.mean(1), each=mine) - resampled(its.mean(1), seed=1, each=its)
-    middle = interquartile_mean(mine.mean(1)) - interquartile_mean(its.mean(1))
-    return Interval(middle, *np.quantile(drawn, [0.025, 0.975]))
+        return interval(mine - its, groups[0] - groups[1])
+    drawn = resampled(groups[0], seed=0) - resampled(groups[1], seed=1)
+    return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(drawn, [0.025, 0.975]))
 
 
 def _plain(values: Sequence[Any] | np.ndarray | None) -> list[float | None] | None:

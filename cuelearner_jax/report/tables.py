@@ -11,10 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from cuelearner_jax.errors import one_line
-from cuelearner_jax.report.statistics import steps_to_reach, stretches_apart
+from cuelearner_jax.report.statistics import (
+    Interval,
+    censored_interval,
+    interquartile_mean,
+    resampled,
+    steps_to_level,
+    stretches_apart,
+)
 from cuelearner_jax.report.variants import Variant
 
 Row = dict[str, str | int | float]  # of a table
+REACHES = ("reaches_unguided_final", "reaches_unguided_final_lower", "reaches_unguided_final_upper")
 
 
 def markdown(text: object) -> str:
@@ -30,9 +38,10 @@ def code(text: object) -> str:
 def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
     """Return one row for each variant, with unrounded numbers; the columns are those of `summary.csv`.
 
-    `reaches_unguided_final` is the first step at which the variant's interquartile mean is as good as the final one
-    without guidance. `above_unguided` and `below_unguided` are stretches of `stretches_apart`. With several runs, a
-    variant is compared with the unguided variant of `unguided_of`.
+    `reaches_unguided_final` is the interquartile mean over seeds of the step from which a seed stays as good as the
+    final value without guidance; "never" if too many seeds end below that for a mean. `above_unguided` and
+    `below_unguided` are stretches of `stretches_apart`. With several runs, a variant is compared with the unguided
+    variant of `unguided_of`.
     """
     sign = -1.0 if lower_is_better else 1.0
     rows = []
@@ -42,18 +51,26 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
         goodness = sign * estimate
         best = int(goodness.argmax())
         row: Row = {**named(variant), "seeds": len(variant.seeds), "failed": len(variant.failed)}
+        row |= {"episodes": variant.episodes or "not known"}
         row |= {"last_step": steps[-1], "final": estimate[-1], "final_lower": lower[-1], "final_upper": upper[-1]}
         row |= dict(zip(("mean", "mean_lower", "mean_upper"), map(float, variant.mean), strict=True))
         row |= {"best_step": steps[best], "best": estimate[best]}
-        row |= {"reaches_unguided_final": "", "above_unguided": "", "below_unguided": ""}
-        if unguided is not None:
-            reached = steps_to_reach(steps, goodness[None], sign * unguided.curve.estimate[-1])[0]
-            row["reaches_unguided_final"] = int(reached) if np.isfinite(reached) else "never"
+        row |= dict.fromkeys((*REACHES, "above_unguided", "below_unguided"), "")
+        if unguided is not None and variant is not unguided:
+            row |= _steps_to(variant, sign, sign * unguided.curve.estimate[-1])
             for column, pair in (("above", (variant, unguided)), ("below", (unguided, variant))):
-                apart = stretches_apart(*(each.curve for each in pair)) if variant is not unguided else []
+                apart = stretches_apart(*(each.curve for each in pair))
                 row[f"{column}_unguided"] = "; ".join(f"{start}-{end}" for start, end in apart)
         rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
     return rows
+
+
+def _steps_to(variant: Variant, sign: float, level: float) -> Row:
+    """Return the columns of the step from which a variant's seeds stay at a level; an interval for several seeds."""
+    bounds = lambda curves: steps_to_level(variant.curve.steps, sign * curves, level)  # noqa: E731
+    ends = censored_interval(resampled(variant.groups, of=bounds)) if len(variant.seeds) > 1 else ()
+    found = (interquartile_mean(bounds(variant.values))[1], *ends)
+    return dict(zip(REACHES, (round(float(step)) if np.isfinite(step) else "never" for step in found), strict=False))
 
 
 def unguided_of(variant: Variant, variants: Sequence[Variant]) -> Variant | None:
@@ -94,20 +111,23 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> l
 
 def summary_lines(rows: Sequence[Row]) -> list[str]:
     """Return the summary as a table in Markdown."""
-    header = ["guidance", "labels", "seeds", "last step", "final", "mean over the curve", "best (at step)"]
-    header += ["reaches the unguided final", "interval above the unguided", "interval below the unguided"]
+    header = ["guidance", "labels", "seeds", "episodes", "last step", "final", "mean over the curve", "best (at step)"]
+    header += ["stays at the unguided final from step", "interval above the unguided", "interval below the unguided"]
     return markdown_table(["run"] * ("run" in rows[0]) + header, [_summary_cells(row) for row in rows])
 
 
+def _step(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:,.0f}"
+
+
 def _summary_cells(row: Row) -> list[object]:
-    reached, failed = row["reaches_unguided_final"], int(row["failed"])
+    reached, *ends = (_step(row[name]) for name in REACHES)
+    failed = int(row["failed"])
     seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
     cells: list[object] = [markdown(row[name]) for name in ("run", "guidance") if name in row]
-    cells += [f"{row['labels']:,}", seeds, f"{row['last_step']:,}"]
-    for key in ("final", "mean"):
-        bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""
-        cells.append(f"{row[key]:.3f}{bounds}")
-    cells += [f"{row['best']:.3f} ({row['best_step']:,})", f"{reached:,}" if isinstance(reached, int) else reached]
+    cells += [f"{row['labels']:,}", seeds, _step(row["episodes"]), f"{row['last_step']:,}"]
+    cells += [str(Interval(*(row[key + end] for end in ("", "_lower", "_upper")))) for key in ("final", "mean")]  # pyright: ignore[reportArgumentType]
+    cells += [f"{row['best']:.3f} ({row['best_step']:,})", f"{reached} [{', '.join(ends)}]" if any(ends) else reached]
     for column in ("above_unguided", "below_unguided"):
         apart = [stretch.split("-") for stretch in str(row[column]).split("; ") if stretch]
         spans = [f"{int(start):,} to {int(end):,}" if start != end else f"{int(start):,}" for start, end in apart]

@@ -35,6 +35,13 @@ class Variant(NamedTuple):
     failed: Int[np.ndarray, "lanes"]
     run: str = ""  # name of the group of runs, where groups are reported separately
     guide: Float[np.ndarray, "guides"] | None = None  # metric of each seed's guide alone, where it was measured
+    episodes: int = 0  # of an evaluation, at least; 0: the runs, of an earlier version, keep none
+    each: Float[np.ndarray, "seeds groups steps"] | None = None  # values of groups of episodes; None: of one group
+
+    @property
+    def groups(self) -> Float[np.ndarray, "seeds groups steps"]:
+        """The values of groups of episodes, of a single group where none are kept."""
+        return self.values[:, None] if self.each is None else self.each
 
     @property
     def name(self) -> str:
@@ -116,16 +123,19 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
         for kind, labels in sorted((tuple(key.values()) for key in keys), key=lambda key: (key[0] != "none", *key)):
             of_variant = (pc.field("guidance") == kind) & (pc.field("labels") == labels)
             rows = group.table.filter(of_variant)
-            seeds, steps, values = _matrix(rows, metric, kind, labels)
+            seeds, steps, values, each = _matrix(rows, metric, kind, labels)
             lost = np.array([step for lane, step in failed.items() if lane[:2] == (kind, labels)], int)
             guide = _guides(rows, metric, None if group.guides is None else group.guides.filter(of_variant))
-            found.append((kind, labels, seeds, steps, values, lost, group.name, guide if len(guide) else None))
+            episodes = min(rows["episodes"].to_pylist()) if each.shape[1] > 1 else 0
+            others = (lost, group.name, guide if len(guide) else None, episodes)
+            found.append((kind, labels, seeds, steps, values, each, *others))
     shared = min(steps[-1] for _, _, _, steps, *_ in found)
     variants = []
-    for kind, labels, seeds, steps, values, *others in found:
+    for kind, labels, seeds, steps, values, each, *others in found:
         until = max(1, int(np.searchsorted(steps, shared, side="right")))
-        mean = interval(mean_over_curve(steps[:until], values[:, :until]))
-        variants.append(Variant(kind, labels, seeds, values, curve(steps, values), mean, *others))
+        areas, parts = (mean_over_curve(steps[:until], of[..., :until]) for of in (values, each))
+        known = curve(steps, values, each)
+        variants.append(Variant(kind, labels, seeds, values, known, interval(areas, parts), *others, each=each))
     return variants
 
 
@@ -142,8 +152,10 @@ def _guides(rows: pa.Table, metric: str, guides: pa.Table | None) -> np.ndarray:
     return np.array([latest[seed] for seed in sorted(latest)])
 
 
-def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a variant's seeds (seeds,), the steps (steps,) that all seeds have, and values (seeds, steps)."""
+def _matrix(
+    table: pa.Table, metric: str, kind: str, labels: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a variant's seeds (seeds,), the steps (steps,) that all seeds have, values (seeds, steps) and `each`."""
     seeds, row = np.unique(table["seed"].to_numpy(), return_inverse=True)
     steps, column = np.unique(table["step"].to_numpy(), return_inverse=True)
     count = np.zeros((len(seeds), len(steps)), int)
@@ -163,4 +175,18 @@ def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.nd
             f"the seeds of {kind} guidance with {labels} labels have no step in common: wait until all have one, or "
             "leave out the run that was evaluated at other steps"
         )
-    return seeds, steps[whole], values[:, whole]
+    return seeds, steps[whole], values[:, whole], _groups(table, metric, values, (row, column), whole)
+
+
+def _groups(
+    table: pa.Table, metric: str, values: np.ndarray, place: tuple[np.ndarray, np.ndarray], whole: np.ndarray
+) -> np.ndarray:
+    """Return means over groups of episodes (seeds, groups, steps); one group unless all rows have equally many."""
+    name = f"{metric}_each"
+    lists = table[name].to_pylist() if name in table.column_names else []
+    if len({len(entries or ()) for entries in lists} - {0}) != 1 or None in lists:
+        return values[:, None, whole]
+    each = np.zeros((*values.shape, len(lists[0])))
+    each[place] = np.array(lists, float)
+    each += (values - each.mean(-1))[..., None]  # groups may differ by one episode in size
+    return np.moveaxis(each[:, whole], -1, 1)

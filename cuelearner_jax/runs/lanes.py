@@ -16,7 +16,7 @@ from jaxtyping import PRNGKeyArray
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import BY_LANE, fixed_numerics, lane_mesh, place
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.evaluate import rollout_lanes
+from cuelearner_jax.evaluate import group_means, rollout_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Clock, TrainState
 from cuelearner_jax.policies import PolicyNode
@@ -135,11 +135,12 @@ class LaneGroup:
         steps: int,
         blocks: list[TrainState],
     ) -> dict[str, np.ndarray]:
-        """Return metrics (lanes,) of a policy of each block on the same episodes."""
+        """Return metrics (lanes,) of a policy of each block on the same episodes, and their `group_means`."""
         mesh = self.mesh if self.mesh.size > 1 else None
 
         def measured(block: TrainState) -> dict[str, Any]:
-            return rollout_lanes(env, policy_of(block), key, num_envs, steps, mesh=mesh).means
+            means, each, _ = rollout_lanes(env, policy_of(block), key, num_envs, steps, mesh=mesh)
+            return means | {f"{name}_each": group_means(np.asarray(values)) for name, values in each.items()}
 
         return self.columns(self.each(measured, blocks))
 

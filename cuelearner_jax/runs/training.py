@@ -170,7 +170,7 @@ class Training:
         """Return the columns of one evaluation of all agents: scalars, or (lanes,) with NaN for failed lanes."""
         group = self.group
         own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
-        own["failed"] = self.failed.astype(float)
+        own |= {"failed": self.failed.astype(float), "episodes": self.group.config.schedule.eval_envs}
         return {**own, **self._measured(lambda lane: self._policy(lane.agent.params, view_of(self.examined)))}
 
     def policies(self, view: Any) -> PolicyNode:
@@ -189,7 +189,7 @@ class Training:
         def guide(lane: TrainState) -> PolicyNode:
             return Guided(base, lane.guide.model, view_of(self.examined), group.config.scalars, group.guidance)
 
-        return {f"guide_{name}": values for name, values in self._measured(guide).items()}
+        return {f"guide_{name}": values for name, values in self._measured(guide).items() if values.ndim == 1}
 
     def _measured(self, policy_of: Any) -> dict[str, np.ndarray]:
         schedule, key = self.group.config.schedule, episodes(self.split)
@@ -197,8 +197,8 @@ class Training:
         return self._of_finite(self.group.evaluate(policy_of, self.examined, key, *size, self.blocks))
 
     def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Replace failed lanes' metrics (lanes,) by NaN, so that they never enter a mean unnoticed."""
-        return {name: np.where(self.failed, np.nan, values) for name, values in columns.items()}
+        """Replace failed lanes' metrics (lanes, ...) by NaN, so that they never enter a mean unnoticed."""
+        return {name: np.where(self.failed, np.nan, values.T).T for name, values in columns.items()}
 
 
 def mean_of_finite(values: np.ndarray) -> str:

@@ -16,6 +16,8 @@ seed:
 | wall_s       | float | seconds since the run started                                    |
 | commit, versions, hardware, command | str | the row's provenance (see `provenance`)     |
 | failed       | float | 1 once the lane stopped being finite: its metrics are null then  |
+| episodes     | int   | episodes of the evaluation, or environments where steps count    |
+| ..._each     | list  | means of a metric over up to 20 equal groups of these episodes   |
 | all others   | float | metrics, for instance `reward`; a value that is not finite is null |
 
 `guide.jsonl` and `guide.parquet` beside them evaluate uniform actions refined by a lane's guide, in the same columns
@@ -49,14 +51,15 @@ SCHEMA = tables.Schema(
     stem="results",
     required=("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash"),
     strings=("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command"),
-    integers=("labels", "seed", "step"),
+    integers=("labels", "seed", "step", "episodes"),
+    lists=("_each",),
     remedy="is damaged: restore it, or move its folder away and give --resume, which trains these lanes anew",
 )
 GUIDES = tables.Schema(
     stem="guide",
     required=(*SCHEMA.required, "asked", "round"),
     strings=SCHEMA.strings,
-    integers=(*SCHEMA.integers, "asked", "round"),
+    integers=("labels", "seed", "step", "asked", "round"),
     remedy=SCHEMA.remedy,
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
@@ -138,7 +141,7 @@ def read_guides(paths: Sequence[PathLike]) -> pa.Table | None:
 def metrics(table: pa.Table) -> list[str]:
     """Return the names of a results table's metric columns."""
     others = (*SCHEMA.strings, *SCHEMA.integers, "wall_s", FAILED, "folder")
-    return [name for name in table.column_names if name not in others]
+    return [name for name in table.column_names if name not in others and not SCHEMA.is_list(name)]
 
 
 def failures(table: pa.Table) -> dict[tuple[str, int, int], int]:

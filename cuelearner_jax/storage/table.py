@@ -45,7 +45,7 @@ class Schema:
     required: tuple[str, ...]
     strings: tuple[str, ...] = ()
     integers: tuple[str, ...] = ()
-    lists: tuple[str, ...] = ()  # of 32-bit floats
+    lists: tuple[str, ...] = ()  # of 32-bit floats: names, or endings of names
     remedy: str = "is damaged: restore it"  # the remedy in the message about a damaged file, after its path
 
     @property
@@ -68,7 +68,11 @@ class Schema:
             return pa.string()
         if name in self.integers:
             return pa.int64()
-        return pa.list_(pa.float32()) if name in self.lists else pa.float64()
+        return pa.list_(pa.float32()) if self.is_list(name) else pa.float64()
+
+    def is_list(self, name: str) -> bool:
+        """Whether a column holds lists."""
+        return name.endswith(self.lists)
 
     def typed(self, table: pa.Table, metadata: dict[bytes, bytes] | None = None) -> pa.Table:
         """Return a table with the columns' types and other metadata."""
@@ -112,7 +116,7 @@ class TableWriter(contextlib.AbstractContextManager):
             OSError: the disk refuses the rows. None of them is in the table, now or later; the call may be repeated.
         """
         arrays = {name: np.asarray(value) for name, value in columns.items()}
-        many = {name for name, array in arrays.items() if array.ndim > (name in self._schema.lists)}
+        many = {name for name, array in arrays.items() if array.ndim > self._schema.is_list(name)}
         (count,) = {len(arrays[name]) for name in many} or {1}
         # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
         values = {name: _plain(array.tolist()) for name, array in arrays.items()}

@@ -90,7 +90,7 @@ def means(row: dict[str, Any]) -> dict[str, float]:
         row: the columns of one evaluation: scalars, or one entry per lane; "labels" gives the lanes' budgets.
     """
     budgets, found = np.asarray(row["labels"]), {}
-    for name in row.keys() - set(LANE):
+    for name in (name for name in row.keys() - set(LANE) if np.ndim(row[name]) < 2):
         values = np.broadcast_to(np.asarray(row[name], float), budgets.shape)
         for budget in np.unique(budgets):
             own = values[(budgets == budget) & np.isfinite(values)]

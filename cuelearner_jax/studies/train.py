@@ -134,6 +134,7 @@ def in_memory(
 
 def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
     """Return the columns of one evaluation as a table with a row per lane."""
-    columns = {name: np.broadcast_to(np.asarray(value), len(group.seeds)) for name, value in row.items()}
-    told = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}
+    count = len(group.seeds)
+    columns = {name: value if np.ndim(value) else np.full(count, value) for name, value in row.items()}
+    told = {name: pa.array(list(values), from_pandas=True) for name, values in columns.items()}
     return pa.table({"guidance": pa.array([group.guidance.name] * len(group.seeds)), **told})

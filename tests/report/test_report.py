@@ -31,7 +31,8 @@ def write(folder, guidance, level, labels=0, *, seeds: Sequence[int] = range(8),
     with TableWriter(folder, results.SCHEMA, known) as writer:
         for step in steps:
             reward = (step > 30) * level + rng.uniform(-0.02, 0.02, len(seeds))
-            writer.append(step=step, split="validation", seed=np.array(seeds), labels=labels, reward=reward, wall_s=1.0)
+            row = {"reward": reward, "reward_each": reward[:, None] + [-0.01, 0.01], "episodes": 30}
+            writer.append(step=step, split="validation", seed=np.array(seeds), labels=labels, wall_s=1.0, **row)
     planned(folder, total_steps=int(STEPS[-1]))
 
 
@@ -65,8 +66,12 @@ def test_a_known_difference_is_found(runs, tmp_path):
     assert float(best["mean"]) == pytest.approx(0.6 * 0.65, abs=0.01)
     assert best["above_unguided"] == "40-100"
     assert best["below_unguided"] == ""
-    assert best["reaches_unguided_final"] == "40"
-    assert best["seeds"] == "8"
+    # A third of the way from 30 to 40: the unguided agents' last value is a third of 0.6.
+    reached = [int(best[f"reaches_unguided_final{end}"]) for end in ("_lower", "", "_upper")]
+    assert reached == sorted(reached)
+    assert 32 <= reached[0] < reached[2] <= 35
+    assert (best["seeds"], best["episodes"]) == ("8", "30")
+    assert text.startswith("# one_ball: validation reward, 8 seeds x 30 episodes")
     for line in ("nothing: all runs are complete", "`cuelearner report runs`", "`0f`", "`abc`", "jax 0", "1 x cpu"):
         assert line in text
 
@@ -115,7 +120,7 @@ def test_of_collisions_the_fewest_are_best(tmp_path):
         report(tmp_path / "runs", tmp_path / str(lower), "collision", lower_is_better=lower)
         row = summary(tmp_path / str(lower))["heuristic", 0]
         found[lower] = (float(row["best"]), int(row["best_step"]), row["reaches_unguided_final"])
-    assert found == {True: (0.3, 10, "10"), False: (0.8, 0, "0")}
+    assert found == {True: (0.3, 10, "8"), False: (0.8, 0, "never")}
 
 
 def test_says_what_is_missing(runs, tmp_path):
@@ -184,7 +189,7 @@ def test_names_are_only_names_in_markdown_csv_and_figures(tmp_path):
     text = report(tmp_path / "runs", tmp_path / "out", command="cuelearner report 'a`b'").read_text()
     assert "\n| relative" not in text
     (row,) = [line for line in text.splitlines() if line.startswith("| mine")]
-    assert len(re.findall(r"(?<!\\)\|", row)) == 11
+    assert len(re.findall(r"(?<!\\)\|", row)) == 12
     assert "<script" not in row
     assert list(summary(tmp_path / "out")) == [(name, 100)]
     for path in (tmp_path / "out").glob("*.svg"):
@@ -198,6 +203,7 @@ def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
             writer.append(step=step, split="validation", seed=[0, 1], reward=[0.1, second])
     text = report(tmp_path / "a", tmp_path / "report").read_text()
     assert "1 validation rows have no finite reward" in text
+    assert "the run keeps no results of episodes" in text
     assert float(summary(tmp_path / "report")["none", 0]["final"]) == pytest.approx(0.2)
 
 
@@ -221,7 +227,7 @@ def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path)
     }
     assert [after[key]["failed"] for key in before] == ["0", "0", "3"]
     assert after.keys() == before.keys()
-    assert "| relative | 500 | 8 of 11, 3 failed |" in text
+    assert "| relative | 500 | 8 of 11, 3 failed | 30 |" in text
     assert (
         "relative, 500 labels: seeds 8 (by step 20), 9 (by step 20), 10 (by step 20) failed, no longer finite: curve "
         "and means are over the other 8"

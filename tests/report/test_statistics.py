@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from cuelearner_jax.evaluate import group_means
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.statistics import Curve
+from cuelearner_jax.report.statistics import Curve, Interval
 
 
 def flat(steps, lower, upper):
@@ -72,21 +73,40 @@ def test_the_mean_over_uneven_steps_by_hand():
     np.testing.assert_allclose(statistics.mean_over_curve(np.array([5]), values[:, :1]), [0.0, 2.0])
 
 
-def test_steps_to_reach_is_the_first_crossing_or_infinity():
-    values = np.array([[0.0, 0.5, 0.4, 0.6], [0.9, 0.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4]])
-    found = statistics.steps_to_reach(np.array([0, 10, 20, 30]), values, 0.5)
-    np.testing.assert_array_equal(found, [10.0, 0.0, np.inf])
+def test_a_level_is_reached_where_a_curve_stays_above_it():
+    values = np.array([[0.0, 0.5, 0.4, 0.6], [0.9, 0.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4], [0.5, 0.9, 0.6, 0.5]])
+    found = statistics.steps_to_level(np.array([0, 10, 20, 30]), values, 0.5)
+    np.testing.assert_allclose(found, [[25.0, 25.0], [30.0, np.inf], [30.0, np.inf], [0.0, 0.0]])
+    assert statistics.censored_interval(np.array([[1.0, 1.0], *[[2.0, 2.0]] * 98, [3.0, np.inf]])) == (2.0, 2.0)
+    assert statistics.censored_interval(np.array([[3.0, np.inf]] * 9)) == (3.0, np.inf)
+
+
+def test_an_interval_covers_the_truth_only_if_it_draws_the_shared_episodes_too():
+    """Seeds near 0 that all meet the same 40 episodes: their luck is no difference between seeds."""
+    rng, covered = np.random.default_rng(4), []
+    for _ in range(200):
+        each = 0.1 * rng.normal(size=(10, 1)) + rng.normal(size=40) + rng.normal(size=(10, 40))
+        found = [statistics.interval(each.mean(-1), part, 400) for part in (None, group_means(each))]
+        covered.append([each.lower < 0 < each.upper for each in found])
+    alone, both = np.mean(covered, axis=0)
+    assert alone < 0.75
+    assert 0.9 < both < 0.99
+
+
+def test_no_interval_is_printed_with_a_width_of_zero():
+    shown = [str(Interval(*map(np.array, ends))) for ends in ((0.97, 0.96996, 0.97004), (0.97,) * 3)]
+    assert shown == ["0.97000 [0.96996, 0.97004]", "0.970 [no spread]"]
 
 
 def test_draws_are_those_of_the_bootstrap_of_an_interval():
     values = np.random.default_rng(3).normal(size=(9, 4)) + np.arange(4)
-    drawn = statistics.resampled(values, resamples=4000)
+    drawn = statistics.resampled(values[:, None], resamples=4000)
     assert drawn.shape == (4000, 4)
     expected = statistics.interval(values, resamples=4000)
     np.testing.assert_allclose(np.quantile(drawn, [0.025, 0.975], axis=0), expected[1:], atol=0.1)
-    np.testing.assert_array_equal(drawn, statistics.resampled(values, resamples=4000))
+    np.testing.assert_array_equal(drawn, statistics.resampled(values[:, None], resamples=4000))
     # Whole curves are drawn: what is the same in two columns of every seed is the same in every draw.
-    twice = statistics.resampled(np.repeat(values[:, :1], 2, axis=1))
+    twice = statistics.resampled(np.repeat(values[:, None, :1], 2, axis=2))
     np.testing.assert_array_equal(twice[:, 0], twice[:, 1])
-    assert (statistics.resampled(values, seed=1)[:4000] != drawn[:2000]).any()
-    np.testing.assert_array_equal(statistics.resampled(np.full((5, 2), 0.25), resamples=7), np.full((7, 2), 0.25))
+    assert (statistics.resampled(values[:, None], seed=1)[:4000] != drawn[:2000]).any()
+    np.testing.assert_array_equal(statistics.resampled(np.full((5, 1, 2), 0.25), resamples=7), np.full((7, 2), 0.25))
