@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -184,14 +183,3 @@ def spread(values: Sequence[float]) -> dict[str, Any]:
     """Return the mean of as many seeds with its 95% bootstrap interval."""
     mean, low, high = mean_interval(np.array(values, float)).tolist()
     return {"seeds": len(values), "mean": mean, "low": low, "high": high}
-
-
-def steps_to(level: float, rows: Sequence[Mapping[str, Any]]) -> float:
-    """Return the steps after which the mean curve reaches a level, on lines between evaluations; inf: never."""
-    for before, after in itertools.pairwise(rows):
-        if before["mean"] >= level:
-            return before["step"]
-        if after["mean"] >= level:
-            share = (level - before["mean"]) / (after["mean"] - before["mean"])
-            return before["step"] + share * (after["step"] - before["step"])
-    return rows[-1]["step"] if rows and rows[-1]["mean"] >= level else float("inf")

@@ -8,8 +8,8 @@ A piece is a sweep with a folder of its own. Every method trains the same `sac`.
 step that is executed, and these steps are half of every minibatch; with demonstrations this is RLPD (Ball et al.,
 2023). `rlpd` fits a policy to as many demonstrations; half of all episodes and of every minibatch are that policy's.
 
-Last come a table and FOLDER/arms.json: success of each variant with its 95% interval, how many seeds reach 80%, their
-median step, and the ratio of steps to those of the agent alone.
+Last come a table and FOLDER/arms.json: success of each variant with its 95% interval, how many seeds end above 80%, the
+interquartile mean of the step from which a seed stays there, and the ratio of steps to those of the agent alone.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _pieces import Options, Piece, Scale, asked_of, folder_at, grouped, run_pieces, spread, steps_to
+from _pieces import Options, Piece, Scale, asked_of, folder_at, grouped, run_pieces, spread
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.report import statistics
 from cuelearner_jax.storage import results
 from cuelearner_jax.storage.provenance import provenance
 
@@ -112,16 +113,21 @@ def rows_of(out: Path) -> list[dict[str, Any]]:
 
 
 def reached(rows: Sequence[dict[str, Any]]) -> list[float]:
-    """Return the steps after which each seed's own curve reaches the level; inf: never."""
-    curves = (
-        [{"step": row["step"], "mean": row["each"][seed]} for row in rows if seed in row["each"]]
-        for seed in rows[0]["each"]
-    )
-    return [steps_to(LEVEL, curve) for curve in curves]
+    """Return the step from which each seed stays at the level or above; inf: the seed ends below."""
+    own = [[(row["step"], row["each"][seed]) for row in rows if seed in row["each"]] for seed in rows[0]["each"]]
+    curves = (np.array(points, float).T for points in own)
+    return [float(statistics.step_at_level(steps, curve, LEVEL)) for steps, curve in curves]
+
+
+def middle(at: Sequence[float], last: float) -> list[float | None]:
+    """Return the interquartile mean of seeds' steps with its 95% interval; None: not known to be below any number."""
+    bounds = np.stack([np.minimum(at, last), at], -1)
+    ends = statistics.censored_interval(statistics.resampled(bounds[:, None]))
+    return [float(step) if np.isfinite(step) else None for step in (statistics.interquartile_mean(at), *ends)]
 
 
 def compared(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return steps to the level for each variant, and their ratio to those of the agent alone with its 95% interval.
+    """Return the steps to the level of each variant, and their ratio to those of the agent alone with its 95% interval.
 
     The ratio is over the steps that both have: a seed that does not get there within these counts with all of them.
     With such seeds among the unguided ones the true ratio is smaller. The interval draws seeds of both, each by itself.
@@ -131,7 +137,7 @@ def compared(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         at, alone = reached(own), curves.get((names[0], "alone", "none", 0))
         row = dict(zip(("world", "run", "guidance", "labels"), names, strict=True))
         row |= {"steps": [step if np.isfinite(step) else None for step in at], "reached": int(np.isfinite(at).sum())}
-        row["median"] = float(np.median(at)) if np.isfinite(np.median(at)) else None
+        row["middle"] = middle(at, own[-1]["step"])
         if alone is not None and alone is not own:
             last = min(own[-1]["step"], alone[-1]["step"])
             row["ratio"] = _ratio(np.minimum(at, last), np.minimum(reached(alone), last))
@@ -155,7 +161,8 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
         line = f"{row['world']:<12}{row['run']:<15}{row['guidance']:<15}{row['labels']:>6}"
         line += f"  {end['mean']:.3f} [{end['low']:.3f}, {end['high']:.3f}] at {end['step']:,}"
         line += f"; {row['reached']} of {len(row['steps'])}"
-        line += "" if row["median"] is None else f", median step {row['median']:,.0f}"
+        steps = ("never" if step is None else f"{step:,.0f}" for step in row["middle"])
+        line += ", from step {} [{}, {}] on".format(*steps)
         if "ratio" in row:
             line += "; {:.2f} [{:.2f}, {:.2f}] of the steps alone".format(*row["ratio"])
         lines_of.append(line)

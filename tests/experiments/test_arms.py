@@ -52,5 +52,5 @@ def test_the_table_counts_the_seeds_that_reach_the_level(study):
     assert ratio == pytest.approx(100 / np.mean([100, 100 + 100 * 0.4 / 0.6, 200]))
     assert low < ratio < high
     line, other = study.table([alone, guided]).splitlines()[1:]
-    assert "at 200; 2 of 3, median step 167" in line
-    assert "3 of 3, median step 100; 0.64 [" in other
+    assert "at 200; 2 of 3, from step never [100, never] on" in line
+    assert "3 of 3, from step 100 [100, 100] on; 0.64 [" in other
