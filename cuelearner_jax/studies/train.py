@@ -136,5 +136,8 @@ def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
     """Return the columns of one evaluation as a table with a row per lane."""
     count = len(group.seeds)
     columns = {name: value if np.ndim(value) else np.full(count, value) for name, value in row.items()}
-    told = {name: pa.array(list(values), from_pandas=True) for name, values in columns.items()}
+    told = {
+        name: pa.array(values if values.ndim == 1 else list(values), from_pandas=True)
+        for name, values in columns.items()
+    }
     return pa.table({"guidance": pa.array([group.guidance.name] * len(group.seeds)), **told})
