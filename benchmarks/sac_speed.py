@@ -89,7 +89,7 @@ def environment_of(name: str, backend: str) -> tuple[Any, Any, int]:
 
 def configuration(setting: Setting) -> RunConfig:
     """Return this package's options."""
-    agent = sac.Config(
+    agent = sac.SacConfig(
         actor_layers=setting.layers,
         critic_layers=setting.layers,
         batch_size=setting.batch_size,

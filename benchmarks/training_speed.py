@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--lanes-per-block", type=int, default=0, help="0: the default of the machine")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
-    agent = ddqn.Config(
+    agent = ddqn.DdqnConfig(
         directions=DIRECTIONS,
         target_directions=DIRECTIONS,
         batch_size=BATCH,

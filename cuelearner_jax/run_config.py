@@ -46,7 +46,7 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
     sizes: Sizes = dataclasses.field(default_factory=Sizes)
     scalars: Scalars = dataclasses.field(default_factory=Scalars)
     schedule: Schedule = dataclasses.field(default_factory=Schedule)
-    agent: AgentT = dataclasses.field(default_factory=ddqn.Config)  # pyright: ignore[reportAssignmentType]
+    agent: AgentT = dataclasses.field(default_factory=ddqn.DdqnConfig)  # pyright: ignore[reportAssignmentType]
     """Options of the agent."""
     arbiter: ArbiterT = dataclasses.field(default_factory=Episodes)  # pyright: ignore[reportAssignmentType]
     """Options of the arbiter."""

@@ -81,7 +81,7 @@ TASK = Task(
                     eval_envs=10,
                     checkpoint_every=2_000,
                 ),
-                ddqn.Config(
+                ddqn.DdqnConfig(
                     q_layers=(64, 64),
                     directions=12,
                     target_directions=12,

@@ -340,7 +340,7 @@ TASK = Task(
                     eval_envs=200,
                     checkpoint_every=1_500,
                 ),
-                ddqn.Config(
+                ddqn.DdqnConfig(
                     q_layers=(64, 64),
                     directions=36,
                     target_directions=12,

@@ -150,7 +150,7 @@ TASK = Task(
                     eval_envs=200,
                     checkpoint_every=2_000,
                 ),
-                ddqn.Config(
+                ddqn.DdqnConfig(
                     q_layers=(64, 64),
                     directions=400,
                     target_directions=16,

@@ -65,7 +65,7 @@ class Tuned(struct.PyTreeNode):
 
 
 @part
-class Noisy(ddqn.Config):
+class Noisy(ddqn.DdqnConfig):
     """Options of an agent whose actions are turned at random while it learns."""
 
     NAME: ClassVar[str] = "ddqn-noisy"

@@ -32,7 +32,7 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import policy_of
-from cuelearner_jax.reading import Distortion, Reading, Unknown, Walk, declared_distortions, simulator_distortion
+from cuelearner_jax.reading import Distortion, ReadingSession, Unknown, Walk, declared_distortions, simulator_distortion
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.report.statistics import RESAMPLES
 from cuelearner_jax.runs.trained import PolicySource, several
@@ -128,7 +128,7 @@ def worth(world: World, policy: Any, split: str, steps: int) -> float:
     return float(evaluate_policy(world.shown, policy, episodes(split), ENVS, steps)[name])
 
 
-def asked(reading: Reading, walk: Walk, seed: int, labels: int) -> None:
+def asked(reading: ReadingSession, walk: Walk, seed: int, labels: int) -> None:
     """Ask so many questions, in batches."""
     key, size = jax.random.key(seed), max(LEAST_BATCH, -(-labels // BATCHES))
     for done in range(0, labels, size):
@@ -170,7 +170,7 @@ class Study(NamedTuple):
         world, family = self.world(name)
         start, walk = time.time(), Walk(world.env, world.teacher, world.scalars)
         policy, eps = self.bases[base], float(world.scalars.eps_deg)
-        reading = Reading(policy, family, actions_of(world.env), eps, labels, world.env.observation)
+        reading = ReadingSession(policy, family, actions_of(world.env), eps, labels, world.env.observation)
         asked(reading, walk, seed * 1000 + labels, labels)
         found = reading.result()
         seconds, better = round(time.time() - start, 1), found.policy if found.used else policy

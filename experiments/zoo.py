@@ -28,7 +28,7 @@ from cuelearner_jax.adaptation.judging import PairedTest, differences
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.reading import fitting
 from cuelearner_jax.reading.fitting import Fit, Hypothesis, Reader
-from cuelearner_jax.reading.linear import Labels
+from cuelearner_jax.reading.linear import CueLabels
 from cuelearner_jax.reading.posterior import PRIORS, habits
 from cuelearner_jax.reading.session import BATCHES, FIRST, MOST_WRONG, USED
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
@@ -57,7 +57,7 @@ class Cell(NamedTuple):
 class Asked(NamedTuple):
     """The state of one cell between batches of questions."""
 
-    labels: Labels
+    labels: CueLabels
     plain: Hypothesis
     smooth: Hypothesis
     fits: Fit  # all hypotheses
@@ -95,7 +95,7 @@ def acts_of(world: Any, fit: Fit, corrects: jax.Array) -> Any:
 
 def ask(
     world: Any, state: Asked, key: jax.Array, number: jax.Array, wrong: jax.Array, one_cue: jax.Array
-) -> tuple[Labels, jax.Array]:
+) -> tuple[CueLabels, jax.Array]:
     """Ask a batch of questions where the policy corrected so far goes, and predict the answers.
 
     Returns all labels so far, and the evidence.
@@ -113,13 +113,13 @@ def ask(
     action = reader.space.exp(to_even(robot, jax.vmap(act)(obs)), away)
     say = lambda key, state, action: zoo.answer(key, world, state, action, reader.eps, wrong, one_cue)  # noqa: E731
     answer = jax.vmap(say)(jax.random.split(k_answer, count), states, from_even(robot, action))
-    new = Labels(obs, action, answer, jnp.ones(count, bool))
+    new = CueLabels(obs, action, answer, jnp.ones(count, bool))
     at = number * count + jnp.arange(count)
-    labels = Labels(*(leaf.at[at].set(part) for leaf, part in zip(state.labels, new, strict=True)))
+    labels = CueLabels(*(leaf.at[at].set(part) for leaf, part in zip(state.labels, new, strict=True)))
     return labels, state.evidence + jnp.where(begun, reader.ratio(state.fits, new), 0.0)
 
 
-def read(world: Any, labels: Labels, evidence: jax.Array, plain: Hypothesis, smooth: Hypothesis) -> Asked:
+def read(world: Any, labels: CueLabels, evidence: jax.Array, plain: Hypothesis, smooth: Hypothesis) -> Asked:
     """Read all labels so far; start from the hypotheses of the fit before."""
     fits = reader_of(world.robot).read(labels, plain, smooth)
     plain, smooth = fitting.again(fits)
@@ -130,7 +130,7 @@ def begun(world: Any, labels: int) -> Asked:
     """Return the state before the first question."""
     robot, size = world.robot, world.robot.order.shape[0]
     n = robot.low.shape[0]
-    blank = Labels(
+    blank = CueLabels(
         jnp.zeros((labels, size)), jnp.zeros((labels, n)), jnp.zeros((labels, robot.cues)), jnp.zeros(labels, bool)
     )
     plain, smooth = fitting.unfitted(space_of(robot), (), size)
@@ -184,7 +184,7 @@ def _begun(worlds: Any, labels: int) -> Asked:
 
 
 @jax.jit
-def _ask(worlds: Any, state: Asked, keys: Any, number: Any, wrong: Any, one_cue: Any) -> tuple[Labels, jax.Array]:
+def _ask(worlds: Any, state: Asked, keys: Any, number: Any, wrong: Any, one_cue: Any) -> tuple[CueLabels, jax.Array]:
     one = lambda world, state, key, wrong, one_cue: ask(world, state, key, number, wrong, one_cue)  # noqa: E731
     return each_lane(one)(worlds, state, keys, wrong, one_cue)
 

@@ -58,14 +58,14 @@ SETTINGS = tuple(
 class Even(WholeObservations, struct.PyTreeNode):
     """A world of the zoo with actions in half ranges and observations in standard deviations, as networks take them."""
 
-    world: zoo.World
+    world: zoo.ZooWorld
     mean: Float[Array, " obs"]
     deviation: Float[Array, " obs"]
     actions: Space = struct.field(pytree_node=False)
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
 
     @classmethod
-    def of(cls, world: zoo.World, key: PRNGKeyArray) -> Even:
+    def of(cls, world: zoo.ZooWorld, key: PRNGKeyArray) -> Even:
         """Return a world in the units of what the robot's policy meets in it."""
         act = lambda obs: zoo.policy(world.robot, obs)  # noqa: E731
         obs = jax.vmap(lambda key: zoo.rollout(key, world, act)[0])(jax.random.split(key, study.PLAYED))

@@ -8,14 +8,14 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from cuelearner_envs.navigation.world import FAR_AWAY, World
+from cuelearner_envs.navigation.world import FAR_AWAY, NavigationWorld
 
 LIDAR_HEIGHT = 0.5  # of the rays above the floor [m]: below the top of every solid
 FIELD_OF_VIEW, BEAMS = np.deg2rad(270.0), 271
 ANGLES = np.linspace(-FIELD_OF_VIEW / 2, FIELD_OF_VIEW / 2, BEAMS)  # from straight ahead [rad]
 
 
-def model(world: World) -> mujoco.MjModel:
+def model(world: NavigationWorld) -> mujoco.MjModel:
     """A static MuJoCo model of one world (no batch): boxes and upright cylinders, no rows that only fill up."""
     geoms = []
     for (x, y, yaw, length, width), height in _used(world.boxes, world.box_heights):
@@ -55,7 +55,7 @@ def scan(
     return np.minimum(np.where(found < 0, max_range, found), max_range)
 
 
-def poses(rng: np.random.Generator, world: World, count: int) -> np.ndarray:
+def poses(rng: np.random.Generator, world: NavigationWorld, count: int) -> np.ndarray:
     """Random poses in the hall (count, 3) in single precision [m, rad], turned at random.
 
     In turn: anywhere (which may be inside a solid), anywhere, inside a solid, and just outside one (within 0.3 m). The

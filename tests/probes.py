@@ -144,7 +144,7 @@ def make_task(name="window"):
 
 SIZES = Sizes(feedback_layers=(32, 32), num_envs=4, labels_per_round=10, fit_steps=200, fit_batch_size=32)
 SCALARS = Scalars(max_grad_norm=10.0, eps_deg=20.0, tau_deg=1.0, feedback_learning_rate=5e-3)
-AGENT = ddqn.Config(
+AGENT = ddqn.DdqnConfig(
     q_layers=(32, 32),
     directions=16,
     target_directions=16,

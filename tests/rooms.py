@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from cuelearner_envs.navigation import World
+from cuelearner_envs.navigation import NavigationWorld
 from cuelearner_envs.navigation.world import FAR_AWAY
 
 ORIGIN = ((0.0, 0.0),)
@@ -16,7 +16,7 @@ def world(
     """Boxes (x, y, yaw, half-length, half-width) and circles (x, y, radius), filled up to so many rows of each."""
     boxes = [*boxes, *[[FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01]] * (rows[0] - len(boxes))]
     circles = [*circles, *[[FAR_AWAY, FAR_AWAY, 0.01]] * (rows[1] - len(circles))]
-    return World(
+    return NavigationWorld(
         boxes=jnp.array(boxes, jnp.float32),
         box_heights=jnp.broadcast_to(jnp.array(heights), (len(boxes),)),
         circles=jnp.array(circles, jnp.float32),

@@ -11,7 +11,7 @@ import page_task
 import probes
 
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.labelling.plan import Base, Plan
+from cuelearner_jax.labelling.plan import Base, SessionPlan
 from cuelearner_jax.policies import Uniform
 
 TESTS = Path(__file__).resolve().parent
@@ -22,7 +22,7 @@ ENV = page_task.TASK.environment(probes.CONFIG.task)
 def plan(labels=20, kind="relative", base=None, config=probes.CONFIG, **others):
     """Return the plan of a session on the bandit."""
     guidance = guidances.make(kind, probes.SIZES, ENV)
-    return Plan(page_task.TASK, config, guidance, base or Base(Uniform(), "uniform"), labels, **others)
+    return SessionPlan(page_task.TASK, config, guidance, base or Base(Uniform(), "uniform"), labels, **others)
 
 
 def expert(item, eps_deg=probes.SCALARS.eps_deg):

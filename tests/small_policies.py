@@ -7,9 +7,9 @@ import numpy as np
 import probes
 
 from cuelearner_jax.adaptation.by_model import AdaptationResult
-from cuelearner_jax.adaptation.by_reading import Evidence, ReadingAdaptation
+from cuelearner_jax.adaptation.by_reading import ReadingAdaptation, ReadingLaneState
 from cuelearner_jax.adaptation.judging import Judgement
-from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, begin
+from cuelearner_jax.adaptation.lanes import Adaptation, LaneRows, begin
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
@@ -23,7 +23,7 @@ from cuelearner_jax.storage import policy_folders
 TASK = probes.make_task()
 ENV = TASK.environment(probes.CONFIG.task)
 SIZES = GuideSizes(**{field.name: getattr(probes.SIZES, field.name) for field in dataclasses.fields(GuideSizes)})
-LANES = Lanes(*(np.array(column) for column in ([0, 0], [0, 1], [10, 10], [45.0, 45.0])))
+LANES = LaneRows(*(np.array(column) for column in ([0, 0], [0, 1], [10, 10], [45.0, 45.0])))
 
 
 def find(name):
@@ -51,7 +51,7 @@ def write(folder, overwrite=False, origin="run", read=False):
         nothing = unread(None, actions_of(ENV), of.family, ENV.obs_size).correction
         both = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), nothing)
         yes = np.ones(2, bool)
-        block = Evidence(LANES.base, both, block.labels, block.bound, yes, np.zeros(2), yes, ~yes)
+        block = ReadingLaneState(LANES.base, both, block.labels, block.bound, yes, np.zeros(2), yes, ~yes)
     found = AdaptationResult(of, LANES, block, judged)
     with policy_folders.place_of(folder, overwrite) as place:
         adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})

@@ -44,7 +44,7 @@ class Walk(WholeObservations, struct.PyTreeNode):
         return jnp.stack([jnp.clip(1 - 4 * obs[0] + self.wrong, -1, 3), 0.25])
 
 
-SMALL = sac.Config(
+SMALL = sac.SacConfig(
     actor_layers=(8,), critic_layers=(8,), batch_size=8, replay_capacity=96, actor_rate=1e-3, critic_rate=1e-3
 )
 

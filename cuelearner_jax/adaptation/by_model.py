@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.judging import LABELS, PERSON, Judge, Judgement, Judging
-from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, ask_round, begin, blame, rounds, take_labels
+from cuelearner_jax.adaptation.lanes import Adaptation, LaneRows, ask_round, begin, blame, rounds, take_labels
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.environment import actions_of
@@ -42,8 +42,8 @@ class AdaptationResult:
     """The adapted lanes and their judgement. A lane whose model is not used acts as its base."""
 
     of: Adaptation
-    lanes: Lanes
-    block: Any  # `LaneState`, or `by_reading.Evidence`
+    lanes: LaneRows
+    block: Any  # `LaneState`, or `by_reading.ReadingLaneState`
     judged: Judgement
     results: tuple[Result, ...] = ()  # reading only: each lane's estimates
 
@@ -98,7 +98,7 @@ class AdaptationResult:
 
 def adapt(
     of: Adaptation,
-    lanes: Lanes,
+    lanes: LaneRows,
     how: Judging,
     teacher: Teacher | None = None,
     labels: Label | None = None,
@@ -122,7 +122,7 @@ def adapt(
     mesh, count = mesh or lane_mesh(), lanes.number
     # the block is filled up with repeats of the last lane, which are dropped in the end
     filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)
-    judge = Judge(of, Lanes(*(column[filled] for column in lanes)), how, mesh, watch)
+    judge = Judge(of, LaneRows(*(column[filled] for column in lanes)), how, mesh, watch)
     placed = of.replace(env=place(mesh, of.env, SHARED), bases=place(mesh, of.bases, SHARED))
     block = place(mesh, begin(of, judge.lanes), BY_LANE)
     if labels is not None:
@@ -143,7 +143,7 @@ def finished(judge: Judge, block: Any, count: int, results: tuple[Result, ...] =
     """Judge a block's first `count` lanes and take out corrections that are not used."""
     judged, block = judge.judge_lanes(block)
     block = judge.of.keep_used(block, jnp.asarray(judged.used))
-    block, lanes = jax.tree.map(lambda leaf: leaf[:count], block), Lanes(*(column[:count] for column in judge.lanes))
+    block, lanes = jax.tree.map(lambda leaf: leaf[:count], block), LaneRows(*(column[:count] for column in judge.lanes))
     judged = Judgement(judged.by, *(column[:count] for column in judged[1:]))
     return AdaptationResult(judge.of, lanes, block, judged, results)
 

@@ -19,11 +19,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_jax.adaptation.by_model import AdaptationResult, finished
 from cuelearner_jax.adaptation.judging import Judge, Judging
-from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
+from cuelearner_jax.adaptation.lanes import Adaptation, LaneRows
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import Tell, ignore_progress
-from cuelearner_jax.reading import Read, Reading, Walk
+from cuelearner_jax.reading import Read, ReadingSession, Walk
 from cuelearner_jax.reading.correction import Correction
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.fitting import pick
@@ -59,7 +59,7 @@ class ReadingAdaptation(Adaptation):
         return unread(base, actions_of(self.env), self.family, self.env.obs_size, labels, mixed)
 
 
-class Evidence(struct.PyTreeNode):
+class ReadingLaneState(struct.PyTreeNode):
     """A block of lanes with their answers and corrections."""
 
     base: Int[Array, " lanes"]
@@ -74,7 +74,7 @@ class Evidence(struct.PyTreeNode):
 
 def adapt(
     of: ReadingAdaptation,
-    lanes: Lanes,
+    lanes: LaneRows,
     how: Judging,
     teacher: Teacher | None = None,
     labels: Label | None = None,
@@ -88,7 +88,7 @@ def adapt(
     rows, results, asked = [], [], 0
     for base, seed, budget, _ in zip(*(column.tolist() for column in lanes), strict=True):
         observation = getattr(of.env, "observation", ())
-        reading = Reading(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation)
+        reading = ReadingSession(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation)
         if labels is None:
             progress = lambda count, before=asked: tell(before + count, total)  # noqa: E731
             own = _asked(of, reading, seed, budget, teacher, progress)
@@ -99,7 +99,7 @@ def adapt(
         results.append(reading.result())
         asked += budget
         tell(asked, total)
-    block = Evidence(
+    block = ReadingLaneState(
         base=jnp.asarray(lanes.base),
         correction=_stacked([one.policy.correction for one in results]),
         labels=_padded(rows) if labels is None else labels,
@@ -114,7 +114,7 @@ def adapt(
 
 
 def _asked(
-    of: ReadingAdaptation, reading: Reading, seed: int, budget: int, teacher: Any, tell: Callable[[int], None]
+    of: ReadingAdaptation, reading: ReadingSession, seed: int, budget: int, teacher: Any, tell: Callable[[int], None]
 ) -> Label:
     """Return one lane's labels, asked and read in batches."""
     walk, rows = Walk(of.env, teacher, of.scalars), []

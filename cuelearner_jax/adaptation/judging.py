@@ -21,7 +21,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array
 
-from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
+from cuelearner_jax.adaptation.lanes import Adaptation, LaneRows, LaneState
 from cuelearner_jax.adaptation.person import Person, preferences
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
@@ -85,7 +85,7 @@ class Judge:
     A block of lanes is a `LaneState`, or any record with `base`, `bound`, `corrects` and `failed`.
     """
 
-    def __init__(self, of: Adaptation, lanes: Lanes, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
+    def __init__(self, of: Adaptation, lanes: LaneRows, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
         """`mesh`: devices that share the lanes; `watch`: given the name of a piece of work, who is told progress."""
         self.of, self.lanes, self.how, self.watch = of, lanes, how, watch
         self.mesh = mesh if mesh.size > 1 else None

@@ -37,7 +37,7 @@ from cuelearner_jax.policies import Guided, PolicyNode
 from cuelearner_jax.types import Label, Teacher
 
 
-class Lanes(NamedTuple):
+class LaneRows(NamedTuple):
     """The lanes of an adaptation as arrays, one row a lane."""
 
     base: np.ndarray  # (lanes,) int: which of the base policies
@@ -53,13 +53,13 @@ class Lanes(NamedTuple):
 
 def product(
     bases: int, seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float], one_each: bool = False
-) -> Lanes:
+) -> LaneRows:
     """Return the lanes of every combination; `one_each`: pair each base policy with a seed of its own."""
     pairs = [*enumerate(seeds)] if one_each else [(base, seed) for base in range(bases) for seed in seeds]
     rows = [(*pair, budget, bound) for bound in bounds_deg for budget in budgets for pair in pairs]
     base, seed, budget, bound = zip(*rows, strict=True)
     whole = lambda column: np.array([*map(index, column)], np.int32)  # noqa: E731  # refuses fractions
-    return Lanes(whole(base), whole(seed), whole(budget), np.array(bound, np.float32))
+    return LaneRows(whole(base), whole(seed), whole(budget), np.array(bound, np.float32))
 
 
 def side_by_side(policies: Sequence[Any]) -> Any:
@@ -116,7 +116,7 @@ class Adaptation(struct.PyTreeNode):
         return block.replace(guide=block.guide.replace(model=model.replace(fitted=model.fitted & used)))
 
 
-def rounds(lanes: Lanes, sizes: GuideSizes) -> int:
+def rounds(lanes: LaneRows, sizes: GuideSizes) -> int:
     """Return the number of rounds until the largest budget is asked for."""
     return asking.label_slots(int(lanes.budget.max()), sizes) // sizes.labels_per_round
 
@@ -131,7 +131,7 @@ def _begin(guidance: Guide, sizes: GuideSizes, slots: int, env: Any, columns: An
     return each_lane(one)(*columns)
 
 
-def begin(of: Adaptation, lanes: Lanes) -> LaneState:
+def begin(of: Adaptation, lanes: LaneRows) -> LaneState:
     """Return lanes that have asked nothing yet. Their number must divide among the devices of the mesh used later."""
     slots = rounds(lanes, of.sizes) * of.sizes.labels_per_round
     bound = actions_of(of.env).from_unit(lanes.bound_deg)

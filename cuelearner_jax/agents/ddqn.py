@@ -29,7 +29,7 @@ ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% fast
 
 
 @part
-class Config:
+class DdqnConfig:
     """Options of double DQN."""
 
     NAME: ClassVar[str] = "ddqn"
@@ -104,7 +104,7 @@ class DDQNState(struct.PyTreeNode):
 class DoubleDQN:
     """The agent's functions (`protocol.AgentFunctions`)."""
 
-    options: Config
+    options: DdqnConfig
     frame: Frame
     spaces: Spaces
     bootstraps: bool  # whether targets use the next observation (discount above 0)
@@ -129,7 +129,7 @@ class DoubleDQN:
         return best_of(partial(self.value, env, params), self._directions, obs)
 
     def explore(
-        self, env: Any, options: Config, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
+        self, env: Any, options: DdqnConfig, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return the greedy action, searched near the peaks of a coarse first look where the options say so."""
         own = self.options
@@ -158,7 +158,7 @@ class DoubleDQN:
     def update(
         self,
         env: Any,
-        options: Config,
+        options: DdqnConfig,
         scalars: Scalars,
         count: Int[Array, ""],
         params: Params,
@@ -191,7 +191,7 @@ class DoubleDQN:
     def targets(
         self,
         env: Any,
-        options: Config,
+        options: DdqnConfig,
         discount: Float[Array, ""] | float,
         params: Params,
         target_params: Params,

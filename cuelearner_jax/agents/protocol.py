@@ -103,4 +103,4 @@ class AgentOptions(Protocol):
         ...
 
 
-AGENTS: dict[str, Any] = {kind.NAME: kind for kind in (ddqn.Config, sac.Config)}
+AGENTS: dict[str, Any] = {kind.NAME: kind for kind in (ddqn.DdqnConfig, sac.SacConfig)}

@@ -35,7 +35,7 @@ LOG_STD = (-20.0, 2.0)  # bounds of the logarithm of the Gaussian's standard dev
 
 
 @part
-class Config:
+class SacConfig:
     """Options of soft actor-critic."""
 
     NAME: ClassVar[str] = "sac"
@@ -127,7 +127,7 @@ class SACState(struct.PyTreeNode):
     """The learning state of SAC beside its parameters."""
 
     target_critics: Params  # None where nothing bootstraps (discount 0)
-    log_temperature: Float[Array, ""]  # logarithm of the temperature over `Config.first_temperature`
+    log_temperature: Float[Array, ""]  # logarithm of the temperature over `SacConfig.first_temperature`
     actor_opt: Any
     critics_opt: Any
     temperature_opt: Any
@@ -137,7 +137,7 @@ class SACState(struct.PyTreeNode):
 class SoftActorCritic:
     """The functions of SAC (`protocol.AgentFunctions`); parameters are a dictionary of `actor` and `critics`."""
 
-    options: Config
+    options: SacConfig
     frame: Frame
     spaces: Spaces
     bootstraps: bool  # whether targets use the next observation (discount above 0)
@@ -164,7 +164,7 @@ class SoftActorCritic:
         return self.in_box(jnp.tanh(self._gaussian(params["actor"], obs)[0]))
 
     def explore(
-        self, env: Any, options: Config, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
+        self, env: Any, options: SacConfig, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return actions drawn from the squashed Gaussian."""
         return self.in_box(self.draw(params["actor"], obs, key).unit)
@@ -200,7 +200,7 @@ class SoftActorCritic:
     def update(
         self,
         env: Any,
-        options: Config,
+        options: SacConfig,
         scalars: Scalars,
         count: Int[Array, ""],
         params: Params,

@@ -25,7 +25,7 @@ from cuelearner_jax.types import Step
 Heuristic = Callable[[Float[Array, " obs"]], Float[Array, " action"]]
 
 
-class Running(struct.PyTreeNode):
+class JaxState(struct.PyTreeNode):
     """State of a `JaxEnvironment` between steps."""
 
     state: Any  # the simulator's state
@@ -46,15 +46,15 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     actions: Space = struct.field(pytree_node=False)
     heuristic: Heuristic | None = struct.field(pytree_node=False, default=None)
 
-    def reset(self, key: PRNGKeyArray) -> tuple[Running, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[JaxState, Float[Array, " obs"]]:
         """Start an episode."""
         state = jax.tree.map(jnp.asarray, self.simulator().reset(jax.random.key_data(key)))
-        return Running(state, jnp.zeros((), jnp.int32)), flat(state.obs)
+        return JaxState(state, jnp.zeros((), jnp.int32)), flat(state.obs)
 
-    def step(self, key: PRNGKeyArray, state: Running, action: Float[Array, " action"]) -> tuple[Running, Step]:
+    def step(self, key: PRNGKeyArray, state: JaxState, action: Float[Array, " action"]) -> tuple[JaxState, Step]:
         """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
         before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into their input dictionaries
-        after = Running(jax.tree.map(jnp.asarray, self.simulator().step(before, action)), state.steps + 1)
+        after = JaxState(jax.tree.map(jnp.asarray, self.simulator().step(before, action)), state.steps + 1)
         stopped = jnp.asarray(after.state.info.get("truncation", 0)) > 0
         terminated = (after.state.done > 0) & ~stopped
         truncated = (stopped | (after.steps >= self.max_steps)) & ~terminated

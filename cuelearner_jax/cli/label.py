@@ -38,7 +38,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Reading
 from cuelearner_jax.labelling import controls
-from cuelearner_jax.labelling.plan import Base, Plan
+from cuelearner_jax.labelling.plan import Base, SessionPlan
 from cuelearner_jax.policies import NearAims, policy_of, uniform_in
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
@@ -60,7 +60,7 @@ UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch
 
 
 @dataclass(frozen=True, kw_only=True)
-class Label(Changed):
+class LabelOptions(Changed):
     """Label actions in a browser: uniform ones, a policy's, or recorded ones.
 
     Name a policy after the task: a run folder, a policy folder, or package.module:NAME of a function of observations.
@@ -108,7 +108,7 @@ def run(arguments: list[str]) -> None:
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
     server = page_module("server")
-    ahead = look_ahead_of(arguments, "label", Label)
+    ahead = look_ahead_of(arguments, "label", LabelOptions)
     task = recorded_or_task(ahead)
     named = ahead.words[1] if len(ahead.words) > 1 else None
     usual = QUICKSTART if named is None and task.proposed is None else PAPER
@@ -117,7 +117,7 @@ def run(arguments: list[str]) -> None:
     if named is not None and not is_code(named):
         source = source_in(shipped.folder_of(named), task, None, ahead.changes)
     default = _suggested(task, preset, source, ahead, named)
-    options = parse(Label, arguments, "label", default, about(Label, task, preset=usual))
+    options = parse(LabelOptions, arguments, "label", default, about(LabelOptions, task, preset=usual))
     plan = make_plan(task, preset.config, options, source)
     config = preset.config if source is None else dataclasses.replace(preset.config, task=default.task)
     again = shlex.join(["cuelearner", "label", *arguments])
@@ -130,16 +130,17 @@ def run(arguments: list[str]) -> None:
     out.print(f"done: {ending.line}\nnext: {ending.following}")
 
 
-def _suggested(task: Task, preset: Preset, source: PolicySource | None, ahead: Namespace, named: str | None) -> Label:
+def _suggested(
+    task: Task, preset: Preset, source: PolicySource | None, ahead: Namespace, named: str | None
+) -> LabelOptions:
     """Return the default options; labels that are to correct a policy are asked for as `adapt` corrects it."""
     config = source.config if source else preset.config
     reads = named is not None or _is_proposed(task, config.task)
     kind = Reading.name if reads else asking_kind(preset_kinds(task, preset))
-    questions, adapts = UNIFORM, named is not None or task.proposed is not None
-    if named is None:
-        questions = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
+    adapts = named is not None or task.proposed is not None
+    usual = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
     asked = AdaptRequest.of(task, config, ahead.scenario, ahead.guidance[0] if ahead.guidance else kind)
-    return Label(
+    return LabelOptions(
         task=asked.task if ahead.cues is None else with_cues(task, asked.task, ahead.cues),
         sizes=GuideSizes(**_values(GuideSizes, (asked if adapts else config).sizes)),
         scalars=GuideScalars(**_values(GuideScalars, (asked if adapts else config).scalars)),
@@ -147,11 +148,11 @@ def _suggested(task: Task, preset: Preset, source: PolicySource | None, ahead: N
         guidance=kind,
         bound_deg=next(iter(asked.bound_deg), None) if adapts else None,
         labels=max(preset.labels) if named is None else asked.labels[0],
-        questions=questions,
+        questions=usual if named is None else UNIFORM,
     )
 
 
-def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySource | None = None) -> Plan:
+def make_plan(task: Task, config: RunConfig, options: LabelOptions, source: PolicySource | None = None) -> SessionPlan:
     """Return the plan of the session. Raises UserError for an invalid request."""
     merged = dataclasses.replace(
         config,
@@ -194,7 +195,7 @@ def make_plan(task: Task, config: RunConfig, options: Label, source: PolicySourc
         family = declared_distortions(env) if named is None else changes.family_of(changes.load(named), env)
     wanted = options.labels, options.seed, options.who.strip(), options.bound_deg, robot
     base = _base(task, options, source, env) if options.again is None else Base(uniform_in(env), "")
-    plan = Plan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
+    plan = SessionPlan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
     return plan if options.again is None else _second(plan, options, options.again)
 
 
@@ -209,7 +210,7 @@ def _robot(task: Task, name: str | None) -> str:
     return "" if body.name == task.bodies[0].name else f"{body.name} {body.digest}".strip()
 
 
-def _second(plan: Plan, options: Label, path: Path) -> Plan:
+def _second(plan: SessionPlan, options: LabelOptions, path: Path) -> SessionPlan:
     """Return a plan with the questions of another page's file. Raises UserError if they are not of this world."""
     file = label_files.read(path)
     if file.session is None or file.people is None:
@@ -231,7 +232,7 @@ def _second(plan: Plan, options: Label, path: Path) -> Plan:
     return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
 
 
-def _base(task: Task, options: Label, source: PolicySource | None, env: Any) -> Base:
+def _base(task: Task, options: LabelOptions, source: PolicySource | None, env: Any) -> Base:
     """Return the policy to ask about. Raises UserError if it is not available, or needs other observations."""
     lane, named, questions = options.base, options.policy, options.questions
     if named is not None and questions != UNIFORM:
@@ -269,7 +270,7 @@ def page_module(name: str) -> Any:
     return module
 
 
-def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, commands: Any) -> Any:
+def _served(server: Any, plan: SessionPlan, options: LabelOptions, port: Any, stopping: Any, commands: Any) -> Any:
     """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
     from cuelearner_jax.labelling.session import Record, Session
 
@@ -293,7 +294,7 @@ def _served(server: Any, plan: Plan, options: Label, port: Any, stopping: Any, c
         leads_there.unlink(missing_ok=True)
 
 
-def _following(task: Task, preset: str, config: RunConfig, options: Label, labels: int) -> str:
+def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions, labels: int) -> str:
     """Return the command that uses the labels: `train` for labels of uniform actions, `adapt` for a policy's.
 
     `config`: the preset's configuration.

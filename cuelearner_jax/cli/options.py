@@ -65,7 +65,7 @@ class Outside:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parts:
+class PartOptions:
     """A run's parts from outside the package, or other parts than the preset's."""
 
     agent_part: Annotated[str | None, tyro.conf.arg(name="agent")] = None
@@ -90,7 +90,7 @@ class Changed(Outside):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finished(Changed, Parts):
+class Finished(Changed, PartOptions):
     """A finished policy's code, which is never loaded because a file names it, and its world."""
 
     code: Annotated[str | None, tyro.conf.arg(name="base")] = None

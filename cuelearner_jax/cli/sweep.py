@@ -7,13 +7,13 @@ from typing import Annotated
 
 import tyro
 
-from cuelearner_jax.cli.train import Training, parse_training, suggested
+from cuelearner_jax.cli.train import TrainingOptions, parse_training, suggested
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.shards import Shard
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sweep(Training):
+class Sweep(TrainingOptions):
     """Train seeds x label budgets x kinds of guidance in one process."""
 
     guidance: tuple[str, ...] = ()

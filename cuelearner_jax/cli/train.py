@@ -13,7 +13,7 @@ from cuelearner_jax.cli.options import (
     Flag,
     Kinds,
     Outside,
-    Parts,
+    PartOptions,
     Unnamed,
     about,
     look_ahead_of,
@@ -31,12 +31,12 @@ from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.studies import train
 from cuelearner_jax.task import QUICKSTART, Task
 
-TrainingT = TypeVar("TrainingT", bound="Training")
+TrainingT = TypeVar("TrainingT", bound="TrainingOptions")
 Settled = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]  # of the order, but no option: set after parsing
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training(Outside, Parts, Order):
+class TrainingOptions(Outside, PartOptions, Order):
     """Options that train and sweep share, and the order that they make."""
 
     task: Settled = None
@@ -67,7 +67,7 @@ class Training(Outside, Parts, Order):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Training):
+class Train(TrainingOptions):
     """Train one seed under one kind of guidance."""
 
     guidance: str = ""

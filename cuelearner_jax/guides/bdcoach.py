@@ -38,7 +38,7 @@ from cuelearner_jax.types import Label, Params
 
 
 @part
-class Config:
+class BatchCoachConfig:
     """Options of BD-COACH."""
 
     batch_steps: Annotated[int, POSITIVE] = 5
@@ -58,7 +58,7 @@ class BatchCoach(DeepCoach):
     """A guide that acts as a cloned policy does, and learns from a model of its teacher."""
 
     name, about, title = "bdcoach", "a policy moved by a model of its teacher", "BD-COACH"
-    colour, config = "#CC6677", Config
+    colour, config = "#CC6677", BatchCoachConfig
 
     def begin(self, key: PRNGKeyArray) -> BatchCoached:
         """Return one member's policy without corrections, and its untrained human model."""

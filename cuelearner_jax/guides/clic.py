@@ -62,7 +62,7 @@ class Searching:
 
 
 @part
-class Config(Searching):
+class ClicConfig(Searching):
     """Options of CLIC."""
 
     implicit_pairs: Annotated[int, POSITIVE] = 8
@@ -106,7 +106,7 @@ def log_desired(
         x: the action as seen from the one asked about, along the cues, in units of eps.
         h: the answer, with `UNSAID`.
         implicit: directions u_i, as long as h.
-        gamma: see `Config`.
+        gamma: see `ClicConfig`.
     """
     spoken = is_answered(h)
     x, h = jnp.where(spoken, x, 0.0), jnp.where(spoken, h, 0.0)
@@ -143,7 +143,7 @@ class Clic(Guide):
 
     name, title = "clic", "CLIC"
     about = "an energy over actions, low in the sets that corrections leave possible"
-    form, colour, config = RELATIVE, "#117733", Config
+    form, colour, config = RELATIVE, "#117733", ClicConfig
 
     @cached_property
     def network(self) -> GuideModel:

@@ -40,7 +40,7 @@ from cuelearner_jax.types import GuidanceModel, Label, Params
 
 
 @part
-class Config:
+class DeepCoachConfig:
     """Options of deep COACH."""
 
     replay_steps: Annotated[int, POSITIVE] = 5
@@ -64,7 +64,7 @@ class DeepCoach(Demonstration):
     """A guide that acts as a cloned policy does, and is updated by each correction."""
 
     name, about, title = "dcoach", "a policy moved by each correction", "deep COACH"
-    form, colour, config = RELATIVE, "#56B4E9", Config
+    form, colour, config = RELATIVE, "#56B4E9", DeepCoachConfig
 
     @cached_property
     def member(self) -> DeepCoach:

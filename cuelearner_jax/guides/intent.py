@@ -39,7 +39,7 @@ WORDS = 3
 
 
 @part
-class Config:
+class IntentConfig:
     """Options of a guide that infers intent."""
 
     aim_layers: Layers = (32, 32)
@@ -119,8 +119,8 @@ class Intent(Guide):
     """A guide that weights the task's aims by the answers, and moves toward the likeliest."""
 
     name, about, needs = "intent", "relative feedback about the task's aims", ("aims",)
-    form, colour, config = RELATIVE, "#CC79A7", Config
-    options: Config
+    form, colour, config = RELATIVE, "#CC79A7", IntentConfig
+    options: IntentConfig
 
     @cached_property
     def network(self) -> GuideModel:

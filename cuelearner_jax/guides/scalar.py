@@ -31,7 +31,7 @@ from cuelearner_jax.types import GuidanceModel
 
 
 @part
-class Config:
+class ScalarConfig:
     """Options of guidance by scalar feedback."""
 
     guide_directions: Annotated[int, POSITIVE] = 360
@@ -44,8 +44,8 @@ class Scalar(Guide):
     """A guide that executes the action of largest predicted value."""
 
     name, about = "scalar", "a model of which actions the teacher calls good"
-    form, colour, config = SCALAR, "#E69F00", Config
-    options: Config
+    form, colour, config = SCALAR, "#E69F00", ScalarConfig
+    options: ScalarConfig
 
     @cached_property
     def network(self) -> GuideModel:

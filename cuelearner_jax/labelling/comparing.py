@@ -17,7 +17,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.labelling.learner import Agreement, agreement, as_teacher
+from cuelearner_jax.labelling.learner import AnswerAgreement, agreement, as_teacher
 from cuelearner_jax.labelling.plan import keys_of, replay
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import LabelFile
@@ -49,7 +49,7 @@ def with_teacher(
     rows: list[dict[str, Any]],
     scalars: Scalars,
     tell: Callable[[str], None] = lambda words: None,
-) -> Agreement:
+) -> AnswerAgreement:
     """Return how well a page's labels agree with the answers of the task's teacher, simulated without mistakes.
 
     The situations of all `rows` (`label_files.history`) are replayed.
@@ -82,7 +82,7 @@ def with_teacher(
     return agreement(form, env, np.asarray(file.labels.answer), theirs)
 
 
-def between(one: LabelFile, other: LabelFile, env: Any) -> Agreement:
+def between(one: LabelFile, other: LabelFile, env: Any) -> AnswerAgreement:
     """Return how well two files agree on the questions both answered (equal observation and action).
 
     Raises UserError if the two files differ in the form, space or strength of their answers.

@@ -23,8 +23,8 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.fitting import held_out
-from cuelearner_jax.labelling.plan import Plan
-from cuelearner_jax.reading import Reading
+from cuelearner_jax.labelling.plan import SessionPlan
+from cuelearner_jax.reading import ReadingSession
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.types import EnvState, Label, Teacher
 
@@ -33,7 +33,7 @@ ALONE = {"xla_cpu_multi_thread_eigen": False}
 NICE = 5  # niceness of the fitting thread, of at most 19
 
 
-class Agreement(NamedTuple):
+class AnswerAgreement(NamedTuple):
     """Agreement of two sets of answers."""
 
     value: float  # share of equal answers; for actions, the mean distance between them
@@ -48,7 +48,7 @@ class Agreement(NamedTuple):
         return f"{self.value:.3g} {self.unit} apart over {self.count}"
 
 
-def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.ndarray) -> Agreement:
+def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.ndarray) -> AnswerAgreement:
     """Compare answers (n, width) to the same questions; a cue counts where both sets say something."""
     space = actions_of(env)
     if form.is_action:
@@ -58,7 +58,7 @@ def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.nda
         if form.by_eps and len(space.cues) > 1:
             alike |= (one == UNSAID) | (other == UNSAID)
         values = alike.all(-1)
-    return Agreement(float(values.mean()) if len(one) else 0.0, len(one), space.unit if form.is_action else "%")
+    return AnswerAgreement(float(values.mean()) if len(one) else 0.0, len(one), space.unit if form.is_action else "%")
 
 
 def as_teacher(
@@ -97,10 +97,10 @@ def answers(of: asking.Inquiry, model: Any, labels: Label) -> Array:
 class Fitted(NamedTuple):
     """A fitted model and its quality."""
 
-    model: Any  # a `GuidanceModel`, or a `Reading`
+    model: Any  # a `GuidanceModel`, or a `ReadingSession`
     labels: int = 0  # number of labels in the fit
     number: int = 0  # of the fit, from 1; 0: no fit yet
-    quality: Agreement | None = None  # with the labels held out of the fit
+    quality: AnswerAgreement | None = None  # with the labels held out of the fit
     problem: str = ""  # why the last fit gave no model (the previous model stays)
     lines: tuple[str, ...] = ()  # reading only: what changed, in words
 
@@ -115,7 +115,7 @@ def step_back() -> None:
 class Learner:
     """The model of a session's answers: a guide fitted from scratch to all labels, or a reading of new ones."""
 
-    def __init__(self, plan: Plan, env: Any, blank: GuideState, key: PRNGKeyArray) -> None:
+    def __init__(self, plan: SessionPlan, env: Any, blank: GuideState, key: PRNGKeyArray) -> None:
         """`blank`: a guide without labels; `key`: the session's."""
         self._plan, self._blank, self._key = plan, blank, key
         space, bound = actions_of(env), plan.bound_deg
@@ -127,10 +127,10 @@ class Learner:
         options: Any = ALONE if jax.default_backend() == "cpu" else None
         self._fit = jax.jit(asking.fit, static_argnums=0, compiler_options=options)
 
-    def _unread(self) -> Reading:
+    def _unread(self) -> ReadingSession:
         plan, env = self._plan, self._of.env
         eps = plan.config.scalars.eps_deg
-        return Reading(plan.base.policy, plan.family, actions_of(env), eps, plan.labels, env.observation)
+        return ReadingSession(plan.base.policy, plan.family, actions_of(env), eps, plan.labels, env.observation)
 
     def question(self, guide: GuideState, keys: Any) -> Float[np.ndarray, " action"]:
         """Return the action to ask about in a situation."""

@@ -46,7 +46,7 @@ class Base(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class SessionPlan:
     """Settings of a labelling session: who is asked, about what, and how many questions."""
 
     task: Task
@@ -94,7 +94,7 @@ class Plan:
         }
 
 
-class Keys(NamedTuple):
+class SessionKeys(NamedTuple):
     """Random keys of a session."""
 
     session: PRNGKeyArray  # for questions and fits
@@ -102,9 +102,9 @@ class Keys(NamedTuple):
     start: PRNGKeyArray  # for the first situation
 
 
-def keys_of(seed: int) -> Keys:
+def keys_of(seed: int) -> SessionKeys:
     """Derive a session's random keys from its seed."""
-    return Keys(*jax.random.split(jax.random.key(seed), 3))
+    return SessionKeys(*jax.random.split(jax.random.key(seed), 3))
 
 
 proceed = jax.jit(asking.proceed)
@@ -116,7 +116,7 @@ def begin(env: Environment, key: PRNGKeyArray) -> GuideState:
     return GuideState(None, None, None, None, *env.reset(key))  # pyright: ignore[reportArgumentType]
 
 
-def replay(env: Environment, keys: Keys, rows: Iterable[Any]) -> Iterator[GuideState]:
+def replay(env: Environment, keys: SessionKeys, rows: Iterable[Any]) -> Iterator[GuideState]:
     """Replay recorded items; yield the situation before each item, and after the last.
 
     `rows` holds the items' observations and actions. The replay ends early, before the first item whose observation

@@ -12,7 +12,7 @@ from cuelearner_jax.asking import GuideState
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.learner import Learner
-from cuelearner_jax.labelling.plan import Plan, keys_of, proceed
+from cuelearner_jax.labelling.plan import SessionPlan, keys_of, proceed
 from cuelearner_jax.policies import policy_name
 from cuelearner_jax.types import Reel, Sketch
 
@@ -32,7 +32,7 @@ class Item(NamedTuple):
 class Questions:
     """Makes items, and holds the model that later items are asked by."""
 
-    def __init__(self, plan: Plan, env: Any) -> None:
+    def __init__(self, plan: SessionPlan, env: Any) -> None:
         """Make the model that later items are asked by."""
         self.plan, self.env, self.pictures, self.space = plan, env, plan.task.pictures(), actions_of(env)
         self.keys = keys_of(plan.seed)

@@ -21,7 +21,7 @@ import numpy as np
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling.learner import Fitted, step_back
-from cuelearner_jax.labelling.plan import Plan, begin, replay
+from cuelearner_jax.labelling.plan import SessionPlan, begin, replay
 from cuelearner_jax.labelling.questions import Item, Questions
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import ANSWERED, UNDONE, UNSURE
@@ -46,7 +46,7 @@ class Response(NamedTuple):
 class Record:
     """The newest response to each item, as in the label file."""
 
-    def __init__(self, plan: Plan, folder: Path) -> None:
+    def __init__(self, plan: SessionPlan, folder: Path) -> None:
         """Open or continue the folder's label file. Raises UserError if it holds labels of another session."""
         shape = shape_of(plan.task, plan.config.task)
         space = actions_of(shape)
@@ -119,7 +119,7 @@ class Status(NamedTuple):
 class Session:
     """Asks questions, saves answers and fits models. Its methods may be called from any thread."""
 
-    def __init__(self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None) -> None:
+    def __init__(self, plan: SessionPlan, folder: Path, tell: Callable[[str], None] = lambda words: None) -> None:
         """Open the label file and prepare the first questions.
 
         Args:

@@ -3,7 +3,7 @@
 from cuelearner_jax.reading.families import Distortion, Unknown, declared_distortions
 from cuelearner_jax.reading.policy import Read
 from cuelearner_jax.reading.result import Estimate, Result
-from cuelearner_jax.reading.session import Reading
+from cuelearner_jax.reading.session import ReadingSession
 from cuelearner_jax.reading.simulator import simulator_distortion
 from cuelearner_jax.reading.walk import Walk
 
@@ -11,7 +11,7 @@ __all__ = [
     "Distortion",
     "Estimate",
     "Read",
-    "Reading",
+    "ReadingSession",
     "Result",
     "Unknown",
     "Walk",

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.families import Family
-from cuelearner_jax.reading.linear import SCALE, Change, Frame
+from cuelearner_jax.reading.linear import SCALE, Change, Units
 from cuelearner_jax.reading.posterior import Posterior, Priors
 from cuelearner_jax.spaces import Space
 
@@ -19,7 +19,7 @@ class Correction(struct.PyTreeNode):
     """The estimate of a change, and the process with which other errors are corrected."""
 
     change: Change
-    frame: Frame
+    frame: Units
     known: Float[Array, "n z"]  # situations that the process was fitted in
     alpha: Float[Array, "n cues"]  # times its variance: weights of the situations
     length: Float[Array, " z"]  # length scale of each input of the process
@@ -32,7 +32,7 @@ class Correction(struct.PyTreeNode):
 
 
 def correction_of(
-    fitted: Posterior, change: Change, frame: Frame, known: Float[Array, "n z"], eps: Any, priors: Priors
+    fitted: Posterior, change: Change, frame: Units, known: Float[Array, "n z"], eps: Any, priors: Priors
 ) -> Correction:
     """Return what is needed to act by a posterior."""
     alpha = posterior.amplitudes(fitted.hyper, priors)[None] ** 2 * fitted.alpha

@@ -22,8 +22,8 @@ from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.correction import Correction, corrected, correction_of
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.likelihood import Habits, curvature, log_likelihood, predictive_log_likelihood
-from cuelearner_jax.reading.linear import PARTS, SCALE, Change, Frame, Labels
-from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, Parts, Posterior, Priors
+from cuelearner_jax.reading.linear import PARTS, SCALE, Change, CueLabels, Units
+from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, ModelParts, Posterior, Priors
 from cuelearner_jax.spaces import Space
 
 Acts = Callable[[Float[Array, "n obs"]], Float[Array, "n action"]]
@@ -50,7 +50,7 @@ _NEVER = -30.0  # logarithm of an amplitude that is no process
 class Hypothesis(struct.PyTreeNode):
     """Parts, estimate and hyperparameters of one hypothesis, from which the next fit starts."""
 
-    parts: Parts
+    parts: ModelParts
     change: Change
     hyper: Hyper
 
@@ -61,7 +61,7 @@ class Fit(struct.PyTreeNode):
     hypothesis: Hypothesis
     posterior: Posterior
     data: Data
-    frame: Frame
+    frame: Units
     evidence: Float[Array, ""]  # bound of the log evidence
     score: Float[Array, ""]  # sum over answers of log p(answer | all others) [nats]
 
@@ -86,7 +86,7 @@ def unfitted(space: Space, family: Family, obs_size: int) -> tuple[Hypothesis, H
 
     def one(names: tuple[str, ...], process: bool) -> Hypothesis:
         used = jnp.array([float(part in names) for part in PARTS])[kinds]
-        return Hypothesis(Parts(used, process), change, hyper)
+        return Hypothesis(ModelParts(used, process), change, hyper)
 
     stack = lambda each: jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)  # noqa: E731
     return stack([one(names, False) for names in HYPOTHESES]), stack([one((), True)] * WITH_PROCESS)
@@ -114,7 +114,7 @@ class Reader:
     ) -> None:
         self.space, self.family, self.acts, self.eps, self.step, self.priors = space, family, acts, eps, step, priors
 
-    def read(self, labels: Labels, plain: Hypothesis, smooth: Hypothesis) -> Fit:
+    def read(self, labels: CueLabels, plain: Hypothesis, smooth: Hypothesis) -> Fit:
         """Return all hypotheses fitted to labels, stacked in the order of `HYPOTHESES`, those with the process last."""
         frame, steady = self._frame(labels)
         plain = self._start(frame, labels, plain)
@@ -126,7 +126,7 @@ class Reader:
     def _ask(self, obs: Float[Array, "*k n obs"]) -> Float[Array, "*k n action"]:
         return self.acts(obs.reshape(-1, obs.shape[-1])).reshape(*obs.shape[:-1], -1)
 
-    def _frame(self, labels: Labels) -> tuple[Frame, Bool[Array, " n"]]:
+    def _frame(self, labels: CueLabels) -> tuple[Units, Bool[Array, " n"]]:
         """Return the units of the linear model, and the labels about which the policy answers steadily."""
         frame = linear.frame_of(self.family, labels, self.step)
         change = linear.no_change(self.space, self.family, labels.obs.shape[-1])
@@ -138,7 +138,7 @@ class Reader:
             frame = linear.frame_of((), labels, None, mixed)
         return frame, steady
 
-    def _start(self, frame: Frame, labels: Labels, plain: Hypothesis) -> Hypothesis:
+    def _start(self, frame: Units, labels: CueLabels, plain: Hypothesis) -> Hypothesis:
         """Return where fits start: where they were, or at shifts of few entries that explain the answers much better.
 
         Slopes lead to the nearest optimum alone, and near its goal a policy may turn by any angle. So shifts of one
@@ -151,12 +151,12 @@ class Reader:
         own = self._worth(labels, plain.change)
         return plain.replace(change=_replace_worse(plain.change, own, change, worth))
 
-    def _worth(self, labels: Labels, changes: Change) -> Float[Array, " k"]:
+    def _worth(self, labels: CueLabels, changes: Change) -> Float[Array, " k"]:
         """Return the log likelihood of labels by each of stacked estimates, without the process."""
         before = _undone_each(self.family, changes, labels.obs)
         return _worth(self.space, self.family, changes, labels, before, self._ask(before), self.eps)
 
-    def _fit(self, frame: Frame, labels: Labels, hypothesis: Hypothesis) -> Fit:
+    def _fit(self, frame: Units, labels: CueLabels, hypothesis: Hypothesis) -> Fit:
         """Return stacked hypotheses fitted to labels."""
         rows = self._data(frame, labels, hypothesis.change)
         posteriors = _unread(rows, hypothesis.hyper)
@@ -166,7 +166,7 @@ class Reader:
         rows = self._data(frame, labels, hypothesis.change)
         return _scored(rows, frame, hypothesis, posteriors, self.priors)
 
-    def _data(self, frame: Frame, labels: Labels, change: Change) -> Data:
+    def _data(self, frame: Units, labels: CueLabels, change: Change) -> Data:
         """Return the linear models at stacked estimates."""
         probe_obs = _probes(self.family, frame, change, labels.obs)
         return _data(self.space, self.family, frame, change, labels, probe_obs, self._ask(probe_obs), self.eps)
@@ -178,7 +178,7 @@ class Reader:
         return _act(self.space, self.family, fitted, obs, before, actions, self.eps, self.priors)
 
     def predict(
-        self, fitted: Fit, labels: Labels
+        self, fitted: Fit, labels: CueLabels
     ) -> tuple[Float[Array, "n cues"], Float[Array, "n cues"], Float[Array, "n cues"]]:
         """Return what one fit says about labels: mean and variance of the change to the right action, and log p.
 
@@ -190,7 +190,7 @@ class Reader:
         rest = (labels, probe_obs, self._ask(probe_obs), own, self.eps, self.priors)
         return _predicted(self.space, self.family, fitted, *rest)
 
-    def ratio(self, fits: Fit, labels: Labels) -> Float[Array, ""]:
+    def ratio(self, fits: Fit, labels: CueLabels) -> Float[Array, ""]:
         """Return log((1 + r) / 2), r = p(answers | best hypothesis) / p(answers | nothing changed)."""
         best, nothing = (self.predict(pick(fits, number), labels)[2].sum() for number in (best_of(fits), 0))
         return jnp.logaddexp(best - nothing, 0.0) - math.log(2)
@@ -198,7 +198,7 @@ class Reader:
     def spread(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n cues"]:
         """Return the standard deviation of the right action along each cue, in the unit of `space.log`."""
         zeros = jnp.zeros((len(obs), len(self.space.cues)))
-        labels = Labels(obs, self.act(fitted, obs), zeros, jnp.ones(len(obs), bool))
+        labels = CueLabels(obs, self.act(fitted, obs), zeros, jnp.ones(len(obs), bool))
         return SCALE * self.eps * jnp.sqrt(self.predict(fitted, labels)[1])
 
 
@@ -220,7 +220,7 @@ def again(fitted: Fit) -> tuple[Hypothesis, Hypothesis]:
     wide = lambda hyper: hyper.replace(width=jnp.full_like(hyper.width, WIDE), lapse=jnp.zeros_like(hyper.lapse))  # noqa: E731
     hyper = wide(plain.hyper.replace(amplitudes=jnp.zeros(count)))
     smooth = smooth.replace(hyper=wide(smooth.hyper))
-    return Hypothesis(Parts(plain.parts.weights, False), plain.change, hyper), smooth
+    return Hypothesis(ModelParts(plain.parts.weights, False), plain.change, hyper), smooth
 
 
 @jax.jit
@@ -249,7 +249,7 @@ def _predicted(
     space: Space,
     family: Family,
     fitted: Fit,
-    labels: Labels,
+    labels: CueLabels,
     probe_obs: Array,
     actions: Array,
     own: Array,
@@ -265,7 +265,7 @@ def _predicted(
 
 
 @partial(jax.jit, static_argnames="family")
-def _moves(family: Family, frame: Frame, change: Change) -> Change:
+def _moves(family: Family, frame: Units, change: Change) -> Change:
     """Return an estimate, and it with another shift of one unknown: of a family, or of the entries that matter most."""
     size = len(frame.step)
     entries = jnp.arange(size) if family else frame.mixed
@@ -297,7 +297,7 @@ def _undone_each(family: Family, changes: Change, obs: Array) -> Array:
 
 @partial(jax.jit, static_argnames=("space", "family"))
 def _worth(
-    space: Space, family: Family, changes: Change, labels: Labels, before: Array, actions: Array, eps: Any
+    space: Space, family: Family, changes: Change, labels: CueLabels, before: Array, actions: Array, eps: Any
 ) -> Array:
     answers = linear.answers_of(space, labels, eps)
     usual = Habits(jnp.float32(PRIORS.tau / SCALE), jnp.float32(1 / SCALE), jnp.float32(0.1))
@@ -311,7 +311,7 @@ def _worth(
 
 
 @partial(jax.jit, static_argnames="family")
-def _probes(family: Family, frame: Frame, change: Change, obs: Array) -> Array:
+def _probes(family: Family, frame: Units, change: Change, obs: Array) -> Array:
     return jax.vmap(lambda one: linear.probes(family, frame, one, obs))(change)
 
 
@@ -319,9 +319,9 @@ def _probes(family: Family, frame: Frame, change: Change, obs: Array) -> Array:
 def _data(
     space: Space,
     family: Family,
-    frame: Frame,
+    frame: Units,
     change: Change,
-    labels: Labels,
+    labels: CueLabels,
     probe_obs: Array,
     actions: Array,
     eps: Array,
@@ -332,7 +332,7 @@ def _data(
 
 @partial(jax.jit, static_argnames="priors")
 def _update(
-    rows: Data, frame: Frame, hypothesis: Hypothesis, posteriors: Posterior, priors: Priors
+    rows: Data, frame: Units, hypothesis: Hypothesis, posteriors: Posterior, priors: Priors
 ) -> tuple[Posterior, Hypothesis]:
     """Infer each hypothesis, and move its estimate."""
 
@@ -352,7 +352,7 @@ def _unread(rows: Data, hyper: Hyper) -> Posterior:
 
 
 @partial(jax.jit, static_argnames="priors")
-def _scored(rows: Data, frame: Frame, hypothesis: Hypothesis, posteriors: Posterior, priors: Priors) -> Fit:
+def _scored(rows: Data, frame: Units, hypothesis: Hypothesis, posteriors: Posterior, priors: Priors) -> Fit:
     """Return fits with the sum of log p(answer | all others) of each, by the cavity of each answer's site."""
 
     def one(rows: Data, hypothesis: Hypothesis, posteriors: Posterior) -> Array:
@@ -377,7 +377,7 @@ def _first_and_best(first: Fit, smooth: Hypothesis) -> Hypothesis:
     best = jnp.argmax(jnp.nan_to_num(first.score, nan=-jnp.inf))
     two = jnp.stack([jnp.zeros_like(best), best])
     start = jax.tree.map(lambda leaf: leaf[two], first.hypothesis)
-    return Hypothesis(Parts(start.parts.weights, True), start.change, smooth.hyper)
+    return Hypothesis(ModelParts(start.parts.weights, True), start.change, smooth.hyper)
 
 
 @jax.jit
@@ -385,6 +385,6 @@ def _together(first: Fit, second: Fit) -> Fit:
     """Return all fits, stacked; those without the process have one of no amplitude."""
     never = lambda hyper: hyper.replace(amplitudes=jnp.full_like(hyper.amplitudes, _NEVER))  # noqa: E731
     hypothesis, posteriors = first.hypothesis, first.posterior
-    hypothesis = hypothesis.replace(parts=Parts(hypothesis.parts.weights, True), hyper=never(hypothesis.hyper))
+    hypothesis = hypothesis.replace(parts=ModelParts(hypothesis.parts.weights, True), hyper=never(hypothesis.hyper))
     first = first.replace(hypothesis=hypothesis, posterior=posteriors.replace(hyper=never(posteriors.hyper)))
     return jax.tree.map(lambda one, other: jnp.concatenate([one, other]), first, second)

@@ -31,7 +31,7 @@ JUMP = 4.0  # change of an action, in `SCALE` eps, from which a bend is a jump
 LARGEST = 5.0  # standard deviations at which inputs of the process are cut
 
 
-class Frame(struct.PyTreeNode):
+class Units(struct.PyTreeNode):
     """Units of the linear model, from the situations asked about."""
 
     mean: Float[Array, " obs"]
@@ -50,7 +50,7 @@ class Change(struct.PyTreeNode):
     action: Float[Array, "cues basis"]  # beta
 
 
-class Labels(NamedTuple):
+class CueLabels(NamedTuple):
     """Relative answers in arrays of a fixed size."""
 
     obs: Float[Array, "n obs"]
@@ -121,8 +121,8 @@ def basis(space: Space, action: Float[Array, "n action"]) -> Float[Array, "n bas
 
 @partial(jax.jit, static_argnums=0)
 def frame_of(
-    family: Family, labels: Labels, step: Float[Array, " unknowns"] | None = None, mixed: Int[Array, " m"] | None = None
-) -> Frame:
+    family: Family, labels: CueLabels, step: Float[Array, " u"] | None = None, mixed: Int[Array, " m"] | None = None
+) -> Units:
     """Return the units for labels; `step`: of a family's unknowns; `mixed`: entries that may mix (default: none)."""
     weight = labels.valid / jnp.maximum(labels.valid.sum(), 1)
     mean = weight @ labels.obs
@@ -131,10 +131,10 @@ def frame_of(
     if step is None:
         step = jnp.where(varies, STEP * deviation, 0.0)
     mixed = jnp.zeros(0, jnp.int32) if mixed is None else mixed
-    return Frame(mean, jnp.where(varies, deviation, 1.0), varies * 1.0, step, mixed)
+    return Units(mean, jnp.where(varies, deviation, 1.0), varies * 1.0, step, mixed)
 
 
-def probes(family: Family, frame: Frame, change: Change, obs: Float[Array, "n obs"]) -> Float[Array, "k n obs"]:
+def probes(family: Family, frame: Units, change: Change, obs: Float[Array, "n obs"]) -> Float[Array, "k n obs"]:
     """Return the observations to ask the policy about: as they are, undone, and undone at both sides of each unknown.
 
     k = 2 + 2 * unknowns.
@@ -149,7 +149,7 @@ def probes(family: Family, frame: Frame, change: Change, obs: Float[Array, "n ob
 def jumps(
     space: Space,
     family: Family,
-    frame: Frame,
+    frame: Units,
     change: Change,
     probe_obs: Float[Array, "k n obs"],
     actions: Float[Array, "k n action"],
@@ -166,7 +166,7 @@ def jumps(
 
 
 def _sides(
-    space: Space, family: Family, frame: Frame, change: Change, probe_obs: Array, actions: Array
+    space: Space, family: Family, frame: Units, change: Change, probe_obs: Array, actions: Array
 ) -> tuple[Float[Array, "u n cues"], Float[Array, "u n cues"]]:
     """Return the changes from a policy's actions at an estimate to those at both sides of each unknown."""
     size, steps = len(frame.step), jnp.diag(frame.step)
@@ -176,20 +176,20 @@ def _sides(
 
 
 @partial(jax.jit, static_argnums=0)
-def influence(space: Space, frame: Frame, labels: Labels, actions: Float[Array, "k n action"]) -> Int[Array, " mixed"]:
+def influence(space: Space, frame: Units, rows: CueLabels, actions: Float[Array, "k n action"]) -> Int[Array, " mixed"]:
     """Return the entries on which the policy's actions depend most, from its answers to `probes`."""
     size = len(frame.step)
     slope = space.log(actions[2 : 2 + size], actions[2 + size :])
-    moved = jnp.einsum("n,unc->u", labels.valid * 1.0, slope**2)
+    moved = jnp.einsum("n,unc->u", rows.valid * 1.0, slope**2)
     return jax.lax.top_k(moved, min(MIXED, size))[1]
 
 
 def data(
     space: Space,
     family: Family,
-    frame: Frame,
+    frame: Units,
     change: Change,
-    labels: Labels,
+    labels: CueLabels,
     probe_obs: Float[Array, "k n obs"],
     actions: Float[Array, "k n action"],
     eps: Float[Array, ""],
@@ -215,13 +215,13 @@ def data(
     return Data(offset, x, situation, answers_of(space, labels, eps), groups(space, family, len(frame.mean)))
 
 
-def answers_of(space: Space, labels: Labels, eps: Float[Array, ""]) -> Answers:
+def answers_of(space: Space, labels: CueLabels, eps: Float[Array, ""]) -> Answers:
     """Return the interval that each answer names."""
     return intervals(labels.answer, labels.valid, *space.room(labels.action), PRIORS.tau * eps)
 
 
 def features(
-    space: Space, frame: Frame, slope: Float[Array, "n cues u"], obs: Float[Array, "n obs"], base: Float[Array, "n a"]
+    space: Space, frame: Units, slope: Float[Array, "n cues u"], obs: Float[Array, "n obs"], base: Float[Array, "n a"]
 ) -> Float[Array, "n cues p"]:
     """Return the change of each cue by each weight."""
     n, cues, _ = slope.shape
@@ -234,14 +234,14 @@ def features(
 
 @partial(jax.jit, static_argnums=0)
 def inputs(
-    space: Space, frame: Frame, obs: Float[Array, "n obs"], action: Float[Array, "n action"]
+    space: Space, frame: Units, obs: Float[Array, "n obs"], action: Float[Array, "n action"]
 ) -> Float[Array, "n z"]:
     """Return what the process sees: the observation, and what the policy does about it."""
     z = jnp.clip((obs - frame.mean[None]) / frame.deviation[None], -LARGEST, LARGEST) * frame.varies[None]
     return jnp.concatenate([z, 2 * space.even(action)], 1)
 
 
-def weights_of(frame: Frame, change: Change) -> Float[Array, " p"]:
+def weights_of(frame: Units, change: Change) -> Float[Array, " p"]:
     """Return an estimate as weights of `features`."""
     step, own = jnp.where(frame.step > 0, frame.step, 1.0), change.action[tuple(terms(*change.action.shape))]
     if not len(frame.mixed):
@@ -251,7 +251,7 @@ def weights_of(frame: Frame, change: Change) -> Float[Array, " p"]:
     return jnp.concatenate([theta / step, mix.ravel(), own])
 
 
-def change_of(frame: Frame, weights: Float[Array, " p"], like: Change) -> Change:
+def change_of(frame: Units, weights: Float[Array, " p"], like: Change) -> Change:
     """Return the estimate that `weights_of` describes."""
     size, mixed = len(like.theta), len(frame.mixed)
     theta, mix, action = jnp.split(weights, (size, size + mixed**2))

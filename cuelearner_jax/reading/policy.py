@@ -15,7 +15,7 @@ from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, describe
 from cuelearner_jax.reading import linear
 from cuelearner_jax.reading.correction import Correction, corrected
 from cuelearner_jax.reading.families import Family, unknowns_of
-from cuelearner_jax.reading.linear import Frame
+from cuelearner_jax.reading.linear import Units
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import EnvState
 
@@ -83,7 +83,7 @@ def unread(
     change, zeros = linear.no_change(space, family, obs_size), jnp.zeros
     z = obs_size + space.size
     unknowns = linear.unknowns(family, obs_size)
-    frame = Frame(zeros(obs_size), jnp.ones(obs_size), zeros(obs_size), zeros(unknowns), zeros(mixed, jnp.int32))
+    frame = Units(zeros(obs_size), jnp.ones(obs_size), zeros(obs_size), zeros(unknowns), zeros(mixed, jnp.int32))
     correction = Correction(
         change, frame, zeros((labels, z)), zeros((labels, len(space.cues))), jnp.ones(z), jnp.float32(0)
     )

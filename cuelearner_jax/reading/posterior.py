@@ -41,7 +41,7 @@ class Data(struct.PyTreeNode):
     group: tuple[int, ...] = struct.field(pytree_node=False)  # number of the group whose size a weight shares
 
 
-class Parts(struct.PyTreeNode):
+class ModelParts(struct.PyTreeNode):
     """Which parts of the model a hypothesis has."""
 
     weights: Float[Array, " p"]  # 1, or 0 for a weight that the hypothesis lacks
@@ -140,7 +140,7 @@ def process(
     labelled: Float[Array, "n z"],
     inputs: Float[Array, "m z"],
     priors: Priors,
-    parts: Parts | None = None,
+    parts: ModelParts | None = None,
 ) -> Float[Array, "m cues"]:
     """Return the mean of the process at `inputs`; `labelled`: those of the answers."""
     if parts is not None and not parts.process:
@@ -149,11 +149,11 @@ def process(
     return amplitude**2 * (correlation(lengths(posterior.hyper, priors), inputs, labelled) @ posterior.alpha)
 
 
-def _sizes(hyper: Hyper, parts: Parts, group: Array, priors: Priors) -> Array:
+def _sizes(hyper: Hyper, parts: ModelParts, group: Array, priors: Priors) -> Array:
     return parts.weights * priors.size * jnp.exp(hyper.groups[group] + hyper.sizes)
 
 
-def _solve(hyper: Hyper, parts: Parts, data: Data, precision: Array, target: Array, priors: Priors) -> _Solved:
+def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target: Array, priors: Priors) -> _Solved:
     """Return the posterior under pseudo-measurements `target` (n, cues) of f with `precision`."""
     size = _sizes(hyper, parts, jnp.array(data.group), priors)
     x = data.features * size[None, None]  # (n, cues, p)
@@ -197,7 +197,7 @@ def _whitened(
     return inverse @ hx, inverse @ hr, inverse @ half_k, back, 2 * jnp.log(jnp.diag(factor)).sum()
 
 
-def _log_prior(hyper: Hyper, parts: Parts, priors: Priors) -> Array:
+def _log_prior(hyper: Hyper, parts: ModelParts, priors: Priors) -> Array:
     terms = (
         (hyper.groups, priors.spread_groups),
         (hyper.sizes * parts.weights, priors.spread_sizes),
@@ -213,7 +213,7 @@ def _log_prior(hyper: Hyper, parts: Parts, priors: Priors) -> Array:
 
 def infer(
     data: Data,
-    parts: Parts,
+    parts: ModelParts,
     eps: Float[Array, ""],
     start: Posterior,
     priors: Priors = PRIORS,
@@ -266,7 +266,7 @@ def unread(data: Data, hyper: Hyper) -> Posterior:
 def predict(
     posterior: Posterior,
     data: Data,
-    parts: Parts,
+    parts: ModelParts,
     features: Float[Array, "m cues p"],
     inputs: Float[Array, "m z"],
     priors: Priors = PRIORS,

@@ -80,7 +80,7 @@ def describe_fit(
 
     Args:
         fitted: one hypothesis.
-        space, family, eps: as for `Reading`; eps in the unit of `space.log`.
+        space, family, eps: as for `ReadingSession`; eps in the unit of `space.log`.
         observation: slices of the observation; empty: entries have numbers alone.
         met: situations that the policy met, as `linear.inputs` has them.
     """

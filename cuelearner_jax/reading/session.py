@@ -1,6 +1,6 @@
 """What answers about one policy say so far: questions are chosen, answers are read, and a verdict is given.
 
-    reading = Reading(policy, env, eps_deg=2.0, labels=100)
+    reading = ReadingSession(policy, env, eps_deg=2.0, labels=100)
     reading.learn(obs, actions, answers)    # as often as there are new ones
     reading.policy(), reading.result()
 
@@ -29,7 +29,7 @@ from cuelearner_jax.policies import policy_name, policy_of
 from cuelearner_jax.reading import fitting, linear
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.fitting import Fit, Reader
-from cuelearner_jax.reading.linear import Labels
+from cuelearner_jax.reading.linear import CueLabels
 from cuelearner_jax.reading.policy import Read, unread
 from cuelearner_jax.reading.result import Result, describe_fit
 from cuelearner_jax.reading.steps import steps_of
@@ -43,7 +43,7 @@ MET = 200  # situations met that are kept
 FIRST = 3.0  # spread of the first questions about the policy's actions, in eps
 
 
-class Reading:
+class ReadingSession:
     """The answers about a policy, and what they say.
 
     Args:
@@ -72,7 +72,7 @@ class Reading:
         self.base, self.family, self.space = policy_of(policy, space), family, space
         self.eps, self.observation = float(space.from_unit(eps_deg)), tuple(observation)
         self.slots = labels
-        self.rows: Labels | None = None  # all answers so far
+        self.rows: CueLabels | None = None  # all answers so far
         self.fits: Fit | None = None  # all hypotheses
         self.fit: Fit | None = None  # the best of them
         self.evidence = 0.0  # log of the test martingale [nats]
@@ -124,7 +124,7 @@ class Reading:
             self.evidence += float(reader.ratio(self.fits, _padded(new, self._batch(len(new[0])))))
         if self.rows is not None:
             new = [np.concatenate(both) for both in zip(self.rows[:3], new, strict=True)]
-        self.rows = Labels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]
+        self.rows = CueLabels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]
         self.slots = max(self.slots, -(-len(new[0]) // self.slots) * self.slots)
         start = fitting.unfitted(self.space, self.family, new[0].shape[1]) if self.fits is None else None
         start = fitting.again(self.fits) if start is None and self.fits is not None else start
@@ -207,8 +207,8 @@ def _act(policy: Any, key: PRNGKeyArray, states: Any, obs: Array) -> Array:
     return policy.act(key, states, obs)
 
 
-def _padded(rows: Sequence[np.ndarray], slots: int) -> Labels:
+def _padded(rows: Sequence[np.ndarray], slots: int) -> CueLabels:
     """Return rows in `slots` slots, those beyond the last repeating the first row and not valid."""
     count = len(rows[0])
     obs, action, answer = (jnp.asarray(np.concatenate([row, np.repeat(row[:1], slots - count, 0)])) for row in rows)
-    return Labels(obs, action, answer, jnp.arange(slots) < count)
+    return CueLabels(obs, action, answer, jnp.arange(slots) < count)

@@ -14,7 +14,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
-from cuelearner_jax.adaptation.lanes import Lanes
+from cuelearner_jax.adaptation.lanes import LaneRows
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import AnswerForm
@@ -41,7 +41,7 @@ class AdaptedLanes:
 
     folder: Path
     values: dict[str, Any]  # the contents of policy.json
-    lanes: Lanes
+    lanes: LaneRows
     used: np.ndarray  # (lanes,) bool
     rows: int | None  # number of base policies, one per lane; None: the lanes share one
     code: Any  # the policy that the folder names as code; None: not given
@@ -102,7 +102,7 @@ def open_folder(
     values = formats.read("policy", path)
     task, world = world_of(values["task"], find, path)
     *columns, used = (np.array(values["lanes"][name]) for name in COLUMNS)
-    return task, world, AdaptedLanes(folder, values, Lanes(*columns), used, values["rows"], code, changes)
+    return task, world, AdaptedLanes(folder, values, LaneRows(*columns), used, values["rows"], code, changes)
 
 
 def write(

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
 from cuelearner_envs.playing import played
 from cuelearner_jax import pictures, user_code
-from cuelearner_jax.bridges.brax import JaxEnvironment, Running, model_of
+from cuelearner_jax.bridges.brax import JaxEnvironment, JaxState, model_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Pictures
 from cuelearner_jax.tasks import fetch_layout
@@ -124,7 +124,7 @@ class Pose(NamedTuple):
     mocap: Float[Array, "*steps bodies 3"] | None  # positions of bodies without joints; None: the simulator has none
 
 
-def pose_of(state: Running) -> Pose:
+def pose_of(state: JaxState) -> Pose:
     """Return the positions of a state's bodies. Raises UserError for a simulator unlike MuJoCo's."""
     if hasattr(state.state, "data"):
         return Pose(state.state.data.qpos, state.state.data.mocap_pos)
@@ -159,10 +159,10 @@ def draw_poses(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
 
 
 @jax.jit
-def _poses_after(env: JaxEnvironment, state: Running, actions: Float[Array, "n action"]) -> tuple[Pose, Array]:
+def _poses_after(env: JaxEnvironment, state: JaxState, actions: Float[Array, "n action"]) -> tuple[Pose, Array]:
     """Return the pose after each action, and whether that step ended the episode."""
 
-    def advance(state: Running, row: Any) -> Any:
+    def advance(state: JaxState, row: Any) -> Any:
         number, action = row
         after, step = env.step(jax.random.key(number), state, action)
         return after, (pose_of(after), step.terminated | step.truncated)
@@ -170,7 +170,7 @@ def _poses_after(env: JaxEnvironment, state: Running, actions: Float[Array, "n a
     return jax.lax.scan(advance, state, (jax.numpy.arange(len(actions)), actions))[1]
 
 
-def _drawn_model(env: JaxEnvironment, state: Running, actions: Any) -> list[Frame]:
+def _drawn_model(env: JaxEnvironment, state: JaxState, actions: Any) -> list[Frame]:
     poses = [jax.device_get(pose_of(state))]
     if len(actions):
         following, ended = jax.device_get(_poses_after(env, state, actions))

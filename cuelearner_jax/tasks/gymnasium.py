@@ -21,7 +21,7 @@ import numpy as np
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax import plugins
 from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
-from cuelearner_jax.bridges.gymnasium.instances import Actions, Running
+from cuelearner_jax.bridges.gymnasium.instances import Actions, Instance
 from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, checked_quantities
 from cuelearner_jax.errors import UserError, format_value
@@ -252,7 +252,7 @@ def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
     Return its actions, the slices of an observation, the limit of steps (0: none), whether it reports success, and
     whether the episode ended by itself.
     """
-    one, ended = Running(source.make, source.name, 0), False
+    one, ended = Instance(source.make, source.name, 0), False
     try:
         slices = [Quantity(leaf.name, leaf.size, UNKNOWN_UNIT) for leaf in one.leaves if leaf.size]
         if not slices:

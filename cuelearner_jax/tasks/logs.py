@@ -97,7 +97,7 @@ def space_of(config: LogsConfig) -> Space:
     return Choices(len(config.low), *cues) if config.actions == "choices" else Box(config.low, config.high, cues)
 
 
-class Place(struct.PyTreeNode):
+class LogPosition(struct.PyTreeNode):
     """Position in a walk over the situations."""
 
     row: Int[Array, ""]  # of the situation
@@ -139,14 +139,14 @@ class Logs(WholeObservations, struct.PyTreeNode):
             return None
         return lambda obs: self.actions.retract(obs[-self.actions.size :])
 
-    def reset(self, key: PRNGKeyArray) -> tuple[Place, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[LogPosition, Float[Array, " obs"]]:
         """Return a random situation."""
         row = jax.random.randint(key, (), 0, len(self.rows))
-        return Place(row, jnp.zeros((), jnp.int32)), self.rows[row]
+        return LogPosition(row, jnp.zeros((), jnp.int32)), self.rows[row]
 
-    def step(self, key: PRNGKeyArray, state: Place, action: Float[Array, " action"]) -> tuple[Place, Step]:
+    def step(self, key: PRNGKeyArray, state: LogPosition, action: Float[Array, " action"]) -> tuple[LogPosition, Step]:
         """Return the next situation, whatever the action; after all of them a random one."""
-        following = Place((state.row + 1) % len(self.rows), state.met + 1)
+        following = LogPosition((state.row + 1) % len(self.rows), state.met + 1)
         final_obs, (anew, first) = self.rows[following.row], self.reset(key)
         change = self.actions.to_unit(self.actions.distance(self.recorded[state.row], action))
         ended = following.met >= len(self.rows)
@@ -344,13 +344,13 @@ def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
     return [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in chosen], place
 
 
-def _sketch(env: Logs, state: Place) -> Sketch:
+def _sketch(env: Logs, state: LogPosition) -> Sketch:
     frames, place = _frames(env, state.row)
     text = _read(Path(env.path)).text(place)
     return pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
 
 
-def _reel(env: Logs, state: Place, action: Any) -> Reel | None:
+def _reel(env: Logs, state: LogPosition, action: Any) -> Reel | None:
     frames, _ = _frames(env, state.row)
     return pictures.clip(frames, CLIP_PERIOD, "as recorded") if len(frames) > 1 else None
 

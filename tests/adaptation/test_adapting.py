@@ -12,7 +12,7 @@ import pytest
 
 from cuelearner_jax.adaptation import by_model, judging
 from cuelearner_jax.adaptation.judging import Judging
-from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, ask_round, begin, product, rounds, side_by_side
+from cuelearner_jax.adaptation.lanes import Adaptation, LaneRows, ask_round, begin, product, rounds, side_by_side
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
@@ -137,7 +137,7 @@ def test_budgets_are_masks_and_lanes_do_not_know_each_other():
         chex.assert_trees_all_equal(first, jax.tree.map(lambda leaf, lane=larger: leaf[lane][:30], labels))
     lane = 5
     own = side_by_side([Shifted(jnp.array(SHIFTS[LANES.base[lane]]))])
-    one = Lanes(*(column[[lane]] for column in LANES))._replace(base=np.zeros(1, np.int32))
+    one = LaneRows(*(column[[lane]] for column in LANES))._replace(base=np.zeros(1, np.int32))
     alone = begin(of(own), one)
     for _ in range(rounds(one, SIZES)):
         alone = ask_round(of(own), EXPERT, alone, MESH)

@@ -20,7 +20,7 @@ from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import evenly_spaced, from_angle
 
 LAYERS = (24, 24, 17)
-FULL = ddqn.Config(q_layers=LAYERS, directions=360)
+FULL = ddqn.DdqnConfig(q_layers=LAYERS, directions=360)
 
 
 def chosen(options, params, obs):

@@ -12,7 +12,7 @@ from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.replay import Transition
 from cuelearner_jax.environment import spaces_of
 
-OPTIONS = ddqn.Config(q_layers=(2,), directions=4, target_directions=4)  # east, north, west, south
+OPTIONS = ddqn.DdqnConfig(q_layers=(2,), directions=4, target_directions=4)  # east, north, west, south
 AGENT = OPTIONS.make("raw", spaces_of(probes.Window()), bootstraps=True)
 
 

@@ -56,7 +56,7 @@ def test_what_a_guide_says_turns_with_the_situation():
 
 @pytest.mark.parametrize("coarse", [0, 12])
 def test_the_greedy_choice_turns_with_the_situation(coarse):
-    env, options = Turned(), ddqn.Config(q_layers=(16,), directions=72, coarse_directions=coarse, peaks=12)
+    env, options = Turned(), ddqn.DdqnConfig(q_layers=(16,), directions=72, coarse_directions=coarse, peaks=12)
     agent = options.make("action", spaces_of(env))
     params, _ = agent.init(jax.random.key(3))
     choose = jax.jit(lambda obs: agent.explore(env, options, params, obs, jax.random.key(0)))

@@ -21,7 +21,7 @@ def traced_operations(function, *arguments):
 
 
 def test_operations_are_those_that_xla_counts():
-    options = ddqn.Config(q_layers=LAYERS, directions=72, target_directions=72)
+    options = ddqn.DdqnConfig(q_layers=LAYERS, directions=72, target_directions=72)
     agent, batch = options.make("raw", SPACES, bootstraps=True), 32
     params, _ = agent.init(jax.random.key(0))
     items = Transition(*(jnp.ones((batch, *shape)) for shape in ((OBS,), (2,), (), (), (OBS,))))

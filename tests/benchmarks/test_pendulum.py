@@ -41,7 +41,7 @@ def test_the_pendulum_keeps_the_laws_of_environments():
     check_environment(Pendulum(jnp.array(3)), 8, tolerance=1e-4)
 
 
-AGENT = sac.Config(
+AGENT = sac.SacConfig(
     actor_layers=(64, 64),
     critic_layers=(64, 64),
     replay_capacity=10_000,

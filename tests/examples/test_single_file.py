@@ -96,7 +96,7 @@ def test_one_update_of_double_dqn(discount):
     obs, action, reward = situations(40)
     goes_on = (jnp.arange(40) % 3 > 0).astype(jnp.float32)
     cfg, scalars = dataclasses.replace(SINGLE, discount=discount), dataclasses.replace(SCALARS, discount=discount)
-    options = ddqn.Config(q_layers=(8, 8), directions=24, target_directions=24, batch_size=8, learning_rate=0.01)
+    options = ddqn.DdqnConfig(q_layers=(8, 8), directions=24, target_directions=24, batch_size=8, learning_rate=0.01)
     double_dqn = options.make("raw", spaces_of(ENV), bootstraps=discount > 0)
 
     @jax.jit

@@ -60,7 +60,7 @@ def test_a_scenario_holds_the_recipe_that_is_reported(path, modules):
     assert asked.scalars == bench.scalars()
     sizes = bench.set("sizes.", GuideSizes(frame=asked.sizes.frame))
     if asked.guidance == "intent":  # whose network is of its own `aim_layers`
-        assert asked.kinds == {"intent": bench.set("intent.", intent.Config())}
+        assert asked.kinds == {"intent": bench.set("intent.", intent.IntentConfig())}
         sizes = dataclasses.replace(sizes, frame=asked.sizes.frame, feedback_layers=asked.sizes.feedback_layers)
     assert asked.sizes == sizes
     own = {key.partition(".")[2]: value for key, value in piece.settings.items() if key.startswith("task.")}
@@ -71,7 +71,7 @@ def test_a_scenario_holds_the_recipe_that_is_reported(path, modules):
 @pytest.mark.parametrize("scale", ["smoke", "paper"])
 def test_every_piece_has_settings_that_can_be(study, scale, modules):
     known, task = modules["_adaptation"], registry.find(study.task)
-    groups = {**GROUPS, "agent": ddqn.Config, "task": task.config, "intent": intent.Config}
+    groups = {**GROUPS, "agent": ddqn.DdqnConfig, "task": task.config, "intent": intent.IntentConfig}
     assert len({piece.path for piece in study.pieces}) == len(study.pieces)
     for piece in study.pieces:
         assert piece.world in (*task.scenarios, "unchanged")

@@ -127,12 +127,12 @@ def test_guides_of_the_same_settings_are_equal_and_hash_alike(kind):
 
 
 def test_a_kind_brings_options_of_its_own_which_a_run_keeps():
-    own = intent.Config(aim_layers=(3,), aim_doubt=7.0)
+    own = intent.IntentConfig(aim_layers=(3,), aim_doubt=7.0)
     values = run_config.to_json(RunConfig(None, kinds={"intent": own}))
     known = run_config.from_json(None, values)
     assert known.kinds == {"intent": own}
     assert known.guide_in(probes.Aimed(), "intent").options == own
-    assert RunConfig(None).guide_in(probes.Aimed(), "intent").options == intent.Config()
+    assert RunConfig(None).guide_in(probes.Aimed(), "intent").options == intent.IntentConfig()
     # The code of a kind from outside is not loaded.
     elsewhere = run_config.from_json(None, {**values, "kinds": {"from-outside": {"way": 0.5}}})
     assert run_config.to_json(elsewhere)["kinds"] == {"from-outside": {"way": 0.5}}

@@ -27,7 +27,7 @@ class Aimless(probes.Aimed):
 
 
 ENV, SHUFFLED, AIMLESS = probes.Aimed(), Shuffled(), Aimless()
-SIZES, OPTIONS = probes.SIZES, intent.Config(aim_layers=(8,))
+SIZES, OPTIONS = probes.SIZES, intent.IntentConfig(aim_layers=(8,))
 OBS = directions.evenly_spaced(16)
 BASE = jax.jit(lambda: directions.rotate(OBS, jnp.linspace(-3.0, 3.0, 16)))()
 EVERYWHERE = jnp.ones(16, bool)

@@ -18,7 +18,7 @@ from cuelearner_jax.types import Label
 
 ENV = probes.Window()
 SIZES = probes.SIZES
-OPTIONS = {"scalar": scalar.Config(guide_directions=36)}
+OPTIONS = {"scalar": scalar.ScalarConfig(guide_directions=36)}
 SCALARS = dataclasses.replace(probes.SCALARS, scalar_within_deg=20.0)
 OBS = directions.evenly_spaced(4)
 BEST = jax.jit(jax.vmap(ENV.best))(OBS)
@@ -123,7 +123,7 @@ def test_answers_that_are_missing_are_no_corrections():
 
 def test_a_correction_moves_the_policy_its_way_by_eps():
     bundle, _, act = compiled("dcoach")
-    fit = jax.jit(dataclasses.replace(bundle, options=dcoach.Config(correction_replay=1)).fit)
+    fit = jax.jit(dataclasses.replace(bundle, options=dcoach.DeepCoachConfig(correction_replay=1)).fit)
     model = bundle.init(KEY).replace(fitted=jnp.array(True))
     scalars = dataclasses.replace(SCALARS, feedback_learning_rate=1e-2)
     everywhere = jnp.ones(4, bool)

@@ -19,8 +19,8 @@ def planned(**options):
     """What `cuelearner label` plans for the task."""
     config = TASK.presets["paper"].config
     options = {"labels": 20, "guidance": "relative", **options}
-    asked = label.Label(task=config.task, sizes=config.sizes, scalars=SCALARS, out=label.Path("labels"), **options)
-    return label.make_plan(TASK, config, asked)
+    own = label.LabelOptions(task=config.task, sizes=config.sizes, scalars=SCALARS, out=label.Path("labels"), **options)
+    return label.make_plan(TASK, config, own)
 
 
 def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():

@@ -15,7 +15,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.labelling import controls, view
 from cuelearner_jax.labelling.questions import Item
-from cuelearner_jax.reading import Reading
+from cuelearner_jax.reading import ReadingSession
 from cuelearner_jax.spaces import UNSAID, Box, cues_from
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import fetch_layout
@@ -133,7 +133,7 @@ def test_entries_that_no_cue_names_are_not_asked_about():
     more = known["pick-2-more"].answer[0]
     np.testing.assert_array_equal(controls.answer_of(space, known["rest"], None, {2: more}), [UNSAID, UNSAID, 1.0])
     np.testing.assert_array_equal(controls.answer_of(space, known["rest"], None, {}), [UNSAID, UNSAID, 0.0])
-    reading = Reading(lambda obs: obs, (), space, 0.1, 20)
+    reading = ReadingSession(lambda obs: obs, (), space, 0.1, 20)
     rows = np.zeros((8, 3), np.float32)
     asked = reading.questions(rows, 8, jax.random.key(0))[1]
     assert (asked[:, :2] == 0).all()

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.reading import Reading
+from cuelearner_jax.reading import ReadingSession
 from cuelearner_jax.spaces import DIRECTIONS
 
 LABELS, EPS_DEG = 50, 9.0
@@ -26,7 +26,7 @@ def met(random):
 
 def read(right, aside):
     """Return the reading of labels, and its mean error in other situations [deg]."""
-    reading, random = Reading(policy, (), DIRECTIONS, EPS_DEG, LABELS), np.random.default_rng(1)
+    reading, random = ReadingSession(policy, (), DIRECTIONS, EPS_DEG, LABELS), np.random.default_rng(1)
     for batch in range(5):
         obs = met(random) + aside
         index, action = reading.questions(obs, LABELS // 5, jax.random.key(batch))

@@ -6,10 +6,10 @@ import numpy as np
 from cuelearner_jax.reading import posterior
 from cuelearner_jax.reading.likelihood import intervals, log_likelihood
 from cuelearner_jax.reading.linear import SCALE
-from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, Parts
+from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, ModelParts
 
 EPS, COUNT, TRUTH = 1 / SCALE, 24, 0.6
-PARTS = Parts(jnp.ones(1), False)
+PARTS = ModelParts(jnp.ones(1), False)
 
 
 def answered():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.reading import Reading
+from cuelearner_jax.reading import ReadingSession
 from cuelearner_jax.spaces import Box
 
 LABELS, OBS, EPS = 50, 8, 0.05
@@ -36,7 +36,7 @@ def moved(obs, factor=1.0, change=0.0):
 
 def read(right, **how):
     """Read labels about the policy; `right`: observations -> right actions; None: answers are random."""
-    reading = Reading(policy, (), BOX, EPS, LABELS)
+    reading = ReadingSession(policy, (), BOX, EPS, LABELS)
     for batch in range(5):
         obs = near(batch, **how)
         index, action = reading.questions(obs, LABELS // 5, jax.random.key(batch))

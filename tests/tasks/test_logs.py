@@ -25,7 +25,7 @@ def folder(tmp_path):
 
 def at(row):
     """The beginning of an episode."""
-    return logs.Place(jnp.int32(row), jnp.int32(0))
+    return logs.LogPosition(jnp.int32(row), jnp.int32(0))
 
 
 def quiet(words):
@@ -69,7 +69,7 @@ def test_the_recorded_policy_acts_as_recorded_with_and_without_states(folder):
     task = logs.task_of(folder, CUES, **BOUNDS)
     env = task.environment(task.plain())
     policy, rows = logs.Recorded(env), jnp.array([7, 0, 3])
-    for states in (logs.Place(rows, rows), None):
+    for states in (logs.LogPosition(rows, rows), None):
         found = policy.act(jax.random.key(0), states, env.rows[rows])
         np.testing.assert_allclose(found, env.recorded[rows], atol=1e-7)
 

@@ -160,7 +160,7 @@ class Went(NamedTuple):
     place: bytes  # the instance's place now
 
 
-class Running:
+class Instance:
     """One instance and its current place. Its methods raise UserError for what the environment raises or gives."""
 
     def __init__(self, make: Callable[[], Any], whose: str, max_steps: int) -> None:
@@ -276,8 +276,8 @@ class Instances:
     def __init__(self, make: Callable[[], Any], whose: str, max_steps: int, size: int) -> None:
         """`make` returns an environment; `size`: entries of an observation by the task."""
         self.make, self.whose, self.max_steps, self.size = make, whose, max_steps, size
-        self.running: list[Running] = []
-        self.cameras: dict[bool, Running] = {}  # the instances that are filmed: for stills (True), and for films
+        self.running: list[Instance] = []
+        self.cameras: dict[bool, Instance] = {}  # the instances that are filmed: for stills (True), and for films
         self.calls = self.replays = 0  # number of calls, and of replayed steps
 
     def carry_out(self, requests: Sequence[Request]) -> list[Went | str | None]:
@@ -286,7 +286,7 @@ class Instances:
         The instance for a request stands at the place, or is the least recently used one, or new.
         """
         self.calls += all(row.history is None for row in requests)  # with histories, a call goes on
-        standing: dict[bytes, list[Running]] = defaultdict(list)
+        standing: dict[bytes, list[Instance]] = defaultdict(list)
         for one in self.running:
             standing[one.place].append(one)
         chosen = [standing[row.place].pop() if row.place and standing[row.place] else None for row in requests]
@@ -295,7 +295,7 @@ class Instances:
         free = iter(sorted((one for one in self.running if one.used < self.calls), key=lambda one: one.used))
         return [self._result(request, one, free) for request, one in zip(requests, chosen, strict=True)]
 
-    def _result(self, request: Request, one: Running | None, free: Iterator[Running]) -> Went | str | None:
+    def _result(self, request: Request, one: Instance | None, free: Iterator[Instance]) -> Went | str | None:
         if one is None and request.place and request.history is None:
             return None
         try:
@@ -316,7 +316,7 @@ class Instances:
                 self.running.remove(one)
             return str(error)
 
-    def _vacated(self, free: Iterator[Running], replays: bool) -> Running:
+    def _vacated(self, free: Iterator[Instance], replays: bool) -> Instance:
         """Return the least recently used instance, or a new one where a state in use would be lost."""
         one = next(free, None)
         wanted = one is not None and one.used > self.calls - RECENT
@@ -326,8 +326,8 @@ class Instances:
         one.used = self.calls
         return one
 
-    def _new(self) -> Running:
-        one = Running(self.make, self.whose, self.max_steps)
+    def _new(self) -> Instance:
+        one = Instance(self.make, self.whose, self.max_steps)
         size = sum(leaf.size for leaf in one.leaves)
         if size != self.size:
             raise UserError(
@@ -335,7 +335,7 @@ class Instances:
             )
         return one
 
-    def _replay(self, one: Running, request: Request, history: np.ndarray) -> None:
+    def _replay(self, one: Instance, request: Request, history: np.ndarray) -> None:
         """Bring an instance to a place. Raises UserError if the environment does not repeat itself."""
         one.reset(request.seed)
         for action in history:

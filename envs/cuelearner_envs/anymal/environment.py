@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal import policy as walking_policy
-from cuelearner_envs.anymal.physics import Body, Ground, control, standing
+from cuelearner_envs.anymal.physics import AnymalBody, Ground, control, standing
 from cuelearner_envs.anymal.policy import WalkingPolicy, observe
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
@@ -34,7 +34,7 @@ ACCELERATION, TURN_ACCELERATION = 8.0, 20.0
 class LeggedWalker(struct.PyTreeNode):
     """State between steps: what the physics and the walking policy carry, and the episode's."""
 
-    body: Body
+    body: AnymalBody
     last_action: Float[Array, "12"]  # of the walking policy
     # the walking policy's command: velocity forward and to the left [m/s], turning rate [rad/s]
     told: Float[Array, "3"]
@@ -84,13 +84,13 @@ class LeggedNavigation(Navigation, kw_only=True):
         )
 
     def act(
-        self, body: Body, last_action: Float[Array, "12"], told: Float[Array, "3"], heading: Float[Array, "2"]
+        self, body: AnymalBody, last_action: Float[Array, "12"], told: Float[Array, "3"], heading: Float[Array, "2"]
     ) -> tuple[Float[Array, "12"], Float[Array, "3"]]:
         """Return the walking policy's action and its command, on the way from `told` to walking toward `heading`."""
         told = self.command(body, told, heading)
         return self.walking(observe(body.qpos, body.qvel, last_action, told)), told
 
-    def command(self, body: Body, told: Float[Array, "3"], heading: Float[Array, "2"]) -> Float[Array, "3"]:
+    def command(self, body: AnymalBody, told: Float[Array, "3"], heading: Float[Array, "2"]) -> Float[Array, "3"]:
         """Return the command that follows `told` on the way toward a heading, a unit vector in the world's frame."""
         yaw = robot.planar_pose(body.qpos)[2]
         off = difference(from_angle(yaw), heading)

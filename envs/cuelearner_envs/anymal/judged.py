@@ -30,7 +30,7 @@ TIMESTEP = 0.002  # [s]
 DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
-class Judge:
+class MujocoRobots:
     """Robots side by side. Each has a model of its own, for friction and payload."""
 
     def __init__(self, friction: Sequence[float], payload: Sequence[float]):
@@ -108,7 +108,7 @@ class Course:
         """Place one robot per key, at the start that `env.reset` gives for its key."""
         self.env = env
         self.state, self.obs = _begin(env, keys)
-        self.judge = Judge([float(env.ground.friction)] * len(keys), [float(env.ground.payload)] * len(keys))
+        self.judge = MujocoRobots([float(env.ground.friction)] * len(keys), [float(env.ground.payload)] * len(keys))
         for number, pose in enumerate(np.asarray(_poses(self.state.body.qpos))):
             self.judge.place(number, pose)
 

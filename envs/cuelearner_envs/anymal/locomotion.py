@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.anymal.physics import Body, Felt, Ground, control, standing
+from cuelearner_envs.anymal.physics import AnymalBody, Felt, Ground, control, standing
 from cuelearner_envs.anymal.policy import OBS, add_noise, observe
 from cuelearner_jax.spaces.directions import from_angle
 
@@ -40,10 +40,10 @@ TRAINING = Trial(speed=1.2, turning=1.6, rest=0.1, noise=1.0, push=0.7, friction
 COMMAND_EVERY, PUSH_EVERY = 4.0, 5.0  # mean times between changes of the command, and between pushes [s]
 
 
-class Walk(struct.PyTreeNode):
+class WalkState(struct.PyTreeNode):
     """`State.pipeline_state`: all that a robot carries between steps."""
 
-    body: Body
+    body: AnymalBody
     last_action: Float[Array, "12"]
     command: Float[Array, "3"]  # velocity forward and to the left [m/s], turning rate [rad/s]
     ground: Ground
@@ -68,7 +68,7 @@ def random_ground(key: PRNGKeyArray, trial: Trial) -> Ground:
     return Ground(jnp.asarray(friction), jax.random.uniform(k_payload) * trial.payload)
 
 
-def push_randomly(key: PRNGKeyArray, body: Body, trial: Trial) -> Body:
+def push_randomly(key: PRNGKeyArray, body: AnymalBody, trial: Trial) -> AnymalBody:
     """Apply a random push with some probability: the trunk's velocity changes at once."""
     k_when, k_angle, k_speed = jax.random.split(key, 3)
     now = jax.random.bernoulli(k_when, robot.CONTROL_PERIOD / PUSH_EVERY)
@@ -78,7 +78,7 @@ def push_randomly(key: PRNGKeyArray, body: Body, trial: Trial) -> Body:
 
 
 def reward(
-    before: Walk, after: Body, felt: Felt, action: Float[Array, "12"], landed: Float[Array, "4"]
+    before: WalkState, after: AnymalBody, felt: Felt, action: Float[Array, "12"], landed: Float[Array, "4"]
 ) -> dict[str, Any]:
     """Return the terms of the reward of a step, already weighted; their sum counts where it is positive.
 
@@ -133,7 +133,7 @@ class Locomotion(envs.Env):
         body = standing(jnp.zeros(2), jax.random.uniform(k_yaw, (), minval=-jnp.pi, maxval=jnp.pi))
         off = jax.random.uniform(k_body, (2, robot.JOINTS), minval=-1.0, maxval=1.0)
         body = body.replace(qpos=body.qpos.at[7:].add(0.1 * off[0]), qvel=body.qvel.at[6:].add(0.5 * off[1]))
-        walk: Any = Walk(
+        walk: Any = WalkState(
             body=body,
             last_action=jnp.zeros(robot.JOINTS),
             command=random_command(k_command, self.trial),
@@ -152,7 +152,7 @@ class Locomotion(envs.Env):
 
     def step(self, state: Any, action: Float[Array, "12"]) -> Any:
         """A step of control, perhaps a push, perhaps a new command. A fall ends the episode."""
-        before: Walk = state.pipeline_state
+        before: WalkState = state.pipeline_state
         k_push, k_when, k_command, k_noise, k_next = jax.random.split(state.info["rng"], 5)
         body, felt = control(push_randomly(k_push, before.body, self.trial), action, before.ground)
         # A body whose numbers diverged counts as fallen; NaN must not reach the network.

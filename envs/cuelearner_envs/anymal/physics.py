@@ -24,7 +24,7 @@ LOWEST_TRUNK, LOWEST_KNEE = 0.3, 0.05  # below these heights the robot counts as
 LEAST_UPRIGHT = 0.5  # cosine of the tilt beyond which it has fallen
 
 
-class Body(struct.PyTreeNode):
+class AnymalBody(struct.PyTreeNode):
     """The state between control steps; `mjx.Data` (kilobytes) is rebuilt from it each step."""
 
     qpos: Float[Array, "19"]  # see `model`
@@ -60,16 +60,16 @@ def compiled() -> tuple[Any, Any, Any]:
         return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"), places
 
 
-def standing(place: Float[Array, "2"], yaw: Scalar) -> Body:
+def standing(place: Float[Array, "2"], yaw: Scalar) -> AnymalBody:
     """Return the robot at rest on straight feet at a position [m], turned by `yaw` [rad]."""
     half = jnp.asarray(yaw) / 2
     quaternion = jnp.stack([jnp.cos(half), jnp.zeros(()), jnp.zeros(()), jnp.sin(half)])
     height = jnp.full(1, robot.STANDING_HEIGHT)
     qpos = jnp.concatenate([place, height, quaternion, jnp.asarray(robot.HOME, jnp.float32)])
-    return Body(qpos, jnp.zeros(18), jnp.zeros(18))
+    return AnymalBody(qpos, jnp.zeros(18), jnp.zeros(18))
 
 
-def control(body: Body, action: Float[Array, "12"], ground: Ground) -> tuple[Body, Felt]:
+def control(body: AnymalBody, action: Float[Array, "12"], ground: Ground) -> tuple[AnymalBody, Felt]:
     """Return the body after a control step (0.02 s) with an action in [-1, 1]: joint targets relative to home."""
     model, data, places = compiled()
     trunk, feet = places["trunk"], places["feet"]
@@ -79,12 +79,12 @@ def control(body: Body, action: Float[Array, "12"], ground: Ground) -> tuple[Bod
     )
     targets = jnp.asarray(robot.HOME) + jnp.asarray(robot.ACTION_SCALE) * action
 
-    def one(carry: Body, _: None) -> tuple[Body, tuple[jax.Array, ...]]:
+    def one(carry: AnymalBody, _: None) -> tuple[AnymalBody, tuple[jax.Array, ...]]:
         begun = data.replace(qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart, ctrl=targets)
         with jax.default_matmul_precision("highest"):  # an accelerator would round the factors to three digits
             done = mjx.step(model, begun)
         heights = done.geom_xpos[feet, 2], done.xpos[places["shanks"], 2], done.actuator_force
-        return Body(done.qpos, done.qvel, done.qacc_warmstart), heights
+        return AnymalBody(done.qpos, done.qvel, done.qacc_warmstart), heights
 
     steps = round(robot.CONTROL_PERIOD / float(robot.load().opt.timestep))
     body, states = jax.lax.scan(one, body, length=steps)
@@ -92,7 +92,7 @@ def control(body: Body, action: Float[Array, "12"], ground: Ground) -> tuple[Bod
     return body, Felt(foot - robot.FOOT_RADIUS, torques, fallen(body, knee))
 
 
-def fallen(body: Body, knees: Float[Array, "4"]) -> Bool[Array, ""]:
+def fallen(body: AnymalBody, knees: Float[Array, "4"]) -> Bool[Array, ""]:
     """Whether the robot lies or touches the floor with more than its feet; true for diverged numbers too."""
     upright = robot.rotation(body.qpos[3:7])[2, 2]
     stands = (upright > LEAST_UPRIGHT) & (body.qpos[2] > LOWEST_TRUNK) & (knees > LOWEST_KNEE).all()

@@ -21,7 +21,7 @@ from cuelearner_envs.anymal.judged import Course
 from cuelearner_envs.anymal.scene import AZIMUTH, Picture, Studio, above, furnish, unobstructed
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import ENDS
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import NavigationWorld
 from cuelearner_jax import pictures
 from cuelearner_jax.types import Policy
 
@@ -34,7 +34,7 @@ COLOURS = 200  # of a GIF
 class LeggedFrame(NamedTuple):
     """One navigation step, in NumPy arrays."""
 
-    world: World  # the one walked in, no batch
+    world: NavigationWorld  # the one walked in, no batch
     goal: Float[np.ndarray, "2"]  # [m]
     goal_radius: float  # nearer than this, the goal is reached [m]
     ends: Float[np.ndarray, "271 3"]  # where the beams end that were perceived at the step's beginning [m]
@@ -95,7 +95,7 @@ def animate(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None
     pictures.write_film(file, fps, partial(_pictures, frames), pictures.palette_of(specimen, COLOURS))
 
 
-def _perceived(env: LeggedNavigation, state: Any) -> tuple[jax.Array, jax.Array, World]:
+def _perceived(env: LeggedNavigation, state: Any) -> tuple[jax.Array, jax.Array, NavigationWorld]:
     """Return the perceived ends of the lidar's beams (beams, 3) [m], which beams hit something, and the world."""
     turn = robot.rotation(state.body.qpos[3:7])
     angles = BEAM_ANGLES + jnp.asarray(env.lidar.rotation)

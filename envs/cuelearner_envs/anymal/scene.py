@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.navigation.world import World, tallness, used
+from cuelearner_envs.navigation.world import NavigationWorld, tallness, used
 from cuelearner_jax.errors import UserError
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -32,7 +32,7 @@ NO_OPENGL = (
 )
 
 
-def furnish(world: World, goal: Float[np.ndarray, "2"], goal_radius: float) -> mujoco.MjModel:
+def furnish(world: NavigationWorld, goal: Float[np.ndarray, "2"], goal_radius: float) -> mujoco.MjModel:
     """Return the robot's model with a world's solids and the goal, for drawing only."""
     spec = mujoco.MjSpec.from_file(str(robot.FILE))
     look: dict[str, Any] = {"contype": 0, "conaffinity": 0}

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.anymal.judged import Judge
+from cuelearner_envs.anymal.judged import MujocoRobots
 from cuelearner_envs.anymal.locomotion import Trial, push_randomly, random_command, random_ground
-from cuelearner_envs.anymal.physics import Body, Ground, control, standing
+from cuelearner_envs.anymal.physics import AnymalBody, Ground, control, standing
 from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe
 
 HELD, SETTLING = 200, 100  # control steps for which a command is held, and how many of them are not yet settled
@@ -58,7 +58,7 @@ def walk(
         return (body, action, down), (robot.planar_velocity(body.qpos, body.qvel), command, down)
 
     keys = jax.random.split(k_run, robots)
-    start: Body = standing(jnp.zeros(2), 0.0)
+    start: AnymalBody = standing(jnp.zeros(2), 0.0)
     begun = (start, jnp.zeros(robot.JOINTS), jnp.array(False))
     states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (robots, *leaf.shape)), begun)
 
@@ -74,7 +74,7 @@ def walk_in_mujoco(
     """`walk` in C MuJoCo at its finer step."""
     k_ground, k_run = jax.random.split(key)
     grounds = jax.vmap(partial(random_ground, trial=trial))(jax.random.split(k_ground, robots))
-    judge = Judge(np.asarray(grounds.friction).tolist(), np.asarray(grounds.payload).tolist())
+    judge = MujocoRobots(np.asarray(grounds.friction).tolist(), np.asarray(grounds.payload).tolist())
     keys = jax.random.split(k_run, robots)
 
     @jax.jit
@@ -83,7 +83,7 @@ def walk_in_mujoco(
 
         def one(key: PRNGKeyArray, qpos: jax.Array, qvel: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
             action, command, k_push = _chosen(policy, trial, key, index, qpos, qvel, last)
-            after = push_randomly(k_push, Body(qpos, qvel, qvel), trial).qvel
+            after = push_randomly(k_push, AnymalBody(qpos, qvel, qvel), trial).qvel
             return action, command, after[:2] - qvel[:2]
 
         return jax.vmap(one)(keys, qpos, qvel, last)

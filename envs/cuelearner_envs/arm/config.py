@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import jax.numpy as jnp
 
 from cuelearner_envs.arm.environment import REWARDS, Arm, Camera, Reward, Skill
-from cuelearner_envs.arm.physics import Ground
+from cuelearner_envs.arm.physics import ArmConditions
 from cuelearner_envs.bounds import MOST_STEPS, check_number, check_vector, check_word
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
@@ -68,7 +68,7 @@ def make_environment(config: ArmConfig, observation: Sequence[Quantity]) -> Arm:
             turn=jnp.deg2rad(jnp.float32(config.camera_turn_deg)),
             offset=jnp.array(config.camera_offset, jnp.float32),
         ),
-        ground=Ground(friction=jnp.float32(config.friction), post=jnp.float32(config.has_post)),
+        ground=ArmConditions(friction=jnp.float32(config.friction), post=jnp.float32(config.has_post)),
         grasps=jnp.float32(config.skill == "pick"),
         within=jnp.float32(config.within),
         max_steps=jnp.int32(config.max_steps),

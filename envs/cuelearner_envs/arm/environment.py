@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from cuelearner_envs.anymal.model import rotation
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
-from cuelearner_envs.arm.physics import Body, Ground
+from cuelearner_envs.arm.physics import ArmBody, ArmConditions
 from cuelearner_envs.arm.scripts import act
 from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
 from cuelearner_jax.environment import Quantity, WholeObservations
@@ -42,7 +42,7 @@ ACTIONS = Box((-1.0,) * 4, (1.0,) * 4, cues_from(CUES, CUE_NAMES))
 class Situation(struct.PyTreeNode):
     """State between steps."""
 
-    body: Body
+    body: ArmBody
     goal: Float[Array, "3"]  # of the gripper, or of the cube's middle [m]
     steps: Int[Array, ""]  # taken in this episode
     passed: Float[Array, ""]  # on which side of the post the cube went by: +1 left, -1 right, 0 not yet
@@ -67,7 +67,7 @@ class Arm(WholeObservations, struct.PyTreeNode):
     """The environment (`cuelearner_jax.environment.Environment`). Everything but the last three fields is traced."""
 
     camera: Camera = Camera()
-    ground: Ground = Ground()
+    ground: ArmConditions = ArmConditions()
     grasps: Scalar = 1.0  # 1: fingers move, goals may lie in the air (`pick`); 0: fingers stay closed
     within: Scalar = 0.05  # of the goal: as near, the episode is a success [m]
     max_steps: Int[Array, ""] | int = 50  # an episode is truncated after this many
@@ -106,7 +106,7 @@ class Arm(WholeObservations, struct.PyTreeNode):
     def _post(self) -> Scalar:
         return self.ground.post if self.has_object else 0.0
 
-    def after(self, state: Situation, body: Body) -> Situation:
+    def after(self, state: Situation, body: ArmBody) -> Situation:
         """Return the state that physics has led to; what blew up stays where it was."""
         sound = jnp.isfinite(body.qpos).all() & jnp.isfinite(body.qvel).all()
         body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), body, state.body)

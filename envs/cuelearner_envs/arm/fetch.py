@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_envs.arm.config import ArmConfig
 from cuelearner_envs.arm.config import make_environment as make_arm
 from cuelearner_envs.arm.environment import Arm, Camera
-from cuelearner_envs.arm.physics import REACH, WORKSPACE, Ground
+from cuelearner_envs.arm.physics import REACH, WORKSPACE, ArmConditions
 from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
@@ -101,5 +101,5 @@ def make_environment(config: ArmConfig, plays: Environment) -> FetchArm:
             "--robot fetch"
         )
     plain = make_arm(config, plays.observation)
-    ground = Ground(friction=plain.ground.friction, post=jnp.zeros(()))
+    ground = ArmConditions(friction=plain.ground.friction, post=jnp.zeros(()))
     return FetchArm(**{**vars(plain), "ground": ground}, plays=plays)

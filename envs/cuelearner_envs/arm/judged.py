@@ -17,13 +17,13 @@ from jaxtyping import Array, Key
 from cuelearner_envs import judging
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm.environment import Arm
-from cuelearner_envs.arm.physics import Body
+from cuelearner_envs.arm.physics import ArmBody
 from cuelearner_jax.types import Policy
 
 TIMESTEP, ITERATIONS = 0.002, 100  # [s]; of the solver
 
 
-class Judge:
+class MujocoGrippers:
     """Grippers side by side in one world."""
 
     def __init__(self, env: Arm, count: int, timestep: float = TIMESTEP, iterations: int | None = ITERATIONS) -> None:
@@ -35,14 +35,14 @@ class Judge:
         self.data = [mujoco.MjData(self.model) for _ in range(count)]
         self.steps = round(arm.CONTROL_PERIOD / timestep)
 
-    def place(self, body: Body) -> None:
+    def place(self, body: ArmBody) -> None:
         """Put each of them into a configuration, leaves (count, ...)."""
         for data, qpos, qvel in zip(self.data, np.asarray(body.qpos), np.asarray(body.qvel), strict=True):
             mujoco.mj_resetData(self.model, data)
             data.qpos[:], data.qvel[:] = qpos, qvel
             mujoco.mj_forward(self.model, data)
 
-    def control(self, targets: np.ndarray) -> Body:
+    def control(self, targets: np.ndarray) -> ArmBody:
         """Step control (0.04 s) of each with targets (count, drives); return where that led."""
 
         def one(number: int) -> None:
@@ -53,10 +53,10 @@ class Judge:
         return self.body
 
     @property
-    def body(self) -> Body:
+    def body(self) -> ArmBody:
         """The grippers' present configurations."""
         rows = [(data.qpos, data.qvel, data.qacc_warmstart) for data in self.data]
-        return Body(*(jnp.asarray(np.stack(column), jnp.float32) for column in zip(*rows, strict=True)))
+        return ArmBody(*(jnp.asarray(np.stack(column), jnp.float32) for column in zip(*rows, strict=True)))
 
 
 @jax.jit
@@ -70,7 +70,7 @@ def _targets(env: Arm, states: Any, actions: Array) -> Array:
 
 
 @jax.jit
-def _after(env: Arm, states: Any, body: Body) -> Any:
+def _after(env: Arm, states: Any, body: ArmBody) -> Any:
     after = jax.vmap(env.after)(states, body)
     return after, jax.vmap(env.observe)(after), jax.vmap(env.ends)(after)
 
@@ -79,7 +79,7 @@ class GripperCourse:
     """Grippers in C MuJoCo, each in an episode of an environment."""
 
     def __init__(self, env: Arm, keys: Key[Array, " grippers"]) -> None:
-        self.env, self.judge = env, Judge(env, len(keys))
+        self.env, self.judge = env, MujocoGrippers(env, len(keys))
         self.state, self.obs = _begin(env, keys)
         self.judge.place(self.state.body)
 

@@ -25,7 +25,7 @@ GRIPPER, FINGERS, CUBE = slice(0, 3), slice(3, 5), slice(5, 12)  # of qpos
 CUBE_VELOCITY, CUBE_TURNING = slice(5, 8), slice(8, 11)  # of qvel
 
 
-class Body(struct.PyTreeNode):
+class ArmBody(struct.PyTreeNode):
     """The state between control steps; `mjx.Data` (kilobytes) is rebuilt from it each step.
 
     Without an object there are no fingers and no cube: the gripper is three numbers.
@@ -36,7 +36,7 @@ class Body(struct.PyTreeNode):
     warmstart: Float[Array, " qvel"]  # the solver's first guess: the last accelerations [m/s^2, rad/s^2]
 
 
-class Ground(struct.PyTreeNode):
+class ArmConditions(struct.PyTreeNode):
     """Conditions that may differ between worlds."""
 
     friction: Scalar = arm.FRICTION  # of the cube on table, fingers and post
@@ -70,12 +70,12 @@ def compiled(has_object: bool) -> tuple[Any, Any, int]:
         return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"), post
 
 
-def standing(gripper: Float[Array, "3"], cube: Float[Array, "2"] | None) -> Body:
+def standing(gripper: Float[Array, "3"], cube: Float[Array, "2"] | None) -> ArmBody:
     """Return the gripper at rest at a place [m], fingers closed, and the cube on the table [m] (None: no object)."""
     if cube is None:
-        return Body(gripper, jnp.zeros(3), jnp.zeros(3))
+        return ArmBody(gripper, jnp.zeros(3), jnp.zeros(3))
     lying = jnp.array([arm.RESTING, 1.0, 0.0, 0.0, 0.0])
-    return Body(jnp.concatenate([gripper, jnp.zeros(2), cube, lying]), jnp.zeros(11), jnp.zeros(11))
+    return ArmBody(jnp.concatenate([gripper, jnp.zeros(2), cube, lying]), jnp.zeros(11), jnp.zeros(11))
 
 
 def command(
@@ -100,7 +100,7 @@ def command(
     return Command(target, grasps * jnp.clip(fingers + action[3], 0.0, arm.OPEN))
 
 
-def control(body: Body, targets: Command, ground: Ground) -> Body:
+def control(body: ArmBody, targets: Command, ground: ArmConditions) -> ArmBody:
     """Return the body after a step of control (0.04 s)."""
     has_object = body.qpos.shape[-1] > 3
     model, data, post = compiled(has_object)
@@ -111,12 +111,12 @@ def control(body: Body, targets: Command, ground: Ground) -> Body:
         )
     mjx, ctrl = _mjx(), targets.all(has_object)
 
-    def one(carry: Body, _: None) -> tuple[Body, None]:
+    def one(carry: ArmBody, _: None) -> tuple[ArmBody, None]:
         begun = data.replace(qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart, ctrl=ctrl)
         # An accelerator would round the factors of products to three digits. MJX promotes ranks.
         with jax.default_matmul_precision("highest"), jax.numpy_rank_promotion("allow"):
             done = mjx.step(model, begun)
-        return Body(done.qpos, done.qvel, done.qacc_warmstart), None
+        return ArmBody(done.qpos, done.qvel, done.qacc_warmstart), None
 
     return jax.lax.scan(one, body, length=arm.SUBSTEPS)[0]
 

@@ -24,7 +24,7 @@ INWARD = 0.25  # a corner pocket is aimed at this share of its gap before the co
 EDGE = 20.0  # steepness of "there is room", per ball diameter or hole width
 
 
-class Contact(NamedTuple):
+class CueContact(NamedTuple):
     """The cue ball at the moment at which it touches a target."""
 
     place: Float[Array, "2"]  # of its centre [m]
@@ -49,17 +49,17 @@ def aims_of(table: Table, obs: Float[Array, " obs"]) -> Aims:
     return jax.vmap(one)(ball, pocket)
 
 
-def contact_for(table: Table, cue: Float[Array, "2"], target: Float[Array, "2"], way: Float[Array, "2"]) -> Contact:
+def contact_for(table: Table, cue: Float[Array, "2"], target: Float[Array, "2"], way: Float[Array, "2"]) -> CueContact:
     """Return the contact at which the cue ball sends a target along `way` (a direction).
 
     Two discs with friction mu: the tangential impulse is the smaller of mu times the normal one and what ends the slip,
     so the target leaves along the normal turned toward the strike by atan(min(mu, tan(cut) / 6)).
     """
 
-    def seen_along(normal: Float[Array, "2"]) -> Contact:
+    def seen_along(normal: Float[Array, "2"]) -> CueContact:
         place = target - 2.0 * table.ball_radius * normal
         strike = retract(place - cue)
-        return Contact(place, strike, normal, difference(strike, normal))
+        return CueContact(place, strike, normal, difference(strike, normal))
 
     contact = seen_along(way)
     for _ in range(THROWS):
@@ -87,7 +87,7 @@ def _features(
     targets: Float[Array, "targets 2"],
     ball: Int[Array, ""],
     others: Bool[Array, " targets"],
-    contact: Contact,
+    contact: CueContact,
     mouth: Float[Array, "2"],
     opening: Float[Array, "2"],
 ) -> Float[Array, "features"]:
@@ -123,7 +123,7 @@ def _clearance(
     return jnp.where(others, distance, jnp.inf).min()
 
 
-def _afterwards(table: Table, contact: Contact) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _afterwards(table: Table, contact: CueContact) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the cue ball's miss of the nearest pocket ahead [hole widths] and its roll after the contact.
 
     All of its speed along the normal goes to the target (equal discs, elastic); it leaves along the tangent. What it

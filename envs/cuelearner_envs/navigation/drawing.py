@@ -24,7 +24,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from cuelearner_envs import canvas
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
-from cuelearner_envs.navigation.recording import Frame
+from cuelearner_envs.navigation.recording import Moment
 from cuelearner_envs.navigation.robot import Robot, hull
 from cuelearner_envs.navigation.world import tallness, used
 from cuelearner_jax import pictures
@@ -49,7 +49,7 @@ HOLD_AFTER = 1.2  # at the end of an animated episode [s]
 Picture = UInt8[np.ndarray, "height width 3"]
 
 
-def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], dpi: int = 160) -> None:
+def still(robot: Robot, frames: Sequence[Moment], file: str | os.PathLike[str], dpi: int = 160) -> None:
     """Write a picture of the first episode: its way, and halfway what the lidar saw and what was chosen."""
     episode = [frame for frame in frames if frame.episode == frames[0].episode]
     middle, last, way = episode[len(episode) // 2], episode[-1], _way(episode)
@@ -70,7 +70,7 @@ def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], d
     canvas.save(figure, file, dpi)
 
 
-def question(robot: Robot, frame: Frame, file: str | os.PathLike[str], dpi: int = 160) -> None:
+def question(robot: Robot, frame: Moment, file: str | os.PathLike[str], dpi: int = 160) -> None:
     """Write a picture of one situation and of the direction in question as an arrow, for somebody to judge it."""
     figure, axes, strip = _figure(frame, np.asarray(frame.world.extent), dpi, ("goal", "lidar", ASKED))
     _lidar(axes, frame)
@@ -80,7 +80,7 @@ def question(robot: Robot, frame: Frame, file: str | os.PathLike[str], dpi: int 
     canvas.save(figure, file, dpi)
 
 
-def animate(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], fps: float = 10.0) -> None:
+def animate(robot: Robot, frames: Sequence[Moment], file: str | os.PathLike[str], fps: float = 10.0) -> None:
     """Write an animation (.gif or .mp4) of all episodes, one picture a step; the end of an episode stands for a moment.
 
     With steps of 0.2 s, 10 pictures a second show twice the speed of life.
@@ -104,7 +104,7 @@ def shade(height: float) -> str:
     return to_hex((1 - share) * np.array(to_rgb(LOW)) + share * np.array(to_rgb(TALL)))  # pyright: ignore[reportArgumentType]
 
 
-def _film(robot: Robot, episode: Sequence[Frame], frames: Sequence[Frame], hold: int) -> Iterator[Picture]:
+def _film(robot: Robot, episode: Sequence[Moment], frames: Sequence[Moment], hold: int) -> Iterator[Picture]:
     """Yield one picture per step of an episode, and its end `hold` times; constant parts are drawn once."""
     extent = np.max([np.asarray(frame.world.extent) for frame in frames], axis=0)  # of the largest world
     figure, axes, strip = _figure(episode[0], extent, 100, COURSE)
@@ -130,13 +130,13 @@ def _to_world(pose: np.ndarray, points: Float[np.ndarray, "points 2"]) -> Float[
     return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
 
 
-def _way(episode: Sequence[Frame]) -> Float[np.ndarray, "poses 3"]:
+def _way(episode: Sequence[Moment]) -> Float[np.ndarray, "poses 3"]:
     """The poses of an episode, those before its steps and the last one's end [m, rad]."""
     return np.stack([frame.pose for frame in episode] + [episode[-1].next_pose])
 
 
 def _figure(
-    first: Frame, extent: Float[np.ndarray, "2"], dpi: float, shown: Sequence[str]
+    first: Moment, extent: Float[np.ndarray, "2"], dpi: float, shown: Sequence[str]
 ) -> tuple[Figure, Axes, Axes]:
     """A figure of axes for a floor and of a strip for words below, as many metres long; its sides are even dots.
 
@@ -201,7 +201,7 @@ def _body(axes: Axes, robot: Robot, pose: np.ndarray, colour: str = BODY, alpha:
     return [axes.add_patch(Polygon(_to_world(pose, points), **look, **rest)) for points, look in shapes]
 
 
-def _lidar(axes: Axes, frame: Frame) -> list[Artist]:
+def _lidar(axes: Axes, frame: Moment) -> list[Artist]:
     """Add one scan, as the robot takes it: the space that it found free, and dots where beams met something."""
     angles = np.asarray(BEAM_ANGLES, float)
     beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -212,7 +212,7 @@ def _lidar(axes: Axes, frame: Frame) -> list[Artist]:
     return [axes.add_patch(free), *dots]
 
 
-def _arrow(axes: Axes, frame: Frame) -> Artist:
+def _arrow(axes: Axes, frame: Moment) -> Artist:
     """Add an arrow beside the body, along the direction that was chosen."""
     ends = _to_world(frame.pose, np.outer(ARROW_REACH, frame.action))
     return canvas.arrow(axes, ends, ARROW, 13, canvas.edged(3.6, "#000000aa"))

@@ -14,8 +14,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.navigation.aims import aims_of
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
-from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
-from cuelearner_envs.navigation.world import World, count_passed, heading
+from cuelearner_envs.navigation.robot import Robot, RobotMotion, collides, walk
+from cuelearner_envs.navigation.world import NavigationWorld, count_passed, heading
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.environment import Aims, Described, Features, Quantity
 from cuelearner_jax.spaces.directions import inward, retract, rotate, to_angle
@@ -46,7 +46,7 @@ AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal
 class Navigation(Described, struct.PyTreeNode):
     """The environment (`cuelearner_jax.environment.Environment`). Everything but the last three fields is traced."""
 
-    worlds: World  # leading axis: worlds
+    worlds: NavigationWorld  # leading axis: worlds
     robot: Robot = Robot()
     lidar: Lidar = Lidar()
     max_steps: Int[Array, ""] | int = 200  # an episode is truncated after this many
@@ -81,7 +81,7 @@ class Navigation(Described, struct.PyTreeNode):
         """The environment without its worlds, at which no policy looks."""
         return self.replace(worlds=None)
 
-    def world(self, index: Int[ArrayLike, "*n"]) -> World:
+    def world(self, index: Int[ArrayLike, "*n"]) -> NavigationWorld:
         """Return one world, or one for each index."""
         return jax.tree.map(lambda leaf: leaf[index], self.worlds)
 
@@ -141,7 +141,7 @@ class Navigation(Described, struct.PyTreeNode):
 
     def moved(self, state: AnyWalker, action: Float[Array, "2"]) -> AnyWalker:
         """The state after a step, without a reset."""
-        motion = walk(self.robot, Motion(state.pose, state.velocity), action, self.period)
+        motion = walk(self.robot, RobotMotion(state.pose, state.velocity), action, self.period)
         return state.replace(
             pose=motion.pose,
             velocity=motion.velocity,

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import NavigationWorld
 from cuelearner_jax.devices import goes_through
 
 
@@ -20,7 +20,7 @@ def in_frame(boxes: Float[Array, "boxes 5"], point: Float[Array, "2"]) -> Float[
     return jnp.stack([cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]], axis=-1)
 
 
-def clearance(world: World, point: Float[Array, "2"]) -> Float[Array, ""]:
+def clearance(world: NavigationWorld, point: Float[Array, "2"]) -> Float[Array, ""]:
     """Distance from a point to the nearest solid [m]; negative inside one."""
     beyond = jnp.abs(in_frame(world.boxes, point)) - world.boxes[:, 3:]
     outside = jnp.sqrt(jnp.sum(jnp.square(jnp.maximum(beyond, 0.0)), -1))
@@ -29,7 +29,7 @@ def clearance(world: World, point: Float[Array, "2"]) -> Float[Array, ""]:
     return jnp.minimum(to_boxes.min(), to_circles.min())
 
 
-def line_clearance(world: World, start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:
+def line_clearance(world: NavigationWorld, start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:
     """Smallest distance between the line from `start` to `end` and any solid [m]; 0 where the line meets a box.
 
     A circle that the line enters gives a negative number: minus how deep.

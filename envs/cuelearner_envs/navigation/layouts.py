@@ -17,7 +17,7 @@ WALL_HEIGHT = 1.5  # [m]
 LOWEST, HIGHEST = 0.8, 1.4  # heights of obstacles [m]: the lidar, at about half a metre, sees all of them
 
 
-class Layout(NamedTuple):
+class Solids(NamedTuple):
     """Solids of one world."""
 
     boxes: Float[Array, "boxes 5"]
@@ -27,7 +27,7 @@ class Layout(NamedTuple):
     extent: Float[Array, "2"]
 
 
-def clutter(key: PRNGKeyArray) -> Layout:
+def clutter(key: PRNGKeyArray) -> Solids:
     """A square hall of 20 m with 8 to 16 boxes and 6 to 12 circles at random places: the training worlds."""
     extent = jnp.array([20.0, 20.0])
     k_count, k_place, k_turn, k_size, k_round, k_radius, k_tall = jax.random.split(key, 7)
@@ -39,7 +39,7 @@ def clutter(key: PRNGKeyArray) -> Layout:
     return _layout(k_tall, extent, _only(used, boxes), _only(drawn, circles))
 
 
-def rooms(key: PRNGKeyArray) -> Layout:
+def rooms(key: PRNGKeyArray) -> Solids:
     """An office of 18 m by 14 m: two rows of three rooms, doorways of 1.3 to 1.7 m, a narrow passage, thin obstacles.
 
     The middle room of each row is a passage about 1.5 to 1.9 m wide, left or right of the office's middle.
@@ -68,7 +68,7 @@ def rooms(key: PRNGKeyArray) -> Layout:
     return _layout(k_tall, extent, jnp.concatenate([walls, thin]), poles)
 
 
-def corridor(key: PRNGKeyArray) -> Layout:
+def corridor(key: PRNGKeyArray) -> Solids:
     """A corridor of 20 m by 4.6 m with four obstacles near its middle line: each can be passed on either side."""
     extent = jnp.array([20.0, 4.6])
     k_along, k_across, k_turn, k_size, k_kind, k_tall = jax.random.split(key, 6)
@@ -82,7 +82,7 @@ def corridor(key: PRNGKeyArray) -> Layout:
     return _layout(k_tall, extent, _only(~is_round, boxes), _only(is_round, circles))
 
 
-STYLES: dict[str, Callable[[PRNGKeyArray], Layout]] = {"clutter": clutter, "rooms": rooms, "corridor": corridor}
+STYLES: dict[str, Callable[[PRNGKeyArray], Solids]] = {"clutter": clutter, "rooms": rooms, "corridor": corridor}
 BOXES, CIRCLES = 24, 12  # rows of every world: the largest layout's, with its four outer walls
 
 
@@ -123,7 +123,7 @@ def _unused(count: int, width: int) -> Float[Array, "count width"]:
 
 def _layout(
     key: PRNGKeyArray, extent: Float[Array, "2"], boxes: Float[Array, "some 5"], circles: Float[Array, "few 3"]
-) -> Layout:
+) -> Solids:
     """Obstacles with outer walls, filled up to the common size."""
     half = extent / 2
     walls = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -135,4 +135,4 @@ def _layout(
     k_boxes, k_circles = jax.random.split(key)
     heights = jax.random.uniform(k_boxes, (BOXES,), minval=LOWEST, maxval=HIGHEST).at[:4].set(WALL_HEIGHT)
     circle_heights = jax.random.uniform(k_circles, (CIRCLES,), minval=LOWEST, maxval=HIGHEST)
-    return Layout(boxes, heights, circles, circle_heights, extent)
+    return Solids(boxes, heights, circles, circle_heights, extent)

@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Float
 
 from cuelearner_envs.navigation.geometry import in_frame
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import NavigationWorld
 from cuelearner_jax.spaces.directions import from_angle, rotate
 
 BEAMS = 271
@@ -36,7 +36,7 @@ class Lidar(struct.PyTreeNode):
     noise: Scalar = 0.0  # standard deviation of a beam's error [m]
     dropout: Scalar = 0.0  # probability that a beam reads `max_range` whatever it meets
 
-    def read(self, world: World, pose: Float[ArrayLike, "3"]) -> Float[Array, "271"]:
+    def read(self, world: NavigationWorld, pose: Float[ArrayLike, "3"]) -> Float[Array, "271"]:
         """Distances that the robot perceives at a pose [m]; without faults they are `scan`'s.
 
         Noise and drop-outs are drawn from the pose's bits, so that the same reading can be made again.
@@ -59,7 +59,7 @@ class Lidar(struct.PyTreeNode):
         return jax.lax.cond(has_faults, drawn, lambda: ranges)
 
 
-def scan(world: World, pose: Float[ArrayLike, "3"], max_range: Scalar = MAX_RANGE) -> Float[Array, "271"]:
+def scan(world: NavigationWorld, pose: Float[ArrayLike, "3"], max_range: Scalar = MAX_RANGE) -> Float[Array, "271"]:
     """Distance along each beam to the first surface [m], from -135 deg to +135 deg, counterclockwise.
 
     The sensor sits at the robot's centre, below the top of every solid. From inside a solid a beam reads the way out,
@@ -72,7 +72,7 @@ def scan(world: World, pose: Float[ArrayLike, "3"], max_range: Scalar = MAX_RANG
 
 
 def scan_tilted(
-    world: World, origin: Float[Array, "3"], turn: Float[Array, "3 3"], max_range: Scalar = MAX_RANGE
+    world: NavigationWorld, origin: Float[Array, "3"], turn: Float[Array, "3 3"], max_range: Scalar = MAX_RANGE
 ) -> Float[Array, "271"]:
     """`scan` of a sensor that is tilted: beams meet the floor, and pass over solids that are too low.
 

@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, PRNGKeyArray
 
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import NavigationWorld
 from cuelearner_envs.playing import played
 from cuelearner_jax.types import Policy, Step
 
 ENDS = ("success", "collision", "fall", "timeout")
 
 
-class Frame(NamedTuple):
+class Moment(NamedTuple):
     """One step of an episode, in NumPy arrays."""
 
-    world: World  # the one walked in, no batch
+    world: NavigationWorld  # the one walked in, no batch
     goal: Float[np.ndarray, "2"]  # [m]
     goal_radius: float | np.ndarray  # nearer than this, the goal is reached [m]
     pose: Float[np.ndarray, "3"]  # before the step: x, y, yaw [m, rad]
@@ -41,12 +41,12 @@ def _seen(env: Navigation, state: Any, after: Any) -> dict[str, Any]:
     return {**view, "max_range": most, "next_pose": after.pose, "seconds": seconds}
 
 
-def situation(env: Navigation, state: Any, action: Float[ArrayLike, "2"]) -> Frame:
+def situation(env: Navigation, state: Any, action: Float[ArrayLike, "2"]) -> Moment:
     """Return a state's frame for a picture, with the asked action."""
-    return Frame(**jax.device_get(_seen(env, state, state)), action=np.asarray(action))
+    return Moment(**jax.device_get(_seen(env, state, state)), action=np.asarray(action))
 
 
-def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
+def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Moment], list[float]]:
     """Frames and rewards of `steps` steps of a policy; a new episode follows the end of one."""
 
     def see(env: Navigation, state: Any, action: jax.Array, step: Step) -> tuple[Any, ...]:
@@ -59,5 +59,5 @@ def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tu
     for number in range(steps):
         outcome = "".join(name for name, ended in zip(ENDS, ends[number], strict=True) if ended)
         one = jax.tree.map(lambda leaf, number=number: leaf[number], views)
-        frames.append(Frame(**one, outcome=outcome, episode=int(finished[number])))
+        frames.append(Moment(**one, outcome=outcome, episode=int(finished[number])))
     return frames, [float(reward) for reward in rewards]

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from cuelearner_envs.navigation.environment import AnyWalker, Navigation
 from cuelearner_envs.navigation.geometry import clearance, line_clearance
 from cuelearner_envs.navigation.robot import Robot
-from cuelearner_envs.navigation.world import World, closed, heading
+from cuelearner_envs.navigation.world import NavigationWorld, closed, heading
 from cuelearner_jax.spaces.directions import from_angle, retract, rotate
 
 NODES = 160
@@ -37,7 +37,7 @@ class RoadMap(struct.PyTreeNode):
     lengths: Float[Array, "nodes nodes"]  # of the line between two nodes [m]; infinite where it is blocked
 
 
-def build(key: PRNGKeyArray, world: World, robot: Robot) -> RoadMap:
+def build(key: PRNGKeyArray, world: NavigationWorld, robot: Robot) -> RoadMap:
     """The road map of a world for a robot's footprint."""
     k_place, k_order = jax.random.split(key)
     candidates, rank = _candidates(k_place, world, robot.reach + NODE_MARGIN)
@@ -51,11 +51,12 @@ def build(key: PRNGKeyArray, world: World, robot: Robot) -> RoadMap:
     return RoadMap(nodes, jnp.where(joined, apart, jnp.inf))
 
 
-def distances(roadmap: RoadMap, world: World, robot: Robot, goal: Float[Array, "2"]) -> Float[Array, " nodes"]:
+def distances(
+    roadmap: RoadMap, world: NavigationWorld, robot: Robot, goal: Float[Array, "2"]
+) -> Float[Array, " nodes"]:
     """Length of the shortest way from each node to a goal [m]; infinite where there is none (Bellman and Ford)."""
-    direct = jnp.linalg.norm(roadmap.nodes - goal[None], axis=-1)
-    useful = jnp.isfinite(roadmap.lengths).any(-1)
-    start = jnp.where(useful & (_view(roadmap, world, robot, goal) >= 0), direct, jnp.inf)
+    lines = jnp.linalg.norm(roadmap.nodes - goal[None], axis=-1)
+    start = jnp.where(jnp.isfinite(roadmap.lengths).any(-1) & (_view(roadmap, world, robot, goal) >= 0), lines, jnp.inf)
 
     def relax(length: jax.Array) -> jax.Array:
         return jnp.minimum(length, (roadmap.lengths + length[None]).min(-1))
@@ -68,7 +69,7 @@ def distances(roadmap: RoadMap, world: World, robot: Robot, goal: Float[Array, "
 
 def way(
     roadmap: RoadMap,
-    world: World,
+    world: NavigationWorld,
     robot: Robot,
     to_goal: Float[Array, " nodes"],
     position: Float[Array, "2"],
@@ -88,19 +89,18 @@ def way(
     return places[best], lengths[best]
 
 
-def _view(roadmap: RoadMap, world: World, robot: Robot, position: Float[Array, "2"]) -> Float[Array, " nodes"]:
-    return jax.vmap(partial(_room, world, robot, position))(roadmap.nodes)
+def _view(roadmap: RoadMap, world: NavigationWorld, robot: Robot, start: Float[Array, "2"]) -> Float[Array, " nodes"]:
+    return jax.vmap(partial(_room, world, robot, start))(roadmap.nodes)
 
 
-def _room(world: World, robot: Robot, position: Float[Array, "2"], place: Float[Array, "2"]) -> Float[Array, ""]:
+def _room(world: NavigationWorld, robot: Robot, start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:
     """Clearance of a line beyond what it must have [m]: the map's, or that of its worse end."""
-    ends = jnp.minimum(clearance(world, position), clearance(world, place))
-    needed = jnp.minimum(robot.reach + LINE_MARGIN, ends - YIELD)
-    return line_clearance(world, position, place) - needed
+    ends = jnp.minimum(clearance(world, start), clearance(world, end))
+    return line_clearance(world, start, end) - jnp.minimum(robot.reach + LINE_MARGIN, ends - YIELD)
 
 
 def _candidates(
-    key: PRNGKeyArray, world: World, away: Float[Array, ""] | float
+    key: PRNGKeyArray, world: NavigationWorld, away: Float[Array, ""] | float
 ) -> tuple[Float[Array, "many 2"], Float[Array, " many"]]:
     """Places for nodes, and their ranks: corners of boxes first, then round circles, beside boxes, anywhere."""
     signs = jnp.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
@@ -127,7 +127,7 @@ def _candidates(
 
 
 def _toward_goal(
-    roadmap: RoadMap, world: World, robot: Robot, to_goal: Float[Array, " nodes"], state: AnyWalker
+    roadmap: RoadMap, world: NavigationWorld, robot: Robot, to_goal: Float[Array, " nodes"], state: AnyWalker
 ) -> Float[Array, "2"]:
     place, _ = way(roadmap, world, robot, to_goal, state.pose[:2], state.goal)
     return rotate(retract(place - state.pose[:2]), -state.pose[2])
@@ -172,11 +172,11 @@ class BriefTeacher(struct.PyTreeNode):
 def make_teacher(env: Navigation, side: Float[Array, ""] | None = None) -> RoadMapTeacher:
     """Road maps of all worlds of an environment; `side`: +1 to pass every obstacle on the left, -1 on the right."""
 
-    def mapped(key: PRNGKeyArray, world: World) -> tuple[RoadMap, Float[Array, "routes nodes"]]:
+    def mapped(key: PRNGKeyArray, world: NavigationWorld) -> tuple[RoadMap, Float[Array, "routes nodes"]]:
         roadmap = build(key, world, env.robot)
         return roadmap, jax.vmap(partial(distances, roadmap, world, env.robot))(world.goals)
 
-    def each(pair: tuple[PRNGKeyArray, World]) -> Any:
+    def each(pair: tuple[PRNGKeyArray, NavigationWorld]) -> Any:
         key, world = pair
         if side is None:
             return mapped(key, world)

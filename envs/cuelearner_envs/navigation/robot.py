@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.navigation.geometry import clearance
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import NavigationWorld
 from cuelearner_jax.spaces.directions import from_angle, rotate, to_angle
 
 Scalar = float | Float[Array, ""]
@@ -45,14 +45,14 @@ def hull(robot: Robot) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray,
     return np.concatenate([front, -front]), np.array([[tip, 0.0], [back, 0.6 * radius], [back, -0.6 * radius]])
 
 
-class Motion(struct.PyTreeNode):
+class RobotMotion(struct.PyTreeNode):
     """Pose and velocity of a robot."""
 
     pose: Float[Array, "3"]  # x, y, yaw [m, rad]
     velocity: Float[Array, "2"]  # in the world's frame [m/s]
 
 
-def walk(robot: Robot, motion: Motion, direction: Float[Array, "2"], duration: Scalar) -> Motion:
+def walk(robot: Robot, motion: RobotMotion, direction: Float[Array, "2"], duration: Scalar) -> RobotMotion:
     """Return the motion after `duration` [s] of the command to walk in `direction` (unit vector in the body's frame).
 
     The command is held in the world's frame meanwhile: the body turns under it.
@@ -64,7 +64,7 @@ def walk(robot: Robot, motion: Motion, direction: Float[Array, "2"], duration: S
     position = position + wanted * duration + (motion.velocity - wanted) * robot.lag * (1.0 - fading)
     limit = robot.turn_rate * duration
     turned = yaw + jnp.clip(to_angle(direction), -limit, limit)
-    return Motion(jnp.concatenate([position, to_angle(from_angle(turned))[None]]), velocity)
+    return RobotMotion(jnp.concatenate([position, to_angle(from_angle(turned))[None]]), velocity)
 
 
 def discs(robot: Robot, pose: Float[Array, "3"]) -> Float[Array, "3 2"]:
@@ -73,7 +73,7 @@ def discs(robot: Robot, pose: Float[Array, "3"]) -> Float[Array, "3 2"]:
     return pose[None, :2] + along[:, None] * from_angle(pose[2])[None]
 
 
-def collides(robot: Robot, world: World, pose: Float[Array, "3"]) -> Bool[Array, ""]:
+def collides(robot: Robot, world: NavigationWorld, pose: Float[Array, "3"]) -> Bool[Array, ""]:
     """Whether the body touches a solid, or stands outside the walls."""
     centres = discs(robot, pose)
     touching = jax.vmap(lambda centre: clearance(world, centre))(centres) < robot.disc_radius

@@ -18,7 +18,7 @@ OUTER = 4  # the first boxes of every world are its outer walls
 BARRIER = 0.02  # half the thickness of what closes a side [m]
 
 
-class World(struct.PyTreeNode):
+class NavigationWorld(struct.PyTreeNode):
     """A world. The arrays of all worlds have equal sizes, whatever the style, so that worlds can be stacked.
 
     Unused rows hold a tiny solid `FAR_AWAY`. Solids stand on the floor and may overlap; the outer walls are boxes too.
@@ -49,14 +49,14 @@ def heading(start: Float[Array, "2"], goal: Float[Array, "2"]) -> Float[Array, "
     return jnp.where(goal[0] >= start[0], 1.0, -1.0)
 
 
-def obstacles(world: World) -> tuple[Float[Array, "obstacles 2"], Bool[Array, " obstacles"]]:
+def obstacles(world: NavigationWorld) -> tuple[Float[Array, "obstacles 2"], Bool[Array, " obstacles"]]:
     """Middles of all solids but the outer walls [m], and which of them there are: unused ones lie far away."""
     middles = jnp.concatenate([world.boxes[OUTER:, :2], world.circles[:, :2]])
     return middles, (jnp.abs(middles) < world.extent[None] / 2).all(-1)
 
 
 def count_passed(
-    world: World, ahead: Float[Array, ""], before: Float[Array, "2"], after: Float[Array, "2"]
+    world: NavigationWorld, ahead: Float[Array, ""], before: Float[Array, "2"], after: Float[Array, "2"]
 ) -> Float[Array, "2"]:
     """Return how many obstacles a straight step passes, on the left and on the right.
 
@@ -71,7 +71,7 @@ def count_passed(
     return jnp.stack([jnp.sum(crosses & left), jnp.sum(crosses & ~left)]).astype(jnp.float32)
 
 
-def closed(world: World, side: Float[Array, ""] | float) -> World:
+def closed(world: NavigationWorld, side: Float[Array, ""] | float) -> NavigationWorld:
     """The world with a thin barrier from each obstacle to the outer wall above it (side +1) or below it (-1)."""
     middles, there = obstacles(world)
     wall = side * world.extent[1] / 2

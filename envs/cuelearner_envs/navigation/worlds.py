@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.navigation.geometry import clearance
-from cuelearner_envs.navigation.layouts import STYLES, Layout
+from cuelearner_envs.navigation.layouts import STYLES, Solids
 from cuelearner_envs.navigation.robot import Robot
-from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.world import NavigationWorld
 
 CELL = 0.2  # side of a grid cell [m]
 CELLS = 100  # along either side: the largest world is 20 m
@@ -26,14 +26,14 @@ ROUTES = 16
 WORLDS_AT_ONCE = 64  # worlds generated together on an accelerator, which bounds the memory of their grids
 
 
-def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) -> World:
+def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) -> NavigationWorld:
     """Return a random world of a style (see `layouts`), whose every start reaches its goal, 5 to 15 m away."""
 
-    def attempt(key: PRNGKeyArray) -> tuple[World, Bool[Array, ""]]:
+    def attempt(key: PRNGKeyArray) -> tuple[NavigationWorld, Bool[Array, ""]]:
         k_layout, k_routes = jax.random.split(key)
         return _with_routes(k_routes, STYLES[style](k_layout), routes)
 
-    def again(key: PRNGKeyArray) -> tuple[PRNGKeyArray, World, Bool[Array, ""]]:
+    def again(key: PRNGKeyArray) -> tuple[PRNGKeyArray, NavigationWorld, Bool[Array, ""]]:
         key, next_key = jax.random.split(key)
         return next_key, *attempt(key)
 
@@ -42,7 +42,7 @@ def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) ->
 
 
 @partial(jax.jit, static_argnames=("count", "style", "routes"))
-def generate_many(key: PRNGKeyArray, count: int, style: str = "clutter", routes: int = ROUTES) -> World:
+def generate_many(key: PRNGKeyArray, count: int, style: str = "clutter", routes: int = ROUTES) -> NavigationWorld:
     """`count` worlds (leading axis). World i does not depend on how many there are."""
     keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(count))
     return jax.lax.map(partial(generate, style=style, routes=routes), keys, batch_size=together())
@@ -59,7 +59,7 @@ def cell_centres() -> Float[Array, "cells cells 2"]:
     return jnp.stack(jnp.meshgrid(along, along, indexing="ij"), axis=-1)
 
 
-def free_space(world: World) -> Float[Array, "cells cells"]:
+def free_space(world: NavigationWorld) -> Float[Array, "cells cells"]:
     """Distance from each cell's middle to the nearest solid [m]; negative outside the walls."""
     centres = cell_centres()
     distance = jax.vmap(jax.vmap(lambda centre: clearance(world, centre)))(centres)
@@ -91,10 +91,10 @@ def any_of(key: PRNGKeyArray, usable: Bool[Array, " all"]) -> Int[Array, ""]:
     return jnp.argmax(jnp.where(usable, drawn, -1.0))
 
 
-def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[World, Bool[Array, ""]]:
+def _with_routes(key: PRNGKeyArray, layout: Solids, routes: int) -> tuple[NavigationWorld, Bool[Array, ""]]:
     """The world of a layout, and whether all its routes are as they should be."""
     nowhere = jnp.zeros((routes, 2))
-    world = World(*layout, starts=nowhere, goals=nowhere)
+    world = NavigationWorld(*layout, starts=nowhere, goals=nowhere)
     distance = free_space(world)
     passable = distance >= Robot().reach + CELL / 2
     # Off its middle by `JITTER` a place still keeps the reach, and so does the line to the middle.

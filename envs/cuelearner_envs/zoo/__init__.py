@@ -6,12 +6,12 @@ pure JAX. `robots` and `measure` take many robots, the others one world, to be m
 
 from cuelearner_envs.zoo.distil import robots
 from cuelearner_envs.zoo.measure import Scores, measure
-from cuelearner_envs.zoo.robots import TASKS, Robot, policy
+from cuelearner_envs.zoo.robots import TASKS, ZooRobot, policy
 from cuelearner_envs.zoo.worlds import (
     ERRORS,
     STEPS,
     State,
-    World,
+    ZooWorld,
     answer,
     changed,
     observe,
@@ -24,6 +24,6 @@ from cuelearner_envs.zoo.worlds import (
 )
 
 __all__ = [
-    "ERRORS", "STEPS", "TASKS", "Robot", "Scores", "State", "World", "answer", "changed", "measure", "observe",
+    "ERRORS", "STEPS", "TASKS", "Scores", "State", "ZooRobot", "ZooWorld", "answer", "changed", "measure", "observe",
     "policy", "reset", "right", "robots", "rollout", "step", "success", "unchanged",
 ]  # fmt: skip

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_envs.zoo.robots import Robot, decode, dimensions, draw, network, policy, run_network, script
+from cuelearner_envs.zoo.robots import ZooRobot, decode, dimensions, draw, network, policy, run_network, script
 from cuelearner_envs.zoo.worlds import STEPS, rollout, unchanged
 
 SPLITS = {"tuning": 0, "held_out": 1}
@@ -20,7 +20,9 @@ BATCH = 256
 ENOUGH = 0.8  # success from which a network is used
 
 
-def robots(key: PRNGKeyArray, cues: int, count: int, split: str = "tuning", first: int | Int[Array, ""] = 0) -> Robot:
+def robots(
+    key: PRNGKeyArray, cues: int, count: int, split: str = "tuning", first: int | Int[Array, ""] = 0
+) -> ZooRobot:
     """Draw the robots `first`, ..., `first + count - 1` of a group. Leading axis of the result: count.
 
     The policies of odd robots are networks, unless a network succeeds in fewer than `ENOUGH` of the episodes. A robot
@@ -43,12 +45,11 @@ def robots(key: PRNGKeyArray, cues: int, count: int, split: str = "tuning", firs
     return jax.tree.map(lambda leaf, new: leaf.at[1::2].set(new), each, taught)
 
 
-def distil(key: PRNGKeyArray, robot: Robot) -> Robot:
+def distil(key: PRNGKeyArray, robot: ZooRobot) -> ZooRobot:
     """Return the robot with a network in place of its script, or the robot itself where the network succeeds less."""
     size, n = robot.unit.shape[0], dimensions(robot.cues)
     k_first, k_net, k_rounds, k_test = jax.random.split(key, 4)
-    first, _ = _play(k_first, robot, EPISODES)
-    flat = first.reshape(-1, size)
+    flat = _play(k_first, robot, EPISODES)[0].reshape(-1, size)
     scale = jnp.maximum(flat.std(0), 0.01 * robot.unit[robot.order])
     net = network(k_net, size, n) | {"mean": flat.mean(0), "scale": scale}
     adam = optax.adam(optax.cosine_decay_schedule(3e-3, ROUNDS * FITTING, 0.02))
@@ -75,14 +76,13 @@ def distil(key: PRNGKeyArray, robot: Robot) -> Robot:
         return (jax.lax.dynamic_update_slice(data, obs.reshape(-1, size), (rows, 0)), layers, moments), None
 
     data = jnp.zeros(((ROUNDS + 1) * EPISODES * STEPS, size)).at[: flat.shape[0]].set(flat)
-    start = data, net["layers"], adam.init(net["layers"])
-    (_, layers, _), _ = jax.lax.scan(one_round, start, jnp.arange(ROUNDS))
+    (_, layers, _), _ = jax.lax.scan(one_round, (data, net["layers"], adam.init(net["layers"])), jnp.arange(ROUNDS))
     pupil = robot.replace(neural=jnp.array(True), net=net | {"layers": layers})
     succeeds = _play(k_test, pupil, 2 * EPISODES)[1]
     return jax.tree.map(lambda new, old: jnp.where(succeeds.mean() >= ENOUGH, new, old), pupil, robot)
 
 
-def _play(key: PRNGKeyArray, robot: Robot, episodes: int) -> tuple[Float[Array, "episodes steps obs"], Array]:
+def _play(key: PRNGKeyArray, robot: ZooRobot, episodes: int) -> tuple[Float[Array, "episodes steps obs"], Array]:
     """Return the observations and successes of a robot's policy where nothing is wrong."""
     act = lambda obs: policy(robot, obs)  # noqa: E731
     obs, _, _, done = jax.vmap(lambda key: rollout(key, unchanged(robot), act))(jax.random.split(key, episodes))

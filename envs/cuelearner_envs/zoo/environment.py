@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_envs.zoo import worlds
 from cuelearner_envs.zoo.robots import policy
-from cuelearner_envs.zoo.worlds import STEPS, State, World
+from cuelearner_envs.zoo.worlds import STEPS, State, ZooWorld
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 from cuelearner_jax.types import EnvState, Step
@@ -22,12 +22,12 @@ class ZooEnvironment(WholeObservations, struct.PyTreeNode):
     Observations have no names and no units. Make one by `ZooEnvironment.of`.
     """
 
-    world: World
+    world: ZooWorld
     actions: Space = struct.field(pytree_node=False)
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
 
     @classmethod
-    def of(cls, world: World) -> ZooEnvironment:
+    def of(cls, world: ZooWorld) -> ZooEnvironment:
         """Return the environment of a world, whose robot's bounds must be concrete."""
         low, high = (tuple(np.asarray(bound).tolist()) for bound in (world.robot.low, world.robot.high))
         space = DIRECTIONS if world.robot.cues == 1 else Box(low, high)
@@ -63,7 +63,7 @@ class ZooEnvironment(WholeObservations, struct.PyTreeNode):
 class ZooTeacher(struct.PyTreeNode):
     """Teacher that knows what is wrong in its world."""
 
-    world: World
+    world: ZooWorld
 
     def best_action(self, state: State, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the right action; see `worlds.right`."""

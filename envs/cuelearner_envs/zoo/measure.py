@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_envs.zoo.robots import Robot, policy
+from cuelearner_envs.zoo.robots import ZooRobot, policy
 from cuelearner_envs.zoo.worlds import ERRORS, changed, right, rollout, unchanged
 
 
@@ -22,10 +22,10 @@ class Scores(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("episodes",))
-def measure(key: PRNGKeyArray, robots: Robot, episodes: int = 20) -> tuple[Scores, Scores]:
+def measure(key: PRNGKeyArray, robots: ZooRobot, episodes: int = 20) -> tuple[Scores, Scores]:
     """Return successes and returns of robots (leading axis) in the world of every error."""
 
-    def one(robot: Robot, key: PRNGKeyArray, error: Array) -> tuple[Array, Array]:
+    def one(robot: ZooRobot, key: PRNGKeyArray, error: Array) -> tuple[Array, Array]:
         world, keys = changed(key, robot, error), jax.random.split(key, episodes)
         act = lambda obs: policy(robot, obs)  # noqa: E731
         ways = (

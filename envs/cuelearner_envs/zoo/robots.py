@@ -34,7 +34,7 @@ class Way(struct.PyTreeNode):
     in_turn: Bool[Array, ""]  # the first axis is aligned before the others move
 
 
-class Robot(struct.PyTreeNode):
+class ZooRobot(struct.PyTreeNode):
     """One robot with its task and policy."""
 
     task: Int[Array, ""]  # index in `TASKS`
@@ -89,7 +89,7 @@ def spread_of(n: int) -> float:
     return (n / 2) ** 0.5
 
 
-def draw(key: PRNGKeyArray, cues: int) -> Robot:
+def draw(key: PRNGKeyArray, cues: int) -> ZooRobot:
     """Draw a robot with a scripted policy."""
     n, keys = dimensions(cues), jax.random.split(key, 16)
     uniform = jax.random.uniform
@@ -113,7 +113,7 @@ def draw(key: PRNGKeyArray, cues: int) -> Robot:
         side=side / jnp.linalg.norm(side),
         in_turn=jnp.array(False),
     )
-    return Robot(
+    return ZooRobot(
         task=jax.random.randint(keys[12], (), 0, len(TASKS)),
         low=half * (skew - 1),
         high=half * (skew + 1),
@@ -152,14 +152,14 @@ def run_network(net: dict[str, Any], obs: Float[Array, " obs"]) -> Float[Array, 
     return x @ weights + bias
 
 
-def encode(robot: Robot, sight: Sight) -> Float[Array, " obs"]:
+def encode(robot: ZooRobot, sight: Sight) -> Float[Array, " obs"]:
     """Return the observation that a robot makes of quantities: in its units and order."""
     origin = jnp.where(robot.relative, sight.position, 0.0)
     parts = [sight.position, sight.goal - origin, sight.thing - origin, sight.velocity, sight.carries[None]]
     return (robot.unit * jnp.concatenate([*parts, sight.clutter]) + robot.offset)[robot.order]
 
 
-def decode(robot: Robot, obs: Float[Array, " obs"]) -> Sight:
+def decode(robot: ZooRobot, obs: Float[Array, " obs"]) -> Sight:
     """Return the quantities of an observation: the inverse of `encode`."""
     n = robot.low.shape[0]
     values = (jnp.zeros_like(obs).at[robot.order].set(obs) - robot.offset) / robot.unit
@@ -168,13 +168,13 @@ def decode(robot: Robot, obs: Float[Array, " obs"]) -> Sight:
     return Sight(position, goal + origin, thing + origin, velocity, rest[0], rest[1:])
 
 
-def policy(robot: Robot, obs: Float[Array, " obs"]) -> Float[Array, " n"]:
+def policy(robot: ZooRobot, obs: Float[Array, " obs"]) -> Float[Array, " n"]:
     """Return the action of the robot's policy."""
     by_net = robot.retract(run_network(robot.net, obs) * robot.half)
     return jnp.where(robot.neural, by_net, script(robot, robot.way, decode(robot, obs)))
 
 
-def script(robot: Robot, way: Way, sight: Sight) -> Float[Array, " n"]:
+def script(robot: ZooRobot, way: Way, sight: Sight) -> Float[Array, " n"]:
     """Return a script's action: proportional to the way that is left, bounded by the cruise speed, in phases."""
     lateral, height = across(robot, sight.position - sight.goal)
     lifts = (height > SURFACE) & (jnp.linalg.norm(lateral) > 0.6 * narrow(robot))
@@ -191,12 +191,12 @@ def script(robot: Robot, way: Way, sight: Sight) -> Float[Array, " n"]:
     return robot.retract(speed / robot.drive)
 
 
-def narrow(robot: Robot) -> float:
+def narrow(robot: ZooRobot) -> float:
     """Return the radius of the hole."""
     return 0.05 * spread_of(robot.low.shape[0])
 
 
-def across(robot: Robot, way: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+def across(robot: ZooRobot, way: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Return the part of a difference across the robot's axis, and its length along the axis."""
     height = jnp.dot(way, robot.axis)
     return way - height * robot.axis, height

@@ -21,9 +21,9 @@ from cuelearner_envs.zoo.robots import (
     SURFACE,
     TRACK,
     TWO_PHASE,
-    Robot,
     Sight,
     Way,
+    ZooRobot,
     across,
     encode,
     narrow,
@@ -52,10 +52,10 @@ TOLERANCE = 0.07  # distance from the goal that counts as there, for n = 2
 HOLD = 5  # steps in a row near the goal that make a success; 1 of directions, which cannot stop
 
 
-class World(struct.PyTreeNode):
+class ZooWorld(struct.PyTreeNode):
     """A robot and what is wrong. Commands are in half ranges of the action; of directions, entry 0 is a turn [rad]."""
 
-    robot: Robot
+    robot: ZooRobot
     error: Int[Array, ""]  # index in `ERRORS`
     mixing: Float[Array, "n n"]  # of the command
     unmixing: Float[Array, "n n"]  # its inverse
@@ -87,7 +87,7 @@ class State(struct.PyTreeNode):
     phase: Float[Array, ""]  # of what moves by itself [rad]
 
 
-def changed(key: PRNGKeyArray, robot: Robot, error: int | Int[Array, ""]) -> World:
+def changed(key: PRNGKeyArray, robot: ZooRobot, error: int | Int[Array, ""]) -> ZooWorld:
     """Draw the world of an error, an index in `ERRORS`."""
     n, (k_wave, *keys) = robot.low.shape[0], jax.random.split(key, 15)
     error = jnp.asarray(error, jnp.int32)
@@ -115,7 +115,7 @@ def changed(key: PRNGKeyArray, robot: Robot, error: int | Int[Array, ""]) -> Wor
     has_other = one_of("other_way", "other_way_shift")
     shift = jax.random.normal(keys[7], (n,))
     shift = shift / jnp.linalg.norm(shift) * jax.random.uniform(keys[8], minval=0.12, maxval=0.35) * spread_of(n)
-    return World(
+    return ZooWorld(
         robot=robot,
         error=error,
         mixing=matrix,
@@ -135,12 +135,12 @@ def changed(key: PRNGKeyArray, robot: Robot, error: int | Int[Array, ""]) -> Wor
     )
 
 
-def unchanged(robot: Robot) -> World:
+def unchanged(robot: ZooRobot) -> ZooWorld:
     """Return the world in which nothing is wrong."""
     return changed(jax.random.key(0), robot, 0)
 
 
-def reset(key: PRNGKeyArray, world: World) -> State:
+def reset(key: PRNGKeyArray, world: ZooWorld) -> State:
     """Begin an episode: the robot before the goal; what lies between them depends on the task."""
     robot, n = world.robot, world.robot.low.shape[0]
     spread, k = spread_of(n), jax.random.split(key, 6)
@@ -161,26 +161,26 @@ def reset(key: PRNGKeyArray, world: World) -> State:
     return State(start, jnp.zeros(n), goal, thing, jnp.zeros(()), zero, no, zero, phase)
 
 
-def goal_of(world: World, state: State) -> Float[Array, " n"]:
+def goal_of(world: ZooWorld, state: State) -> Float[Array, " n"]:
     """Return the place of the goal, which moves to and fro along the robot's axis in `track`."""
     sway = 0.2 * jnp.sin(0.07 * state.steps + state.phase) * world.robot.axis
     return state.anchor + jnp.where(world.robot.task == TRACK, sway, 0.0)
 
 
-def sight_of(world: World, state: State) -> Sight:
+def sight_of(world: ZooWorld, state: State) -> Sight:
     """Return the true quantities of a state."""
     clutter = jnp.stack([jnp.ones(()), jnp.sin(0.05 * state.steps + state.phase), 0.01 * state.steps - 0.25])
     return Sight(state.position, goal_of(world, state), state.thing, state.velocity, state.carries, clutter)
 
 
-def observe(world: World, state: State) -> Float[Array, " obs"]:
+def observe(world: ZooWorld, state: State) -> Float[Array, " obs"]:
     """Return the observation that the policy acts on."""
     sight = sight_of(world, state)
     view = lambda place: world.about + world.turn @ (place - world.about) + world.shift  # noqa: E731
     return encode(world.robot, sight.replace(goal=view(sight.goal), thing=view(sight.thing)))
 
 
-def step(world: World, state: State, action: Float[Array, " n"]) -> tuple[State, Float[Array, ""]]:
+def step(world: ZooWorld, state: State, action: Float[Array, " n"]) -> tuple[State, Float[Array, ""]]:
     """Execute an action; return the state and the reward: minus the distance that is left, 0 once the task is done."""
     robot, spread, done = world.robot, spread_of(world.robot.low.shape[0]), success(world, state)
     speed = robot.drive * execute(world, state.position, action)
@@ -206,12 +206,12 @@ def step(world: World, state: State, action: Float[Array, " n"]) -> tuple[State,
     return after, jnp.where(done, 0.0, reward)
 
 
-def success(world: World, state: State) -> Bool[Array, ""]:
+def success(world: ZooWorld, state: State) -> Bool[Array, ""]:
     """Return whether the robot has been near the goal for `HOLD` steps in a row, at any time, and touched nothing."""
     return (state.near >= (1 if world.robot.cues == 1 else HOLD)) & ~state.hit
 
 
-def execute(world: World, position: Float[Array, " n"], action: Float[Array, " n"]) -> Float[Array, " n"]:
+def execute(world: ZooWorld, position: Float[Array, " n"], action: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return what is executed in place of an action."""
     robot, error = world.robot, _error(world, position)
     if robot.cues == 1:
@@ -219,7 +219,7 @@ def execute(world: World, position: Float[Array, " n"], action: Float[Array, " n
     return (world.mixing @ (action / robot.half) + error) * robot.half
 
 
-def right(world: World, state: State) -> Float[Array, " n"]:
+def right(world: ZooWorld, state: State) -> Float[Array, " n"]:
     """Return the teacher's action: its effect is that of the unchanged policy's (or the teacher's own) true action.
 
     Where no action within the bounds has this effect, it is clipped.
@@ -233,7 +233,7 @@ def right(world: World, state: State) -> Float[Array, " n"]:
 
 def answer(
     key: PRNGKeyArray,
-    world: World,
+    world: ZooWorld,
     state: State,
     action: Float[Array, " n"],
     eps: float | Float[Array, ""],
@@ -257,7 +257,7 @@ def answer(
 
 
 def rollout(
-    key: PRNGKeyArray, world: World, act: Callable[[Any], Array], steps: int = STEPS, *, knows: bool = False
+    key: PRNGKeyArray, world: ZooWorld, act: Callable[[Any], Array], steps: int = STEPS, *, knows: bool = False
 ) -> tuple[Float[Array, "steps obs"], State, Float[Array, ""], Bool[Array, ""]]:
     """Play an episode; return the observations and states acted in, the return and the success.
 
@@ -273,14 +273,14 @@ def rollout(
     return obs, states, rewards.sum(), success(world, last)
 
 
-def _error(world: World, position: Float[Array, " n"]) -> Float[Array, " n"]:
+def _error(world: ZooWorld, position: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return what is added to the executed command at a position."""
     inside = jnp.dot(position, world.region_axis) > world.threshold
     wave = world.waves * jnp.sin(world.wave_numbers @ position + world.wave_phases)
     return world.constant + jnp.where(inside, world.region, 0.0) + wave
 
 
-def _stopped(world: World, state: State, position: Float[Array, " n"]) -> Float[Array, " n"]:
+def _stopped(world: ZooWorld, state: State, position: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return the position that the surface around the hole, and the hole's wall, allow."""
     robot, goal = world.robot, goal_of(world, state)
     lateral, height = across(robot, position - goal)

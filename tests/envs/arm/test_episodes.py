@@ -10,8 +10,8 @@ import pytest
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
 from cuelearner_envs.arm.environment import Arm
-from cuelearner_envs.arm.judged import Judge, rollout
-from cuelearner_envs.arm.physics import Ground
+from cuelearner_envs.arm.judged import MujocoGrippers, rollout
+from cuelearner_envs.arm.physics import ArmConditions
 from cuelearner_envs.arm.scripts import past, pick
 
 EPISODES, STEPS = 24, 50
@@ -51,7 +51,7 @@ class Scripted:
 def world(post=1.0, grasps=0.0, friction=1.0):
     """Both skills as values of one environment's fields."""
     return Arm(
-        ground=Ground(friction=F(friction), post=F(post)),
+        ground=ArmConditions(friction=F(friction), post=F(post)),
         grasps=F(grasps),
         within=F(0.05),
         max_steps=jnp.int32(STEPS),
@@ -135,7 +135,7 @@ def test_reward_is_minus_the_ways_from_gripper_to_cube_to_goal(pushed):
 def test_c_mujoco_agrees_step_by_step(which, request):
     """Each step of control begins where MJX stood."""
     _, states, _, targets, _ = request.getfixturevalue(which)
-    judge = Judge(world(post=float(which == "pushed")), EPISODES, arm.CONTROL_PERIOD / arm.SUBSTEPS, None)
+    judge = MujocoGrippers(world(post=float(which == "pushed")), EPISODES, arm.CONTROL_PERIOD / arm.SUBSTEPS, None)
     off = []
     for step in range(0, STEPS - 1, 6):
         now, following = (jax.tree.map(lambda leaf, n=n: leaf[n], states.body) for n in (step, step + 1))

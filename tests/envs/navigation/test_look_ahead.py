@@ -13,7 +13,7 @@ from cuelearner_envs.navigation.aims import RADII, SCALE, WAYS, aims_of
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.lidar import scan
 from cuelearner_envs.navigation.worlds import FARTHEST
-from cuelearner_jax.adaptation.lanes import Lanes
+from cuelearner_jax.adaptation.lanes import LaneRows
 from cuelearner_jax.config import GuideSizes, to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig
@@ -101,7 +101,7 @@ def kept(guidance, look_ahead):
     """A policy folder, as it is known without its arrays."""
     own = {"sizes": to_json(GuideSizes()), "options": {"aim_layers": (8,), "aim_doubt": 2.0}}
     layer = {"policy": "guided", "guidance": guidance, **own, "bounded": True, "base": {"policy": "uniform"}}
-    adapted = AdaptedLanes(Path(), {"policy": layer}, Lanes(*(np.zeros(1),) * 4), np.ones(1, bool), None, None)
+    adapted = AdaptedLanes(Path(), {"policy": layer}, LaneRows(*(np.zeros(1),) * 4), np.ones(1, bool), None, None)
     config = RunConfig(world(look_ahead=look_ahead))
     return PolicySource(registry.find("navigation"), config, None, Path(), adapted=adapted)
 

@@ -9,7 +9,7 @@ import pytest
 from rooms import world
 from scipy.integrate import solve_ivp
 
-from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
+from cuelearner_envs.navigation.robot import Robot, RobotMotion, collides, walk
 
 step = jax.jit(walk)
 step_many = jax.jit(jax.vmap(walk, (None, 0, 0, None)))
@@ -17,7 +17,7 @@ touches = jax.jit(jax.vmap(collides, (None, None, 0)))
 
 
 def motion(x=0.0, y=0.0, yaw=0.0, velocity=(0.0, 0.0)):
-    return Motion(jnp.array([x, y, yaw]), jnp.array(velocity))
+    return RobotMotion(jnp.array([x, y, yaw]), jnp.array(velocity))
 
 
 def toward(angle):
@@ -41,7 +41,7 @@ def test_a_step_is_what_a_general_integrator_finds():
     robot = Robot(speed=0.8, lag=0.15)
     direction = np.stack([np.cos(angle), np.sin(angle)], -1)
     ours = step_many(
-        robot, Motion(*(jnp.asarray(v, jnp.float32) for v in (pose, velocity))), jnp.asarray(direction), 0.3
+        robot, RobotMotion(*(jnp.asarray(v, jnp.float32) for v in (pose, velocity))), jnp.asarray(direction), 0.3
     )
     for number in range(20):
         heading = pose[number, 2] + angle[number]  # held in the world's frame from the beginning of the step
