@@ -47,6 +47,7 @@ class CallablePolicy:
     trained: RunConfig | None = None  # configuration of its training; None: not known
     actions: Space = DIRECTIONS  # space of its actions
     world: World | None = None  # world in which it was corrected, or loaded for; None: not known
+    lane: trained.Chosen | None = None  # guidance, labels and seed in the run that it was loaded from
 
     def __post_init__(self) -> None:
         """Make a policy of an object that acts. Raises UserError for any other."""
@@ -128,10 +129,9 @@ def load_policy(
         folder: folder of a run, of a sweep in pieces, or of a policy; or a shipped agent, as "shipped:navigation".
         policy: "agent", "guided" or another that `evaluate TASK --help` lists (default: the trained agent, or the
             adapted policy).
-        guidance: the lane's kind of guidance (default: the run's last).
-        labels: the lane's label budget (default: the largest).
+        guidance, labels, seed: the lane's kind of guidance, label budget and seed (default: the lane with the best
+            validated reward, which is printed; of a policy folder the largest budget and the first seed).
         bound_deg: bound [deg] of a lane of a policy folder (default: the largest).
-        seed: the lane's seed (default: the first).
         base: the policy that was adapted, where it is code: the folder names it, and does not hold it.
         changes: the distortions of your own that a reading corrected: the folder names them, and does not hold them.
         task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
@@ -147,9 +147,10 @@ def load_policy(
     changed = world.config if world else source.config.task
     source.check(name, changed)
     shape = shape_of(known, changed)
-    found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
+    lane = trained.chosen_lane(source, name, (guidance, labels, () if seed is None else (seed,)))
+    (found, *_), _ = trained.several(source, changed, name, *lane, bound_deg)
     where, taught = world or World(known, changed), trained.POLICIES[name].taught
-    return CallablePolicy(found, shape.observation, taught, source.config, actions_of(shape), where)
+    return CallablePolicy(found, shape.observation, taught, source.config, actions_of(shape), where, lane)
 
 
 @user_code.report_user_errors
@@ -241,7 +242,8 @@ def _world_of(policy: Any, world: World | None) -> World:
 
 
 def _about(policy: Any, world: World) -> dict[str, Any]:
-    return {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
+    lane = zip(("guidance", "labels", "seeds"), getattr(policy, "lane", None) or (), strict=False)
+    return {"subject": type(policy).__name__, **dict(lane), "world": {"name": world.task.name, **to_json(world.config)}}
 
 
 def load_exported(folder: str | Path) -> Any:

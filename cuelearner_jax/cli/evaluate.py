@@ -53,10 +53,14 @@ def run(arguments: list[str]) -> None:
     if options.out and options.out.exists():
         raise UserError(f"{options.out} exists: give another --out")
     other = _other(source, options) if options.compare else None
+    planned, measure = evaluate.prepare(source, options)
+    every = {"guidance": (), "labels": (), "seed": ()}
+    its = evaluate.prepare(other[0], replace(options, policy=other[1], **every)) if other else None
+    if its:
+        measurements.differences(planned, its[0])  # UserError before anything is measured
     with progress_bars() as bars:
         watch = watched_by(bars)
-        rows = evaluate.run(source, options, watch)
-        others = evaluate.run(other[0], replace(options, policy=other[1], guidance=()), watch) if other else []
+        rows, others = measure(watch), its[1](watch) if its else []
     _print_measured(source, options, rows, others)
 
 
@@ -93,7 +97,8 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
         raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
     assert path is not None
     kind = next(iter(options.guidance), None)
-    found = agreement(trained.one_policy(source, options.task, name, kind, None, None), path)
+    labels, seed = (next(iter(values), None) for values in (options.labels, options.seed))
+    found = agreement(trained.one_policy(source, options.task, name, kind, labels, seed), path)
     named = options.subject if name == "own" else f"{source.folder}, {name}"
     title = f"{named}: agreement with {found.labels} labels of {path}"
     table = Table("", "share of answers", "95% interval", title=title)

@@ -49,6 +49,7 @@ def run(arguments: list[str]) -> None:
     if trained.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who needs the true state: choose another policy")
     contract.check_request(options.format, options.out)
+    options = options.settled(source, name)
     env = source.task.environment(options.task)
     if options.only_correction and source.adapted is not None:
         source = replace(source, adapted=replace(source.adapted, code=source.adapted.code or uniform_in(env)))

@@ -76,9 +76,10 @@ def report(
     groups = read_groups(folders, metric, split, by_run)
     variants = variants_of(groups, metric)
     rows = tables.summary(variants, lower_is_better)
-    seeds = _range("seed", [len(variant.seeds) for variant in variants])
+    counts = sorted({len(variant.seeds) for variant in variants})
+    seeds = f"{counts[0]} seed{'s' * (counts[0] > 1)}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds"
     if episodes := [variant.episodes for variant in variants if variant.episodes]:
-        seeds += f" x {_range('episode', episodes)}"
+        seeds += f" x {min(episodes):,} episodes"
     title = f"{groups[0].table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {seeds}"
     figures = {"curves": draw_curves(variants, title, metric)}
     if len({variant.labels for variant in variants if variant.labels}) > 1:
@@ -100,12 +101,6 @@ def report(
         tables.write_csv(out / f"{name}.csv", each)
     (out / "report.md").write_text("\n".join(lines), encoding="utf-8")
     return out / "report.md"
-
-
-def _range(name: str, counts: Sequence[int]) -> str:
-    """Return the least and the largest number of things of a name in words."""
-    least, most = min(counts), max(counts)
-    return f"{least:,}{f' to {most:,}' if most > least else ''} {name}{'s' * (most > 1)}"
 
 
 def _origins(table: pa.Table, command: str) -> list[str]:

@@ -106,9 +106,7 @@ def _short(table: pa.Table, variants: Sequence[Variant]) -> list[str]:
         if len(variant.seeds) == 1:
             lines.append(f"{variant.name}: a single seed, so there is no interval")
         elif not variant.episodes:
-            lines.append(
-                f"{variant.name}: the run keeps no results of episodes, so intervals leave out the evaluation's error"
-            )
+            lines.append(f"{variant.name}: the run keeps no results of episodes, so intervals are over seeds alone")
     hashes = sorted(set(table["config_hash"].to_pylist()))
     if len(hashes) > 1:
         where = f" of {variants[0].run}" if variants and variants[0].run else ""

@@ -50,11 +50,16 @@ def without_failed(loaded: Sequence[Any]) -> list[Any]:
             names = named(lanes.seeds[failed], lanes.budgets[failed])
             console.print(f"{lanes.guidance.name}: {names} failed, no longer finite: left out")
         if not failed.all():
-            kept = jax.tree.map(lambda leaf, failed=failed: leaf[~failed], lanes.policies)
-            left.append(replace(lanes, seeds=lanes.seeds[~failed], budgets=lanes.budgets[~failed], policies=kept))
+            left.append(select(lanes, ~failed))
     if not left:
         raise UserError("all of these lanes failed: there is nothing to evaluate; train again with other settings")
     return left
+
+
+def select(lanes: Any, mask: np.ndarray) -> Any:
+    """Return the lanes (`run_folders.RunLanes`) of a mask (lanes,)."""
+    policies = jax.tree.map(lambda leaf: leaf[mask], lanes.policies)
+    return replace(lanes, seeds=lanes.seeds[mask], budgets=lanes.budgets[mask], policies=policies)
 
 
 def named(seeds: np.ndarray, budgets: np.ndarray) -> str:

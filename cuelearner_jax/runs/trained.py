@@ -26,10 +26,10 @@ from cuelearner_jax.policies import (
 )
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
-from cuelearner_jax.runs.failures import without_failed
+from cuelearner_jax.runs.failures import select, without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.run_folders import Piece, RunLanes, lanes_of, open_run
-from cuelearner_jax.storage import label_files, policy_folders
+from cuelearner_jax.storage import label_files, policy_folders, results
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher
@@ -74,6 +74,21 @@ class Block(NamedTuple):
     step: int
     policy: Any  # a block, or `Common`
     failed: np.ndarray  # (lanes,) bool
+
+
+Chosen = tuple[str | None, int | None, tuple[int, ...]]  # guidance, labels and seeds; None and (): open
+
+
+class ChosenLanes(NamedTuple):
+    """A choice among lanes; empty: all."""
+
+    guidance: tuple[str, ...] = ()
+    labels: tuple[int, ...] = ()
+    seeds: tuple[int, ...] = ()
+
+    def mask(self, lanes: Any) -> np.ndarray:
+        """Return which lanes (lanes,), with their seeds and budgets, are chosen."""
+        return np.isin(lanes.seeds, self.seeds or lanes.seeds) & np.isin(lanes.budgets, self.labels or lanes.budgets)
 
 
 @dataclass(frozen=True)
@@ -181,12 +196,13 @@ class PolicySource:
         return Heuristic(view) if name == "heuristic" else uniform_in(view)
 
     def blocks(
-        self, name: str, view: Any, teacher: Teacher | None, kinds: tuple[str, ...], failed_too: bool = False
+        self, name: str, view: Any, teacher: Teacher | None, only: ChosenLanes, failed_too: bool = False
     ) -> list[Block]:
-        """Return a policy of the folder, in blocks of lanes of some kinds of guidance (none named: all).
+        """Return a policy of the folder, in blocks of lanes (`only`: of some kinds, and of a run's budgets and seeds).
 
         `view`, `teacher`: those of the world that it acts in. Raises UserError if it is not available.
         """
+        kinds = only.guidance
         if (kept := self.adapted) is not None:
             if kinds and kept.guidance not in kinds:
                 raise UserError(f"{self.folder} was adapted by {kept.guidance} guidance: leave out --guidance")
@@ -194,7 +210,11 @@ class PolicySource:
             policy = policy if name == "adapted" else policy.base
             columns = (kept.lanes.seed, kept.lanes.budget, kept.bounds_deg)
             return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
-        loaded, blocks = self.load(kinds), []
+        masks = [(lanes, only.mask(lanes)) for lanes in self.load(kinds)]
+        loaded, blocks = [select(lanes, mask) for lanes, mask in masks if mask.any()], []
+        if not loaded and (grid := self.grid):
+            there = f"seeds {format_numbers(grid.seeds)} and labels {format_numbers(grid.labels)}"
+            raise UserError(f"{self.folder} has no such lane: there are {there}")
         for lanes in loaded if failed_too else without_failed(loaded):
             policy, failed = self._acting(name, lanes, view, teacher), np.asarray(lanes.policies["failed"])
             columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
@@ -235,6 +255,33 @@ def check_no_lane(policy: str, *choices: Any) -> None:
         raise UserError(f"policy {policy!r} belongs to no lane of a run: leave out the options that choose a lane")
 
 
+def chosen_lane(source: PolicySource, name: str, choice: Chosen) -> Chosen:
+    """Return a choice, its open parts filled from the run's lane with the best last reward in validation, and print it.
+
+    Raises UserError if the run has several lanes to choose among and no results.
+    """
+    grid, (kind, labels, seeds) = source.grid, choice
+    kind = kind and guidances.kind_name(kind)
+    if grid is None or not POLICIES[name].trained or len(grid.guidance) * len(grid.seeds) * len(grid.labels) == 1:
+        return choice
+    try:
+        table = results.read(source.folder).select([*results.LANE, "step", "reward"]).sort_by("step")
+    except UserError as error:
+        raise UserError(f"{error}; or choose the lane by --guidance, --labels and --seed") from error
+    last = {tuple(row[part] for part in results.LANE): row["reward"] for row in table.to_pylist()}
+    fits = [lane for lane in last if kind in (None, lane[0]) and labels in (None, lane[1])]
+    fits = [lane for lane in fits if not seeds or lane[2] in seeds]
+    if not fits:
+        return choice
+    best = max(fits, key=lambda lane: -np.inf if last[lane] is None else last[lane])
+    if len({lane[:2] for lane in fits}) > 1 or (len(fits) > 1 and not seeds):
+        console.print(
+            f"{source.folder}: {best[0]}, {best[1]} labels, seed {best[2]} has the best validated reward of "
+            f"{len(fits)} lanes; --guidance, --labels and --seed choose another"
+        )
+    return best[0], best[1], seeds or best[2:]
+
+
 def one_policy(
     source: PolicySource,
     world: Any,
@@ -268,9 +315,8 @@ def several(
         source: the policies' origin.
         world: the world they are to act in.
         name: name of the policy.
-        kind: kind of guidance (None: the run's last).
-        labels: budget (None: the largest).
-        seeds: the lanes' seeds (empty: the first).
+        kind, labels, seeds: kind of guidance, budget and seeds (None, empty: those of `chosen_lane` in a run, of a
+            policy folder the largest budget and the first seed).
         bound_deg: bound of a policy folder's lanes (None: the largest).
         env: that world's environment, for a teacher (default: with its training episodes).
 
@@ -285,8 +331,9 @@ def several(
     if not named.kept:
         check_no_lane(name, kind, labels, seeds, bound_deg)
         return [source.alone(name, view, teacher)], (0,)
-    kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
-    blocks = source.blocks(name, view, teacher, kinds, failed_too=True)
+    kind, labels, seeds = chosen_lane(source, name, (kind, labels, seeds))
+    kinds = (guidances.kind_name(kind),) if kind else ()
+    blocks = source.blocks(name, view, teacher, ChosenLanes(kinds), failed_too=True)
     budget = int(max(block.budgets.max() for block in blocks)) if labels is None else labels
     bound = float(max(block.bounds.max() for block in blocks)) if bound_deg is None else bound_deg
     seeds = seeds or (int(blocks[0].seeds[0]),)

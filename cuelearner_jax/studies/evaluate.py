@@ -23,7 +23,7 @@ from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, mean_interv
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
-from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource
+from cuelearner_jax.runs.trained import POLICIES, Block, ChosenLanes, PolicySource
 from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Label
@@ -45,6 +45,10 @@ class EvaluateRequest(Generic[TaskT]):
     """Who acts."""
     guidance: tuple[str, ...] = ()
     """Kinds of guidance of the run to evaluate (default: all)."""
+    labels: tuple[int, ...] = ()
+    """Label budgets of the lanes to evaluate (default: all)."""
+    seed: tuple[int, ...] = ()
+    """Seeds of the lanes to evaluate (default: all)."""
     episodes: int | None = None
     """Number of whole episodes per lane, where the task counts episodes (default: 100)."""
     steps: int | None = None
@@ -99,17 +103,19 @@ def amount(task: Task, asked: EvaluateRequest[Any]) -> tuple[int, int]:
     return envs, steps
 
 
-def run(
-    source: PolicySource,
-    asked: EvaluateRequest[Any],
-    watch: Callable[[str], Tell] = lambda kind: ignore_progress,
-) -> list[Measured]:
-    """Return metrics of a policy on validation episodes of a world, for each guidance and budget.
+Watch = Callable[[str], Tell]  # given a kind of guidance, returns the function that reports the progress of its lanes
+Measure = Callable[[Watch], list[Measured]]
 
-    Args:
-        source: the policy's origin.
-        asked: the request, whose `task` is the world (a configuration).
-        watch: given a kind of guidance, returns the function that reports the progress of its lanes.
+
+def run(source: PolicySource, asked: EvaluateRequest[Any]) -> list[Measured]:
+    """Return metrics of a policy on validation episodes of a world, for each guidance and budget, see `prepare`."""
+    return prepare(source, asked)[1](lambda kind: ignore_progress)
+
+
+def prepare(source: PolicySource, asked: EvaluateRequest[Any]) -> tuple[list[Measured], Measure]:
+    """Return the rows of an evaluation without metrics, and the function that measures these.
+
+    `asked.task` is the world (a configuration). Raises UserError if there is no such policy or lane.
     """
     release_programs()
     task, world, name = source.task, asked.task, asked.policy
@@ -119,15 +125,16 @@ def run(
     named, unit = POLICIES[name], actions_of(env).unit.replace("degrees", "deg")
     teacher = task.make_teacher(world, env) if named.taught else None
     if named.kept:
-        blocks = source.blocks(name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
+        kinds = tuple(map(guidances.kind_name, asked.guidance))
+        blocks = source.blocks(name, view_of(env), teacher, ChosenLanes(kinds, asked.labels, asked.seed))
     else:
         policy = source.alone(name, view_of(env), teacher)
         none = np.zeros(1, int)
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
-    rows = []
-    for block in blocks:
+
+    def measured(block: Block, tell: Tell) -> list[dict[str, np.ndarray]]:
+        """Return means (lanes,) and each environment's values (lanes, envs)."""
         count, is_shared = len(block.seeds), lanes_in(block.policy) is None
-        tell = watch(name if block.guidance == "-" else block.guidance)
         if engine:
             tells = [part_of(tell, lane, count) for lane in range(count)]
             lanes = [engine(block.policy.lane(lane), env, key, num_envs, steps, tells[lane]) for lane in range(count)]
@@ -136,12 +143,21 @@ def run(
         else:
             means, each, _ = rollout_lanes(env, block.policy, key, num_envs, steps, tell)
         place = np.zeros(count, int) if is_shared and not engine else np.arange(count)  # row of each lane
-        for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
-            own = (block.budgets == budget) & (block.bounds == bound)
-            mine, apart = ({metric: np.asarray(of[metric])[place[own]] for metric in of} for of in (means, each))
-            variant = block.guidance, budget, block.step, block.seeds[own]
-            rows.append(Measured(*variant, mine, apart, bound or None, is_shared, unit))
-    return rows
+        return [{metric: np.asarray(values)[place] for metric, values in of.items()} for of in (means, each)]
+
+    def rows(watch: Watch | None) -> list[Measured]:
+        found = []
+        for block in blocks:
+            named = name if block.guidance == "-" else block.guidance
+            of_lanes = ({}, {}) if watch is None else measured(block, watch(named))
+            for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
+                own = (block.budgets == budget) & (block.bounds == bound)
+                mine, apart = ({metric: values[own] for metric, values in of.items()} for of in of_lanes)
+                variant = block.guidance, budget, block.step, block.seeds[own]
+                found.append(Measured(*variant, mine, apart, bound or None, lanes_in(block.policy) is None, unit))
+        return found
+
+    return rows(None), rows
 
 
 class Agreement(NamedTuple):

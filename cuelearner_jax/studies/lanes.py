@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 from cuelearner_jax.runs import trained
 from cuelearner_jax.runs.trained import PolicySource
@@ -16,9 +16,9 @@ class Lanes:
     policy: str | None = None
     """Name of the acting policy, as for evaluate (default: the agent, or the adapted policy)."""
     guidance: str | None = None
-    """Kind of guidance of the lane (default: the run's last)."""
+    """Kind of guidance of the lane (default: that of the lane with the best validated reward)."""
     labels: int | None = None
-    """Label budget of the lane (default: the largest)."""
+    """Label budget of the lane (default: that of the best lane; of a policy folder the largest)."""
     bound_deg: float | None = None
     """Bound of a policy folder's lane (default: the largest) [deg]."""
 
@@ -34,7 +34,13 @@ class Lane(Lanes):
     """Choice of a folder's policy, and of its lane."""
 
     seed: int | None = None
-    """Seed of the lane (default: the first)."""
+    """Seed of the lane (default: that of the best lane; of a policy folder the first)."""
+
+    def settled(self, source: PolicySource, name: str) -> Self:
+        """Return the choice with the lane that is taken by default, see `trained.chosen_lane`."""
+        seeds = () if self.seed is None else (self.seed,)
+        kind, labels, seeds = trained.chosen_lane(source, name, (self.guidance, self.labels, seeds))
+        return replace(self, guidance=kind, labels=labels, seed=seeds[0] if seeds else None)
 
     def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:
         """Return the single policy. Raises UserError if there is no such lane."""
@@ -47,4 +53,4 @@ class BaseLanes(Lanes):
     """Choice of the lanes of the folder to adapt."""
 
     seeds: tuple[int, ...] = ()
-    """Seeds of the lanes to adapt, each with labels of its own (default: the first lane)."""
+    """Seeds of the lanes to adapt, each with labels of its own (default: the best lane's)."""

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from small_runs import SMALL
 
-from cuelearner_jax import terminal
+from cuelearner_jax import studies, terminal
 from cuelearner_jax.cli import dispatch, evaluate, main
 from cuelearner_jax.storage import results
 
@@ -58,7 +58,7 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     assert {(row["guidance"], row["labels"]) for row in rows} == (lanes if trained else {("-", 0)})
 
 
-def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, capsys):
+def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, capsys, monkeypatch):
     few, out = ["--steps", "20", "--envs", "10"], tmp_path / "compared.json"
     command = ["evaluate", str(run_folder), *few]
     assert main([*command, "--policy", "heuristic", "--compare", "uniform", "--out", str(out)]) == 0
@@ -73,6 +73,11 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     assert found["difference"]["reward"][0] == pytest.approx(less)
     assert main(["evaluate", "--compare", str(run_folder), "heuristic", *few]) == 0
     assert capsys.readouterr().out.count("difference over seeds") == 3  # a table for each kind and budget
+    monkeypatch.setattr(studies.evaluate, "rollout_lanes", None)  # nothing is measured before this is refused
+    assert main([*command, "--policy", "uniform", "--compare", str(run_folder)]) == 2
+    assert "has 3 variants" in capsys.readouterr().err
+    assert main([*command, "--seed", "5"]) == 2
+    assert "no such lane: there are seeds 2000, 2001 and labels 10, 20" in capsys.readouterr().err
 
 
 def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, capsys):
