@@ -42,9 +42,9 @@ def labelled(arguments, ask):
 
             shown(session, acts, finish)
             places[:] = [asked.out]
-            return server.ended(session, commands)
+            return server.end_session(session, commands)
 
-    with mock.patch.object(label, "_served", served):
+    with mock.patch.object(label, "_serve", served):
         label.run([*map(str, arguments)])
     return places[0]
 
@@ -52,7 +52,7 @@ def labelled(arguments, ask):
 async def drawn(page, session):
     """The question of the session, once the page shows it: an answer moves the session on before the page."""
     for _ in range(4000):
-        if page._drawn is (item := session.item):
+        if page._item is (item := session.item):
             return item
         await asyncio.sleep(0.002)
     raise AssertionError("the page does not show the question")
@@ -65,7 +65,7 @@ async def answer(user, page, session, said):
         user.find(marker=name).click()
     for _ in range(4000):
         await asyncio.sleep(0.002)
-        if session.number != number or session.done:
+        if session.number != number or session.is_done:
             return
     raise AssertionError(f"{said} was not taken")
 

@@ -53,10 +53,10 @@ def run(arguments: list[str]) -> None:
     if options.only_correction and source.adapted is not None:
         source = replace(source, adapted=replace(source.adapted, code=source.adapted.code or uniform_in(env)))
     policy = options.policy_in(source, options.task, env)
-    drawn, seen = (lambda: decisions.observations(env, policy)), env
+    draw, view = (lambda: decisions.observations(env, policy)), env
     if options.only_correction:
-        policy, seen = correction.correction_of(policy, env)
-        drawn = lambda: correction.cases(env)  # noqa: E731
+        policy, view = correction.correction_of(policy, env)
+        draw = lambda: correction.cases(env)  # noqa: E731
     lane = {option: getattr(options, option) for option in ("guidance", "labels", "seed", "bound_deg")}
     if source.grid and trained.POLICIES[name].trained:
         lane |= source.lane(options.guidance, options.labels, options.seed)
@@ -69,10 +69,10 @@ def run(arguments: list[str]) -> None:
         "world": {"name": source.task.name, **to_json(options.task)},
         "config": digest(to_json(source.config)),
     }
-    written = contract.write(policy, seen, drawn, options.format, options.out, origin)
-    golden = written["golden"]
+    record = contract.write(policy, view, draw, options.format, options.out, origin)
+    golden = record["golden"]
     out.print(
-        f"{golden['cases']} golden cases replayed, largest difference {written['difference']:.1e} "
+        f"{golden['cases']} golden cases replayed, largest difference {record['difference']:.1e} "
         f"({golden['steady']} of {golden['drawn']} decisions are insensitive to rounding); wrote {options.out}"
     )
 
@@ -86,9 +86,9 @@ def _into_checkpoint(source: PolicySource, options: Export) -> None:
     env = source.task.environment(options.task)
     policy = replace(options, policy=None).policy_in(source, options.task, env)
     names = tuple(getattr(options.task, "cue_names", ()))
-    written = lerobot.write(policy, env, names, Path(options.policy), options.out)
+    checkpoint = lerobot.write(policy, env, names, Path(options.policy), options.out)
     out.print(
-        f"wrote {written}; run it with LeRobot, where the package lerobot_processor_cuelearner is installed: "
-        f"lerobot-eval --policy.path={written}",
+        f"wrote {checkpoint}; run it with LeRobot, where the package lerobot_processor_cuelearner is installed: "
+        f"lerobot-eval --policy.path={checkpoint}",
         soft_wrap=True,
     )

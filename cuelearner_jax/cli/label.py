@@ -110,13 +110,13 @@ def run(arguments: list[str]) -> None:
     server = page_module("server")
     ahead = look_ahead_of(arguments, "label", LabelOptions)
     task = recorded_or_task(ahead)
-    named = ahead.words[1] if len(ahead.words) > 1 else None
-    usual = QUICKSTART if named is None and task.proposed is None else PAPER
+    policy = ahead.words[1] if len(ahead.words) > 1 else None
+    usual = QUICKSTART if policy is None and task.proposed is None else PAPER
     name, preset = preset_of(task, ahead.preset, usual)
     source = None
-    if named is not None and not is_code(named):
-        source = source_in(shipped.folder_of(named), task, None, ahead.changes)
-    default = _suggested(task, preset, source, ahead, named)
+    if policy is not None and not is_code(policy):
+        source = source_in(shipped.folder_of(policy), task, None, ahead.changes)
+    default = _defaults(task, preset, source, ahead, policy)
     options = parse(LabelOptions, arguments, "label", default, about(LabelOptions, task, preset=usual))
     plan = make_plan(task, preset.config, options, source)
     config = preset.config if source is None else dataclasses.replace(preset.config, task=default.task)
@@ -124,48 +124,47 @@ def run(arguments: list[str]) -> None:
     commands = server.Commands(again, partial(_following, task, name, config, options))
     # The port comes first, so that nothing has been written where it is refused.
     with server.bind(options.port) as port, claimed(options.out), interruptible("the answer of the moment") as stopping:
-        ending = _served(server, plan, options, port, stopping, commands)
+        ending = _serve(server, plan, options, port, stopping, commands)
     if ending is None:
         raise Interrupted(f"stopped; every answer is in {options.out}: repeat the same command to continue")
     out.print(f"done: {ending.line}\nnext: {ending.following}")
 
 
-def _suggested(
-    task: Task, preset: Preset, source: PolicySource | None, ahead: Namespace, named: str | None
+def _defaults(
+    task: Task, preset: Preset, source: PolicySource | None, ahead: Namespace, policy: str | None
 ) -> LabelOptions:
     """Return the default options; labels that are to correct a policy are asked for as `adapt` corrects it."""
     config = source.config if source else preset.config
-    reads = named is not None or _is_proposed(task, config.task)
+    reads = policy is not None or _has_proposals(task, config.task)
     kind = ReadingGuide.name if reads else asking_kind(preset_kinds(task, preset))
-    questions, adapts = UNIFORM, named is not None or task.proposed is not None
-    if named is None:
-        questions = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
-    asked = AdaptRequest.of(task, config, ahead.scenario, ahead.guidance[0] if ahead.guidance else kind)
+    adapts = policy is not None or task.proposed is not None
+    usual = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
+    request = AdaptRequest.of(task, config, ahead.scenario, ahead.guidance[0] if ahead.guidance else kind)
     return LabelOptions(
-        task=asked.task if ahead.cues is None else with_cues(task, asked.task, ahead.cues),
-        sizes=GuideSizes(**_values(GuideSizes, (asked if adapts else config).sizes)),
-        scalars=GuideScalars(**_values(GuideScalars, (asked if adapts else config).scalars)),
+        task=request.task if ahead.cues is None else with_cues(task, request.task, ahead.cues),
+        sizes=GuideSizes(**_values(GuideSizes, (request if adapts else config).sizes)),
+        scalars=GuideScalars(**_values(GuideScalars, (request if adapts else config).scalars)),
         out=Path("labels") / task.name,
         guidance=kind,
-        bound_deg=next(iter(asked.bound_deg), None) if adapts else None,
-        labels=max(preset.labels) if named is None else asked.labels[0],
-        questions=questions,
+        bound_deg=next(iter(request.bound_deg), None) if adapts else None,
+        labels=max(preset.labels) if policy is None else request.labels[0],
+        questions=usual if policy is None else UNIFORM,
     )
 
 
 def make_plan(task: Task, config: RunConfig, options: LabelOptions, source: PolicySource | None = None) -> SessionPlan:
     """Return the plan of the session. Raises UserError for an invalid request."""
-    merged = dataclasses.replace(
+    settings = dataclasses.replace(
         config,
         task=options.task,
         sizes=dataclasses.replace(config.sizes, **dataclasses.asdict(options.sizes)),
         scalars=dataclasses.replace(config.scalars, **dataclasses.asdict(options.scalars)),
     )
-    configuration.check_guide(merged.sizes, merged.scalars)
+    configuration.check_guide(settings.sizes, settings.scalars)
     check_numbers(options, labels=(1, MOST_LABELS), seed=(0, LARGEST_SEED - 1), port=(0, 65535))
-    if merged.sizes.candidates > 1:
+    if settings.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but the page takes situations as they come: leave it out")
-    if merged.sizes.store_labelled:
+    if settings.sizes.store_labelled:
         raise UserError("this preset keeps labelled steps, but the page executes none: give another --preset")
     robot, task = _robot(task, options.robot), task.on(options.robot)
     if task.pictures(UNDRAWN).sketch is None:
@@ -176,7 +175,7 @@ def make_plan(task: Task, config: RunConfig, options: LabelOptions, source: Poli
         raise UserError(
             f"--bound-deg is {options.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
-    guidance = merged.guide_in(env, guidances.kind_name(options.guidance))
+    guidance = settings.guide_in(env, guidances.kind_name(options.guidance))
     if guidance.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
@@ -187,20 +186,20 @@ def make_plan(task: Task, config: RunConfig, options: LabelOptions, source: Poli
         raise UserError("--one-cue is for relative answers about several cues: leave it out")
     family: Any = ()
     if guidance.by_evidence:
-        is_proposed = options.questions == PROPOSED and _is_proposed(task, options.task)
-        if (options.policy is None and not is_proposed) or options.again is not None:
+        has_proposals = options.questions == PROPOSED and _has_proposals(task, options.task)
+        if (options.policy is None and not has_proposals) or options.again is not None:
             raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
         if options.bound_deg is not None:
             raise UserError("bound_deg is given, but guidance reading asks without a bound: leave bound_deg out")
-        named = options.changes
-        family = declared_distortions(env) if named is None else changes.family_of(changes.load(named), env)
-    wanted = options.labels, options.seed, options.who.strip(), options.bound_deg, robot
+        path = options.changes
+        family = declared_distortions(env) if path is None else changes.family_of(changes.load(path), env)
+    values = options.labels, options.seed, options.who.strip(), options.bound_deg, robot
     base = _base(task, options, source, env) if options.again is None else Base(uniform_in(env), "")
-    plan = SessionPlan(task, merged, guidance, base, *wanted, family=family, one_cue=options.one_cue)
+    plan = SessionPlan(task, settings, guidance, base, *values, family=family, one_cue=options.one_cue)
     return plan if options.again is None else _second(plan, options, options.again)
 
 
-def _is_proposed(task: Task, config: Any) -> bool:
+def _has_proposals(task: Task, config: Any) -> bool:
     """Return whether observations hold the action that a policy elsewhere proposes."""
     return any(part.kind == PROPOSED for part in getattr(shape_of(task, config), "observation", ()))
 
@@ -223,28 +222,28 @@ def _second(plan: SessionPlan, options: LabelOptions, path: Path) -> SessionPlan
             raise UserError(f"{path} asked in a world with another {name} ({file.task.get(name)}, not {value})")
     if (other := file.session.get("robot", "")) != plan.robot:
         raise UserError(f"{path} asked about {other or 'its own robot'}: give the same --robot")
-    found = label_files.found_in(path)
-    assert found is not None  # the file was read above
-    actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(found)}
+    place = label_files.found_in(path)
+    assert place is not None  # the file was read above
+    actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(place)}
     again = tuple(actions[number] for number in sorted(actions))
     base = plan.base._replace(name=f"{file.session['base']} {file.session['base_digest']}".strip())
-    wanted, digest = min(plan.labels, len(again)), label_files.digest(path)
+    count, digest = min(plan.labels, len(again)), label_files.digest(path)
     seed = int(file.session["seed"])
-    return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
+    return dataclasses.replace(plan, base=base, seed=seed, labels=count, again=again, again_of=digest)
 
 
 def _base(task: Task, options: LabelOptions, source: PolicySource | None, env: Any) -> Base:
     """Return the policy to ask about. Raises UserError if it is not available, or needs other observations."""
-    lane, named, questions = options.base, options.policy, options.questions
-    if named is not None and questions != UNIFORM:
-        raise UserError(f"--questions is {questions}, but the questions are about {named}: leave out one of them")
+    lane, policy, questions = options.base, options.policy, options.questions
+    if policy is not None and questions != UNIFORM:
+        raise UserError(f"--questions is {questions}, but the questions are about {policy}: leave out one of them")
     if source is not None:
         name = lane.name_in(source, options.task)
         return Base(lane.policy_in(source, options.task, None), f"{source.folder.resolve().name}, {name}")
     if lane != LaneChoice():
         raise UserError("--base.… chooses a folder's lane, but no folder is given: leave it out")
-    if named is not None:
-        return Base(policy_of(code_of(named), actions_of(env)), named)
+    if policy is not None:
+        return Base(policy_of(code_of(policy), actions_of(env)), policy)
     if questions == UNIFORM:
         return Base(uniform_in(env), UNIFORM)
     if questions == PROPOSED:
@@ -271,7 +270,7 @@ def page_module(name: str) -> Any:
     return module
 
 
-def _served(server: Any, plan: SessionPlan, options: LabelOptions, port: Any, stopping: Any, commands: Any) -> Any:
+def _serve(server: Any, plan: SessionPlan, options: LabelOptions, port: Any, stopping: Any, commands: Any) -> Any:
     """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
     from cuelearner_jax.labelling.session import Record, Session
 
@@ -303,7 +302,7 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
     name, out, policy = task.origin or task.named or task.name, str(options.out), options.policy
     if options.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
-    if policy is None and options.questions == PROPOSED and _is_proposed(task, options.task):
+    if policy is None and options.questions == PROPOSED and _has_proposals(task, options.task):
         return shlex.join(["cuelearner", "adapt", "--labels-from", out, "--out", f"policies/{Path(out).name}"])
     if policy is None and options.questions == PROPOSED:
         return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'

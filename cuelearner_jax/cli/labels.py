@@ -40,12 +40,12 @@ class Inspect:
         """Print a table with a column a file."""
         files = [comparing.read_checked(path) for path in self.files]
         table = Table("", *(one_line(str(path)) for path in self.files))
-        told = [_facts(file) for file in files]
+        columns = [_facts(file) for file in files]
         if self.teacher:
-            for path, file, facts in zip(self.files, files, told, strict=True):
+            for path, file, facts in zip(self.files, files, columns, strict=True):
                 facts["agrees with the teacher"] = _with_teacher(path, file)
-        for name in dict.fromkeys(name for facts in told for name in facts):
-            table.add_row(name, *(one_line(facts.get(name, "")) for facts in told))
+        for name in dict.fromkeys(name for facts in columns for name in facts):
+            table.add_row(name, *(one_line(facts.get(name, "")) for facts in columns))
         if len(files) == 2:
             task = registry.find(str(files[0].task.get("name")))
             env = shape_of(task, comparing.world_of(task, files[0]))
@@ -152,10 +152,10 @@ def _facts(file: LabelFile) -> dict[str, str]:
 
 def _with_teacher(path: Path, file: LabelFile) -> str:
     """Return how often the answers are those of the task's teacher. Raises UserError where no page asked them."""
-    task, found = registry.find(str(file.task.get("name"))), label_files.found_in(path)
-    assert found is not None  # the file was read before
+    task, place = registry.find(str(file.task.get("name"))), label_files.found_in(path)
+    assert place is not None  # the file was read before
     scalars = next((preset.config.scalars for preset in task.presets.values()), Scalars())
-    rows = label_files.history(found)
+    rows = label_files.history(place)
     return str(comparing.with_teacher(task, file, rows, scalars, lambda words: console.print(f"{words} ...")))
 
 
@@ -170,6 +170,6 @@ def _columns(file: LabelFile) -> dict[str, list[Any]]:
     for kind in ("action", "answer", "obs"):
         values = np.asarray(getattr(file.labels, kind))
         plain = [f"{kind}[{place}]" for place in range(values.shape[1])]
-        given = names if kind == "obs" and len(names) == len(plain) else plain
-        columns |= dict(zip(given, values.T.tolist(), strict=True))
+        heads = names if kind == "obs" and len(names) == len(plain) else plain
+        columns |= dict(zip(heads, values.T.tolist(), strict=True))
     return columns

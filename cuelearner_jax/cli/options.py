@@ -152,10 +152,10 @@ def parse(kind: Any, arguments: list[str], command: str, default: Any = None, ab
     `about`: the text above the options (default: the docstring of `kind`).
     """
     errors = io.StringIO()
-    chosen: dict[str, Any] = {} if default is None else {"default": default}
+    values: dict[str, Any] = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(errors):
-            options = tyro.cli(kind, args=arguments, prog=f"cuelearner {command}", description=about or None, **chosen)
+            options = tyro.cli(kind, args=arguments, prog=f"cuelearner {command}", description=about or None, **values)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -193,8 +193,8 @@ def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -
         "policies (--policy)": {name: one.about for name, one in POLICIES.items() if policies},
     }
     # A line that is not indented would be taken for the end of the one above: the groups stand apart.
-    listed = (f"{title}:\n{rows(texts)}" for title, texts in groups.items() if texts)
-    return "\n\n".join([str(inspect.getdoc(kind)), *listed])
+    sections = (f"{title}:\n{rows(texts)}" for title, texts in groups.items() if texts)
+    return "\n\n".join([str(inspect.getdoc(kind)), *sections])
 
 
 def as_options(part: str, values: dict[str, Any]) -> list[str]:

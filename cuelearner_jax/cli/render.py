@@ -41,8 +41,8 @@ def run(arguments: list[str]) -> None:
     robot = "-".join(part for part in re.split(r"[^\w.-]+", options.robot or "") if part.strip("."))
     names = [source.folder.name, robot, options.scenario, policy_name]
     files = filming.files(options.out, "-".join(name for name in names if name), options.film)
-    wanted = (files.question,) if options.question else (files.film, files.still)
-    filming.check_free(*wanted, overwrite=options.overwrite)
+    targets = (files.question,) if options.question else (files.film, files.still)
+    filming.check_free(*targets, overwrite=options.overwrite)
     env = source.task.environment(options.task, "validation")
     policy = options.policy_in(source, options.task, env)
     if options.question:

@@ -41,7 +41,7 @@ def run(arguments: list[str]) -> None:
     options = parse(Report, arguments, "report")
     if not options.folders:
         raise UserError("no folder to report on: cuelearner report RUN_FOLDER ... --out FOLDER")
-    written = report(
+    page = report(
         options.folders,
         options.out,
         options.metric,
@@ -51,4 +51,4 @@ def run(arguments: list[str]) -> None:
         overwrite=options.overwrite,
         command=shlex.join(["cuelearner", "report", *arguments]),
     )
-    out.print(f"wrote {written}")
+    out.print(f"wrote {page}")

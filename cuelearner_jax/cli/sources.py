@@ -48,10 +48,10 @@ def with_cues(task: Task, config: Any, cues: str) -> Any:
     if not {"cues", "cue_names"} <= fields:
         raise UserError(f"--cues names cues, and {task.name} has its own: leave it out")
     own = {"keys": ()} if "keys" in fields else {}  # the recorded keys belong to the replaced words
-    named = cues_from(cues, config.cue_names if "=" in cues else ())
-    changed = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in named), **own)
-    shape_of(task, changed)  # reports cues that do not fit
-    return changed
+    own_cues = cues_from(cues, config.cue_names if "=" in cues else ())
+    result = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in own_cues), **own)
+    shape_of(task, result)  # reports cues that do not fit
+    return result
 
 
 def preset_of(task: Task, name: str | None, default: str = PAPER) -> tuple[str, Preset]:
@@ -77,58 +77,58 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
     Raises:
         UserError: the folder or task does not exist or is not available.
     """
-    named, task, code = ahead.words[0] if ahead.words else None, _task_by_option(ahead), None
-    if named is task is None and ahead.labels_from is not None:
-        task = _recorded("a recording's proposed actions", ahead.labels_from)
+    word, task, code = ahead.words[0] if ahead.words else None, _task_by_option(ahead), None
+    if word is task is None and ahead.labels_from is not None:
+        task = _recording_task("a recording's proposed actions", ahead.labels_from)
     base = None if ahead.base is None else code_of(ahead.base)
     for name, table in PARTS.items():
         if (part := getattr(ahead, name)) is not None:
             plugins.resolve(table, part, name)
-    if named is not None:
-        folder = shipped.folder_of(named)
+    if word is not None:
+        folder = shipped.folder_of(word)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
-        if holds or (folder.exists() and named not in registry.names()):
+        if holds or (folder.exists() and word not in registry.names()):
             source = source_in(folder, task, base, ahead.changes)
             return dataclasses.replace(source, task=_with_teacher(source.task, ahead.teacher))
-        if is_code(named) and (task is not None or is_policy or ahead.labels_from is not None):
-            task = task or _recorded(named, ahead.labels_from)
-            code = code_of(named)
+        if is_code(word) and (task is not None or is_policy or ahead.labels_from is not None):
+            task = task or _recording_task(word, ahead.labels_from)
+            code = code_of(word)
         elif task is not None:
-            raise UserError(f"{named!r} is no run folder of the task {task.name}: give one, or code as module:NAME")
-        elif ":" not in named and named not in registry.names():
+            raise UserError(f"{word!r} is no run folder of the task {task.name}: give one, or code as module:NAME")
+        elif ":" not in word and word not in registry.names():
             raise UserError(
-                f"{named!r} is neither a run folder nor a task ({', '.join(registry.names())}) "
+                f"{word!r} is neither a run folder nor a task ({', '.join(registry.names())}) "
                 f"nor a shipped agent ({', '.join(shipped.names())})"
             )
-    task = task or registry.resolve(str(named))
+    task = task or registry.resolve(str(word))
     if base is not None:
         raise UserError("--base names the code in a policy folder: give that folder, or leave it out")
     _, preset = preset_of(task, ahead.preset)
     return PolicySource(_with_teacher(task, ahead.teacher), preset.config, None, Path(task.name), code=code)
 
 
-def source_in(folder: Path, known: Task | None, code: Any, changed: str | None) -> PolicySource:
+def source_in(folder: Path, task: Task | None, code: Any, path: str | None) -> PolicySource:
     """Return the policies of a run or policy folder, for a family of tasks in the environment named beside it.
 
-    `code`, `changed`: code of a policy folder (an object, and package.module:NAME).
+    `code`, `path`: code of a policy folder (an object, and package.module:NAME).
 
     Raises UserError for another kind of folder, another task than named, or other observations or actions.
     """
 
     def find(name: str) -> Task:
-        return known if known is not None and known.name == name and not known.named else registry.find(name)
+        return task if task is not None and task.name == name and not task.named else registry.find(name)
 
-    source = PolicySource.of_folder(folder, find, code, None if changed is None else changes.load(changed))
-    if known is not None and known.name != source.task.name:
+    source = PolicySource.of_folder(folder, find, code, None if path is None else changes.load(path))
+    if task is not None and task.name != source.task.name:
         what = "a run" if source.grid else "a policy"
-        raise UserError(f"{folder} is {what} of {source.task.name}, not of {known.name}: give one of {known.name}")
-    if known is None or not known.named:
+        raise UserError(f"{folder} is {what} of {source.task.name}, not of {task.name}: give one of {task.name}")
+    if task is None or not task.named:
         return source
-    before = shape_of(known, source.config.task)
-    check_layout(f"{folder}", before.observation, actions_of(before), shape_of(known, known.plain()))
-    if getattr(known.plain(), "environment", None) == getattr(source.config.task, "environment", ""):
-        return dataclasses.replace(source, task=known)  # with the folder's settings of this environment
-    return dataclasses.replace(source, task=known, config=dataclasses.replace(source.config, task=known.plain()))
+    before = shape_of(task, source.config.task)
+    check_layout(f"{folder}", before.observation, actions_of(before), shape_of(task, task.plain()))
+    if getattr(task.plain(), "environment", None) == getattr(source.config.task, "environment", ""):
+        return dataclasses.replace(source, task=task)  # with the folder's settings of this environment
+    return dataclasses.replace(source, task=task, config=dataclasses.replace(source.config, task=task.plain()))
 
 
 def source_and_options(arguments: list[str], command: str, kind: Any, more: str = "") -> tuple[PolicySource, Any]:
@@ -152,25 +152,25 @@ def _task_by_option(ahead: Namespace) -> Task | None:
     """Return the task of --task or --env, where code that is no task is an environment of Gymnasium's kind."""
     if ahead.task is not None and ahead.env is not None:
         raise UserError(f"the task is named twice, {ahead.task!r} and {ahead.env!r}: name it once")
-    named = ahead.env
-    if named is None:
+    word = ahead.env
+    if word is None:
         return None if ahead.task is None else registry.resolve(ahead.task)
-    is_outside = plugins.REFERENCE.fullmatch(named) and named.partition(":")[0] not in registry.FAMILIES
-    if is_outside and not isinstance(plugins.load(named, object, "an environment"), Task):
-        named = f"gymnasium:{named}"
-    return registry.resolve(named)
+    is_outside = plugins.REFERENCE.fullmatch(word) and word.partition(":")[0] not in registry.FAMILIES
+    if is_outside and not isinstance(plugins.load(word, object, "an environment"), Task):
+        word = f"gymnasium:{word}"
+    return registry.resolve(word)
 
 
-def _recorded(named: str, path: str | None) -> Task:
+def _recording_task(subject: str, path: str | None) -> Task:
     """Return the situations of a label file as a task. Raises UserError unless its labels are about a recording.
 
-    `named`: the code that acts in them.
+    `subject`: the code that acts in them.
     """
     labels = None if path is None else labels_from_file(Path(path))
     if labels is None or labels.task.get("name") != logs.NAME:
         why = "" if path is None else f", since {path} does not hold labels of a recording"
         raise UserError(
-            f"{named} needs a task to act in{why}: give one, for instance --task navigation or --env gymnasium:NAME"
+            f"{subject} needs a task to act in{why}: give one, for instance --task navigation or --env gymnasium:NAME"
         )
     return world_of(labels).task
 
@@ -186,11 +186,11 @@ def _with_teacher(task: Task, reference: str | None) -> Task:
     return dataclasses.replace(task, teacher=lambda config, env: teaching(code, actions_of(env)), brief_teacher=None)
 
 
-def is_code(named: str) -> bool:
+def is_code(word: str) -> bool:
     """Return whether a word names a policy that is code: package.module:NAME, or a file of another library."""
-    if shipped.is_shipped(named) or Path(named).is_dir():
+    if shipped.is_shipped(word) or Path(word).is_dir():
         return False
-    return named.endswith(FILES) or ".py:" in named or bool(plugins.REFERENCE.fullmatch(named))
+    return word.endswith(FILES) or ".py:" in word or bool(plugins.REFERENCE.fullmatch(word))
 
 
 def code_of(reference: str) -> Any:

@@ -97,11 +97,11 @@ def suggested(arguments: list[str], command: str, kind: type[TrainingT]) -> tupl
     request = train.suggested(task, preset)
     config = request.config
     for part, table in PARTS.items():
-        chosen = None if (word := getattr(ahead, part)) is None else plugins.resolve(table, word, part)
-        if chosen is not None and chosen is not type(getattr(config, part)):
-            config = replace(config, **{part: chosen()})
-    used = [guidances.resolve(word) for word in ahead.guidance or request.grid.guidance]
-    kinds = {one.name: config.kinds.get(one.name) or one.config() for one in used if one.config}
+        own = None if (word := getattr(ahead, part)) is None else plugins.resolve(table, word, part)
+        if own is not None and own is not type(getattr(config, part)):
+            config = replace(config, **{part: own()})
+    guides = [guidances.resolve(word) for word in ahead.guidance or request.grid.guidance]
+    kinds = {one.name: config.kinds.get(one.name) or one.config() for one in guides if one.config}
     place = Path("runs") / f"{task.name}-{name}"
     return task, request.grid, kind(config=replace(config, kinds=kinds), out=place)
 

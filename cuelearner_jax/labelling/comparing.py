@@ -77,8 +77,8 @@ def with_teacher(
     scalars = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
     one = jax.jit(lambda env, teacher, *question: as_teacher(form, env, scalars, teacher, *question))
     guides = [(situations[item], jnp.asarray(items[item][1])) for item in file.people.item]
-    asked = [(guide.env, guide.obs, action) for guide, action in guides]
-    theirs = np.stack([np.asarray(one(env, teacher, *question)) for question in asked])
+    questions = [(guide.env, guide.obs, action) for guide, action in guides]
+    theirs = np.stack([np.asarray(one(env, teacher, *question)) for question in questions])
     return agreement(form, env, np.asarray(file.labels.answer), theirs)
 
 
@@ -115,7 +115,7 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     """
     files = list(files)
     first, everyone = files[0], all(file.people is not None for file in files)
-    known: set[Any] = set()
+    earlier: set[Any] = set()
     fresh: list[bool] = []
     for file in files:
         if len(np.unique(file.seeds)) > 1:
@@ -130,13 +130,13 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
         keys: list[Any] = list(zip(_questions(file), map(bytes, np.asarray(file.labels.answer)), strict=True))
         if everyone and file.people is not None:
             keys = list(zip(keys, file.people.who.tolist(), file.people.when.tolist(), strict=True))
-        fresh += [key not in known for key in keys]
-        known.update(keys)
-    kept = np.array(fresh, bool)
-    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves)[kept], *(file.labels for file in files))
+        fresh += [key not in earlier for key in keys]
+        earlier.update(keys)
+    mask = np.array(fresh, bool)
+    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves)[mask], *(file.labels for file in files))
     people = None
     if everyone:
-        columns = [np.concatenate(each)[kept] for each in zip(*(file.people or () for file in files), strict=True)]
+        columns = [np.concatenate(each)[mask] for each in zip(*(file.people or () for file in files), strict=True)]
         people = label_files.People(np.arange(len(labels.valid)), *columns[1:])
     seeds = np.zeros(len(labels.valid), np.int64)
-    return LabelFile(first.task, first.answers, first.space, first.eps, seeds, labels, people), int((~kept).sum())
+    return LabelFile(first.task, first.answers, first.space, first.eps, seeds, labels, people), int((~mask).sum())

@@ -40,7 +40,7 @@ class Control(NamedTuple):
         return self.cue is not None and self.answer is not None and len(self.answer) == 1
 
     @property
-    def shown(self) -> str:
+    def first_key(self) -> str:
         """The first key, as the page writes it."""
         return key_words(self.keys[0]) if self.keys else ""
 
@@ -63,8 +63,8 @@ def _cases(key: str) -> tuple[str, ...]:
 
 def _spare(space: Space, keys: tuple[str, ...] | str) -> tuple[str, ...]:
     """Return those of `keys` that no cue of the space uses."""
-    named = {one for cue in space.cues for key in cue.keys for one in _cases(key)}
-    return tuple(key for key in keys if key not in named)
+    own = {one for cue in space.cues for key in cue.keys for one in _cases(key)}
+    return tuple(key for key in keys if key not in own)
 
 
 def _keys_of(space: Space, cue: Cue) -> tuple[tuple[str, ...], ...]:
@@ -102,8 +102,8 @@ def answers(form: AnswerForm, space: Space, one_cue: bool = False) -> tuple[Cont
         right = AS_IT_IS._replace(keys=_spare(space, AS_IT_IS.keys))
         return Control("+1", words[0], more, (1.0,), "left"), right, Control("-1", words[1], less, (-1.0,), "right")
     if form.by_eps:
-        asked = [number for number, cue in enumerate(space.cues) if cue.is_asked]
-        about_cues = (control for number in asked for control in _of_cue(number, space, one_cue))
+        numbers = [number for number, cue in enumerate(space.cues) if cue.is_asked]
+        about_cues = (control for number in numbers for control in _of_cue(number, space, one_cue))
         whole = (ALL_RIGHT,) if one_cue else (REST_RIGHT, REST_UNSAID)
         return (*about_cues, *(control._replace(keys=_spare(space, control.keys)) for control in whole))
     if form.values is None:
@@ -124,11 +124,11 @@ def controls(
 
     `films`: whether the task films a situation. `simulated`: whether it can film the outcome of any action.
     """
-    found = {control.name: control for control in answers(form, space, one_cue)}
-    taken = {key for control in found.values() for key in control.keys}
+    result = {control.name: control for control in answers(form, space, one_cue)}
+    own_keys = {key for control in result.values() for key in control.keys}
     for control in (UNSURE, UNDO, *[FILM] * films, *[CORRECTED] * (films and simulated), HELP):
-        found[control.name] = control._replace(keys=tuple(key for key in control.keys if key not in taken))
-    return found
+        result[control.name] = control._replace(keys=tuple(key for key in control.keys if key not in own_keys))
+    return result
 
 
 def check(form: AnswerForm, space: Space) -> None:
@@ -157,10 +157,10 @@ def question(form: AnswerForm, space: Space) -> str:
     return f"Your answer? ({form.meaning(space)})"
 
 
-def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list[str]:
+def help_lines(form: AnswerForm, space: Space, entries: Iterable[Control]) -> list[str]:
     """Return the lines of the page's help about these controls."""
-    known, lines = list(known), []
-    for one in known:
+    entries, lines = list(entries), []
+    for one in entries:
         name = f"{space.cues[one.cue].name}: " if one.cue is not None else ""
         lines += [f"{name}{one.words}: {', '.join(dict.fromkeys(map(key_words, one.keys)))}"] if one.keys else []
     if form.by_eps and space == DIRECTIONS:
@@ -168,7 +168,7 @@ def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list
             "Left and right are meant for somebody who walks along the arrow: left turns it counterclockwise. "
             "Two arrows in the picture show both turns, each in the colour of its button and with its key."
         )
-    if any(one.picks for one in known):
+    if any(one.picks for one in entries):
         lines.append("Say which way each cue should change, then send. An answer about no cue counts as: don't know.")
     elif form.by_eps and len(space.cues) > 1:
         lines.append("Say what comes to mind first: one press is the answer. Nothing is said of the other cues.")
@@ -180,29 +180,29 @@ def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list
 
 
 def answer_of(
-    space: Space, pressed: Control | None, angle_deg: float | None, parts: Mapping[int, float]
+    space: Space, control: Control | None, angle_deg: float | None, parts: Mapping[int, float]
 ) -> np.ndarray | None:
     """Return the answer in the form's encoding, (width,); None for "don't know".
 
-    Without a `pressed` control the answer is the direction pointed at [deg]. `parts` maps a cue's index to the part of
+    Without a `control` the answer is the direction pointed at [deg]. `parts` maps a cue's index to the part of
     the answer chosen for it.
     """
-    if pressed is None:
+    if control is None:
         assert angle_deg is not None
         return np.array([np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))], np.float32)
-    if pressed.answer is None:
+    if control.answer is None:
         return None
-    if pressed.name not in (REST_RIGHT.name, REST_UNSAID.name):  # these two complete the parts chosen so far
-        return np.asarray(pressed.answer, np.float32)
-    rest = [pressed.answer[0] if cue.is_asked else UNSAID for cue in space.cues]
+    if control.name not in (REST_RIGHT.name, REST_UNSAID.name):  # these two complete the parts chosen so far
+        return np.asarray(control.answer, np.float32)
+    rest = [control.answer[0] if cue.is_asked else UNSAID for cue in space.cues]
     answer = np.array([parts.get(number, value) for number, value in enumerate(rest)], np.float32)
     return None if (answer == UNSAID).all() else answer
 
 
 def outcomes(form: AnswerForm, space: Space, action: np.ndarray, eps: float) -> dict[str, np.ndarray]:
     """Return the asked action ("asked") and, for a single cue, each answer's outcome ("left", "right")."""
-    found = {"asked": action}
+    result = {"asked": action}
     if form.by_eps and len(space.cues) == 1:
         for name, h in (("left", 1.0), ("right", -1.0)):
-            found[name] = np.asarray(space.toward(jnp.asarray(action), jnp.array([h]), space.from_unit(eps)))
-    return found
+            result[name] = np.asarray(space.toward(jnp.asarray(action), jnp.array([h]), space.from_unit(eps)))
+    return result

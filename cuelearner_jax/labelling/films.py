@@ -15,7 +15,7 @@ from fastapi import FastAPI
 from fastapi.requests import Request
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
 
-from cuelearner_jax.labelling.server import HOST, bind, guarded
+from cuelearner_jax.labelling.server import HOST, bind, guard
 from cuelearner_jax.signals import Interrupted, interruptible
 
 WORDS = {"left": -1, "same": 0, "right": 1}  # answers, and what they say of the right film
@@ -101,8 +101,8 @@ def film_page(port: int, tell: Callable[[str], None]) -> Iterator[Callable[[Path
         app.add_route("/", lambda request: desk.page())
         app.add_route("/film/{number:int}/{side}", desk.film)
         app.add_route("/answer/{number:int}/{word}", desk.answer, methods=["POST"])
-        served = guarded(app, listening.getsockname()[1], token)
-        server = uvicorn.Server(uvicorn.Config(served, log_level="warning", timeout_graceful_shutdown=1))
+        gate = guard(app, listening.getsockname()[1], token)
+        server = uvicorn.Server(uvicorn.Config(gate, log_level="warning", timeout_graceful_shutdown=1))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
         thread.start()
         tell(f"http://{HOST}:{listening.getsockname()[1]}/?token={token}")

@@ -77,7 +77,7 @@ def question(of: asking.Inquiry, guide: GuideState, keys: Any) -> Array:
 
 
 @jax.jit
-def refined(of: asking.Inquiry, model: Any, obs: Array, action: Array) -> Array:
+def refine_action(of: asking.Inquiry, model: Any, obs: Array, action: Array) -> Array:
     """Return an action refined by the model (action,)."""
     return of.guidance.act(model, of.env, obs[None], action[None], jnp.ones(1, bool), of.scalars).actions[0]
 
@@ -87,7 +87,7 @@ def answers(of: asking.Inquiry, model: Any, labels: Label) -> Array:
     """Return the answers that the model predicts (labels, width)."""
 
     def one(obs: Array, action: Array) -> Array:
-        best = refined(of, model, obs, action)
+        best = refine_action(of, model, obs, action)
         teacher: Any = SimpleNamespace(best_action=lambda state, obs: best)
         return as_teacher(of.guidance.form, of.env, of.scalars, teacher, None, obs, action)  # pyright: ignore[reportArgumentType]
 
@@ -122,7 +122,7 @@ class Learner:
         within = None if bound is None else space.from_unit(bound)
         self._of = asking.Inquiry(plan.guidance, env, plan.config.scalars, plan.base.policy, within)
         self._reads = plan.guidance.by_evidence
-        self._read: list[np.ndarray] = []  # reading: observations, actions and answers that the newest model has read
+        self._rows: list[np.ndarray] = []  # reading: observations, actions and answers that the newest model has read
         self.newest = Fitted(self._unread() if self._reads else blank.model)
         options: Any = ALONE if jax.default_backend() == "cpu" else None
         self._fit = jax.jit(asking.fit, static_argnums=0, compiler_options=options)
@@ -138,13 +138,13 @@ class Learner:
             return self.newest.model.questions(np.asarray(guide.obs)[None], 1, keys.question)[1][0]
         return np.asarray(question(self._of, guide.replace(model=self.newest.model), keys))
 
-    def refined(self, obs: Float[Array, " obs"], action: np.ndarray) -> Float[np.ndarray, " action"]:
+    def refine(self, obs: Float[Array, " obs"], action: np.ndarray) -> Float[np.ndarray, " action"]:
         """Return an action refined by the newest model; of a reading the corrected policy's action."""
         if self._reads:
             return np.asarray(self.newest.model.act(jnp.asarray(obs)[None]))[0]
-        return np.asarray(refined(self._of, self.newest.model, obs, jnp.asarray(action)))
+        return np.asarray(refine_action(self._of, self.newest.model, obs, jnp.asarray(action)))
 
-    def padded(self, rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Label:
+    def pad(self, rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Label:
         """Put observations, actions and answers into a padded `Label` of the session's size."""
         blank = jax.tree.map(np.array, self._blank.labels)
         for slot, (obs, action, answer) in enumerate(rows[: len(blank.valid)]):
@@ -173,19 +173,19 @@ class Learner:
         if not all_finite(model):
             return self.newest._replace(labels=count, problem="the last fit diverged")
         apart = np.asarray(labels.valid) & held_out(len(labels.valid))
-        predicted = np.asarray(answers(of, model, labels))[apart]
-        quality = agreement(plan.form, of.env, predicted, np.asarray(labels.answer)[apart])
+        predictions = np.asarray(answers(of, model, labels))[apart]
+        quality = agreement(plan.form, of.env, predictions, np.asarray(labels.answer)[apart])
         return Fitted(model, count, self.newest.number + 1, quality if quality.count else None)
 
     def _reading_of(self, rows: list[np.ndarray]) -> Fitted:
         """Read what is new in `rows`; all of it again if earlier answers were taken back."""
-        done = len(self._read[0]) if self._read else 0
-        if done and all(np.array_equal(old, new[:done]) for old, new in zip(self._read, rows, strict=True)):
+        count = len(self._rows[0]) if self._rows else 0
+        if count and all(np.array_equal(old, new[:count]) for old, new in zip(self._rows, rows, strict=True)):
             # a copy learns, so that questions in the meantime are asked by what was known before
             reading = copy.copy(self.newest.model)
-            reading.learn(*(part[done:] for part in rows))
+            reading.learn(*(part[count:] for part in rows))
         else:
             reading = self._unread()
             reading.read_in_batches(*rows)
-        self._read = rows
+        self._rows = rows
         return Fitted(reading, len(rows[0]), self.newest.number + 1, lines=tuple(reading.result().words()))

@@ -42,7 +42,7 @@ class Page:
         self.controls = controls.controls(self.form, self.space, self._one_cue, *films)
         self._parts: dict[int, float] = {}  # parts of the answer chosen so far, by the cue's index
         self._parts_of = session.number
-        self._drawn: Item | None = None  # the item on the screen
+        self._item: Item | None = None  # the item on the screen
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
         keys = {key: name for name, control in self.controls.items() for key in control.keys}
@@ -53,7 +53,7 @@ class Page:
         with ui.element("main").classes("label-page many" if rows else "label-page").style(f"--rows: {rows}"):
             with ui.column().classes("asking w-full gap-2"):
                 ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")
-                self._asked = ui.label(controls.question(self.form, self.space)).classes("big")
+                self._question = ui.label(controls.question(self.form, self.space)).classes("big")
                 self._note = ui.label().classes("note")
                 self._scene = ui.html("", sanitize=False).classes("stage")
             with ui.column().classes("answering w-full gap-2"):
@@ -77,7 +77,7 @@ class Page:
     def _button(self, control: Control, props: str = "") -> ui.button:
         """Make a button whose event names the control and the item on the screen."""
         with ui.button(color=None).props(props).classes(control.colour).mark(control.name) as button:
-            ui.html(f"{control.words}<span class=key>{control.shown}</span>", sanitize=False)
+            ui.html(f"{control.words}<span class=key>{control.first_key}</span>", sanitize=False)
         send = f"event => cue.send({json.dumps(control.name)}, {{clicks: event.detail}})"
         button.on("click", lambda event, name=control.name: self._heard(event, name), js_handler=send)
         return button
@@ -104,15 +104,15 @@ class Page:
     def _build_side(self) -> None:
         self._count = ui.label().classes("big")
         self._bar = ui.linear_progress(value=0.0, show_value=False).props("rounded size=10px")
-        self._pace, self._left = ui.label(), ui.label()
+        self._pace, self._minutes = ui.label(), ui.label()
         ui.separator()
         self._model, self._quality = ui.label(), ui.label().classes("told")
         ui.separator()
         self._words = ui.label()
         with ui.element("div").classes("hide-small"):
-            turned = [one for one in self.controls.values() if one.colour in ("left", "right") and one.cue is None]
+            turns = [one for one in self.controls.values() if one.colour in ("left", "right") and one.cue is None]
             by_evidence = self.session.plan.guidance.by_evidence
-            swatches = {"asked": "the action in question", **{one.colour: one.words for one in turned}}
+            swatches = {"asked": "the action in question", **{one.colour: one.words for one in turns}}
             swatches["refined"] = "the corrected policy" if by_evidence else "the model's correction"
             for name, about in swatches.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
@@ -120,7 +120,7 @@ class Page:
         with ui.element("div").classes("tools"):
             names = [name for name in ("undo", "film", "film-refined", "help") if name in self.controls]
             self._tools = {name: self._button(self.controls[name], "flat dense") for name in names}
-        self._saved = ui.label().classes("text-caption")
+        self._path = ui.label().classes("text-caption")
         self._trouble = ui.label().classes("trouble")
         if self._finish is not None:
             ui.button("finish", on_click=self._end, color="grey-7").mark("finish")
@@ -129,40 +129,40 @@ class Page:
 
     async def _heard(self, event: GenericEventArguments, name: str | None = None) -> None:
         """Handle a control's event; without an item from the browser, it is about the current question."""
-        given = event.args if isinstance(event.args, dict) and "name" in event.args else {"name": name}
-        item = given.get("item")
-        await self._act(str(given["name"]), self.session.number if item is None else int(item), given)
+        event_data = event.args if isinstance(event.args, dict) and "name" in event.args else {"name": name}
+        item = event_data.get("item")
+        await self._act(str(event_data["name"]), self.session.number if item is None else int(item), event_data)
 
-    async def _act(self, name: str, number: int, given: dict[str, Any]) -> None:
+    async def _act(self, name: str, number: int, data: dict[str, Any]) -> None:
         """Act on a control pressed, or a direction pointed at, while an item was on the screen."""
-        pressed, angle = self.controls.get(name), given.get("angle")
+        control, angle = self.controls.get(name), data.get("angle")
         if name == "help":
             self._help.value = not self._help.value
             return
         if name.startswith("film"):
             await self._show_film(name.removeprefix("film-"), number)
             return
-        if pressed is None and not (name == "point" and self.form.is_action and angle is not None):
+        if control is None and not (name == "point" and self.form.is_action and angle is not None):
             return
-        taken, why = False, LATE
+        is_accepted, why = False, LATE
         if self._help.value:  # the browser may not know yet that the window opened
             why = "a window lies over the question: close it first"
-        elif pressed is not None and pressed.picks and pressed.answer and number == self.session.number:
-            self._parts_about(number)[pressed.cue or 0] = pressed.answer[0]  # stored until the answer is sent
+        elif control is not None and control.picks and control.answer and number == self.session.number:
+            self._parts_about(number)[control.cue or 0] = control.answer[0]  # stored until the answer is sent
             self._mark()
             return
-        elif pressed is None or not pressed.picks:
+        elif control is None or not control.picks:
             try:
                 if name == "undo":
-                    taken = await run.io_bound(self.session.undo, number)
+                    is_accepted = await run.io_bound(self.session.undo, number)
                     why = "there is nothing to take back" if number == self.session.number else LATE
                 else:
                     parts = self._parts if self._parts_of == number else {}
-                    answer = controls.answer_of(self.space, pressed, angle, parts)
-                    taken = await run.io_bound(self.session.answer, number, answer, given.get("seconds"))
+                    answer = controls.answer_of(self.space, control, angle, parts)
+                    is_accepted = await run.io_bound(self.session.answer, number, answer, data.get("seconds"))
             except UserError as error:
                 why = str(error)
-        if not taken:
+        if not is_accepted:
             self._script(f"cue.refused({json.dumps(why)})")
         for page in list(self._pages):
             page.refresh()
@@ -185,8 +185,8 @@ class Page:
         item, questions = self.session.item, self.session.questions
         if item is None or item.number != number:
             return
-        shown = item.refined if of == "refined" else questions.outcomes(item).get(of, item.action)
-        if shown is not None and (reel := await run.io_bound(questions.film, item, shown)) is not None:
+        action = item.refined if of == "refined" else questions.outcomes(item).get(of, item.action)
+        if action is not None and (reel := await run.io_bound(questions.film, item, action)) is not None:
             self._script(f"cue.play({view.film(item, reel)})")
 
     def goto(self, address: str) -> None:
@@ -199,8 +199,8 @@ class Page:
         """Show the session's current state."""
         item = self.session.item
         how = self.form, self.session.plan.config.scalars.eps_deg, self.space
-        if item is not self._drawn:  # chosen parts of an answer do not change the picture
-            self._drawn = item
+        if item is not self._item:  # chosen parts of an answer do not change the picture
+            self._item = item
             self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
             self._note.text = "" if item is None else view.note(item, *how)
         self._parts_about(self.session.number)
@@ -208,9 +208,9 @@ class Page:
         if "film-refined" in self._tools:
             self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
         if item is None:
-            self._asked.text = "All labels are given. Thank you. Press finish, or undo to change the last one."
+            self._question.text = "All labels are given. Thank you. Press finish, or undo to change the last one."
         else:
-            self._asked.text = controls.question(self.form, self.space)
+            self._question.text = controls.question(self.form, self.space)
             self._words.text = item.sketch.words if item.sketch else ""
         for button in self._pressable:
             button.set_enabled(item is not None)
@@ -224,27 +224,27 @@ class Page:
 
     def _mark(self) -> None:
         """Highlight the parts chosen so far, where there are several cues."""
-        picked = {one.name for one in self._picks if one.answer == (self._parts.get(one.cue or 0, UNSAID),)}
+        names = {one.name for one in self._picks if one.answer == (self._parts.get(one.cue or 0, UNSAID),)}
         for control, button in self._picks.items():
-            button.classes(**{"add" if control.name in picked else "remove": "picked"})
+            button.classes(**{"add" if control.name in names else "remove": "picked"})
         if self._picks:
-            self._script(f"cue.mark({json.dumps(sorted(picked))})")
+            self._script(f"cue.mark({json.dumps(sorted(names))})")
 
     def _show_progress(self, status: Status) -> None:
         unsure = f", {status.unsure} not known" if status.unsure else ""
         self._count.text = f"{status.answered} of {status.labels}{unsure}"
         self._bar.value = status.answered / status.labels
         self._pace.text = f"{status.per_minute:.0f} labels a minute" if status.per_minute else "no labels yet"
-        left, newest = status.minutes_left, status.newest
-        self._left.text = "" if left is None else "nearly done" if left < 1 else f"{left:.0f} minutes left"
+        minutes, newest = status.minutes_left, status.newest
+        self._minutes.text = "" if minutes is None else "nearly done" if minutes < 1 else f"{minutes:.0f} minutes left"
         by_evidence = self.session.plan.guidance.by_evidence
         what, doing = ("estimate", "reading") if by_evidence else ("model", "fitting")
-        fitted = f"{what} {newest.number}, of {newest.labels} labels" if newest.number else f"no {what} yet"
+        state = f"{what} {newest.number}, of {newest.labels} labels" if newest.number else f"no {what} yet"
         now = newest.problem or (f"{doing} the next" if status.fitting else "")
-        self._model.text = f"{fitted}; {now}" if now else fitted
-        agreed = f"agreement with held-out labels: {newest.quality}" if newest.quality else ""
-        self._quality.text = "\n".join(newest.lines) or agreed
+        self._model.text = f"{state}; {now}" if now else state
+        quality = f"agreement with held-out labels: {newest.quality}" if newest.quality else ""
+        self._quality.text = "\n".join(newest.lines) or quality
         place = "/".join(self.session.record.path.parts[-2:])
-        self._saved.text = f"{place}: {status.answered + status.unsure} answers saved"
+        self._path.text = f"{place}: {status.answered + status.unsure} answers saved"
         self._trouble.text = status.trouble
         self._trouble.set_visibility(bool(status.trouble))

@@ -123,8 +123,8 @@ def replay(env: Environment, keys: SessionKeys, rows: Iterable[Any]) -> Iterator
     differs from the recorded one (a program of another version).
     """
     guide = begin(env, keys.start)
-    for number, (recorded, action) in enumerate(rows):
-        if recorded.shape != guide.obs.shape or not np.allclose(np.asarray(guide.obs), recorded, atol=SAME):
+    for number, (obs, action) in enumerate(rows):
+        if obs.shape != guide.obs.shape or not np.allclose(np.asarray(guide.obs), obs, atol=SAME):
             return
         yield guide
         guide = proceed(env, guide, jnp.asarray(action), asking.question_keys(keys.session, number))

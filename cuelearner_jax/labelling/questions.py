@@ -68,8 +68,8 @@ class Questions:
 
     def refine(self, item: Item) -> Item:
         """Add the newest model's action."""
-        fitted = self.learner.newest.number
-        return item._replace(refined=self.learner.refined(item.guide.obs, item.action) if fitted else None)
+        number = self.learner.newest.number
+        return item._replace(refined=self.learner.refine(item.guide.obs, item.action) if number else None)
 
     def outcomes(self, item: Item) -> dict[str, np.ndarray]:
         """Return each answer's outcome for an item's action, see `controls.outcomes`."""

@@ -62,7 +62,7 @@ pre {{ background: #80808022; padding: 0.8rem; white-space: pre-wrap; overflow-w
 <p>The command in the terminal has ended by itself. You may close this tab.</p></body></html>"""
 
 
-def ended(session: Session, commands: Commands) -> Ending:
+def end_session(session: Session, commands: Commands) -> Ending:
     """Finish a session. Raises UserError if its labels cannot be saved; the session then continues."""
     file, status = session.finish().resolve(), session.status()
     also = f", and {status.unsure} questions without an answer" if status.unsure else ""
@@ -73,18 +73,18 @@ def ended(session: Session, commands: Commands) -> Ending:
 
 def bind(port: int) -> socket.socket:
     """Return a socket bound to this machine only (port 0: any free port). Raises UserError if the port is taken."""
-    bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        bound.bind((HOST, port))
-        bound.listen()  # from now on a browser waits for the page, where it would have been refused
+        listener.bind((HOST, port))
+        listener.listen()  # from now on a browser waits for the page, where it would have been refused
     except OSError as error:
-        bound.close()
+        listener.close()
         raise UserError(f"port {port} of {HOST} is not available ({error.strerror}): give another --port") from error
-    return bound
+    return listener
 
 
-def guarded(app: Any, port: int, token: str) -> Any:
+def guard(app: Any, port: int, token: str) -> Any:
     """Return an ASGI application that passes on connections to `127.0.0.1:port` that present the token.
 
     A page of another site can make a browser send requests to 127.0.0.1, and a domain name of that site can resolve to
@@ -94,13 +94,13 @@ def guarded(app: Any, port: int, token: str) -> Any:
     cookie = f"cuelearner-{port}"  # browsers share cookies among ports
     hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
 
-    def refusal(asked: HTTPConnection) -> str:
-        if [host.lower() for host in asked.headers.getlist("host")] not in [[host] for host in hosts]:
+    def refusal(request: HTTPConnection) -> str:
+        if [host.lower() for host in request.headers.getlist("host")] not in [[host] for host in hosts]:
             return f"this page answers to {HOST} alone: open the address that the command printed"
-        if not {origin.lower() for origin in asked.headers.getlist("origin")} <= {f"http://{host}" for host in hosts}:
+        if not {origin.lower() for origin in request.headers.getlist("origin")} <= {f"http://{host}" for host in hosts}:
             return "this page answers no other site"
-        presented = [*asked.query_params.getlist("token"), asked.cookies.get(cookie, "")]
-        if not any(secrets.compare_digest(each.encode(), token.encode()) for each in presented):
+        tokens = [*request.query_params.getlist("token"), request.cookies.get(cookie, "")]
+        if not any(secrets.compare_digest(each.encode(), token.encode()) for each in tokens):
             return "the token is missing or wrong: open the address that the command printed when it started last"
         return ""
 
@@ -112,12 +112,12 @@ def guarded(app: Any, port: int, token: str) -> Any:
 
         if scope["type"] not in ("http", "websocket"):
             await app(scope, receive, send)
-        elif why := refusal(asked := HTTPConnection(scope)):
-            refused = PlainTextResponse(f"{why}\n", 403) if scope["type"] == "http" else WebSocketClose(1008, why)
-            await refused(scope, receive, send)
+        elif why := refusal(request := HTTPConnection(scope)):
+            response = PlainTextResponse(f"{why}\n", 403) if scope["type"] == "http" else WebSocketClose(1008, why)
+            await response(scope, receive, send)
         else:
-            carried = f"{cookie}={token}; HttpOnly; SameSite=Strict; Path=/".encode()
-            entry = [(b"set-cookie", carried)] if "token" in asked.query_params else []
+            value = f"{cookie}={token}; HttpOnly; SameSite=Strict; Path=/".encode()
+            entry = [(b"set-cookie", value)] if "token" in request.query_params else []
             await app(scope, receive, send_private)
 
     return gate
@@ -158,7 +158,7 @@ class Site:
 
     async def finish(self) -> None:
         """Finish the session. Raises UserError if its labels cannot be saved; the session then continues."""
-        ending = await run.io_bound(ended, self.session, self.commands)
+        ending = await run.io_bound(end_session, self.session, self.commands)
         if ending is None or self.ending is not None:  # the program ends, or another page was first
             return
         self.ending, self._waiting = ending, len(self.pages)
@@ -170,9 +170,9 @@ class Site:
         """Answer a browser's request of the last page."""
         if self.ending is None:
             return HTMLResponse("nothing is finished yet", 404)
-        return HTMLResponse(self.ending.page, background=BackgroundTask(self._shown))
+        return HTMLResponse(self.ending.page, background=BackgroundTask(self._count_down))
 
-    def _shown(self) -> None:
+    def _count_down(self) -> None:
         self._waiting -= 1
         if self._waiting <= 0:
             self.stopping.set()
@@ -213,7 +213,7 @@ def serve(
         ui.run_with(app, root=site.show, **look)
         # uvloop would take over the signal wake-up that the thread of `signals` waits for.
         how = {"log_level": "warning", "ws": "wsproto", "loop": "asyncio", "timeout_graceful_shutdown": 1}
-        server = _Server(uvicorn.Config(guarded(app, port, token), **how))
+        server = _Server(uvicorn.Config(guard(app, port, token), **how))
         server.ends, server.after_startup = stopping, opened
         server.run(sockets=[listening])
         return site.ending

@@ -85,8 +85,8 @@ class Record:
     def per_minute(self) -> float | None:
         """Return the answers a minute over the last questions; None without any."""
         recent = [row for row in self.in_order() if row.said != UNDONE][-RECENT:]
-        seconds, answered = sum(row.seconds for row in recent), sum(row.said == ANSWERED for row in recent)
-        return 60 * answered / seconds if answered and seconds > 0 else None
+        seconds, count = sum(row.seconds for row in recent), sum(row.said == ANSWERED for row in recent)
+        return 60 * count / seconds if count and seconds > 0 else None
 
     def finish(self) -> Path:
         """Write the answers as Parquet and return that file. Raises UserError without an answer or on a full disk."""
@@ -142,7 +142,7 @@ class Session:
         self._fits = ThreadPoolExecutor(1, thread_name_prefix="fit", initializer=step_back)
         self._listeners: list[Callable[[], object]] = []
         self._items: dict[int, Item] = {}
-        self._finished: Path | None = None
+        self._file: Path | None = None
         self.number = 0  # of the current question
         self._replay(tell)
         tell("preparing questions")
@@ -182,8 +182,8 @@ class Session:
         """Move to an item that is ready, and start preparing the next one."""
         with self._lock:
             self.number, self._since = number, time.monotonic()
-            if passed := self._items.get(number - KEPT):
-                self._items[passed.number] = passed._replace(sketch=None, trails=None)
+            if old := self._items.get(number - KEPT):
+                self._items[old.number] = old._replace(sketch=None, trails=None)
             self._next = self._ahead.submit(self._prepare, number + 1)
 
     def _fit(self) -> None:
@@ -203,20 +203,20 @@ class Session:
         for number in (self.number, self.number + 1):
             if number in self._items:
                 self._items[number] = self.questions.refine(self._items[number])
-        for heard in list(self._listeners):
-            heard()
+        for listener in list(self._listeners):
+            listener()
 
     @property
     def item(self) -> Item | None:
         """The current question; None once all are answered or the session is finished."""
         with self._lock:
-            return None if self.done else self._items[self.number]
+            return None if self.is_done else self._items[self.number]
 
     @property
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         """Whether all wanted labels are given, or the session was finished early."""
         enough = self.record.count(ANSWERED) >= self.plan.labels or 0 < len(self.plan.again) <= self.number
-        return enough or self._finished is not None
+        return enough or self._file is not None
 
     # --- answer ------------------------------------------------------------------------------------------------------
 
@@ -233,7 +233,7 @@ class Session:
         """
         with self._acting:
             with self._lock:
-                if self.done or number != self.number:
+                if self.is_done or number != self.number:
                     return False
                 took = time.monotonic() - self._since
                 took = took if seconds is None or not 0 <= seconds <= took else seconds
@@ -250,7 +250,7 @@ class Session:
     def _labels(self) -> Label:
         """Return the answers in the order of their items, as a padded `Label`."""
         rows = [(row.obs, row.action, row.answer) for row in self.record.in_order() if row.answer is not None]
-        return self._learner.padded(rows)
+        return self._learner.pad(rows)
 
     def undo(self, number: int) -> bool:
         """Take back the answer before this question and ask it again.
@@ -259,7 +259,7 @@ class Session:
         """
         with self._acting:
             with self._lock:
-                before = None if number == 0 or self._finished else self._items.get(number - 1)
+                before = None if number == 0 or self._file else self._items.get(number - 1)
                 if number != self.number or before is None:
                     return False
                 self._save(before, UNDONE, None, time.monotonic() - self._since)
@@ -275,25 +275,25 @@ class Session:
         Raises UserError if there is no answer yet or the disk is full; the session then continues.
         """
         with self._acting:
-            self._finished = self._finished or self.record.finish()
-            return self._finished
+            self._file = self._file or self.record.finish()
+            return self._file
 
     def status(self) -> Status:
         """Return the session's progress."""
-        answered, pace = self.record.count(ANSWERED), self.record.per_minute()
-        counts = answered, self.record.count(UNSURE), self.plan.labels
-        left = (self.plan.labels - answered) / pace if pace else None
+        count, pace = self.record.count(ANSWERED), self.record.per_minute()
+        counts = count, self.record.count(UNSURE), self.plan.labels
+        minutes = (self.plan.labels - count) / pace if pace else None
         seconds = sum(row.seconds for row in self.record.in_order())
-        due, newest = self._learner.is_due(answered), self._learner.newest
-        return Status(*counts, pace, left, due, newest, self.record.trouble, seconds)
+        due, newest = self._learner.is_due(count), self._learner.newest
+        return Status(*counts, pace, minutes, due, newest, self.record.trouble, seconds)
 
-    def listen(self, heard: Callable[[], object]) -> Callable[[], None]:
+    def listen(self, listener: Callable[[], object]) -> Callable[[], None]:
         """Register a function that is called, from any thread, when a new model is in use.
 
         Returns a function that ends the registration.
         """
-        self._listeners.append(heard)
-        return lambda: self._listeners.remove(heard)
+        self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
 
     def close(self) -> None:
         """Close the file and stop the threads, after any running fit."""

@@ -59,8 +59,8 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
         parts += [f'<g class="trail halo">{trail}</g>', f'<g class="trail {name}">{trail}</g>']
     for name, body in sketch.movers.items():
         x, y, turn = sketch.places[name]
-        moved = f"translate({x:.4f} {y:.4f}) rotate({turn:.2f})"
-        parts.append(f'<g class="mover" data-mover="{html.escape(name)}" transform="{moved}">{body}</g>')
+        place = f"translate({x:.4f} {y:.4f}) rotate({turn:.2f})"
+        parts.append(f'<g class="mover" data-mover="{html.escape(name)}" transform="{place}">{body}</g>')
     parts += _arrows(item, form, eps_deg) if planar else _cues(item, space, controls.answers(form, space, one_cue))
     data = {
         "item": item.number,
@@ -72,8 +72,8 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
     }
     attributes = " ".join(f'data-{name}="{html.escape(str(value))}"' for name, value in data.items())
     box = " ".join(f"{value:.4f}" for value in sketch.box)
-    asked = "the arrow is the action in question" if planar else note(item, form, eps_deg, space)
-    words = html.escape(f"{sketch.words}; {asked}")
+    about = "the arrow is the action in question" if planar else note(item, form, eps_deg, space)
+    words = html.escape(f"{sketch.words}; {about}")
     return f'<svg class="scene" role="img" aria-label="{words}" viewBox="{box}" {attributes}>{"".join(parts)}</svg>'
 
 
@@ -85,7 +85,7 @@ def note(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS
             return words
         change = np.asarray(space.to_unit(space.log(item.action, item.refined)))
         return f"{words}. The correction: {change_words(space, change)}"
-    times = magnified(item, eps_deg) if form.by_eps else 1
+    times = magnification_of(item, eps_deg) if form.by_eps else 1
     if times == 1:
         return ""
     true = "; the thin lines are true" if item.trails else ""
@@ -126,7 +126,7 @@ def _farthest(item: Item) -> float:
     return BESIDE_TRAILS if item.trails else TURNED_REACH[1]
 
 
-def magnified(item: Item, eps_deg: float) -> int:
+def magnification_of(item: Item, eps_deg: float) -> int:
     """Return the factor by which turns of an item's action are magnified, so that a turn by eps is visible."""
     sketch = sketch_of(item)
     _, far = _ends(sketch, angle_of(item.action), _farthest(item))
@@ -137,13 +137,13 @@ def magnified(item: Item, eps_deg: float) -> int:
 def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
     """Return the arrows of the asked direction, of the answers' outcomes, of the model's action, and the pointer."""
     sketch, angle = sketch_of(item), angle_of(item.action)
-    parts, times = [], magnified(item, eps_deg) if form.by_eps else 1
+    parts, times = [], magnification_of(item, eps_deg) if form.by_eps else 1
     if form.by_eps:
         turn = times * eps_deg
         longer = min(max(APART / turn, TURNED_REACH[0]), _farthest(item))
         for one in controls.answers(form, DIRECTIONS):
             if one.answer and one.answer[0]:
-                parts.append(arrow(sketch, angle + one.answer[0] * turn, one.colour, longer, one.shown))
+                parts.append(arrow(sketch, angle + one.answer[0] * turn, one.colour, longer, one.first_key))
     parts += ["" if item.trails else _aim(sketch, angle), arrow(sketch, angle, "asked")]
     if item.refined is not None:
         turn = (angle_of(item.refined) - angle + 180) % 360 - 180
@@ -201,12 +201,12 @@ def _at_edge(sketch: Sketch, angle: float, lane: int, control: Control) -> str:
     out = _room(sketch._replace(foot=middle, turn=0.0), angle) - length - 2.5 * size
     foot = middle[0] + x * out, middle[1] + y * out
     at = sketch._replace(foot=foot, turn=0.0, reach=(0.0, length))
-    drawn = arrow(at, angle, control.colour, key=control.shown, larger=LARGER)
+    shape = arrow(at, angle, control.colour, key=control.first_key, larger=LARGER)
     centre = f'cx="{foot[0] + x * length:.3f}" cy="{foot[1] + y * length:.3f}"'
     title = f"<title>{html.escape(control.words)}</title>"
     return (
         f'<g class="said {control.colour}" data-name="{html.escape(control.name)}">{title}'
-        f'<circle class="touched" {centre} r="{length:.3f}"/>{drawn}</g>'
+        f'<circle class="touched" {centre} r="{length:.3f}"/>{shape}</g>'
     )
 
 

@@ -70,8 +70,8 @@ class AdaptedLanes:
         place, remedy = self.folder / policy_folders.ARRAYS, "restore it, or adapt the policy anew"
         if not place.is_dir():
             raise UserError(f"{place} is missing: {remedy}")
-        with Checkpoints(place, read_only=True, remedy=remedy) as saved:
-            arrays = saved.restore({"policy": like})["policy"]
+        with Checkpoints(place, read_only=True, remedy=remedy) as store:
+            arrays = store.restore({"policy": like})["policy"]
         if digest(arrays) != self.values.get("arrays"):
             raise UserError(f"{place} holds the arrays of another policy: {remedy}")
         policy = serialization.with_arrays(policy, arrays)
@@ -101,13 +101,13 @@ def open_folder(
     path = folder / policy_folders.POLICY
     values = formats.read("policy", path)
     task, world = world_of(values["task"], find, path)
-    *columns, used = (np.array(values["lanes"][name]) for name in COLUMNS)
-    return task, world, AdaptedLanes(folder, values, Lanes(*columns), used, values["rows"], code, changes)
+    *columns, is_used = (np.array(values["lanes"][name]) for name in COLUMNS)
+    return task, world, AdaptedLanes(folder, values, Lanes(*columns), is_used, values["rows"], code, changes)
 
 
 def write(
     place: Place,
-    adapted: AdaptationResult,
+    result: AdaptationResult,
     task: Task,
     world: Any,
     origin: dict[str, Any],
@@ -117,7 +117,7 @@ def write(
 
     Args:
         place: the target; the folder appears once it is complete.
-        adapted: the lanes.
+        result: the lanes.
         task, world: in which the lanes were adapted.
         origin: the base policies in plain values: "folder" and which lanes of it, or "code".
         used: further inputs by name: the label file, another robot.
@@ -125,57 +125,57 @@ def write(
     Raises:
         UserError: something appeared at the place meanwhile, or the policy cannot be written.
     """
-    lanes, judged, env = adapted.lanes, adapted.judged, shape_of(task, world)
-    block = replace(adapted.policy(env), base=adapted.of.bases)
+    lanes, judgement, env = result.lanes, result.judged, shape_of(task, world)
+    block = replace(result.policy(env), base=result.of.bases)
     values, arrays = serialization.to_json(block, origin.get("code")), serialization.arrays_of(block)
-    described = {
+    contents = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
         **({"files": files} if (files := task.files(world)) else {}),
         "of": origin,
         "policy": values,
-        "rows": lanes_in(adapted.of.bases),
+        "rows": lanes_in(result.of.bases),
         "lanes": {
             "base": lanes.base.tolist(),
             "seeds": lanes.seed.tolist(),
             "labels": lanes.budget.tolist(),
             "bounds_deg": [float(f"{bound:g}") for bound in lanes.bound_deg],
-            "used": judged.used.tolist(),
+            "used": judgement.used.tolist(),
         },
         "judged": {
-            "by": judged.by,
+            "by": judgement.by,
             "split": SPLIT,
-            "before": _plain(judged.before),
-            "after": _plain(judged.after),
-            "within_deg": [float(f"{bound:g}") for bound in judged.within_deg],
-            "difference": [_plain(ends) for ends in judged.difference],
-            "rewarded_steps": judged.rewarded_steps.tolist(),
+            "before": _plain(judgement.before),
+            "after": _plain(judgement.after),
+            "within_deg": [float(f"{bound:g}") for bound in judgement.within_deg],
+            "difference": [_plain(ends) for ends in judgement.difference],
+            "rewarded_steps": judgement.rewarded_steps.tolist(),
         },
-        **({"reading": [one.to_json() for one in adapted.results]} if adapted.results else {}),
+        **({"reading": [one.to_json() for one in result.results]} if result.results else {}),
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,
         **provenance(),
     }
     with place.writing() as folder:
-        with Checkpoints(folder / policy_folders.ARRAYS) as saved:
-            saved.save(0, {"policy": arrays})
-        formats.write("policy", folder / policy_folders.POLICY, {**described, "arrays": digest(arrays)})
-        _write_labels(folder, adapted, task, world)
+        with Checkpoints(folder / policy_folders.ARRAYS) as store:
+            store.save(0, {"policy": arrays})
+        formats.write("policy", folder / policy_folders.POLICY, {**contents, "arrays": digest(arrays)})
+        _write_labels(folder, result, task, world)
 
 
 def _plain(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: Any) -> None:
+def _write_labels(folder: Path, result: AdaptationResult, task: Task, world: Any) -> None:
     """Write one label file per bound: for each seed the largest budget's set, which starts with the smaller sets."""
-    of, lanes = adapted.of, adapted.lanes
+    of, lanes = result.of, result.lanes
     form: AnswerForm | None = of.guidance.form
     assert form is not None
-    told, space = {"name": task.name, **configuration.to_json(world)}, actions_of(of.env)
+    head, space = {"name": task.name, **configuration.to_json(world)}, actions_of(of.env)
     eps, largest = of.scalars.eps_deg if form.by_eps else None, lanes.budget == lanes.budget.max()
     for bound in (bounds := np.unique(lanes.bound_deg)):
         own = np.flatnonzero(largest & (lanes.bound_deg == bound))
-        sets: Label = jax.tree.map(lambda leaf, own=own: leaf[own], adapted.labels)
+        sets: Label = jax.tree.map(lambda leaf, own=own: leaf[own], result.labels)
         file = folder / (label_files.PARQUET if len(bounds) == 1 else f"labels-{bound:g}deg.parquet")
-        label_files.write(file, told, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
+        label_files.write(file, head, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))

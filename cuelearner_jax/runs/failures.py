@@ -28,50 +28,49 @@ def describe_failed(table: pa.Table) -> dict[tuple[str, int], str]:
     steps: dict[tuple[str, int], list[str]] = {}
     for (guidance, labels, seed), step in results.failures(table).items():
         steps.setdefault((guidance, labels), []).append(f"{seed} (by step {step:,})")
-    return {variant: _listed(seeds) for variant, seeds in steps.items()}
+    return {variant: _format_seeds(seeds) for variant, seeds in steps.items()}
 
 
 def summary(table: pa.Table) -> str:
     """Return a sentence on the failed lanes of a results table; empty if no lane failed."""
-    failed = results.failures(table)
+    steps = results.failures(table)
     which = "; ".join(f"{variant_name(*variant)}: {seeds}" for variant, seeds in describe_failed(table).items())
-    return f"{len(failed)} of {results.lanes(table)} lanes failed, no longer finite ({which})" if failed else ""
+    return f"{len(steps)} of {results.lanes(table)} lanes failed, no longer finite ({which})" if steps else ""
 
 
-def without_failed(loaded: Sequence[Any]) -> list[Any]:
+def without_failed(groups: Sequence[Any]) -> list[Any]:
     """Drop the failed lanes of trained lanes (`run_folders.RunLanes`) and name them on the console.
 
     Raises UserError if no lane is left.
     """
-    left = []
-    for lanes in loaded:
-        failed = np.asarray(lanes.policies["failed"])
-        if failed.any():
-            names = named(lanes.seeds[failed], lanes.budgets[failed])
+    rest = []
+    for lanes in groups:
+        mask = np.asarray(lanes.policies["failed"])
+        if mask.any():
+            names = name_lanes(lanes.seeds[mask], lanes.budgets[mask])
             console.print(f"{lanes.guidance.name}: {names} failed, no longer finite: left out")
-        if not failed.all():
-            kept = jax.tree.map(lambda leaf, failed=failed: leaf[~failed], lanes.policies)
-            left.append(replace(lanes, seeds=lanes.seeds[~failed], budgets=lanes.budgets[~failed], policies=kept))
-    if not left:
+        if not mask.all():
+            policies = jax.tree.map(lambda leaf, mask=mask: leaf[~mask], lanes.policies)
+            rest.append(replace(lanes, seeds=lanes.seeds[~mask], budgets=lanes.budgets[~mask], policies=policies))
+    if not rest:
         raise UserError("all of these lanes failed: there is nothing to evaluate; train again with other settings")
-    return left
+    return rest
 
 
-def named(seeds: np.ndarray, budgets: np.ndarray) -> str:
+def name_lanes(seeds: np.ndarray, budgets: np.ndarray) -> str:
     """Return the names of lanes (lanes,) of one kind of guidance in a message."""
     pairs = zip(seeds.tolist(), budgets.tolist(), strict=True)
-    return _listed([f"{seed} ({budget:,} labels)" if budget else str(seed) for seed, budget in pairs])
+    return _format_seeds([f"{seed} ({budget:,} labels)" if budget else str(seed) for seed, budget in pairs])
 
 
-def _listed(seeds: Sequence[str]) -> str:
+def _format_seeds(seeds: Sequence[str]) -> str:
     more = [f"{len(seeds) - LISTED} more"] if len(seeds) > LISTED else []
     return ("seed " if len(seeds) == 1 else "seeds ") + ", ".join([*seeds[:LISTED], *more])
 
 
 def check(out: Path, folders: Iterable[Path]) -> None:
     """Raise NotFinite if the results in these folders of a run at `out` contain failed lanes."""
-    found = summary(results.read(list(folders)))
-    if found:
+    if words := summary(results.read(list(folders))):
         raise NotFinite(
-            f"{found}: their rows in {out} are marked and excluded from reports; everything else is finished"
+            f"{words}: their rows in {out} are marked and excluded from reports; everything else is finished"
         )

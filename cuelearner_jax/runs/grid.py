@@ -92,17 +92,17 @@ def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from:
     }
 
 
-def config_hash(described: dict[str, Any]) -> str:
+def config_hash(contents: dict[str, Any]) -> str:
     """Return a short hash of what a lane's result depends on: a description without format and other lanes."""
     apart = ("format", "grid", "shard")
-    learned_from = {name: value for name, value in described.items() if name not in apart}
-    task = {name: value for name, value in described["task"].items() if name != "from"}
+    learned_from = {name: value for name, value in contents.items() if name not in apart}
+    task = {name: value for name, value in contents["task"].items() if name != "from"}
     return configuration.digest({**learned_from, "task": task})
 
 
-def run_key(described: dict[str, Any], kind: str) -> str:
+def run_key(contents: dict[str, Any], kind: str) -> str:
     """Return the hash by which a file knows its run, given the run's config.json, and its kind of guidance."""
-    return configuration.digest({**described, "kind": kind})
+    return configuration.digest({**contents, "kind": kind})
 
 
 def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid]:
@@ -123,14 +123,14 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     return task.on(values.get("robot")), config, grid
 
 
-def world_of(told: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:
+def world_of(values: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:
     """Return the task and the world (a configuration) that a folder's file describes.
 
     Raises UserError if the task is unknown; the message says how to name a task from outside the package.
     """
-    origin = told.get("from")
+    origin = values.get("from")
     try:
-        task = find(told["name"])
+        task = find(values["name"])
     except UserError as error:
         if origin is None:
             raise UserError(f"{path} belongs to an unknown task ({error})") from error
@@ -138,5 +138,5 @@ def world_of(told: dict[str, Any], find: Callable[[str], Task], path: Path) -> t
             f"{path} belongs to a task outside the package; its code is not loaded just because a file names it: "
             f"add --task {origin} if you trust that code"
         ) from error
-    fields = {field: value for field, value in told.items() if field not in ("name", "from")}
+    fields = {field: value for field, value in values.items() if field not in ("name", "from")}
     return task, configuration.from_json(task.config, fields)

@@ -50,18 +50,18 @@ class LaneGroup:
         """Label rounds of the largest budget."""
         return label_slots(self.largest_budget, self.config.sizes) // self.config.sizes.labels_per_round
 
-    def asked(self, rounds: int) -> np.ndarray:
+    def label_counts(self, rounds: int) -> np.ndarray:
         """Return the labels (lanes,) asked for after a number of rounds."""
         return np.minimum(self.budgets, rounds * self.config.sizes.labels_per_round)
 
-    def examined(self, rounds: int, before: int) -> np.ndarray:
+    def due_guides(self, rounds: int, before: int) -> np.ndarray:
         """Return a mask (lanes,) of the guides to evaluate after `rounds` rounds, the last time being `before`.
 
         A guide is due at every multiple of `guide_eval_every` labels of its own, and at its last label.
         """
-        earlier, now, every = self.asked(before), self.asked(rounds), self.config.schedule.guide_eval_every
+        old, now, every = self.label_counts(before), self.label_counts(rounds), self.config.schedule.guide_eval_every
         due = now == self.budgets
-        return (now > earlier) & (due | (now % every == 0) if every else due)
+        return (now > old) & (due | (now % every == 0) if every else due)
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return (seeds, budgets) of each block; the last block is padded with repeats, whose results are dropped."""
@@ -78,8 +78,8 @@ class LaneGroup:
     def recut(self, blocks: list[TrainState]) -> list[TrainState]:
         """Return blocks of any cut in this group's cut."""
         if [block.key.shape[0] for block in blocks] != [len(rows) for rows in self.cut]:
-            joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *blocks)
-            blocks = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], joined) for rows in self.cut]
+            whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *blocks)
+            blocks = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], whole) for rows in self.cut]
         return [place(self.mesh, block, BY_LANE) for block in blocks]
 
     def each(self, work: Callable[..., T], *blocks: list[Any]) -> list[T]:
@@ -110,15 +110,15 @@ class LaneGroup:
     ) -> tuple[Clock, list[TrainState], list[dict[str, jax.Array]]]:
         """Train all lanes for some iterations; return (clock, blocks, each block's means (lanes,)) when done."""
         settings = self.config.settings
-        done = self.each(lambda block: self.program.train(self.env, settings, clock, block, iterations), blocks)
-        after = jax.block_until_ready(done[0][0])
-        return after, [block for _, block, _ in done], [measured for _, _, measured in done]
+        results = self.each(lambda block: self.program.train(self.env, settings, clock, block, iterations), blocks)
+        after = jax.block_until_ready(results[0][0])
+        return after, [block for _, block, _ in results], [metrics for _, _, metrics in results]
 
     def label_round(self, teacher: Teacher, clock: Clock, blocks: list[TrainState]) -> tuple[Clock, list[TrainState]]:
         """Ask a simulated teacher one round of questions and fit the guides to all answers."""
         scalars = self.config.scalars
-        done = self.each(lambda block: self.program.label_round(self.env, teacher, scalars, clock, block), blocks)
-        return jax.block_until_ready(done[0][0]), [block for _, block in done]
+        results = self.each(lambda block: self.program.label_round(self.env, teacher, scalars, clock, block), blocks)
+        return jax.block_until_ready(results[0][0]), [block for _, block in results]
 
     def take_labels(self, labels: list[Label], blocks: list[TrainState]) -> list[TrainState]:
         """Take labels (lanes, slots, ...) of each block from elsewhere and fit the guides to them."""
@@ -138,11 +138,11 @@ class LaneGroup:
         """Return metrics (lanes,) of a policy of each block on the same episodes, and their `group_means`."""
         mesh = self.mesh if self.mesh.size > 1 else None
 
-        def measured(block: TrainState) -> dict[str, Any]:
+        def measure(block: TrainState) -> dict[str, Any]:
             means, each, _ = rollout_lanes(env, policy_of(block), key, num_envs, steps, mesh=mesh)
             return means | {f"{name}_each": group_means(np.asarray(values)) for name, values in each.items()}
 
-        return self.columns(self.each(measured, blocks))
+        return self.columns(self.each(measure, blocks))
 
     def columns(self, blocks: list[Any]) -> dict[str, np.ndarray]:
         """Join per-block dictionaries of (lanes,) arrays into columns with one row per lane."""

@@ -89,12 +89,12 @@ def make_plan(order: Order) -> Plan:
     for kind in order.grid.guidance:
         order.config.guide_in(env, kind)
     labels = labels_of(order)
-    described = describe(order.task, order.config, order.grid, order.split, order.labels_from)
+    contents = describe(order.task, order.config, order.grid, order.split, order.labels_from)
     if shard:
-        described["shard"] = {**shard._asdict(), "seeds": list(sweep.grid.seeds)}
-        shard.check_sweep(sweep.out, described)
-    check_folder(order.out, described, order.resume, order.overwrite)
-    return Plan(order, described, labels)
+        contents["shard"] = {**shard._asdict(), "seeds": list(sweep.grid.seeds)}
+        shard.check_sweep(sweep.out, contents)
+    check_folder(order.out, contents, order.resume, order.overwrite)
+    return Plan(order, contents, labels)
 
 
 def read_labels(
@@ -127,11 +127,11 @@ def read_labels(
     return file
 
 
-def _check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> None:
+def _check_world(path: Path, head: dict[str, Any], task: Task, world: Any) -> None:
     """Raise UserError unless labels belong to a run's task and, in all that labels depend on, to its world."""
-    if (name := told.get("name")) != task.name:
+    if (name := head.get("name")) != task.name:
         raise UserError(f"{path} holds labels of {name}, but this run trains {task.name}: give labels of the same task")
-    values = {name: value for name, value in told.items() if name not in ("name", "from")}
+    values = {name: value for name, value in head.items() if name not in ("name", "from")}
     theirs, ours = configuration.to_json(configuration.from_json(task.config, values)), configuration.to_json(world)
     apart = [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]
     if apart:

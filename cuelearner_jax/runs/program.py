@@ -97,8 +97,8 @@ def _program_of(
 
     def label_round(env, teacher, scalars, clock, state):
         rest, agent = state.replace(agent=None), state.agent  # the agent's state is large, and not needed for questions
-        asked = each_lane(partial(lane.label_round, env, teacher, scalars))(rest).replace(agent=agent)
-        return clock.replace(round=clock.round + 1), asked
+        after = each_lane(partial(lane.label_round, env, teacher, scalars))(rest).replace(agent=agent)
+        return clock.replace(round=clock.round + 1), after
 
     def take_labels(env, scalars, labels, state):
         rest, agent = state.replace(agent=None), state.agent
@@ -111,8 +111,8 @@ def _program_of(
                 state, metrics = lane.iterate(env, settings, clock, state)
                 return (lane.advance(clock, settings.schedule), state), metrics
 
-            (after, trained), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
-            return lane.keep_finite(trained, state), after, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+            (after, last), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
+            return lane.keep_finite(last, state), after, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
 
         state, after, metrics = each_lane_in_place(run)(state)
         return after, state, metrics

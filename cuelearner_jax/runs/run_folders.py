@@ -52,19 +52,19 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
     """
     whole = (folder / CONFIG).exists()
     folders = [] if whole else sorted(file.parent for file in folder.glob(f"shard-*-of-*/{CONFIG}"))
-    loaded = [load(one, find) for one in folders or [folder]]
-    pieces = tuple(Piece(one, grid) for one, (_, _, grid) in zip(folders or [folder], loaded, strict=True))
+    runs = [load(one, find) for one in folders or [folder]]
+    pieces = tuple(Piece(one, grid) for one, (_, _, grid) in zip(folders or [folder], runs, strict=True))
     first, of_seed = formats.read("config", pieces[0].folder / CONFIG), {}
     for piece in pieces:
-        if found := shards.differing_options(first, formats.read("config", piece.folder / CONFIG)):
+        if names := shards.differing_options(first, formats.read("config", piece.folder / CONFIG)):
             raise UserError(
-                f"{pieces[0].folder} and {piece.folder} are shards of different sweeps (they differ in {found}): "
+                f"{pieces[0].folder} and {piece.folder} are shards of different sweeps (they differ in {names}): "
                 "give the folder of one of them"
             )
         for seed in piece.grid.seeds:
             if (other := of_seed.setdefault(seed, piece.folder)) != piece.folder:
                 raise UserError(f"{other} and {piece.folder} both hold seed {seed}: delete the one that is a copy")
-    task, config, grid = loaded[0]
+    task, config, grid = runs[0]
     return task, config, Grid(grid.guidance, tuple(of_seed), grid.labels), pieces
 
 
@@ -83,36 +83,36 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
         return {"params": config.agent_in(env).init(key)[0], "guidance": guidance.init(key)}
 
     like = jax.eval_shape(lane, jax.random.key(0))
-    found: dict[int, list[RunLanes]] = {}
-    told = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
+    groups: dict[int, list[RunLanes]] = {}
+    notes = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
     for folder, grid in pieces:
         if not (folder / kind / "checkpoints").is_dir():
-            told.append(f"{folder}: no checkpoint of {kind} guidance, left out")
+            notes.append(f"{folder}: no checkpoint of {kind} guidance, left out")
             continue
         seeds, budgets = grid.lanes(guidance)
         key = run_key(formats.read("config", folder / CONFIG), kind)
-        with Checkpoints(folder / kind / "checkpoints", read_only=True, run=key) as saved:
-            policies, step = _restored(saved, like, len(seeds))
-        found.setdefault(step, []).append(RunLanes(guidance, seeds, budgets, policies, step))
+        with Checkpoints(folder / kind / "checkpoints", read_only=True, run=key) as store:
+            policies, step = _restore(store, like, len(seeds))
+        groups.setdefault(step, []).append(RunLanes(guidance, seeds, budgets, policies, step))
         if step < config.schedule.total_steps:
-            told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")
-    if not found:
+            notes.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")
+    if not groups:
         raise UserError(f"there is no checkpoint of {kind} guidance: train first, or choose another --guidance")
-    for line in told:
+    for line in notes:
         console.print(line)
-    return [_joined(found[step]) for step in sorted(found, reverse=True)]
+    return [_join(groups[step]) for step in sorted(groups, reverse=True)]
 
 
-def _restored(saved: Checkpoints, like: Any, lanes: int) -> tuple[dict[str, Any], int]:
+def _restore(store: Checkpoints, like: Any, lanes: int) -> tuple[dict[str, Any], int]:
     """Return what lanes act with (one lane: shapes `like`) and whether each has failed, and their training step."""
-    clock, _, count, size = restore_clock(saved)
+    clock, _, count, size = restore_clock(store)
     block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), like)
-    found = saved.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})
-    blocks = [{**policy, "failed": failed} for policy, failed in zip(found["policy"], found["failed"], strict=True)]
+    arrays = store.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})
+    blocks = [{**policy, "failed": mask} for policy, mask in zip(arrays["policy"], arrays["failed"], strict=True)]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:lanes], *blocks), int(clock.step)
 
 
-def _joined(parts: list[RunLanes]) -> RunLanes:
+def _join(parts: list[RunLanes]) -> RunLanes:
     """Join the lanes of several shards at one step."""
     if len(parts) == 1:
         return parts[0]

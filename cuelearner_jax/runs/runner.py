@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.runs.failures import named
+from cuelearner_jax.runs.failures import name_lanes
 from cuelearner_jax.runs.grid import config_hash, run_key
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
@@ -32,22 +32,22 @@ class Runner:
     def __init__(
         self,
         group: LaneGroup,
-        examined: Environment,
+        eval_env: Environment,
         order: Order,
-        described: dict[str, Any],
+        contents: dict[str, Any],
         stopping: threading.Event,
         bars: Progress,
     ) -> None:
         """Prepare without starting.
 
-        `described`: contents of config.json. `stopping`: set by Ctrl-C. For `examined` see `Training`.
+        `contents`: of config.json. `stopping`: set by Ctrl-C. For `eval_env` see `Training`.
         """
-        self.training = Training(group, examined, order.split)
-        self.group, self.order, self.described = group, order, described
+        self.training = Training(group, eval_env, order.split)
+        self.group, self.order, self.contents = group, order, contents
         self.stopping, self.bars = stopping, bars
         self.name = group.guidance.name
         self.folder = order.out / self.name
-        self.key = run_key(described, self.name)
+        self.key = run_key(contents, self.name)
         self.failed = np.zeros(len(group.seeds), bool)  # lanes whose failure has been reported
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
@@ -61,30 +61,30 @@ class Runner:
             return
         asks = self.group.guidance.asks
         self._bar = self.bars.add_task(self.name, total=self.group.config.schedule.total_steps, note="preparing")
-        with Checkpoints(self.folder / "checkpoints", run=self.key) as saved:
-            self._restore(saved)
+        with Checkpoints(self.folder / "checkpoints", run=self.key) as store:
+            self._restore(store)
             about, order = {"run": self.key}, self.order
             constants = {"run": order.out.name, "task": order.task.name, "guidance": self.name, "split": order.split}
-            constants |= {"config_hash": config_hash(self.described), **provenance.provenance()}
+            constants |= {"config_hash": config_hash(self.contents), **provenance.provenance()}
             with (
                 TableWriter(self.folder, results.SCHEMA, constants, about) as writer,
                 TableWriter(self.folder, results.GUIDES, constants, about) if asks else nullcontext() as guides,
-                tracking.open_tracker(order.track, self.folder, self.described, self.training.step) as tracker,
+                tracking.open_tracker(order.track, self.folder, self.contents, self.training.step) as tracker,
             ):
                 if guides is not None:
-                    self._label(saved, guides, teacher, labels)
-                self._train(saved, writer, tracker)
+                    self._label(store, guides, teacher, labels)
+                self._train(store, writer, tracker)
         if asks:
             tables.finish(self.folder, results.GUIDES)
         tables.finish(self.folder, results.SCHEMA)  # last, since a kind with finished results counts as finished
 
-    def _restore(self, saved: Checkpoints) -> None:
+    def _restore(self, store: Checkpoints) -> None:
         """Restore the newest checkpoint, or start afresh; drop the rows after it."""
         last_step = last_round = -1
-        if saved.latest() is None:
+        if store.latest() is None:
             self.training.begin()
         else:
-            self.training.restore(saved)
+            self.training.restore(store)
             self.failed = self.training.failed
             last_step = self.training.step or -1  # a checkpoint of labels alone precedes the rows of step 0
             last_round = self.training.round
@@ -97,21 +97,21 @@ class Runner:
         evaluations = step // self.group.config.schedule.eval_every + 1
         results.check_complete(self.folder, step, len(self.group.seeds) * evaluations, self.key)
 
-    def _save(self, saved: Checkpoints) -> None:
+    def _save(self, store: Checkpoints) -> None:
         now = self.training
-        saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
+        store.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
 
-    def _stop_if_asked(self, saved: Checkpoints) -> None:
+    def _stop_if_asked(self, store: Checkpoints) -> None:
         if self.stopping.is_set():
-            self._save(saved)
+            self._save(store)
             step = self.training.step
             raise Interrupted(f"stopped at step {step} of {self.name}; go on with the same command and --resume")
 
     def _tell_failed(self, when: str) -> None:
         """Print a line if lanes have newly failed."""
-        found, group = self.training.failed & ~self.failed, self.group
-        if found.any():
-            names = named(group.seeds[found], group.budgets[found])
+        new, group = self.training.failed & ~self.failed, self.group
+        if new.any():
+            names = name_lanes(group.seeds[new], group.budgets[new])
             console.print(
                 f"{self.name}: {names} no longer finite {when}: kept at the last finite state, marked as failed"
             )
@@ -119,7 +119,7 @@ class Runner:
 
     def _label(
         self,
-        saved: Checkpoints,
+        store: Checkpoints,
         guides: TableWriter,
         teacher: Teacher | None,
         labels: label_files.LabelFile | None,
@@ -138,17 +138,17 @@ class Runner:
                     guides.append(**row)
             else:
                 assert teacher is not None  # `teacher` may be None only where a file was given
-                for done in now.label_rounds(teacher):
-                    self.bars.update(bar, completed=done)
-                    self._tell_failed(f"after {done * self.group.config.sizes.labels_per_round} labels")
-                    if row := now.guides(before=done - 1):
+                for number in now.label_rounds(teacher):
+                    self.bars.update(bar, completed=number)
+                    self._tell_failed(f"after {number * self.group.config.sizes.labels_per_round} labels")
+                    if row := now.guides(before=number - 1):
                         guides.append(**row)
-                    if done % ROUNDS_A_CHUNK == 0:
-                        self._save(saved)
-                    self._stop_if_asked(saved)
+                    if number % ROUNDS_A_CHUNK == 0:
+                        self._save(store)
+                    self._stop_if_asked(store)
         self._write_labels()
         if asks:
-            self._save(saved)
+            self._save(store)
 
     def _write_labels(self) -> None:
         form, config = self.group.guidance.form, self.group.config
@@ -157,10 +157,10 @@ class Runner:
         seeds, labels = self.training.labels()
         eps = config.scalars.eps_deg if form.by_eps else None
         space = actions_of(self.group.env)
-        told = form.name, space, eps, seeds, labels, form.meaning(space)
-        label_files.write(self.folder / label_files.PARQUET, task, *told, run=self.key)
+        values = form.name, space, eps, seeds, labels, form.meaning(space)
+        label_files.write(self.folder / label_files.PARQUET, task, *values, run=self.key)
 
-    def _train(self, saved: Checkpoints, writer: TableWriter, tracker: tracking.Tracker | None) -> None:
+    def _train(self, store: Checkpoints, writer: TableWriter, tracker: tracking.Tracker | None) -> None:
         now, schedule = self.training, self.group.config.schedule
         self.bars.update(self._bar, completed=now.step)
         for row in now.stretches():
@@ -172,5 +172,5 @@ class Runner:
                 continue
             self.bars.update(self._bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
-                self._save(saved)
-            self._stop_if_asked(saved)
+                self._save(store)
+            self._stop_if_asked(store)

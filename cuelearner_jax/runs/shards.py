@@ -25,8 +25,8 @@ class Shard(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Shard:
         """Parse "i/n". Raises UserError for anything else."""
-        found = re.fullmatch(r"(\d+)/(\d+)", text)
-        shard = cls(*(int(number) for number in found.groups())) if found else cls(0, 0)
+        match = re.fullmatch(r"(\d+)/(\d+)", text)
+        shard = cls(*(int(number) for number in match.groups())) if match else cls(0, 0)
         if not 1 <= shard.index <= shard.count:
             raise UserError(f"--shard is {text!r}: give i/n with i from 1 to n, for instance 3/8")
         return shard
@@ -35,8 +35,8 @@ class Shard(NamedTuple):
         """Return the shard's folder below the sweep's folder."""
         return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
 
-    def check_sweep(self, out: Path, described: dict[str, Any]) -> None:
-        """Check that the shard, with `described` as its config.json, belongs to the sweep in the folder `out`.
+    def check_sweep(self, out: Path, contents: dict[str, Any]) -> None:
+        """Check that the shard, with `contents` as its config.json, belongs to the sweep in the folder `out`.
 
         Raises UserError if the folder holds a whole run, shards of another number, or of a sweep with other settings.
         """
@@ -52,9 +52,9 @@ class Shard(NamedTuple):
                 )
             if folder == self.folder(out) or not (folder / CONFIG).is_file():
                 continue
-            if found := differing_options(formats.read("config", folder / CONFIG), described):
+            if names := differing_options(formats.read("config", folder / CONFIG), contents):
                 raise UserError(
-                    f"{folder} is a shard of a sweep with another {found}: give the same options for all shards, or "
+                    f"{folder} is a shard of a sweep with another {names}: give the same options for all shards, or "
                     "another --out"
                 )
 

@@ -119,7 +119,7 @@ class PolicySource:
         """Return the source with another robot of the task (None: the default). Raises UserError if unknown."""
         return replace(self, task=self.task.on(robot))
 
-    def check(self, policy: str, changed: Any, guidance: str | tuple[str, ...] | None = None) -> None:
+    def check(self, policy: str, world: Any, guidance: str | tuple[str, ...] | None = None) -> None:
         """Raise UserError unless the policy is available and acts in the changed world.
 
         A trained policy needs the observations and aims of its training world; other policies act in any world.
@@ -127,27 +127,27 @@ class PolicySource:
         """
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{suggestion(policy, POLICIES)}")
-        named, after = POLICIES[policy], shape_of(self.task, changed)
-        if named.trained and not self.grid:
+        entry, after = POLICIES[policy], shape_of(self.task, world)
+        if entry.trained and not self.grid:
             others = [name for name, one in POLICIES.items() if not one.kept or (one.adapted and self.adapted)]
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
-        if named.adapted and not self.adapted:
+        if entry.adapted and not self.adapted:
             raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` wrote")
         if policy == "own" and self.code is None:
             raise UserError("policy 'own' is code: name it first, as package.module:NAME --env TASK")
-        if lacking := [need for need in named.needs if not offers(after, need)]:
-            raise UserError(f"{self.task.name} has no {lacking[0]}: choose another policy")
-        if not named.kept:
+        if absent := [need for need in entry.needs if not offers(after, need)]:
+            raise UserError(f"{self.task.name} has no {absent[0]}: choose another policy")
+        if not entry.kept:
             check_no_lane(policy, guidance)
             return
-        what, known = "run" if self.grid else "policy", shape_of(self.task, self.config.task)
-        check_layout(f"the {what}", known.observation, actions_of(known), after)
+        what, own = "run" if self.grid else "policy", shape_of(self.task, self.config.task)
+        check_layout(f"the {what}", own.observation, actions_of(own), after)
         if policy in ("agent", "corrected"):
             return
-        chosen = (guidance,) if isinstance(guidance, str) else guidance
-        kinds = self.adapted.kinds if self.adapted else chosen or (self.grid.guidance if self.grid else ())
+        choice = (guidance,) if isinstance(guidance, str) else guidance
+        kinds = self.adapted.kinds if self.adapted else choice or (self.grid.guidance if self.grid else ())
         weighs_aims = any("aims" in kind.needs for name in kinds if (kind := guidances.guides().get(name)))
-        if weighs_aims and (width := spaces_of(known).aims) != (now := spaces_of(after).aims):
+        if weighs_aims and (width := spaces_of(own).aims) != (now := spaces_of(after).aims):
             raise UserError(
                 f"the {what} uses aims of {width} features, this world's have {now}: keep the options that set the aims"
             )
@@ -158,7 +158,7 @@ class PolicySource:
         Raises UserError for a kind that the run lacks, or if there is no checkpoint.
         """
         assert self.grid is not None  # ensured by `check`
-        loaded = []
+        groups = []
         for name in kinds or self.grid.guidance:
             if name not in self.grid.guidance:
                 raise UserError(f"{self.folder} has no guidance {name!r}: choose among {', '.join(self.grid.guidance)}")
@@ -168,8 +168,8 @@ class PolicySource:
                     "--guidance package.module:NAME, if you trust that code"
                 )
             pieces = self.pieces or (Piece(self.folder, self.grid),)
-            loaded += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
-        return loaded
+            groups += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
+        return groups
 
     def lane(self, guidance: str | None, labels: int | None, seed: int | None) -> dict[str, Any]:
         """Return guidance, labels and seed of a run's lane, by default the last kind, largest budget and first seed."""
@@ -195,18 +195,18 @@ class PolicySource:
 
         `view`, `teacher`: those of the world that it acts in. Raises UserError if it is not available.
         """
-        if (kept := self.adapted) is not None:
-            if kinds and kept.guidance not in kinds:
-                raise UserError(f"{self.folder} was adapted by {kept.guidance} guidance: leave out --guidance")
-            policy = kept.policy(view)
+        if (own := self.adapted) is not None:
+            if kinds and own.guidance not in kinds:
+                raise UserError(f"{self.folder} was adapted by {own.guidance} guidance: leave out --guidance")
+            policy = own.policy(view)
             policy = policy if name == "adapted" else policy.base
-            columns = (kept.lanes.seed, kept.lanes.budget, kept.bounds_deg)
-            return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
-        loaded, blocks = self.load(kinds), []
-        for lanes in loaded if failed_too else without_failed(loaded):
-            policy, failed = self._acting(name, lanes, view, teacher), np.asarray(lanes.policies["failed"])
+            columns = (own.lanes.seed, own.lanes.budget, own.bounds_deg)
+            return [Block(own.guidance, *columns, 0, policy, np.zeros(own.lanes.number, bool))]
+        groups, blocks = self.load(kinds), []
+        for lanes in groups if failed_too else without_failed(groups):
+            policy, mask = self._acting(name, lanes, view, teacher), np.asarray(lanes.policies["failed"])
             columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
-            blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, failed))
+            blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, mask))
         return blocks
 
     def _acting(self, name: str, lanes: RunLanes, view: Any, teacher: Teacher | None) -> Policy:
@@ -285,12 +285,12 @@ def several(
     Raises:
         UserError: there is no such lane.
     """
-    named = POLICIES[name]
-    if named.taught and env is None:
+    entry = POLICIES[name]
+    if entry.taught and env is None:
         env = source.task.environment(world)
-    teacher = source.task.make_teacher(world, env) if named.taught else None
+    teacher = source.task.make_teacher(world, env) if entry.taught else None
     view = source.task.view(world) if env is None else view_of(env)
-    if not named.kept:
+    if not entry.kept:
         check_no_lane(name, kind, labels, seeds, bound_deg)
         return [source.alone(name, view, teacher)], (0,)
     kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()

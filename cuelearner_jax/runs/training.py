@@ -39,11 +39,11 @@ def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]
     }
 
 
-def restore_clock(saved: Checkpoints) -> tuple[Clock, float, int, int]:
+def restore_clock(store: Checkpoints) -> tuple[Clock, float, int, int]:
     """Return the newest checkpoint's clock, seconds of training, number of blocks and lanes of a block."""
     like = {"clock": jax.eval_shape(start_clock), "wall_s": np.float32(0), "cut": np.zeros(2, np.int32)}
-    found = saved.restore({"clock": like})["clock"]
-    return found["clock"], float(found["wall_s"]), *found["cut"].tolist()
+    arrays = store.restore({"clock": like})["clock"]
+    return arrays["clock"], float(arrays["wall_s"]), *arrays["cut"].tolist()
 
 
 class Training:
@@ -52,15 +52,15 @@ class Training:
     Between two stretches `clock`, `blocks` and `wall` are the whole state.
     """
 
-    def __init__(self, group: LaneGroup, examined: Environment, split: str) -> None:
+    def __init__(self, group: LaneGroup, eval_env: Environment, split: str) -> None:
         """Start at the beginning.
 
         Args:
             group: the lanes.
-            examined, split: environment and episodes of evaluations, see `evaluate.SPLITS`.
+            eval_env, split: environment and episodes of evaluations, see `evaluate.SPLITS`.
         """
         self.group, self.split = group, split
-        self.examined = place(group.mesh, examined, SHARED)
+        self.eval_env = place(group.mesh, eval_env, SHARED)
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
         self.wall = 0.0  # seconds of labelling and training so far
@@ -69,20 +69,20 @@ class Training:
         """Start fresh lanes."""
         self.blocks = self.group.start()
 
-    def restore(self, saved: Checkpoints) -> None:
+    def restore(self, store: Checkpoints) -> None:
         """Continue from the newest checkpoint, in this group's cut of the lanes. Raises as `Checkpoints.restore`."""
-        group, (clock, self.wall, count, size) = self.group, restore_clock(saved)
+        group, (clock, self.wall, count, size) = self.group, restore_clock(store)
         self.clock = place(group.mesh, clock, SHARED)
         cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
         shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
-        found = saved.restore({name: shapes[name] for name in ("policy", "rest", "failed")})
+        arrays = store.restore({name: shapes[name] for name in ("policy", "rest", "failed")})
         blocks = [
             rest.replace(
                 agent=rest.agent.replace(params=policy["params"]),
                 guide=rest.guide.replace(model=policy["guidance"]),
-                failed=failed,
+                failed=mask,
             )
-            for policy, rest, failed in zip(found["policy"], found["rest"], found["failed"], strict=True)
+            for policy, rest, mask in zip(arrays["policy"], arrays["rest"], arrays["failed"], strict=True)
         ]
         self.blocks = group.recut(blocks)
 
@@ -109,9 +109,9 @@ class Training:
     def label_rounds(self, teacher: Teacher) -> Iterator[int]:
         """Ask a simulated teacher for all labels, round by round; yield the number of rounds so far."""
         while not self.labelled:
-            started = time.perf_counter()
+            start = time.perf_counter()
             self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks)
-            self.wall += time.perf_counter() - started
+            self.wall += time.perf_counter() - start
             if self.failed.all():
                 blame(self.group.env, teacher, jax.tree.map(lambda leaf: leaf[0], self.blocks[0].guide))
             yield self.round
@@ -125,20 +125,20 @@ class Training:
             for seeds, budgets in group.blocks()
         ]
         self.blocks = group.take_labels(rows, self.blocks)
-        taken = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
-        self.clock = place(group.mesh, taken, SHARED)
+        clock = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
+        self.clock = place(group.mesh, clock, SHARED)
 
     def guides(self, before: int) -> dict[str, Any]:
         """Return the columns of an evaluation of the guides alone after the rounds since `before`.
 
-        Scalars, or one entry for each lane whose guide is due, see `LaneGroup.examined`. Empty: none is due.
+        Scalars, or one entry for each lane whose guide is due, see `LaneGroup.due_guides`. Empty: none is due.
         """
         group, rounds = self.group, self.round
-        due = group.examined(rounds, before)
+        due = group.due_guides(rounds, before)
         if not due.any():
             return {}
         own = {"round": rounds, "step": self.step, "wall_s": self.wall}
-        each = {"seed": group.seeds, "labels": group.budgets, "asked": group.asked(rounds)}
+        each = {"seed": group.seeds, "labels": group.budgets, "asked": group.label_counts(rounds)}
         each |= {"failed": self.failed.astype(float), **self.guide_alone()}
         return {**own, **{name: values[due] for name, values in each.items()}}
 
@@ -160,24 +160,24 @@ class Training:
             yield {**self.evaluation(), **self.guide_alone()}
         iterations = schedule.eval_every // group.config.sizes.num_envs
         while self.step < schedule.total_steps:
-            started = time.perf_counter()
+            start = time.perf_counter()
             self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
-            self.wall += time.perf_counter() - started
-            trained = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
-            yield {**self.evaluation(), **self._of_finite(trained)}
+            self.wall += time.perf_counter() - start
+            columns = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
+            yield {**self.evaluation(), **self._of_finite(columns)}
 
     def evaluation(self) -> dict[str, Any]:
         """Return the columns of one evaluation of all agents: scalars, or (lanes,) with NaN for failed lanes."""
         group = self.group
         own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
         own |= {"failed": self.failed.astype(float), "episodes": self.group.config.schedule.eval_envs}
-        return {**own, **self._measured(lambda lane: self._policy(lane.agent.params, view_of(self.examined)))}
+        return {**own, **self._evaluate(lambda lane: self._policy(lane.agent.params, view_of(self.eval_env)))}
 
     def policies(self, view: Any) -> PolicyNode:
         """The finished policies of all lanes as they stand, for a world of that view."""
         params = [lane.agent.params for lane in self.blocks]
-        joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
-        return self._policy(joined, view)
+        whole = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
+        return self._policy(whole, view)
 
     def _policy(self, params: Params, view: Any) -> PolicyNode:
         return Agent(params, self.group.config.agent_in(view), view)
@@ -187,14 +187,14 @@ class Training:
         group, base = self.group, asked_from(self.group.env, self.group.config.sizes)
 
         def guide(lane: TrainState) -> PolicyNode:
-            return Guided(base, lane.guide.model, view_of(self.examined), group.config.scalars, group.guidance)
+            return Guided(base, lane.guide.model, view_of(self.eval_env), group.config.scalars, group.guidance)
 
-        return {f"guide_{name}": values for name, values in self._measured(guide).items() if values.ndim == 1}
+        return {f"guide_{name}": values for name, values in self._evaluate(guide).items() if values.ndim == 1}
 
-    def _measured(self, policy_of: Any) -> dict[str, np.ndarray]:
+    def _evaluate(self, policy_of: Any) -> dict[str, np.ndarray]:
         schedule, key = self.group.config.schedule, episodes(self.split)
         size = (schedule.eval_envs, schedule.eval_steps)
-        return self._of_finite(self.group.evaluate(policy_of, self.examined, key, *size, self.blocks))
+        return self._of_finite(self.group.evaluate(policy_of, self.eval_env, key, *size, self.blocks))
 
     def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Replace failed lanes' metrics (lanes, ...) by NaN, so that they never enter a mean unnoticed."""

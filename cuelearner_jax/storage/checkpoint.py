@@ -59,9 +59,9 @@ def _digests(flat: dict[str, Any]) -> dict[str, str]:
     """Return the SHA-256 of each array's shape, type and values."""
 
     def sha256(leaf: Any) -> str:
-        found = hashlib.sha256(f"{leaf.shape} {leaf.dtype}".encode())
-        found.update(np.ascontiguousarray(leaf).data)
-        return found.hexdigest()
+        hasher = hashlib.sha256(f"{leaf.shape} {leaf.dtype}".encode())
+        hasher.update(np.ascontiguousarray(leaf).data)
+        return hasher.hexdigest()
 
     with ThreadPoolExecutor() as pool:  # hashing releases the interpreter lock
         return dict(zip(flat, pool.map(sha256, flat.values()), strict=True))
@@ -118,14 +118,14 @@ class Checkpoints(AbstractContextManager):
             shape = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)  # noqa: E731
             args[name] = ocp.args.StandardRestore(jax.tree.map(shape, jax.eval_shape(_flat, item)))
         try:
-            restored = self._manager.restore(number, args=ocp.args.Composite(**args))
-            recorded = restored[DIGESTS]
-            if recorded.get("run", self._run) != self._run:
+            contents = self._manager.restore(number, args=ocp.args.Composite(**args))
+            digests = contents[DIGESTS]
+            if digests.get("run", self._run) != self._run:
                 raise ValueError("it belongs to another run")
             for name in like:
-                if _digests(restored[name]) != recorded[name]:
+                if _digests(contents[name]) != digests[name]:
                     raise ValueError(f"{name} is not what was written")
-            return {name: _unflat(restored[name], like[name]) for name in like}
+            return {name: _unflat(contents[name], like[name]) for name in like}
         except Exception as error:  # Orbax and TensorStore raise many exception types for damaged files
             # Orbax prints the method in place of TensorStore's details.
             words = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()

@@ -34,20 +34,20 @@ def in_use(out: Path) -> bool:
     return any(entry.name != LOCK and not entry.name.startswith(f".{CONFIG}.") for entry in out.iterdir())
 
 
-def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: bool) -> None:
-    """Raise UserError unless `out` may be resumed, overwritten or begun with `described` as its config.json."""
+def check_folder(out: Path, contents: dict[str, Any], resume: bool, overwrite: bool) -> None:
+    """Raise UserError unless `out` may be resumed, overwritten or begun with `contents` as its config.json."""
     if resume and overwrite:
         raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
-    used, ours = in_use(out), (out / CONFIG).is_file()
+    is_filled, ours = in_use(out), (out / CONFIG).is_file()
     if resume:
         if not ours:
             raise UserError(f"nothing to resume in {out}: give the --out of an interrupted run, or leave out --resume")
-        if differing := sorted(differences(formats.read("config", out / CONFIG), described)):
-            named = ", ".join(differing[:4])
-            raise UserError(f"{out} was run with other values of {named}: give the same options, or another --out")
-    elif used and not overwrite:
+        if differing := sorted(differences(formats.read("config", out / CONFIG), contents)):
+            names = ", ".join(differing[:4])
+            raise UserError(f"{out} was run with other values of {names}: give the same options, or another --out")
+    elif is_filled and not overwrite:
         raise UserError(f"{out} is not empty: give --resume to go on, --overwrite to delete it, or another --out")
-    elif used and not ours:
+    elif is_filled and not ours:
         raise UserError(f"{out} is not a run folder, so --overwrite will not delete it: give another --out")
 
 
@@ -74,7 +74,7 @@ def claimed(out: Path) -> Iterator[None]:
         yield
 
 
-def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
+def prepare_folder(out: Path, contents: dict[str, Any], clean: bool) -> None:
     """Make the folder and write config.json where missing; with `clean`, delete everything else in the folder.
 
     Links are removed without what they lead to. config.json is deleted last: without it the folder could not be
@@ -86,4 +86,4 @@ def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
             continue
         shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
     if not (out / CONFIG).exists():
-        formats.write("config", out / CONFIG, described)
+        formats.write("config", out / CONFIG, contents)

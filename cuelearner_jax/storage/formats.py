@@ -35,7 +35,7 @@ REMEDIES = {  # the remedy in the message about a damaged file, after its path
 Values = dict[str, Any]
 
 
-def damaged(kind: str, path: Path, reason: object = "") -> UserError:
+def damage_error(kind: str, path: Path, reason: object = "") -> UserError:
     """Return the error for a file that cannot be parsed; `reason` says why, where known."""
     return UserError(f"{path} {REMEDIES[kind]}{f' ({why})' if (why := first_line(reason)) else ''}")
 
@@ -48,10 +48,10 @@ def read(kind: str, path: Path) -> Values:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise damaged(kind, path) from error
+        raise damage_error(kind, path) from error
     check(kind, values, path)
     if values.pop(DIGEST, None) != configuration.digest(values):
-        raise damaged(kind, path)
+        raise damage_error(kind, path)
     return values
 
 
@@ -66,7 +66,7 @@ def check(kind: str, values: Any, path: Path) -> None:
     """Raise UserError unless a file's values have the current format of its kind (a key of `FORMATS`)."""
     number = values.get("format") if isinstance(values, dict) else None
     if type(number) is not int:
-        raise damaged(kind, path)
+        raise damage_error(kind, path)
     if number != FORMATS[kind]:
         raise UserError(
             f"{path} is of format {number}, this program reads format {FORMATS[kind]}: use the cuelearner that wrote "

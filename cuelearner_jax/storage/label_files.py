@@ -199,21 +199,21 @@ def read(path: Path) -> LabelFile:
 
     Raises UserError if the file is missing, damaged, of another format, or holds no labels.
     """
-    found = found_in(path)
-    if found is None or not found.is_file():
+    file = found_in(path)
+    if file is None or not file.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
-    table, head = _table_and_head(found)
+    table, head = _table_and_head(file)
     said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
     table = _standing(table)
     if head is None or not table.num_rows:
-        raise UserError(f"{found} holds no labels: collect some first")
+        raise UserError(f"{file} holds no labels: collect some first")
     try:
         columns = {name: _array(table[name], name) for name in table.column_names}
         labels = Label(**{name: columns[name] for name in ROW}, valid=np.ones(table.num_rows, bool))  # pyright: ignore[reportArgumentType]
         eps = None if head["eps"] is None else float(head["eps"])
         about = {"task": dict(head["task"]), "answers": head["answers"], "space": spaces.from_json(head["space"])}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise formats.damaged("labels", found, error) from error
+        raise formats.damage_error("labels", file, error) from error
     people = None
     if "item" in columns and not (columns["item"] < 0).any():
         people = People(*(columns[name] for name in People._fields))
@@ -229,8 +229,8 @@ def _standing(table: pa.Table) -> pa.Table:
     for row, (seed, item) in enumerate(zip(*(table[name].to_pylist() for name in ("seed", "item")), strict=True)):
         last[seed, row if item is None else item, item is None] = row
     said = table["said"].to_pylist()
-    kept = [row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if said[row] in (None, ANSWERED)]
-    return table.take(pa.array(kept, pa.int64()))
+    rows = [row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if said[row] in (None, ANSWERED)]
+    return table.take(pa.array(rows, pa.int64()))
 
 
 def digest(path: Path) -> str:
@@ -244,23 +244,23 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
     A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget. Raises
     UserError for a seed without labels, or with fewer than a lane's budget.
     """
-    kept = np.unique(file.seeds)
+    own_seeds = np.unique(file.seeds)
     sets = []
     for seed, budget in zip(seeds, budgets, strict=True):
-        own = kept[0] if len(kept) == 1 else seed
-        chosen = np.flatnonzero(file.seeds == own)
-        if own not in kept:
+        own = own_seeds[0] if len(own_seeds) == 1 else seed
+        rows = np.flatnonzero(file.seeds == own)
+        if own not in own_seeds:
             raise UserError(
-                f"the label file has labels for the seeds {format_numbers(kept.tolist())}, none for seed {seed}: "
+                f"the label file has labels for the seeds {format_numbers(own_seeds.tolist())}, none for seed {seed}: "
                 "give --first-seed and --seeds (train: --seed) for these, or the labels of another run"
             )
-        if len(chosen) < budget:
+        if len(rows) < budget:
             raise UserError(
-                f"the label file has {len(chosen)} labels for seed {seed}, the budget is {budget}: "
+                f"the label file has {len(rows)} labels for seed {seed}, the budget is {budget}: "
                 "lower --labels or collect more"
             )
-        chosen = chosen[:budget]
-        sets.append(jax.tree.map(lambda leaf, rows=chosen: _padded(leaf[rows], slots), file.labels))
+        rows = rows[:budget]
+        sets.append(jax.tree.map(lambda leaf, rows=rows: _pad(leaf[rows], slots), file.labels))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
 
 
@@ -297,5 +297,5 @@ def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
     return np.array(column.to_pylist(), np.float32)
 
 
-def _padded(rows: np.ndarray, slots: int) -> np.ndarray:
+def _pad(rows: np.ndarray, slots: int) -> np.ndarray:
     return np.concatenate([rows, np.zeros((slots - len(rows), *rows.shape[1:]), rows.dtype)])

@@ -88,14 +88,14 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str
     features = _features(path)
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
     parts = [_parts(path, features, name, cameras) for name in (OBSERVATION, ACTION)]
-    intervened = [INTERVENTION] if INTERVENTION in features else []
-    stored = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
+    marks = [INTERVENTION] if INTERVENTION in features else []
+    images = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
     files = sorted((path / "data").glob("chunk-*/file-*.parquet"))
     if not files:
-        raise _damaged(path / "data", "no frames")
-    columns = [*parts[0], *parts[1], "episode_index", "timestamp", *stored, *intervened]
+        raise _damage_error(path / "data", "no frames")
+    columns = [*parts[0], *parts[1], "episode_index", "timestamp", *images, *marks]
     table = pa.concat_tables([_parquet(file, columns) for file in files], promote_options="permissive")
-    for name in intervened:
+    for name in marks:
         table = table.filter(pa.array(_vectors(path, table, name, 1)[:, 0] == 0))
     none = np.zeros((len(table), 0), np.float32)
     observations, actions = (
@@ -106,7 +106,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str
     return observations, actions, names, entries, _frames(path, features, table, cameras[0]) if cameras else None
 
 
-def _damaged(path: Path, why: object) -> UserError:
+def _damage_error(path: Path, why: object) -> UserError:
     return UserError(f"{path} cannot be read ({why}): restore it from where the dataset came from")
 
 
@@ -132,7 +132,7 @@ def _features(path: Path) -> dict[str, Any]:
         info = json.loads((path / INFO).read_text(encoding="utf-8"))
         version, features = info["codebase_version"], dict(info["features"])
     except (ValueError, KeyError, TypeError) as error:
-        raise _damaged(path / INFO, error) from error
+        raise _damage_error(path / INFO, error) from error
     if version != VERSION:
         raise UserError(
             f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is needed: convert it by "
@@ -150,16 +150,16 @@ def _parquet(file: Path, columns: list[str]) -> pa.Table:
     try:
         return pq.read_table(file, columns=columns)
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        raise _damaged(file, error) from error
+        raise _damage_error(file, error) from error
 
 
 def _vectors(path: Path, table: pa.Table, key: str, size: int) -> Float[np.ndarray, "n size"]:
     try:
-        found = np.asarray(table[key].to_pylist(), np.float32)
-        found = found.reshape(-1, 1) if size == 1 else found
-        if found.shape != (len(table), size):
+        values = np.asarray(table[key].to_pylist(), np.float32)
+        values = values.reshape(-1, 1) if size == 1 else values
+        if values.shape != (len(table), size):
             raise ValueError
-        return found
+        return values
     except (TypeError, ValueError) as error:
         raise UserError(f"{path}: {key} does not hold {size} numbers in every frame: leave the others out") from error
 
@@ -188,7 +188,7 @@ def _flat(names: Any) -> list[str]:
 def _frames(path: Path, features: dict[str, Any], table: pa.Table, key: str) -> Frames:
     """Return a function from a row to its camera picture."""
     if features[key]["dtype"] == "image":
-        return lambda row: _embedded(path, key, table[key][row].as_py())
+        return lambda row: _read_embedded(path, key, table[key][row].as_py())
     names = [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     starts: dict[int, list[Any]] = {}
     for file in sorted((path / "meta/episodes").glob("chunk-*/file-*.parquet")):
@@ -201,23 +201,23 @@ def _frames(path: Path, features: dict[str, Any], table: pa.Table, key: str) -> 
         if chunk is None or number is None or start is None or not math.isfinite(start + timestamp):
             raise UserError(f"{path / 'meta/episodes'} does not say where episode {episode} begins: restore it")
         video = inside(path, VIDEO.format(key=key, chunk=chunk, file=number), "the video")
-        return Picture(_decoded(video, start + timestamp), "image/png")
+        return Picture(_decode_frame(video, start + timestamp), "image/png")
 
     return frame
 
 
-def _embedded(path: Path, key: str, stored: Any) -> Picture:
+def _read_embedded(path: Path, key: str, value: Any) -> Picture:
     """Return the picture stored in a row, as {"bytes": ..., "path": ...}, or in a file that the row names."""
-    data, name = (stored.get(part) for part in ("bytes", "path")) if isinstance(stored, dict) else (None, None)
+    data, name = (value.get(part) for part in ("bytes", "path")) if isinstance(value, dict) else (None, None)
     if data is None and isinstance(name, str):
         return read_picture(path, name)
     if not isinstance(data, bytes):
-        raise _damaged(path, f"a frame of {key} holds no picture")
+        raise _damage_error(path, f"a frame of {key} holds no picture")
     return Picture(data, "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png")
 
 
 @lru_cache(maxsize=64)
-def _decoded(file: Path, time: float) -> bytes:
+def _decode_frame(file: Path, time: float) -> bytes:
     """Return the frame nearest to a time [s] of a video, as PNG. Raises UserError if there is none.
 
     The video's own rate may differ from the dataset's.
@@ -231,7 +231,7 @@ def _decoded(file: Path, time: float) -> bytes:
         picture = Image.frombytes("RGB", next(frames)["size"], next(frames))
         frames.close()
     except (OSError, RuntimeError, StopIteration, ZeroDivisionError) as error:
-        raise _damaged(file, f"no frame at {time:.3f} s") from error
-    stored = io.BytesIO()
-    picture.save(stored, "PNG")
-    return stored.getvalue()
+        raise _damage_error(file, f"no frame at {time:.3f} s") from error
+    data = io.BytesIO()
+    picture.save(data, "PNG")
+    return data.getvalue()

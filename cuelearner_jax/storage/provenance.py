@@ -20,11 +20,11 @@ def provenance() -> dict[str, str]:
     from cuelearner_jax.devices import numerics
 
     packages = ("cuelearner-jax", "jax", "jaxlib", "flax", "optax", "numpy")
-    found = [(name, _version(name)) for name in packages]
+    pairs = [(name, _version(name)) for name in packages]
     kinds = [device.device_kind for device in jax.devices()]
     return {
         "commit": _commit(),
-        "versions": ", ".join([f"python {sys.version.split()[0]}", *(f"{n} {v}" for n, v in found if v), numerics()]),
+        "versions": ", ".join([f"python {sys.version.split()[0]}", *(f"{n} {v}" for n, v in pairs if v), numerics()]),
         "hardware": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in dict.fromkeys(kinds)),
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     }

@@ -91,7 +91,7 @@ def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
 
     `schema` is that of the wanted tables. Raises UserError if no file is at a path or below it.
     """
-    found: dict[Path, Path] = {}
+    by_path: dict[Path, Path] = {}
     for path in map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths):
         files = [path] if path.is_file() else sorted([*path.rglob(schema.jsonl), *path.rglob(schema.parquet)])
         if not files:
@@ -100,8 +100,8 @@ def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
             # Both exist only after a crash between writing one and removing the other; they then hold equal rows.
             whole = file.with_name(schema.parquet)
             file = whole if file.name == schema.jsonl and whole.exists() else file  # noqa: PLW2901
-            found[file.resolve()] = file
-    return list(found.values())
+            by_path[file.resolve()] = file
+    return list(by_path.values())
 
 
 def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> pa.Table:
@@ -148,8 +148,8 @@ def failures(table: pa.Table) -> dict[tuple[str, int, int], int]:
     """Return the failed lanes of a results table, each with the first step marked as failed, in order."""
     if FAILED not in table.column_names:
         return {}
-    marked = table.filter(pc.field(FAILED) == 1.0)
-    first = marked.group_by(list(LANE)).aggregate([("step", "min")]).to_pylist()
+    rows = table.filter(pc.field(FAILED) == 1.0)
+    first = rows.group_by(list(LANE)).aggregate([("step", "min")]).to_pylist()
     return dict(sorted((tuple(row[name] for name in LANE), row["step_min"]) for row in first))
 
 

@@ -67,11 +67,11 @@ def read(path: Path) -> Situations:
         UserError: nothing to read, missing columns, sizes that do not fit, or a number that is not finite.
     """
     if lerobot.is_dataset(path):
-        return _checked(path, *lerobot.read(path))
+        return _situations_of(path, *lerobot.read(path))
     table = _table_in(path)
     columns = _columns(table)
-    known = (OBSERVATION, ACTION, PICTURE, TEXT, PHASE)
-    if strange := [name for name in columns if name not in known and name.partition(".")[0] not in known[:2]]:
+    standard = (OBSERVATION, ACTION, PICTURE, TEXT, PHASE)
+    if strange := [name for name in columns if name not in standard and name.partition(".")[0] not in standard[:2]]:
         raise UserError(
             f"{table} has an unknown column {format_value(strange[0])}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
             "or leave it out"
@@ -79,19 +79,19 @@ def read(path: Path) -> Situations:
     observations, names = _matrix(table, columns, OBSERVATION)
     actions, entries = _matrix(table, columns, ACTION)
     files, texts = columns.get(PICTURE), columns.get(TEXT)
-    if len({len(observations), len(actions), *(len(columns[name]) for name in known[2:] if name in columns)}) > 1:
+    if len({len(observations), len(actions), *(len(columns[name]) for name in standard[2:] if name in columns)}) > 1:
         raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
 
     def picture(row: int) -> Picture | None:
         return read_picture(table.parent, str(files[row])) if files is not None and files[row] else None
 
     phase = _numbers(table, PHASE, columns[PHASE], 1) if PHASE in columns else None
-    read = _checked(table, observations, actions, names, entries, None if files is None else picture, phase)
+    situations = _situations_of(table, observations, actions, names, entries, None if files is None else picture, phase)
     text: Callable[[int], str] = lambda row: str(texts[row] or "") if texts is not None else ""  # noqa: E731
-    return read._replace(text=text, bounds=_bounds(table, actions.shape[1]))
+    return situations._replace(text=text, bounds=_bounds(table, actions.shape[1]))
 
 
-def _checked(
+def _situations_of(
     path: Path,
     observations: np.ndarray,
     actions: np.ndarray,
@@ -129,11 +129,11 @@ def _checked(
 
 def _bounds(table: Path, size: int) -> tuple[list[float], list[float]] | None:
     """Return the bounds in a table's metadata. Raises UserError where they do not fit its actions."""
-    stored = (pq.read_schema(table).metadata or {}).get(b"cuelearner") if table.suffix == ".parquet" else None
-    if stored is None:
+    text = (pq.read_schema(table).metadata or {}).get(b"cuelearner") if table.suffix == ".parquet" else None
+    if text is None:
         return None
     try:
-        bounds = json.loads(stored)
+        bounds = json.loads(text)
         low, high = (np.asarray(bounds[name], float).reshape(size).tolist() for name in ("low", "high"))
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{table} has metadata that tell no bounds of {size} entries: write the table anew") from error
@@ -144,24 +144,24 @@ def _table_in(path: Path) -> Path:
     """Return the only table in a folder, or the given table."""
     if path.is_file() and path.suffix in SUFFIXES:
         return path
-    found = [path / f"{STEM}{suffix}" for suffix in SUFFIXES if (path / f"{STEM}{suffix}").is_file()]
-    if len(found) != 1:
+    tables = [path / f"{STEM}{suffix}" for suffix in SUFFIXES if (path / f"{STEM}{suffix}").is_file()]
+    if len(tables) != 1:
         if not path.exists():
             raise UserError(f"there is no folder of situations at {path}: give one that holds {STEM}.parquet")
-        there = f"holds {' and '.join(table.name for table in found)}" if found else "is no LeRobot dataset either"
+        there = f"holds {' and '.join(table.name for table in tables)}" if tables else "is no LeRobot dataset either"
         raise UserError(
             f"{path} {there}: give the path of one table, or a folder with one {STEM}.parquet, .csv or .npz with the "
             f"columns {OBSERVATION} and {ACTION}"
         )
-    return found[0]
+    return tables[0]
 
 
 def _columns(table: Path) -> dict[str, Any]:
     """Return the columns of a table by name."""
     try:
         if table.suffix == ".npz":
-            with np.load(table, allow_pickle=False) as stored:
-                return {name: stored[name] for name in stored.files}
+            with np.load(table, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
         rows: pa.Table = csv.read_csv(table) if table.suffix == ".csv" else pq.ParquetFile(table).read()
     except (pa.ArrowException, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         why = " ".join(str(error).split())[:120]
@@ -199,10 +199,10 @@ def _numbers(table: Path, name: str, values: Any, axes: int) -> np.ndarray:
     """Convert a column to 32-bit floats. Raises UserError for rows of several sizes, or non-numbers."""
     try:
         with np.errstate(over="ignore"):
-            found = np.asarray(values, np.float32)
-        if found.size and found.ndim != axes:
+            array = np.asarray(values, np.float32)
+        if array.size and array.ndim != axes:
             raise ValueError
     except (TypeError, ValueError):
-        wanted = "the same number of numbers" if axes == 2 else "one number"
-        raise UserError(f"{table}: give {wanted} in every row of the column {name}") from None
-    return found if found.size else np.zeros((len(found), 0)[:axes], np.float32)
+        what = "the same number of numbers" if axes == 2 else "one number"
+        raise UserError(f"{table}: give {what} in every row of the column {name}") from None
+    return array if array.size else np.zeros((len(array), 0)[:axes], np.float32)

@@ -74,7 +74,7 @@ class Schema:
         """Whether a column holds lists."""
         return name.endswith(self.lists)
 
-    def typed(self, table: pa.Table, metadata: dict[bytes, bytes] | None = None) -> pa.Table:
+    def cast(self, table: pa.Table, metadata: dict[bytes, bytes] | None = None) -> pa.Table:
         """Return a table with the columns' types and other metadata."""
         return table.cast(pa.schema([(name, self.type(name)) for name in table.column_names], metadata))
 
@@ -98,7 +98,7 @@ class TableWriter(contextlib.AbstractContextManager):
         """
         self.path, self._schema = Path(folder) / schema.jsonl, schema
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        lines = _reopened(self.path, schema)
+        lines = _reopen(self.path, schema)
         self._file = self.path.open("ab", buffering=0)
         if about is not None and not any("about" in line for line in lines):
             self._put([{"about": about}])
@@ -147,7 +147,7 @@ class TableWriter(contextlib.AbstractContextManager):
 def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
     """Drop a folder's rows for which `keep` is false, and a torn last line; do nothing without a table."""
     path = Path(folder) / schema.jsonl
-    if lines := _reopened(path, schema):
+    if lines := _reopen(path, schema):
         _rewrite(path, [line for line in lines if line.keys() & HEADS or keep(line)])
 
 
@@ -170,7 +170,7 @@ def finish(folder: PathLike, schema: Schema) -> Path:
 
 def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None, fresh: bool = False) -> None:
     """Write a whole table as Parquet, atomically. `about`: its description. `fresh`: see `whole.replacing`."""
-    table = schema.typed(table, _metadata(about))
+    table = schema.cast(table, _metadata(about))
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), DIGEST: digest(table)})
     with replacing(path, "wb", fresh) as file:
         pq.write_table(table, file, compression="zstd", write_page_checksum=True)
@@ -178,20 +178,20 @@ def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None,
 
 def digest(table: pa.Table) -> str:
     """Return the SHA-256 of a table's column names, types and values, in order, and of its description."""
-    found = hashlib.sha256((table.schema.metadata or {}).get(META, b""))
+    hasher = hashlib.sha256((table.schema.metadata or {}).get(META, b""))
     for name in table.column_names:
         column = table[name].combine_chunks()
-        found.update(json.dumps([name, str(column.type), len(column)]).encode())
+        hasher.update(json.dumps([name, str(column.type), len(column)]).encode())
         if pa.types.is_list(column.type):
-            found.update(np.asarray(column.value_lengths().fill_null(-1)).tobytes())
+            hasher.update(np.asarray(column.value_lengths().fill_null(-1)).tobytes())
             column = column.flatten()
         if pa.types.is_string(column.type):
             column = column.dictionary_encode()
-            found.update(json.dumps(column.dictionary.to_pylist()).encode())
+            hasher.update(json.dumps(column.dictionary.to_pylist()).encode())
             column = column.indices
-        found.update(np.asarray(column.is_null()).tobytes())
-        found.update(np.asarray(column.fill_null(0)).tobytes())
-    return found.hexdigest()
+        hasher.update(np.asarray(column.is_null()).tobytes())
+        hasher.update(np.asarray(column.fill_null(0)).tobytes())
+    return hasher.hexdigest()
 
 
 def read(path: Path, schema: Schema) -> pa.Table:
@@ -204,26 +204,26 @@ def read(path: Path, schema: Schema) -> pa.Table:
             table = _growing(path, schema)
         else:
             with path.open("rb") as file:
-                stored = pq.ParquetFile(file).read()
-            table = schema.typed(stored, stored.schema.metadata)
+                raw = pq.ParquetFile(file).read()
+            table = schema.cast(raw, raw.schema.metadata)
             if (table.schema.metadata or {}).get(DIGEST, b"").decode() != digest(table):
                 raise ValueError("its contents are not those that were written")
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException, OSError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # not one of Arrow's own
             raise
         raise UserError(f"{path} {schema.remedy} ({first_line(error)})") from error
-    missing = [name for name in schema.required if name not in table.column_names]
-    if missing and table.num_rows:
+    absent = [name for name in schema.required if name not in table.column_names]
+    if absent and table.num_rows:
         raise UserError(
-            f"{path} lacks the columns {', '.join(missing)}: it is not a table of {schema.stem} of this package"
+            f"{path} lacks the columns {', '.join(absent)}: it is not a table of {schema.stem} of this package"
         )
     return table
 
 
 def about_of(table: pa.Table) -> Row | None:
     """Return a table's description."""
-    described = (table.schema.metadata or {}).get(META)
-    return None if described is None else json.loads(described)
+    text = (table.schema.metadata or {}).get(META)
+    return None if text is None else json.loads(text)
 
 
 def _metadata(about: Row | None) -> dict[bytes, bytes]:
@@ -253,7 +253,7 @@ def _rewrite(path: Path, rows: Iterable[Row]) -> None:
         file.write(_text(rows))
 
 
-def _reopened(path: Path, schema: Schema) -> list[Row]:
+def _reopen(path: Path, schema: Schema) -> list[Row]:
     """Return a table's lines, to be continued: a finished table becomes JSONL again, a torn last line is cut off."""
     whole = path.with_name(schema.parquet)
     if whole.exists() and not path.exists():
@@ -281,4 +281,4 @@ def _growing(path: Path, schema: Schema) -> pa.Table:
     # Integers are cast last, since Arrow would truncate a fractional value.
     types = {name: None if name in schema.integers else schema.type(name) for name in names}
     table = pa.table({name: pa.array(column, types[name]) for name, column in columns.items()})
-    return schema.typed(table, _metadata(about))
+    return schema.cast(table, _metadata(about))

@@ -23,7 +23,7 @@ class TensorBoard:
 
     package = "tensorboardX"
 
-    def __init__(self, folder: Path, described: dict[str, Any], step: int) -> None:
+    def __init__(self, folder: Path, contents: dict[str, Any], step: int) -> None:
         """Continue in a folder; points written after `step` are discarded."""
         writer = importlib.import_module(self.package).SummaryWriter
         self._writer = writer(str(folder), purge_step=step + 1 if step else None)
@@ -41,14 +41,14 @@ class Wandb:
 
     package = "wandb"
 
-    def __init__(self, folder: Path, described: dict[str, Any], step: int) -> None:
+    def __init__(self, folder: Path, contents: dict[str, Any], step: int) -> None:
         """Start a wandb run below the folder, named after the folders above; a resumed run gets a new one."""
         folder.mkdir(parents=True, exist_ok=True)
         kind, run = folder.parent.name, folder.parent.parent.name
         self._run = importlib.import_module(self.package).init(
             mode="offline",
             dir=str(folder),
-            config=described,
+            config=contents,
             reinit="create_new",
             project="cuelearner",
             group=run,
@@ -77,10 +77,10 @@ def check(name: str | None) -> None:
 
 
 def open_tracker(
-    name: str | None, folder: Path, described: dict[str, Any], step: int
+    name: str | None, folder: Path, contents: dict[str, Any], step: int
 ) -> AbstractContextManager[Tracker | None]:
     """Open a tracker that writes below a folder, continuing after `step`; None without a name."""
-    return nullcontext() if name is None else closing(TRACKERS[name](folder / name, described, step))
+    return nullcontext() if name is None else closing(TRACKERS[name](folder / name, contents, step))
 
 
 def means(row: dict[str, Any]) -> dict[str, float]:
@@ -89,11 +89,11 @@ def means(row: dict[str, Any]) -> dict[str, float]:
     Args:
         row: the columns of one evaluation: scalars, or one entry per lane; "labels" gives the lanes' budgets.
     """
-    budgets, found = np.asarray(row["labels"]), {}
+    budgets, result = np.asarray(row["labels"]), {}
     for name in (name for name in row.keys() - set(LANE) if np.ndim(row[name]) < 2):
         values = np.broadcast_to(np.asarray(row[name], float), budgets.shape)
         for budget in np.unique(budgets):
             own = values[(budgets == budget) & np.isfinite(values)]
             if len(own):
-                found[f"{name}/labels_{budget}"] = float(own.mean())
-    return dict(sorted(found.items()))
+                result[f"{name}/labels_{budget}"] = float(own.mean())
+    return dict(sorted(result.items()))

@@ -26,16 +26,16 @@ def hold(lock: Path, what: Path) -> Iterator[None]:
 
     Raises UserError if another process holds the lock.
     """
-    held = FileLock(lock, blocking=False)
+    file_lock = FileLock(lock, blocking=False)
     try:
-        held.acquire()
+        file_lock.acquire()
     except Timeout:
         raise UserError(f"{what} is being written by another process: wait for it, or give another --out") from None
     try:
         yield
     finally:
         lock.unlink(missing_ok=True)
-        held.release()
+        file_lock.release()
 
 
 @contextmanager

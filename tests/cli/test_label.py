@@ -111,7 +111,7 @@ def asked_for(monkeypatch, *arguments):
         found.extend([asked, plan, commands])
         return server.Ending("40 of 50 labels are saved", commands.following(40), commands.again)
 
-    monkeypatch.setattr(label, "_served", served)
+    monkeypatch.setattr(label, "_serve", served)
     assert main(["label", *arguments]) == 0
     return found
 

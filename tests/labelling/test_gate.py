@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from cuelearner_jax.labelling.server import guarded
+from cuelearner_jax.labelling.server import guard
 
 TOKEN = "right"
 HOST, ORIGIN, COOKIE = "127.0.0.1:8123", "http://127.0.0.1:8123", f"cuelearner-8123={TOKEN}"
@@ -30,7 +30,7 @@ def talk(kind="http", query="", **headers):
     async def send(message):
         sent.append(message)
 
-    asyncio.run(guarded(inner, 8123, TOKEN)(scope, receive, send))
+    asyncio.run(guard(inner, 8123, TOKEN)(scope, receive, send))
     return sent
 
 

@@ -126,7 +126,7 @@ def test_a_session_opened_again_goes_on_where_it_stopped(opened, tmp_path):
     give(again, 2)
     assert again.number == 11
     give(again, 9)
-    assert again.done
+    assert again.is_done
     assert again.item is None
     assert not again.answer(20, np.zeros(1))
     assert label_files.read(tmp_path / "labels").people.item.tolist() == list(range(20))
@@ -171,7 +171,7 @@ def test_a_session_is_finished_once_and_takes_nothing_afterwards(opened, tmp_pat
         session.finish()
     give(session, 2)
     file = session.finish()
-    assert (file, session.finish(), session.done, session.item) == (tmp_path / "labels" / PARQUET, file, True, None)
+    assert (file, session.finish(), session.is_done, session.item) == (tmp_path / "labels" / PARQUET, file, True, None)
     assert not session.answer(2, np.ones(1))
     assert not session.undo(2)
     assert label_files.read(file).people.item.tolist() == [0, 1]
@@ -222,7 +222,7 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
         np.testing.assert_array_equal(second.item.action, item.action)
         turned = expert(item) if item.number < 6 else np.ones(1) - np.abs(expert(item))
         second.answer(item.number, turned)
-    assert second.done
+    assert second.is_done
     theirs = label_files.read(tmp_path / "second")
     found = comparing.between(file, theirs, ENV)
     same = sum(bool(expert(item)[0] == (1 - abs(expert(item)[0]))) for item in items[6:])

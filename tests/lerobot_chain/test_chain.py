@@ -41,7 +41,7 @@ def answer_all(arguments: list[str], out: Path) -> None:
     ahead = look_ahead_of(arguments, "label", label.LabelOptions)
     task = recorded_or_task(ahead)
     _, preset = preset_of(task, None)
-    options = parse(label.LabelOptions, arguments, "label", label._suggested(task, preset, None, ahead, None))
+    options = parse(label.LabelOptions, arguments, "label", label._defaults(task, preset, None, ahead, None))
     with Session(label.make_plan(task, preset.config, options), out) as session:
         space = session.questions.space
         while (item := session.item) is not None:
