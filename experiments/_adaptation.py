@@ -273,14 +273,14 @@ def open_bench(folder: Path, study: Study, piece: Piece, scale: Scale) -> Bench:
     own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
     world = dataclasses.replace(world, **own)
     env = environment(source.task.name, world, "training", piece.robot)
-    policies, seeds = several(source, world, "agent", None, None, source.grid.seeds, env=env)
+    policies, _ = several(source, world, "agent", None, None, source.grid.seeds, env=env)
     agents = side_by_side(policies)
     if scale.directions:
         agents = agents.replace(
             sizes=dataclasses.replace(agents.sizes, directions=scale.directions, coarse_directions=0)
         )
     steps = scale.steps if source.task.longest is None else source.task.longest(world)
-    return Bench(source.task, config, agents, np.array(seeds), world, piece, scale.envs, steps)
+    return Bench(source.task, config, agents, np.array(source.grid.seeds), world, piece, scale.envs, steps)
 
 
 def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, resume: bool) -> None:

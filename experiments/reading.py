@@ -118,8 +118,8 @@ def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, An
     source = PolicySource.of_folder(folder, registry.find)
     assert source.grid is not None
     env = task.environment(source.config.task)
-    policies, seeds = several(source, source.config.task, "agent", None, None, source.grid.seeds, env=env)
-    return source.config.task, source.config.scalars, dict(zip(map(int, seeds), policies, strict=True))
+    policies, _ = several(source, source.config.task, "agent", None, None, source.grid.seeds, env=env)
+    return source.config.task, source.config.scalars, dict(zip(source.grid.seeds, policies, strict=True))
 
 
 def worth(world: World, policy: Any, split: str, steps: int) -> float:

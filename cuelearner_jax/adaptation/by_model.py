@@ -43,7 +43,7 @@ class AdaptationResult:
 
     of: Adaptation
     lanes: Lanes
-    block: Any  # `LaneState`, or `by_reading.Evidence`
+    block: Any  # `LaneState`, or `by_reading.ReadingLanes`
     judged: Judgement
     results: tuple[Result, ...] = ()  # reading only: each lane's estimates
 
@@ -136,10 +136,10 @@ def adapt(
             if block.failed.all():
                 blame(placed, asks, block)
         tell(number, number)
-    return finished(judge, block, count)
+    return result_of(judge, block, count)
 
 
-def finished(judge: Judge, block: Any, count: int, results: tuple[Result, ...] = ()) -> AdaptationResult:
+def result_of(judge: Judge, block: Any, count: int, results: tuple[Result, ...] = ()) -> AdaptationResult:
     """Judge a block's first `count` lanes and take out corrections that are not used."""
     judged, block = judge.judge_lanes(block)
     block = judge.of.keep_used(block, jnp.asarray(judged.used))

@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax.adaptation.by_model import AdaptationResult, finished
+from cuelearner_jax.adaptation.by_model import AdaptationResult, result_of
 from cuelearner_jax.adaptation.judging import Judge, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
 from cuelearner_jax.devices import lane_mesh
@@ -110,7 +110,7 @@ def adapt(
         failed=jnp.zeros(lanes.number, bool),
     )
     judge = Judge(of, lanes, how, lane_mesh(jax.local_devices()[:1]), watch)
-    return finished(judge, block, lanes.number, tuple(results))
+    return result_of(judge, block, lanes.number, tuple(results))
 
 
 def _asked(

@@ -97,10 +97,11 @@ class Judge:
         """
         how, lanes = self.how, self.lanes
         if how.by == LABELS:
-            by_evidence = self.of.guidance.by_evidence
-            columns = (np.zeros(lanes.number), block.evidence, block.used) if by_evidence else None
+            if self.of.guidance.by_evidence:
+                before_after_used = np.zeros(lanes.number), block.evidence, block.used
+            else:
+                before_after_used = judged_by_labels(self.of, block)
             unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
-            before_after_used = columns or judged_by_labels(self.of, block)
             return Judgement(LABELS, *before_after_used, bounds_of(self.of, block), unknown, none), block
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
         if how.person is not None:

@@ -52,20 +52,19 @@ def run(arguments: list[str]) -> None:
     env = source.task.environment(options.task)
     if options.only_correction and source.adapted is not None:
         source = replace(source, adapted=replace(source.adapted, code=source.adapted.code or uniform_in(env)))
-    policy = options.policy_in(source, options.task, env)
+    (policy,), (lane,) = options.lanes_in(source, options.task, env)
     draw, view = (lambda: decisions.observations(env, policy)), env
     if options.only_correction:
         policy, view = correction.correction_of(policy, env)
         draw = lambda: correction.cases(env)  # noqa: E731
-    lane = {option: getattr(options, option) for option in ("guidance", "labels", "seed", "bound_deg")}
-    if source.grid and trained.POLICIES[name].trained:
-        lane |= source.lane(options.guidance, options.labels, options.seed)
-        words = ", ".join(f"{option} {lane[option]}" for option in ("guidance", "labels", "seed"))
+    if trained.POLICIES[name].trained:
+        words = ", ".join(f"{option} {value}" for option, value in lane.items())
         out.print(f"the run's lane of {words}; choose by --guidance, --labels and --seed")
     origin = {
         "subject": source.folder.name,
         "policy": name,
-        **{option: value for option, value in lane.items() if value is not None},
+        **lane,
+        **({} if options.bound_deg is None else {"bound_deg": options.bound_deg}),
         "world": {"name": source.task.name, **to_json(options.task)},
         "config": digest(to_json(source.config)),
     }

@@ -46,7 +46,8 @@ class _Output(Console):
         if not self.is_terminal or width > self.width:
             table.box, table.caption, below = None, None, table.caption
             self.print(table, width=max(width, 80))
-            self.print(below or "", end="\n" if below else "")
+            if below:
+                self.print(below)
         else:
             self.print(table)
 

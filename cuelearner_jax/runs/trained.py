@@ -171,14 +171,6 @@ class PolicySource:
             groups += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
         return groups
 
-    def lane(self, guidance: str | None, labels: int | None, seed: int | None) -> dict[str, Any]:
-        """Return guidance, labels and seed of a run's lane, by default the last kind, largest budget and first seed."""
-        assert self.grid is not None
-        name = guidances.kind_name(guidance) if guidance else self.grid.guidance[-1]
-        seeds, budgets = self.grid.lanes(guidances.find(name))
-        most, first = int(budgets.max()), int(seeds[0])
-        return {"guidance": name, "labels": most if labels is None else labels, "seed": first if seed is None else seed}
-
     def alone(self, name: str, view: Any, teacher: Teacher | None = None) -> Policy:
         """Return a policy that belongs to no lane, in a view of a world; `teacher`: that world's."""
         if name == "own":
@@ -267,10 +259,10 @@ def several(
     seeds: tuple[int, ...],
     bound_deg: float | None = None,
     env: Any = None,
-) -> tuple[list[Any], tuple[int, ...]]:
-    """Return single policies of a folder's lanes that differ only in their seeds, and the seeds.
+) -> tuple[list[Any], list[dict[str, Any]]]:
+    """Return single policies of a folder's lanes that differ only in their seeds, and what chooses each lane.
 
-    A policy of the task alone has seed 0.
+    That is its "guidance", "labels" and "seed"; a policy of the task alone has the seed 0.
 
     Args:
         source: the policies' origin.
@@ -292,13 +284,14 @@ def several(
     view = source.task.view(world) if env is None else view_of(env)
     if not entry.kept:
         check_no_lane(name, kind, labels, seeds, bound_deg)
-        return [source.alone(name, view, teacher)], (0,)
+        return [source.alone(name, view, teacher)], [{"seed": 0}]
     kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
     blocks = source.blocks(name, view, teacher, kinds, failed_too=True)
     budget = int(max(block.budgets.max() for block in blocks)) if labels is None else labels
     bound = float(max(block.bounds.max() for block in blocks)) if bound_deg is None else bound_deg
-    seeds = seeds or (int(blocks[0].seeds[0]),)
-    return [_lane(blocks, seed, budget, bound, actions_of(view).unit) for seed in seeds], seeds
+    seeds, unit = seeds or (int(blocks[0].seeds[0]),), actions_of(view).unit
+    lanes = [{"guidance": blocks[0].guidance, "labels": budget, "seed": seed} for seed in seeds]
+    return [_lane(blocks, seed, budget, bound, unit) for seed in seeds], lanes
 
 
 def _lane(blocks: list[Block], seed: int, budget: int, bound: float, unit: str) -> Any:

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,48 +25,12 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from cuelearner_jax.errors import UserError, format_value
+from cuelearner_jax.storage.picture_files import Picture, inside, read_picture
 
 INFO = Path("meta/info.json")
 VERSION = "v3.0"  # of the format
 VIDEO = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
 OBSERVATION, ACTION, INTERVENTION = "observation", "action", "intervention"
-KINDS = {
-    ".png": "image/png",
-    ".jpg": "image/jpeg",
-    ".jpeg": "image/jpeg",
-    ".gif": "image/gif",
-    ".mp4": "video/mp4",
-}
-
-
-class Picture(NamedTuple):
-    """A picture or a short clip as stored in a file."""
-
-    data: bytes
-    kind: str  # media type, one of `KINDS`
-
-
-def inside(folder: Path, name: str, what: str) -> Path:
-    """Return the path of a file below a folder. Raises UserError for a name that leads out of the folder.
-
-    Links are followed: datasets lie in the hub's cache as links to files elsewhere.
-    """
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise UserError(f"{what} {format_value(name)} leads out of {folder}: give the name of a file in that folder")
-    return folder / name
-
-
-def read_picture(folder: Path, name: str) -> Picture:
-    """Read a picture below a folder. Raises UserError for a name that leads out of it, or that is not a picture's."""
-    path = inside(folder, name, "picture")
-    if (kind := KINDS.get(path.suffix.lower())) is None:
-        raise UserError(f"{format_value(name)} is no picture's file that the page shows: give {', '.join(KINDS)}")
-    try:
-        return Picture(path.read_bytes(), kind)
-    except (OSError, ValueError) as error:
-        raise UserError(f"picture {path} cannot be read ({error}): put it there") from error
-
-
 Frames = Callable[[int], Picture]  # row -> its picture
 
 

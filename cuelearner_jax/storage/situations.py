@@ -37,7 +37,7 @@ from pyarrow import csv
 from cuelearner_jax.environment import BASE, PROPOSED, Quantity
 from cuelearner_jax.errors import UserError, format_numbers, format_value
 from cuelearner_jax.storage import lerobot
-from cuelearner_jax.storage.lerobot import Picture, read_picture
+from cuelearner_jax.storage.picture_files import Picture, read_picture
 
 STEM = "situations"
 SUFFIXES = (".parquet", ".csv", ".npz")

@@ -84,7 +84,8 @@ def subject_of(source: PolicySource, world: Any, base: BaseLanes, named: str | N
         raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
     if len(set(base.seeds)) < len(base.seeds):
         raise UserError("--base.seeds: give each seed once")
-    policies, seeds = trained.several(source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env)
+    policies, lanes = trained.several(source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env)
+    seeds = tuple(lane["seed"] for lane in lanes)
     chosen = {option: value for option, value in dataclasses.asdict(base).items() if value not in (None, ())}
     origin = {"folder": source.folder.name, **chosen, "policy": name, "seeds": list(seeds)}
     origin |= {"code": named} if named else {}

@@ -36,10 +36,14 @@ class LaneChoice(LanesChoice):
     seed: int | None = None
     """Seed of the lane (default: the first)."""
 
+    def lanes_in(self, source: PolicySource, world: Any, env: Any) -> tuple[list[Any], list[dict[str, Any]]]:
+        """Return the single policy and what chooses its lane, see `trained.several`."""
+        name, seeds = self.policy or source.default_policy, () if self.seed is None else (self.seed,)
+        return trained.several(source, world, name, self.guidance, self.labels, seeds, self.bound_deg, env)
+
     def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:
         """Return the single policy. Raises UserError if there is no such lane."""
-        name = self.policy or source.default_policy
-        return trained.one_policy(source, world, name, self.guidance, self.labels, self.seed, self.bound_deg, env)
+        return self.lanes_in(source, world, env)[0][0]
 
 
 @dataclass(frozen=True, kw_only=True)
