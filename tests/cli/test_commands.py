@@ -29,7 +29,7 @@ def test_a_sweep_leaves_a_complete_folder(run_folder):
         assert (run_folder / kind / "results.parquet").exists()
         assert len(rows) == lanes * 3  # steps 0, 100 and 200
         assert {row["step"] for row in rows} == {0, 100, 200}
-        assert {(row["episodes"], len(row["reward_each"])) for row in rows} == {(100, 20)}
+        assert {(row["episodes"], len(row["reward_each"])) for row in rows} == {(50, 20)}
         assert all(np.mean(row["reward_each"]) == pytest.approx(row["reward"], abs=1e-6) for row in rows)
     assert (run_folder / "relative" / "labels.parquet").exists()
 
