@@ -70,7 +70,7 @@ def policy(env) -> Read:
 
 
 def test_a_checkpoint_gets_the_steps_the_arrays_and_the_golden_cases(env, policy, tmp_path):
-    lerobot.write(policy, env, (), checkpoint(tmp_path / "before"), tmp_path / "after")
+    lerobot.write(policy, env, (), checkpoint(tmp_path / "before"), tmp_path / "after", {})
     pre, post = (json.loads((tmp_path / "after" / name).read_text())["steps"] for name in (lerobot.PRE, lerobot.POST))
     named = lambda steps: [one.get("registry_name") or one["class"].rpartition(".")[2] for one in steps]  # noqa: E731
     assert named(pre) == ["to_batch_processor", "StateStep", "normalizer_processor"]
@@ -110,7 +110,7 @@ def test_the_steps_decide_as_jax_does(env, policy, tmp_path):
 def test_a_checkpoint_of_another_robot_is_refused(robot, more, told, env, policy, tmp_path):
     before = checkpoint(tmp_path / "before", ROBOT | robot, more)
     with pytest.raises(UserError, match=told):
-        lerobot.write(policy, env, ("x", "y"), before, tmp_path / "after")
+        lerobot.write(policy, env, ("x", "y"), before, tmp_path / "after", {})
     assert not (tmp_path / "after").exists()
 
 
