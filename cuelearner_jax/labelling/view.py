@@ -184,7 +184,9 @@ def _at_edge(sketch: Sketch, angle: float, lane: int, control: Control) -> str:
     across = (lane + 1) // 2 * (-1) ** lane * 4.0 * size
     x, y = math.cos(math.radians(angle)), -math.sin(math.radians(angle))
     middle = left + width / 2 - y * across, top + height / 2 + x * across
-    out = _room(sketch._replace(foot=middle, turn=0.0), angle) - length - 2.5 * size
+    edge = 1.5 * size
+    inner = sketch._replace(foot=middle, turn=0.0, box=(left + edge, top + edge, width - 2 * edge, height - 2 * edge))
+    out = _room(inner, angle) - length - size
     foot = middle[0] + x * out, middle[1] + y * out
     at = sketch._replace(foot=foot, turn=0.0, reach=(0.0, length))
     shape = arrow(at, angle, control.colour, key=control.first_key, larger=LARGER)
