@@ -78,7 +78,7 @@ LEROBOT := .venv-lerobot
 $(LEROBOT)/.installed: $(BIN)/uv plugins/lerobot_processor_cuelearner/pyproject.toml
 	$(PYTHON312) -m venv $(LEROBOT)
 	$(UV) pip install --python $(LEROBOT)/bin/python "lerobot[training,evaluation,pusht]==0.6.1" \
-		--editable plugins/lerobot_processor_cuelearner
+		--editable "plugins/lerobot_processor_cuelearner[kinematics]"
 	@touch $@
 
 test-lerobot: $(VENV)/.tested $(LEROBOT)/.installed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -85,7 +86,8 @@ def _into_checkpoint(source: PolicySource, options: Export) -> None:
     env = source.task.environment(options.task)
     policy = replace(options, policy=None).policy_in(source, options.task, env)
     names = tuple(getattr(options.task, "cue_names", ()))
-    checkpoint = lerobot.write(policy, env, names, Path(options.policy), options.out)
+    hand = json.loads(getattr(options.task, "hand", "") or "{}")
+    checkpoint = lerobot.write(policy, env, names, Path(options.policy), options.out, hand)
     out.print(
         f"wrote {checkpoint}; run it with LeRobot, where the package lerobot_processor_cuelearner is installed: "
         f"lerobot-eval --policy.path={checkpoint}",

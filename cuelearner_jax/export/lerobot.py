@@ -37,7 +37,7 @@ CASES = 64
 Arrays = dict[str, np.ndarray]
 
 
-def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: Path) -> Path:
+def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: Path, hand: dict[str, Any]) -> Path:
     """Write a checkpoint with the correction; the folder appears completely or not at all. Return its path.
 
     Args:
@@ -46,15 +46,17 @@ def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: 
         names: names of the action's entries; empty: none are known.
         checkpoint: the folder with the checkpoint's `config.json` and processors.
         out: the folder to write.
+        hand: the robot's kinematics where actions are positions of its hand, as `storage.situations`; else empty.
 
-    Raises:
-        UserError: a policy without such a correction, a checkpoint of another robot, or of relative actions.
+    Raises UserError for a policy without such a correction, a checkpoint of another robot, or of relative actions.
     """
     with place_of(out, _check_unused) as place:
         space, arrays = actions_of(env), arrays_of(policy, env)
+        size, names = (len(hand["joints"]), tuple(hand["entries"])) if hand else (space.size, names)
+        arrays |= {f"hand_{name}": np.asarray(hand[name], np.float32) for name in hand if name != "entries"}
         config, pre, post = (_read(checkpoint / name) for name in ("config.json", PRE, POST))
         state_size = env.obs_size - 1 - space.size
-        _check(checkpoint, config, {"observation.state": state_size, "action": space.size}, names)
+        _check(checkpoint, config, {"observation.state": state_size, "action": size}, names)
         _check_steps(checkpoint, pre, post)
         digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays.values())).hexdigest()[:16]
         more = {"chunk": int(config.get("n_action_steps") or 1), "version": VERSION}

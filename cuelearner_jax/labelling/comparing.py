@@ -52,17 +52,12 @@ def with_teacher(
 ) -> AnswerAgreement:
     """Return how well a page's labels agree with the answers of the task's teacher, simulated without mistakes.
 
-    The situations of all `rows` (`label_files.history`) are replayed.
-
-    Raises:
-        UserError: the task has no teacher, or the situations cannot be replayed.
+    The situations of all `rows` (`label_files.history`) are replayed. Raises UserError where they cannot be, or without
+    a teacher.
     """
     form = form_of(file)
     if form is None or file.people is None or file.session is None:
-        raise UserError(
-            "this file does not hold what is needed to replay its situations for the teacher: "
-            "give a file that `cuelearner label` wrote"
-        )
+        raise UserError("the teacher cannot be asked about this file: give a file that `cuelearner label` wrote")
     config, task = world_of(task, file), task.on(str(file.session.get("robot", "")).partition(" ")[0] or None)
     tell(f"asking the teacher of {task.name} about {len(rows)} questions")
     env = task.environment(config)
@@ -70,10 +65,7 @@ def with_teacher(
     items = {row["item"]: (np.asarray(row["obs"], np.float32), np.asarray(row["action"], np.float32)) for row in rows}
     situations = list(replay(env, keys_of(file.session["seed"]), [items[number] for number in range(len(items))]))
     if len(situations) <= len(items):
-        raise UserError(
-            "replaying the file's situations gives other observations: use the version of cuelearner that wrote the "
-            "file"
-        )
+        raise UserError("replaying gives other observations than the file: use the version of cuelearner that wrote it")
     scalars = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
     one = jax.jit(lambda env, teacher, *question: as_teacher(form, env, scalars, teacher, *question))
     guides = [(situations[item], jnp.asarray(items[item][1])) for item in file.people.item]
@@ -119,9 +111,7 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     fresh: list[bool] = []
     for file in files:
         if len(np.unique(file.seeds)) > 1:
-            raise UserError(
-                "a file holds the labels of several seeds, which must stay separate: merge files of one seed each"
-            )
+            raise UserError("a file holds the labels of several seeds: merge files of one seed each")
         for name in ("task", "answers", "space", "eps"):
             if (other := getattr(file, name)) != (own := getattr(first, name)):
                 raise UserError(f"the files differ in {name} ({own}, {other}): merge only files that agree in it")

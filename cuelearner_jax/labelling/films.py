@@ -85,15 +85,10 @@ class _Desk:
 def film_page(port: int, tell: Callable[[str], None]) -> Iterator[Callable[[Path, Path], int]]:
     """Serve the page on this machine, and yield a function of two films that waits for an answer.
 
-    The function returns -1 where the left film is better, 0 where neither is, 1 where the right one is.
+    The function returns -1 where the left film is better, 0 where neither is, 1 where the right one is. `tell` gets the
+    page's address, which contains a secret token. Port 0 is any free one.
 
-    Args:
-        port: the port; 0: any free one.
-        tell: called with the page's address, which contains a secret token.
-
-    Raises:
-        UserError: the port is taken.
-        Interrupted: Ctrl-C while an answer is waited for.
+    Raises UserError if the port is taken, and Interrupted for Ctrl-C while an answer is waited for.
     """
     with bind(port) as listening:
         token, desk = secrets.token_urlsafe(18), _Desk()

@@ -28,13 +28,10 @@ class Page:
     """One browser's view of a session; several browsers may show the same session."""
 
     def __init__(self, session: Session, pages: set[Page], finish: Finish | None = None, again: str = "") -> None:
-        """Build the page in NiceGUI's current client.
+        """Build the page in NiceGUI's current client; the page is among the session's open `pages` while it is open.
 
-        Args:
-            session: the session to show.
-            pages: the open pages of the session; this page adds itself while it is open.
-            finish: called by the button that ends the session; None: no such button.
-            again: the command that opens the session once more.
+        `finish` is called by the button that ends the session; None: no such button. `again` is the command that opens
+        the session once more.
         """
         self.session, self._finish, self._pages = session, finish, pages
         self.form, self.space, self._one_cue = session.plan.form, session.questions.space, session.plan.one_cue
@@ -71,8 +68,6 @@ class Page:
         stop = session.listen(lambda: loop.call_soon_threadsafe(self.refresh))
         self._client.on_delete(lambda: (pages.discard(self), stop()))
         self.refresh()
-
-    # --- building ------------------------------------------------------------------------------------------
 
     def _button(self, control: Control, props: str = "") -> ui.button:
         """Make a button whose event names the control and the item on the screen."""
@@ -124,8 +119,6 @@ class Page:
         self._trouble = ui.label().classes("trouble")
         if self._finish is not None:
             ui.button("finish", on_click=self._end, color="grey-7").mark("finish")
-
-    # --- events ------------------------------------------------------------------------------------------------
 
     async def _heard(self, event: GenericEventArguments, name: str | None = None) -> None:
         """Handle a control's event; without an item from the browser, it is about the current question."""
@@ -187,13 +180,11 @@ class Page:
             return
         action = item.refined if of == "refined" else questions.outcomes(item).get(of, item.action)
         if action is not None and (reel := await run.io_bound(questions.film, item, action)) is not None:
-            self._script(f"cue.play({view.film(item, reel)})")
+            self._script(f"cue.play({json.dumps({'item': number, **reel._asdict()})})")
 
     def goto(self, address: str) -> None:
         """Make the browser open another page of this server."""
         self._script(f"location.replace({json.dumps(address)})")
-
-    # --- showing -----------------------------------------------------------------------------------------------
 
     def refresh(self) -> None:
         """Show the session's current state."""

@@ -14,6 +14,7 @@ from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.learner import Learner
 from cuelearner_jax.labelling.plan import SessionPlan, keys_of, proceed
 from cuelearner_jax.policies import policy_name
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.types import Reel, Sketch
 
 
@@ -59,17 +60,24 @@ class Questions:
             assert self.pictures.sketch is not None
             item = item._replace(sketch=self.pictures.sketch(self.env, item.guide.env))
         if item.trails is None:
-            outcomes, trails = self.outcomes(item), {}
-            if self.pictures.trails is not None:
-                actions = jnp.asarray(np.stack([*outcomes.values()]))
-                trails = dict(zip(outcomes, self.pictures.trails(self.env, item.guide.env, actions), strict=True))
-            item = item._replace(trails=trails)
+            item = item._replace(trails=self._trails(item, self.outcomes(item)))
         return self.refine(item)
 
+    def _trails(self, item: Item, actions: dict[str, np.ndarray]) -> dict[str, str]:
+        """Return the task's drawings of where actions lead; empty where it draws none."""
+        if self.pictures.trails is None:
+            return {}
+        drawn = self.pictures.trails(self.env, item.guide.env, jnp.asarray(np.stack([*actions.values()])))
+        return {name: trail for name, trail in zip(actions, drawn, strict=True) if trail}
+
     def refine(self, item: Item) -> Item:
-        """Add the newest model's action."""
-        number = self.learner.newest.number
-        return item._replace(refined=self.learner.refine(item.guide.obs, item.action) if number else None)
+        """Add the newest model's action; a direction is drawn as an arrow, other actions as the task draws them."""
+        if not self.learner.newest.number:
+            return item._replace(refined=None)
+        refined, trails = self.learner.refine(item.guide.obs, item.action), item.trails
+        if trails and self.space != DIRECTIONS:
+            trails = trails | self._trails(item, {"refined": refined})
+        return item._replace(refined=refined, trails=trails)
 
     def outcomes(self, item: Item) -> dict[str, np.ndarray]:
         """Return each answer's outcome for an item's action, see `controls.outcomes`."""

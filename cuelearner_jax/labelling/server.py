@@ -188,15 +188,10 @@ def serve(
 ) -> Ending | None:
     """Serve a session's page until the session ends; close the session.
 
-    Args:
-        make: opens the session. It is called once the server has started: NiceGUI then lists every object that Python's
-            garbage collector knows, also tuples that a session's threads are just building, which CPython refuses to
-            finish (see the documentation of `gc.get_referrers`).
-        title: of the page.
-        listening: a socket of `bind`.
-        stopping: set it to stop the server.
-        tell: called with the page's address, which contains a secret token.
-        commands: what the last page shows for copying.
+    `make` opens the session once the server has started: NiceGUI then lists every object that Python's garbage
+    collector knows, also tuples that a session's threads are just building, which CPython refuses to finish (see the
+    documentation of `gc.get_referrers`). `listening` is a socket of `bind`; setting `stopping` stops the server. `tell`
+    gets the page's address, which contains a secret token. The last page shows `commands`.
 
     Returns how a person finished the session; None if `stopping` was set before. Raises what `make` raises.
     """

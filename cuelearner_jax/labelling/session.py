@@ -120,15 +120,10 @@ class Session:
     """Asks questions, saves answers and fits models. Its methods may be called from any thread."""
 
     def __init__(self, plan: SessionPlan, folder: Path, tell: Callable[[str], None] = lambda words: None) -> None:
-        """Open the label file and prepare the first questions.
+        """Open the label file in `folder`, which the caller keeps claimed, and prepare the first questions.
 
-        Args:
-            plan: the session's settings.
-            folder: the folder of `labels.jsonl`. Keep the folder claimed (`storage.folders.claimed`).
-            tell: called with progress lines.
-
-        Raises:
-            UserError: the folder holds labels of another session, or the task cannot be drawn here.
+        `tell` gets progress lines. Raises UserError if the folder holds labels of another session, or the task cannot
+        be drawn here.
         """
         tell("building the environment")
         env, check = plan.task.environment(plan.config.task), plan.task.pictures().check
@@ -168,8 +163,6 @@ class Session:
         self.number = min((number for number in self._items if rows[number].said == UNDONE), default=count)
         self._learner.fit(self._labels())
         self._items[count] = questions.ask(count, situations[-1])
-
-    # --- question ----------------------------------------------------------------------------------------------------
 
     def _prepare(self, number: int) -> None:
         """Make an item ready to be shown; the item before it exists already."""
@@ -218,18 +211,13 @@ class Session:
         enough = self.record.count(ANSWERED) >= self.plan.labels or 0 < len(self.plan.again) <= self.number
         return enough or self._file is not None
 
-    # --- answer ------------------------------------------------------------------------------------------------------
-
     def answer(self, number: int, answer: np.ndarray | None, seconds: float | None = None) -> bool:
         """Save an answer and move on. Return False if another question is current: the answer came too late.
 
-        Args:
-            number: number of the item that was on the screen.
-            answer: in the form's encoding, (width,); None for "don't know".
-            seconds: time from showing the question to the answer (default: since it became the current question) [s].
+        `number` is that of the item on the screen. `answer` has the form's encoding, (width,); None: "don't know".
+        `seconds` is the time since the question was shown (default: since it became the current question).
 
-        Raises:
-            UserError: the answer could not be saved. It may be given again.
+        Raises UserError if the answer could not be saved; it may be repeated.
         """
         with self._acting:
             with self._lock:
@@ -266,8 +254,6 @@ class Session:
             self._ahead.submit(self._prepare, number - 1).result()
             self._show(number - 1)
             return True
-
-    # --- for the page ------------------------------------------------------------------------------------------------
 
     def finish(self) -> Path:
         """End the session: write the answers as Parquet and return that file. Later answers are refused.

@@ -15,7 +15,7 @@ from cuelearner_jax.labelling.controls import Control
 from cuelearner_jax.labelling.questions import Item
 from cuelearner_jax.spaces import DIRECTIONS, Cue, Space
 from cuelearner_jax.spaces.box import SHARE
-from cuelearner_jax.types import Reel, Sketch
+from cuelearner_jax.types import Sketch
 
 HAIR = 1 / 400  # width of a thin line, as a share of the sketch's width; "hair" below is this length
 HEAD, BADGE = 7.0, 7.0  # length of an arrow's head, and radius of the key's disc at its tip [hairs]
@@ -42,9 +42,6 @@ WORDS: dict[str, Direction] = {
 LENGTH = 0.1  # length of a cue's arrow, as a share of the picture's shorter side
 LEAST = 0.05  # arrows of actions shorter than this share of the sketch's reach are not drawn
 LARGER = 1.5  # factor on strokes and keys of cues' arrows, compared with those of directions
-
-
-# --- the whole picture -----------------------------------------------------------------------------------------------
 
 
 def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS, one_cue: bool = False) -> str:
@@ -102,18 +99,10 @@ def change_words(space: Space, change: np.ndarray) -> str:
     return f"{', '.join(words)}{' of the range' * shares}" if words else "as it is"
 
 
-def film(item: Item, reel: Reel) -> str:
-    """Return a film as JSON for the page's script."""
-    return json.dumps({"item": item.number, **reel._asdict()})
-
-
 def sketch_of(item: Item) -> Sketch:
     """Return the sketch of an item that the page shows."""
     assert item.sketch is not None
     return item.sketch
-
-
-# --- directions ------------------------------------------------------------------------------------------------------
 
 
 def angle_of(action: np.ndarray) -> float:
@@ -153,9 +142,6 @@ def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
     return [*parts, arrow(sketch, angle, "pointer")] if form.is_action else parts
 
 
-# --- cues ------------------------------------------------------------------------------------------------------------
-
-
 def by_words(cue: Cue) -> Direction | None:
     """Return the screen direction for "more" of a cue by its words; None: the words give none, or contradict."""
     ways = [
@@ -185,7 +171,7 @@ def _cues(item: Item, space: Space, answers: Sequence[Control]) -> list[str]:
             lane = lanes[round(angle)] = lanes.get(round(angle), -1) + 1  # several cues may point in one direction
             parts.append(_at_edge(sketch, angle, lane, control))
     for name, action in (("asked", item.action), ("refined", item.refined)):
-        if action is not None and middle is not None:
+        if action is not None and middle is not None and not item.trails:  # which show where actions lead
             shares = np.asarray(space.to_unit(space.log(middle, action))) / (space.reach / 2)
             parts.append(_from_foot(sketch, ways, shares, name))
     return parts
@@ -198,7 +184,9 @@ def _at_edge(sketch: Sketch, angle: float, lane: int, control: Control) -> str:
     across = (lane + 1) // 2 * (-1) ** lane * 4.0 * size
     x, y = math.cos(math.radians(angle)), -math.sin(math.radians(angle))
     middle = left + width / 2 - y * across, top + height / 2 + x * across
-    out = _room(sketch._replace(foot=middle, turn=0.0), angle) - length - 2.5 * size
+    edge = 1.5 * size
+    inner = sketch._replace(foot=middle, turn=0.0, box=(left + edge, top + edge, width - 2 * edge, height - 2 * edge))
+    out = _room(inner, angle) - length - size
     foot = middle[0] + x * out, middle[1] + y * out
     at = sketch._replace(foot=foot, turn=0.0, reach=(0.0, length))
     shape = arrow(at, angle, control.colour, key=control.first_key, larger=LARGER)
@@ -222,9 +210,6 @@ def _from_foot(sketch: Sketch, ways: Sequence[Direction | None], shares: np.ndar
     first, last = sketch.reach
     at = sketch._replace(turn=0.0, reach=(first, first + far * (last - first)))
     return arrow(at, math.degrees(math.atan2(-y, x)), name)
-
-
-# --- arrows in the coordinate frame of a task's sketch ---------------------------------------------------------------
 
 
 def _point(sketch: Sketch, angle: float, along: float, across: float = 0.0) -> tuple[float, float]:
@@ -260,15 +245,10 @@ def _line(one: tuple[float, float], other: tuple[float, float], width: float, mo
 
 
 def arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0, key: str = "", larger: float = 1.0) -> str:
-    """Return the SVG of an arrow along an action's direction.
+    """Return the SVG of an arrow along a direction [deg, counterclockwise], from the foot of a sketch over its reach.
 
-    Args:
-        sketch: gives the arrow's start and length.
-        angle: the direction, counterclockwise [deg].
-        name: the arrow's CSS class, which sets its colour.
-        longer: factor on the arrow's length.
-        key: the key shown at the arrow's tip; empty for no key.
-        larger: factor on the widths of strokes, head and key.
+    `name` is the CSS class, which sets the colour; `key` stands at the tip. `longer` is a factor on the length,
+    `larger` on the widths of strokes, head and key.
     """
     hair = sketch.box[2] * HAIR * larger
     head, half, badge = HEAD * hair, 2.8 * hair, BADGE * hair

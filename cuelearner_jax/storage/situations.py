@@ -10,10 +10,14 @@ too, see `storage.lerobot`. Columns of the table:
 | picture     | string                      | optional: a file in the folder, PNG or JPEG, or a clip, GIF or MP4  |
 | text        | string                      | optional: what the robot was told to do                             |
 | phase       | float, 0 to 1               | optional: the action's place in the chunk that its policy proposed  |
+| hand        | list of floats (3,)         | optional: where the hand is, in the frame of the actions [m]        |
 
 With `phase`, the policy cannot be asked again: what it depends on, such as pictures, is not in the table. Observations
 then end with the phase and a slice `BASE`, the proposed action. The metadata `cuelearner` of a Parquet file may have
-the bounds of the actions, `low` and `high`. Of a LeRobot dataset with pictures alone, observations are the actions.
+the bounds of the actions, `low` and `high`; `hand`, the kinematics of a robot whose hand's positions they are;
+`projections` (cameras, 3, 4) from these positions to shares of the picture's width and height, and each camera's
+`areas` (cameras, 4) of it: left, top, width, height. Of a LeRobot dataset with pictures alone, observations are the
+actions.
 In place of a list there may be one column per entry, `observation.NAME` or `action.NAME`, which names the entries.
 Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
 """
@@ -41,7 +45,7 @@ from cuelearner_jax.storage.picture_files import Picture, read_picture
 
 STEM = "situations"
 SUFFIXES = (".parquet", ".csv", ".npz")
-OBSERVATION, ACTION, PICTURE, TEXT, PHASE = "observation", "action", "picture", "text", "phase"
+OBSERVATION, ACTION, PICTURE, TEXT, PHASE, HAND = "observation", "action", "picture", "text", "phase", "hand"
 MOST_NAMED = 64  # largest number of observation entries that each get a slice of their own
 
 
@@ -57,7 +61,8 @@ class Situations(NamedTuple):
     # row -> its picture; None: that row has none. Raises UserError for a picture that cannot be read.
     picture: Callable[[int], Picture | None]
     text: Callable[[int], str] = lambda row: ""  # row -> what the robot was told to do
-    bounds: tuple[list[float], list[float]] | None = None  # low and high of the actions; None: the table has none
+    about: dict[str, Any] = {}  # the table's metadata  # noqa: RUF012
+    hands: Float[np.ndarray, "n 3"] | None = None  # where the hand is; None: not known
 
 
 def read(path: Path) -> Situations:
@@ -70,7 +75,7 @@ def read(path: Path) -> Situations:
         return _situations_of(path, *lerobot.read(path))
     table = _table_in(path)
     columns = _columns(table)
-    standard = (OBSERVATION, ACTION, PICTURE, TEXT, PHASE)
+    standard = (OBSERVATION, ACTION, PICTURE, TEXT, PHASE, HAND)
     if strange := [name for name in columns if name not in standard and name.partition(".")[0] not in standard[:2]]:
         raise UserError(
             f"{table} has an unknown column {format_value(strange[0])}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
@@ -88,7 +93,8 @@ def read(path: Path) -> Situations:
     phase = _numbers(table, PHASE, columns[PHASE], 1) if PHASE in columns else None
     situations = _situations_of(table, observations, actions, names, entries, None if files is None else picture, phase)
     text: Callable[[int], str] = lambda row: str(texts[row] or "") if texts is not None else ""  # noqa: E731
-    return situations._replace(text=text, bounds=_bounds(table, actions.shape[1]))
+    hands = _numbers(table, HAND, columns[HAND], 2) if HAND in columns else None
+    return situations._replace(text=text, about=_about(table, actions.shape[1]), hands=hands)
 
 
 def _situations_of(
@@ -127,17 +133,18 @@ def _situations_of(
     return Situations(observations, actions, slices, entries, digest, picture is not None, picture or none)
 
 
-def _bounds(table: Path, size: int) -> tuple[list[float], list[float]] | None:
-    """Return the bounds in a table's metadata. Raises UserError where they do not fit its actions."""
+def _about(table: Path, size: int) -> dict[str, Any]:
+    """Return a table's metadata. Raises UserError where they do not fit its actions."""
     text = (pq.read_schema(table).metadata or {}).get(b"cuelearner") if table.suffix == ".parquet" else None
     if text is None:
-        return None
+        return {}
     try:
-        bounds = json.loads(text)
-        low, high = (np.asarray(bounds[name], float).reshape(size).tolist() for name in ("low", "high"))
+        about = json.loads(text)
+        bounds = {name: np.asarray(about[name], float).reshape(size).tolist() for name in ("low", "high")}
+        cameras = {name: np.asarray(about.get(name, []), float) for name in ("projections", "areas")}
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{table} has metadata that tell no bounds of {size} entries: write the table anew") from error
-    return low, high
+    return {**about, **bounds, **cameras}
 
 
 def _table_in(path: Path) -> Path:

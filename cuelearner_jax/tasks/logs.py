@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
+import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -46,6 +48,8 @@ Actions = Literal["box", "directions", "choices"]
 Order = Literal["shuffled", "recorded"]
 CLIP_FRAMES, CLIP_PERIOD = 60, 0.1  # most frames of a clip, and the time between two of them [s]
 FARTHEST = 5.0  # networks' input entries are clipped at this many spreads from the centre
+STEP = 0.01  # move by which a picture shows where an axis points [m]
+LEAST_WAY = 0.2  # an axis that appears shorter, beside the longest, points nowhere in a picture
 FRAME = "action"  # frame of the networks' input, computed by `Logs.features`
 
 
@@ -81,6 +85,8 @@ class LogsConfig:
     """Value subtracted from each entry of an observation before networks see it (default: 0)."""
     spread: tuple[float, ...] = ()
     """Value by which each entry is divided afterwards (default: 1)."""
+    hand: str = ""
+    """Kinematics of the robot whose hand's positions the actions are, as JSON (empty: they are the robot's own)."""
 
 
 def space_of(config: LogsConfig) -> Space:
@@ -198,8 +204,8 @@ def task_of(
     size, names = recording.actions.shape[1], ()
     bounds: Any = (0.0,) * size, (1.0,) * size
     if actions == "box":
-        if recording.bounds is not None and low is None and high is None:
-            low, high = recording.bounds
+        if recording.about and low is None and high is None:
+            low, high = recording.about["low"], recording.about["high"]
         names, bounds = recording.entries, bounds_of(recording.actions, low, high, recording.entries, note)
     elif low is not None or high is not None:
         raise UserError(f"low and high are bounds of a box, but actions are {actions}: leave them out")
@@ -219,6 +225,7 @@ def task_of(
         cue_names=names if pairs else (),
         centre=centre,
         spread=spread,
+        hand=json.dumps(recording.about["hand"]) if "hand" in recording.about else "",
     )
     space = space_of(config)
     remedy = "bounds that hold the recorded actions" if actions == "box" else "another kind of actions"
@@ -349,7 +356,45 @@ def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
 def _sketch(env: Logs, state: SituationState) -> Sketch:
     frames, place = _frames(env, state.row)
     text = _read(Path(env.path)).text(place)
-    return pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
+    drawn = pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
+    for _, (hand, *steps) in _seen(env, state, drawn, lambda hand: hand + STEP * np.eye(3))[:1]:
+        ways = np.stack(steps) - hand
+        ways /= np.linalg.norm(ways, axis=-1).max()
+        points = [(x, y) if math.hypot(x, y) > LEAST_WAY else None for x, y in ways.tolist()]
+        drawn = drawn._replace(points=(*points, *[None] * (env.actions.size - len(points))))
+    return drawn
+
+
+def _seen(
+    env: Logs, state: SituationState, sketch: Sketch, places: Callable[[np.ndarray], np.ndarray]
+) -> list[tuple[np.ndarray, Float[np.ndarray, "n 2"]]]:
+    """Return, of each camera that sees the hand, its area in the sketch, and where the hand and other places appear.
+
+    `places` is a function of the hand's position (3,) that returns others (n, 3).
+    """
+    recording, seen = _read(Path(env.path)), []
+    if recording.hands is None or not recording.about:
+        return []
+    hand = recording.hands[int(env.places[state.row])]
+    rows = np.pad(np.vstack([hand, places(hand)]), ((0, 0), (0, 1)), constant_values=1.0)
+    for projection, area in zip(recording.about["projections"], recording.about["areas"], strict=True):
+        across, depth = np.split(rows @ projection.T, [2], -1)
+        points, box = across / depth * sketch.box[2:], area * np.tile(sketch.box[2:], 2)
+        if (depth > 0).all() and ((box[:2] <= points[0]) & (points[0] <= box[:2] + box[2:])).all():
+            seen.append((box, points))
+    return seen
+
+
+def _trails(env: Logs, state: SituationState, actions: Float[Array, "n action"]) -> list[str]:
+    """Draw each action as an arrow from the hand to where it leads, in the picture of each camera with the hand."""
+    from cuelearner_jax.labelling import view
+
+    drawn, arrows = _sketch(env, state), [""] * len(actions)
+    for box, (hand, *ends) in _seen(env, state, drawn, lambda hand: np.asarray(actions)[:, :3]):
+        for number, (x, y) in enumerate(ends - hand):
+            own = drawn._replace(box=box, foot=hand, reach=(0.0, math.hypot(x, y)), turn=0.0)
+            arrows[number] += view.arrow(own, math.degrees(math.atan2(-y, x)), "motion")
+    return arrows
 
 
 def _reel(env: Logs, state: SituationState, action: Any) -> Reel | None:
@@ -369,6 +414,7 @@ PICTURES = Pictures(
     question=lambda env, state, obs, action, file: pictures.still(_frames(env, state.row)[0][:1], file),
     sketch=_sketch,
     reel=_reel,
+    trails=_trails,
     simulates=False,
 )
 BODY = Body("recording", "situations as they were recorded", _environment, pictures=lambda: PICTURES, filled=filled)

@@ -70,12 +70,24 @@ def policy(env) -> Read:
 
 
 def test_a_checkpoint_gets_the_steps_the_arrays_and_the_golden_cases(env, policy, tmp_path):
-    lerobot.write(policy, env, (), checkpoint(tmp_path / "before"), tmp_path / "after")
+    lerobot.write(policy, env, (), checkpoint(tmp_path / "before"), tmp_path / "after", {})
     pre, post = (json.loads((tmp_path / "after" / name).read_text())["steps"] for name in (lerobot.PRE, lerobot.POST))
     named = lambda steps: [one.get("registry_name") or one["class"].rpartition(".")[2] for one in steps]  # noqa: E731
     assert named(pre) == ["to_batch_processor", "StateStep", "normalizer_processor"]
     assert named(post) == ["PlaceStep", "unnormalizer_processor", "CorrectStep", "device_processor"]
     assert post[2]["config"] == {"pair": pre[1]["config"]["pair"], "chunk": 5, "version": lerobot.VERSION}
+
+
+def test_a_correction_of_a_hand_brings_its_kinematics_to_the_checkpoint_of_the_joints(env, policy, tmp_path):
+    joints = {"entries": ["pan", "lift", "jaw"], "joints": [[1, 0], [0, 1], [0, 0]], "high": [float("inf"), 2.0]}
+    arm = {"output_features": {"action": {"shape": [3]}}, "action_feature_names": ["pan", "lift", "jaw"]}
+    before = checkpoint(tmp_path / "before", ROBOT | arm)
+    lerobot.write(policy, env, ("x", "y"), before, tmp_path / "after", joints)
+    stored = (tmp_path / "after" / lerobot.STATE_FILE).read_bytes()
+    described = json.loads(stored[8 : 8 + int.from_bytes(stored[:8], "little")])
+    assert (described["hand_joints"]["shape"], described["hand_high"]["shape"]) == ([3, 2], [2])
+    with pytest.raises(UserError, match="moves pan, lift, jaw, the correction lift, pan, jaw"):
+        lerobot.write(policy, env, (), before, tmp_path / "no", joints | {"entries": ["lift", "pan", "jaw"]})
 
 
 def test_the_steps_decide_as_jax_does(env, policy, tmp_path):
@@ -110,7 +122,7 @@ def test_the_steps_decide_as_jax_does(env, policy, tmp_path):
 def test_a_checkpoint_of_another_robot_is_refused(robot, more, told, env, policy, tmp_path):
     before = checkpoint(tmp_path / "before", ROBOT | robot, more)
     with pytest.raises(UserError, match=told):
-        lerobot.write(policy, env, ("x", "y"), before, tmp_path / "after")
+        lerobot.write(policy, env, ("x", "y"), before, tmp_path / "after", {})
     assert not (tmp_path / "after").exists()
 
 

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -34,6 +35,14 @@ def seconds(step, value) -> float:
     return sorted(times)[ROUNDS // 2]
 
 
+def apart(correct, proposed, corrected) -> list[list[float]]:
+    """Return how far corrected actions are from proposed ones; of a hand, its positions and the last entry."""
+    if correct.hand is None:
+        return (corrected - proposed).tolist()
+    places = [correct.hand.place(actions.numpy()) for actions in (proposed, corrected)]
+    return np.column_stack([places[1] - places[0], (corrected - proposed)[:, -1:].numpy()]).tolist()
+
+
 def main(before: str, after: str, dataset: str) -> None:
     """Play frames in their order, with a reset in the middle of a chunk."""
     data = LeRobotDataset("tiny", root=dataset)
@@ -47,10 +56,10 @@ def main(before: str, after: str, dataset: str) -> None:
         batch = {key: value[None] for key, value in item.items() if key.startswith("observation.")}
         pre2({**batch, "task": [item["task"]]})
         action = policy.select_action(pre({**batch, "task": [item["task"]]}))
-        moves.append((post2(action) - post(action)).tolist()[0])
+        moves += apart(correct, post(action), post2(action))
         phases.append(post2.steps[0].place)
     chunk = torch.stack([policy.select_action(pre({**batch, "task": [""]})) for _ in range(3)], 1)
-    moved = (post2(chunk) - post(chunk)).tolist()[0]
+    moved = apart(correct, post(chunk)[0], post2(chunk)[0])
     added = seconds(post2, action) - seconds(post, action) + seconds(pre2.steps[3], {"observation": batch})
     names = [type(step).__name__ for step in (*pre2.steps, *post2.steps)]
     again = Path(after).with_name("saved_again")
@@ -58,7 +67,6 @@ def main(before: str, after: str, dataset: str) -> None:
     post2.save_pretrained(again, config_filename="policy_postprocessor.json")
     make_pre_post_processors(PreTrainedConfig.from_pretrained(after), pretrained_path=str(again))
     told = {"moves": moves, "chunk": moved, "places": phases, "added_ms": 1e3 * added, "steps": names}
-    told["entries"] = len(correct.correction.arrays["low"])
     print(json.dumps(told))
 
 

@@ -16,6 +16,8 @@ from cuelearner_jax.labelling.session import Session
 HERE = Path(__file__).parent
 PYTHON = os.environ.get("LEROBOT_PYTHON", "")  # a Python with LeRobot 0.6.1 and plugins/lerobot_processor_cuelearner
 MOVED = np.array([40.0, -20.0])  # the executed action is this far off [pixels]
+HAND_MOVED = np.array([0.0, 0.03, -0.02])  # so is the hand of an arm [m]
+MJCF = HERE.parent / "export/arm.xml"
 TRAIN = (
     "--policy.type=act --policy.push_to_hub=false --policy.device=cpu --policy.chunk_size=8 --policy.n_action_steps=5 "
     "--policy.dim_model=32 --policy.n_heads=2 --policy.dim_feedforward=32 --policy.n_encoder_layers=1 "
@@ -36,26 +38,34 @@ def run(folder: Path, *command: str) -> str:
     return done.stdout
 
 
-def answer_all(arguments: list[str], out: Path) -> None:
-    """Answer the page's questions by a script that knows how far the action is off."""
+def answer_all(arguments: list[str], out: Path, moved: np.ndarray = MOVED) -> list[str]:
+    """Answer the page's questions by a script that knows how far the action is off; return the drawn trails."""
     ahead = look_ahead_of(arguments, "label", label.LabelOptions)
     task = recorded_or_task(ahead)
     _, preset = preset_of(task, None)
     options = parse(label.LabelOptions, arguments, "label", label._defaults(task, preset, None, ahead, None))
+    trails = []
     with Session(label.make_plan(task, preset.config, options), out) as session:
         space = session.questions.space
         while (item := session.item) is not None:
-            best = np.asarray(item.guide.obs)[-2:] + MOVED
+            trails.append((item.trails or {}).get("asked", ""))
+            best = np.asarray(item.guide.obs)[-len(moved) :] + moved
             share = (best - item.action) / np.subtract(space.high, space.low)
             session.answer(item.number, np.where(np.abs(share) < 1 / 72, 0.0, np.sign(share)).astype(np.float32))
         session.finish()
+    return trails
+
+
+def checkpoint_of(folder: Path, *arguments: str) -> str:
+    """Record a dataset and train a policy; return its checkpoint."""
+    run(folder, str(HERE / "record.py"), "data", *arguments)
+    run(folder, "lerobot-train", "--dataset.repo_id=tiny", "--dataset.root=data", "--output_dir=act", *TRAIN.split())
+    return "act/checkpoints/last/pretrained_model"
 
 
 def test_a_checkpoint_is_corrected_by_labels_and_evaluated_by_lerobot(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    run(tmp_path, str(HERE / "record.py"), "data")
-    run(tmp_path, "lerobot-train", "--dataset.repo_id=tiny", "--dataset.root=data", "--output_dir=act", *TRAIN.split())
-    checkpoint = "act/checkpoints/last/pretrained_model"
+    checkpoint = checkpoint_of(tmp_path)
     write = ["--policy", checkpoint, "--dataset", "data", "--out", "situations", "--count", "60"]
     run(tmp_path, "-m", "lerobot_processor_cuelearner", "situations", *write)
     answer_all(["situations", "--cues", "left,right;up,down", "--labels", "60", "--out", "labels"], Path("labels"))
@@ -71,3 +81,22 @@ def test_a_checkpoint_is_corrected_by_labels_and_evaluated_by_lerobot(tmp_path, 
     run(tmp_path, "lerobot-eval", "--policy.path=checkpoint", "--output_dir=evaluated", *EVALUATE.split())
     assert main([*export[:-1], "checkpoint", "--out", "twice"]) == 2
     assert "holds a correction already" in capsys.readouterr().err
+
+
+def test_the_hand_of_an_arm_is_corrected_where_people_think(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    checkpoint = checkpoint_of(tmp_path, str(MJCF))
+    write = ["--policy", checkpoint, "--dataset", "data", "--out", "situations", "--count", "60"]
+    arm = ["--mjcf", str(MJCF), "--site", "grip", "--joints", "pan,lift,elbow,turn,flex,roll"]
+    write += [*arm, "--joint-unit", "degrees", "--projection", "image=camera.json"]
+    run(tmp_path, "-m", "lerobot_processor_cuelearner", "situations", *write)
+    cues = "forward,back;left,right;up,down"
+    trails = answer_all(["situations", "--cues", cues, "--labels", "60", "--out", "labels"], Path("labels"), HAND_MOVED)
+    assert all('class="arrow motion"' in trail for trail in trails)
+    assert main(["adapt", "--labels-from", "labels", "--out", "corrected"]) == 0
+    assert main(["export", "corrected", "--format", "lerobot", "--policy", checkpoint, "--out", "checkpoint"]) == 0
+    found = json.loads(run(tmp_path, str(HERE / "play.py"), checkpoint, "checkpoint", "data").splitlines()[-1])
+    print(f"added time an action: {found['added_ms']:.2f} ms")
+    for moves in (found["moves"], found["chunk"]):
+        np.testing.assert_allclose(np.array(moves)[:, :3], np.tile(HAND_MOVED, (len(moves), 1)), atol=0.006)
+        assert np.array(moves)[:, 3].tolist() == [0.0] * len(moves)

@@ -101,7 +101,7 @@ def test_proposed_actions_are_part_of_what_is_observed(tmp_path):
     found = situations.read(tmp_path / "there")
     np.testing.assert_array_equal(found.observations, [[0.0, 1.0, 0.0, 0.5], [2.0, 3.0, 0.5, 0.25]])
     assert [(one.name, one.size) for one in found.slices] == [("observation", 2), ("phase", 1), (BASE, 1)]
-    assert (found.bounds, found.text(0)) == (([-1.0], [2.0]), "pick")
+    assert (found.about["low"], found.about["high"], found.text(0)) == ([-1.0], [2.0], "pick")
 
 
 def table(folder, **columns):

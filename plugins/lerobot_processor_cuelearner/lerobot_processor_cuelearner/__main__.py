@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
+from lerobot_processor_cuelearner.kinematics import UNITS, hand_of
 from lerobot_processor_cuelearner.situations import write
 
 
@@ -18,9 +20,25 @@ def main() -> None:
     situations.add_argument("--out", type=Path, required=True, help="folder for the situations, new or empty")
     situations.add_argument("--count", type=int, default=200, help="number of situations (default: 200)")
     situations.add_argument("--seed", type=int, default=0, help="seed of the chosen frames")
+    situations.add_argument("--mjcf", type=Path, help="the robot's MJCF: actions are then the positions of its hand")
+    situations.add_argument("--site", help="site of the MJCF at the hand")
+    situations.add_argument(
+        "--joints", type=lambda text: text.split(","), default=[], help="joint of each entry of the action, as a,b,,d"
+    )
+    situations.add_argument("--joint-unit", choices=list(UNITS), default="radians", help="of the action's entries")
+    situations.add_argument(
+        "--projection", action="append", default=[], metavar="CAMERA=FILE", help="3x4 matrix from metres to pixels"
+    )
     options = parser.parse_args()
-    count = write(options.policy, options.dataset, options.out, options.count, options.seed)
-    print(f'wrote {count} situations; next: cuelearner label {options.out} --cues "left,right;up,down"')
+    if (options.mjcf is None) != (options.site is None):
+        parser.error("give --mjcf and --site together")
+    if wrong := [text for text in options.projection if "=" not in text]:
+        parser.error(f"--projection {wrong[0]} names no file: give CAMERA=matrix.json")
+    matrices = {name: Path(file) for name, _, file in (text.partition("=") for text in options.projection)}
+    hand = partial(hand_of, options.mjcf, options.site, options.joints, options.joint_unit) if options.mjcf else None
+    count = write(options.policy, options.dataset, options.out, options.count, options.seed, hand, matrices)
+    cues = "forward,back;left,right;up,down" if hand else "left,right;up,down"
+    print(f'wrote {count} situations; next: cuelearner label {options.out} --cues "{cues}"')
 
 
 if __name__ == "__main__":

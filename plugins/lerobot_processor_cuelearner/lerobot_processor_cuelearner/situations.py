@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +19,41 @@ from lerobot.processor import RelativeActionsProcessorStep
 from lerobot.utils.constants import ACTION, OBS_STATE
 from PIL import Image
 
+from lerobot_processor_cuelearner.kinematics import Hand
 from lerobot_processor_cuelearner.steps import PlaceStep
 
 LEAST_RANGE = 1e-6  # of an entry of the action that counts as moving
+PLACE = ["x", "y", "z"]  # entries of an action that is a hand's position
+MARGIN = 0.1, 0.1  # of the positions' bounds: at least [m], and as a share of their range
+BEYOND = 0.1, 0.2  # beyond a joint's limits by this much [rad], most proposals that a right unit leaves there
 
 
-def write(checkpoint: str, dataset: Path, out: Path, count: int, seed: int = 0) -> int:
+def write(
+    checkpoint: str,
+    dataset: Path,
+    out: Path,
+    count: int,
+    seed: int = 0,
+    hand_of: Callable[[Sequence[str]], Hand] | None = None,
+    matrices: Mapping[str, Path] | None = None,
+) -> int:
     """Write situations at random frames of a dataset; return their number.
 
     A situation holds the state at its frame, and the action that the policy proposes there, in the robot's own units:
     the first action of a new chunk, or a later one of a chunk that was predicted some frames before. `phase` is the
     place in the chunk, from 0 to 1. Pictures show all cameras side by side.
 
-    Raises SystemExit, with one line, for a dataset or policy that does not fit, or a folder in use.
+    With `hand_of`, a function of the names of the action's entries, the position that the hand is led to stands for the
+    action. With `matrices`, files with a 3x4 projection of a camera, the page shows in pictures where the hand goes.
+
+    Raises SystemExit, with one line, for a dataset, policy or file that does not fit, or a folder in use.
     """
     if out.exists() and any(out.iterdir()):
         raise SystemExit(f"{out} is not empty: give another --out")
     data = LeRobotDataset(dataset.name, root=dataset)
+    names = {key: _names(data, key) for key in (OBS_STATE, ACTION) if key in data.meta.features}
+    hand = hand_of(names[ACTION]) if hand_of else None
+    projections = _projections(matrices or {}, data)
     policy, config, pre, post = _load(checkpoint, data)
     chunk = int(getattr(config, "n_action_steps", 1))
     frames = np.random.default_rng(seed).permutation(len(data))[:count]
@@ -53,7 +72,7 @@ def write(checkpoint: str, dataset: Path, out: Path, count: int, seed: int = 0) 
             {"state": now[OBS_STATE].reshape(-1).numpy(), "action": action, "phase": place / max(chunk - 1, 1)}
             | {"text": str(now.get("task", "")), "picture": picture if cameras else ""}
         )
-    pq.write_table(_table(rows, data), out / "situations.parquet")
+    pq.write_table(_table(rows, data, names, hand, projections), out / "situations.parquet")
     return len(rows)
 
 
@@ -103,29 +122,97 @@ def _side_by_side(cameras: list[torch.Tensor]) -> Image.Image:
     return sheet
 
 
-def _table(rows: list[dict[str, Any]], data: LeRobotDataset) -> pa.Table:
-    """Return the table of situations; its metadata has the bounds of the actions and what a checkpoint must have."""
+def _table(
+    rows: list[dict[str, Any]],
+    data: LeRobotDataset,
+    names: dict[str, list[str]],
+    hand: Hand | None,
+    projections: Sequence[tuple[Any, Any]],
+) -> pa.Table:
+    """Return the table of situations; its metadata has the bounds of the actions, the hand and the projections."""
     states, actions = (np.stack([row[name] for row in rows]) for name in ("state", "action"))
+    stats, own = (data.meta.stats or {}).get(ACTION, {}), names[ACTION]
+    hands = _hands(states, names, hand) if projections else None
+    if hand is not None:
+        _check_unit(hand, actions)
+        actions, stats, own = hand.place(actions).astype(np.float32), {}, PLACE
     columns: dict[str, Any] = {}
-    names: dict[str, list[str]] = {}
-    for name, key, values in (("observation", OBS_STATE, states), ("action", ACTION, actions)):
-        names[name] = _flat(data.meta.features[key].get("names"))
-        if len(set(names[name])) == values.shape[1] == len(names[name]):
-            columns |= {f"{name}.{entry}": values[:, place] for place, entry in enumerate(names[name])}
+    for name, entries, values in (("observation", names[OBS_STATE], states), ("action", own, actions)):
+        if len(set(entries)) == values.shape[1] == len(entries):
+            columns |= {f"{name}.{entry}": values[:, place] for place, entry in enumerate(entries)}
         else:
             columns[name] = list(values)
     columns |= {name: [row[name] for row in rows] for name in ("phase", "text")}
     if any(row["picture"] for row in rows):
         columns["picture"] = [row["picture"] for row in rows]
-    stats = (data.meta.stats or {}).get(ACTION, {})
+    if hands is not None:
+        columns["hand"] = list(hands)
     low = np.minimum(np.asarray(stats.get("min", actions.min(0)), np.float64).reshape(-1), actions.min(0))
     high = np.maximum(np.asarray(stats.get("max", actions.max(0)), np.float64).reshape(-1), actions.max(0))
+    margin = 0.0 if hand is None else np.maximum(MARGIN[0], MARGIN[1] * (high - low))
+    low, high = low - margin, high + margin
     still = high - low < LEAST_RANGE
     low, high = np.where(still, low - 0.5, low), np.where(still, high + 0.5, high)
     # the next 32-bit numbers, so that rounding leaves no action outside
     ends = np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)
-    bounds = {name: [float(value) for value in end] for name, end in zip(("low", "high"), ends, strict=True)}
-    return pa.table(columns).replace_schema_metadata({"cuelearner": json.dumps(bounds)})
+    about: dict[str, Any] = {name: end.tolist() for name, end in zip(("low", "high"), ends, strict=True)}
+    if hand is not None:
+        arrays = {name: array.round(9).tolist() for name, array in hand.arrays.items()}
+        about["hand"] = {"entries": names[ACTION], **arrays}
+    about |= {"projections": [one for one, _ in projections], "areas": [area for _, area in projections]}
+    return pa.table(columns).replace_schema_metadata({"cuelearner": json.dumps(about)})
+
+
+def _check_unit(hand: Hand, actions: np.ndarray) -> None:
+    """Raise SystemExit where many proposed actions lie far beyond the joints' limits."""
+    joints = actions @ hand.joints
+    beyond = ((joints < hand.low - BEYOND[0]) | (joints > hand.high + BEYOND[0])).any(1).mean()
+    if beyond > BEYOND[1]:
+        raise SystemExit(
+            f"{100 * beyond:.0f}% of the proposed actions lie beyond the limits of the MJCF's joints: give "
+            "--joint-unit degrees or radians as the robot has, and --joints in the order of the action's entries"
+        )
+
+
+def _hands(states: np.ndarray, names: dict[str, list[str]], hand: Hand | None) -> np.ndarray:
+    """Return where the hand is in states (n, 3). Raises SystemExit where the state does not tell."""
+    own, entries = names[OBS_STATE], names[ACTION] if hand is not None else names[ACTION][:3]
+    used = [True] * len(entries) if hand is None else (hand.joints != 0).any(1)
+    values = np.zeros((len(states), len(entries)))
+    for place, (name, is_used) in enumerate(zip(entries, used, strict=True)):
+        if is_used and name not in own:
+            raise SystemExit(f"--projection needs the place of the hand, but {OBS_STATE} has no {name}")
+        if is_used:
+            values[:, place] = states[:, own.index(name)]
+    return (values if hand is None else hand.place(values)).astype(np.float32)
+
+
+def _projections(matrices: Mapping[str, Path], data: LeRobotDataset) -> list[tuple[Any, Any]]:
+    """Return projections into the picture of all cameras, and the area of each camera, in shares of that picture.
+
+    Raises SystemExit for an unknown camera or a file without a matrix.
+    """
+    sizes = {key: data[0][key].shape[1:] for key in data.meta.camera_keys} if matrices else {}
+    width, height = sum(size[1] for size in sizes.values()), max((size[0] for size in sizes.values()), default=0)
+    projections = []
+    for camera, path in matrices.items():
+        keys = [key for key in sizes if camera in (key, key.rpartition(".")[2])]
+        if not keys:
+            raise SystemExit(f"the dataset has no camera {camera}: give --projection one of {', '.join(sizes)}")
+        left = sum(size[1] for size in list(sizes.values())[: list(sizes).index(keys[0])])
+        try:
+            matrix = np.asarray(json.loads(path.read_text()), np.float64).reshape(3, 4)
+        except (OSError, ValueError, TypeError) as error:
+            raise SystemExit(f"{path} holds no 3x4 matrix of numbers: write three rows of four as JSON") from error
+        into = np.array([[1 / width, 0, left / width], [0, 1 / height, 0], [0, 0, 1]])
+        area = [left / width, 0.0, sizes[keys[0]][1] / width, sizes[keys[0]][0] / height]
+        projections.append(((into @ matrix).tolist(), area))
+    return projections
+
+
+def _names(data: LeRobotDataset, key: str) -> list[str]:
+    """Return the names of a feature's entries; empty where it has none."""
+    return _flat(data.meta.features[key].get("names"))
 
 
 def _flat(names: Any) -> list[str]:

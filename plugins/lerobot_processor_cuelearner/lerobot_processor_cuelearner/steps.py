@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
@@ -20,6 +21,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_processor_cuelearner.correction import VERSION, Correction
+from lerobot_processor_cuelearner.kinematics import PREFIX, Hand
 
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 _newest: dict[tuple[str, str], Any] = {}  # the step that was made last, by its pair and class
@@ -93,6 +95,7 @@ class CorrectStep(_Step):
     chunk: int = 1  # actions of a chunk that are executed
     version: int = VERSION
     correction: Correction | None = field(default=None, init=False, repr=False)
+    hand: Hand | None = field(default=None, init=False, repr=False)  # None: actions are corrected entry by entry
 
     def __post_init__(self) -> None:
         """Find the pair. Raises ValueError for arrays of another version."""
@@ -116,8 +119,27 @@ class CorrectStep(_Step):
         else:
             place = torch.full((len(rows),), self._place.place)
         phase = (place / max(self.chunk - 1, 1)).clamp(max=1.0)
-        moved = {**transition, TransitionKey.ACTION: self.correction(state, phase, rows).reshape(action.shape)}
+        corrected = self.correction(state, phase, rows) if self.hand is None else self._by_hand(state, phase, rows)
+        moved = {**transition, TransitionKey.ACTION: corrected.reshape(action.shape)}
         return moved  # pyright: ignore[reportReturnType]
+
+    def _by_hand(self, state: Tensor, phase: Tensor, rows: Tensor) -> Tensor:
+        """Return joint actions that lead the hand to corrected positions. Raises ValueError for another robot's."""
+        correction, hand, state = self.correction, self.hand, state.to("cpu")
+        assert correction is not None
+        assert hand is not None
+        if rows.shape[-1] != len(hand.joints):
+            raise ValueError(
+                f"an action has {rows.shape[-1]} entries, but the correction is of a robot with {len(hand.joints)}: "
+                "use the checkpoint that it was exported for"
+            )
+
+        def change(place: np.ndarray) -> np.ndarray:
+            proposed = torch.from_numpy(place).float()
+            return (correction(state, phase, proposed) - proposed).numpy()
+
+        moved = hand.moved(rows.detach().to("cpu", torch.float32).numpy(), change)
+        return torch.from_numpy(moved).to(rows)
 
     def get_config(self) -> dict[str, Any]:
         """Return the constructor's arguments."""
@@ -125,8 +147,12 @@ class CorrectStep(_Step):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the correction's arrays."""
-        return {} if self.correction is None else dict(self.correction.arrays)
+        hand = {} if self.hand is None else self.hand.arrays
+        own = {PREFIX + name: torch.from_numpy(array).float() for name, array in hand.items()}
+        return own if self.correction is None else {**self.correction.arrays, **own}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take the correction's arrays. Raises ValueError where they do not fit."""
+        """Take the arrays of the correction and of the hand. Raises ValueError where they do not fit."""
         self.correction = Correction(state)
+        own = {name.removeprefix(PREFIX): array for name, array in state.items() if name.startswith(PREFIX)}
+        self.hand = Hand({name: array.cpu().numpy() for name, array in own.items()}) if own else None
