@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cuelearner_jax.adaptation.judging import PairedTest
 from cuelearner_jax.environment import BASE
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import lerobot
@@ -27,6 +28,14 @@ ROBOT = {
     "output_features": {"action": {"type": "ACTION", "shape": [2]}},
     "n_action_steps": 5,
 }
+
+
+def plugin_module(name):
+    """Import a file of the plugin, which is not installed here."""
+    spec = importlib.util.spec_from_file_location(name, PLUGIN / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def step(name, **config):
@@ -92,11 +101,8 @@ def test_a_correction_of_a_hand_brings_its_kinematics_to_the_checkpoint_of_the_j
 
 def test_the_steps_decide_as_jax_does(env, policy, tmp_path):
     torch = pytest.importorskip("torch")
-    spec = importlib.util.spec_from_file_location("correction", PLUGIN / "correction.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     arrays = {name: torch.tensor(array) for name, array in lerobot.arrays_of(policy, env).items()}
-    decide = module.Correction(arrays)  # replays the golden cases
+    decide = plugin_module("correction").Correction(arrays)  # replays the golden cases
     beyond = torch.tensor([[-3.0, -2.0], [-3.0, -2.0], [0.5, 2.0]])
     moved = decide(torch.zeros(3, 2), torch.tensor([0.0, 1.0, 1.0]), beyond) - beyond
     at_bound = decide(torch.zeros(1, 2), torch.tensor([1.0]), torch.tensor([[-1.0, 0.0]])) - torch.tensor([[-1.0, 0.0]])
@@ -134,3 +140,29 @@ def test_what_is_no_correction_of_proposed_actions_is_refused(env, policy):
     ):
         with pytest.raises(UserError, match=told):
             lerobot.arrays_of(other, env)
+
+
+def evaluation(folder, successes):
+    """Write what `lerobot-eval` writes of one task."""
+    folder.mkdir()
+    task = {"task_group": "pusht", "task_id": 0, "metrics": {"successes": successes}}
+    (folder / "eval_info.json").write_text(json.dumps({"per_task": [task]}))
+    return folder
+
+
+def test_paired_episodes_tell_which_checkpoint_is_better(tmp_path):
+    judging = plugin_module("judging")
+    # seven wins: the mean of (1 + stake)^7 is 26.9, of six 15.6; a tie tells nothing
+    before = evaluation(tmp_path / "before", [False] * 6 + [True] + [False] * 3)
+    after = evaluation(tmp_path / "after", [True] * 10)
+    assert judging.judge(before, after) == "better after 8 of 10 pairs of episodes: success 0.10 -> 1.00"
+    assert judging.judge(after, before).startswith("worse after 8 of 10")
+    with pytest.raises(SystemExit, match="evaluate both alike"):
+        judging.judge(before, evaluation(tmp_path / "short", [True] * 3))
+    with pytest.raises(SystemExit, match="holds no results"):
+        judging.judge(before, tmp_path)
+    for wins in np.random.default_rng(0).choice([-1, 0, 1], (40, 60), p=(0.1, 0.5, 0.4)):
+        test = PairedTest(1)
+        test.add(wins[None])
+        verdict = "better" if test.better[0] else "worse" if test.worse[0] else "not told apart"
+        assert judging.decide(wins)[0] == verdict

@@ -1,4 +1,4 @@
-"""`python -m lerobot_processor_cuelearner situations`."""
+"""`python -m lerobot_processor_cuelearner situations` and `judge`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
+from lerobot_processor_cuelearner.judging import judge
 from lerobot_processor_cuelearner.kinematics import UNITS, hand_of
 from lerobot_processor_cuelearner.situations import write
 
@@ -13,7 +14,10 @@ from lerobot_processor_cuelearner.situations import write
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser("lerobot_processor_cuelearner", description=__doc__)
-    commands = parser.add_subparsers(required=True)
+    commands = parser.add_subparsers(dest="command", required=True)
+    judged = commands.add_parser("judge", help="tell which of two evaluations of the same episodes is better")
+    judged.add_argument("before", type=Path, help="output folder of lerobot-eval, of the policy as it was")
+    judged.add_argument("after", type=Path, help="the same of the corrected policy, with the same seed")
     situations = commands.add_parser("situations", help="write recorded situations with a policy's proposed actions")
     situations.add_argument("--policy", required=True, help="checkpoint of a LeRobot policy (…/pretrained_model)")
     situations.add_argument("--dataset", type=Path, required=True, help="folder of a LeRobot dataset, format v3.0")
@@ -30,6 +34,9 @@ def main() -> None:
         "--projection", action="append", default=[], metavar="CAMERA=FILE", help="3x4 matrix from metres to pixels"
     )
     options = parser.parse_args()
+    if options.command == "judge":
+        print(judge(options.before, options.after))
+        return
     if (options.mjcf is None) != (options.site is None):
         parser.error("give --mjcf and --site together")
     if wrong := [text for text in options.projection if "=" not in text]:
