@@ -107,44 +107,6 @@ def test_another_shape_is_refused_before_anything_is_compiled():
         one_line(lambda odd=odd: cl.CallablePolicy(Opaque(lambda obs: odd, on_host=True))(SEEN), "returned")
 
 
-class Failing:
-    """Raises while it is traced."""
-
-    class Teacher(struct.PyTreeNode):
-        def best_action(self, state, obs):
-            return {}["left"]
-
-    class Window(probes.Window):
-        def step(self, key, state, action):
-            raise ZeroDivisionError("no floor\nhere")
-
-    class Policy(struct.PyTreeNode):
-        def act(self, key, states, obs):
-            return obs @ jnp.ones((3, 2))
-
-
-def test_what_raises_while_it_is_compiled_keeps_its_own_traceback():
-    with pytest.raises(KeyError):
-        adapted(Scaled(1.0), Failing.Teacher())
-    with pytest.raises(TypeError):
-        cl.CallablePolicy(Failing.Policy())(SEEN)
-    with pytest.raises(ZeroDivisionError, match="no floor"):
-        cl.adapt(Scaled(1.0), Failing.Window(), TEACHER, sizes=SIZES, guidance="relative")
-
-
-@pytest.mark.parametrize("at", [1, 7])  # in the first call, and within a compiled program
-def test_a_policy_that_ends_the_process_is_named(at):
-    calls = []
-
-    def leaving(obs):
-        calls.append(obs)
-        if len(calls) >= at:
-            raise SystemExit("enough")
-        return obs
-
-    one_line(lambda: cl.CallablePolicy(leaving)(SEEN), "policy .*leaving raised SystemExit: enough")
-
-
 def test_a_refusal_of_the_package_within_a_policy_is_told_as_it_is():
     def asking(obs):
         raise cl.UserError("give another")

@@ -255,14 +255,6 @@ def test_faults_of_an_environment_are_told_with_their_step(fault, told):
     assert after.steps == 1
 
 
-def test_without_gymnasium_one_line_says_what_to_install(monkeypatch):
-    from cuelearner_jax.bridges.gymnasium import source
-
-    monkeypatch.setattr(source, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"Gymnasium is not installed: pip install 'cuelearner-jax\[gymnasium\]'"):
-        cl.from_gymnasium("CartPole-v1")
-
-
 # --- environments as people have them: late or odd success, odd bounds, ids of their own -----------------------------
 
 

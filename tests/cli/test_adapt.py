@@ -16,7 +16,6 @@ from test_house import ROW
 import cuelearner_jax as cl
 from cuelearner_jax.cli import main
 from cuelearner_jax.guides import base
-from cuelearner_jax.policies import Guided
 from cuelearner_jax.storage import formats, label_files, policy_folders
 from cuelearner_jax.studies.adapt import AdaptRequest
 from cuelearner_jax.tasks import registry
@@ -143,20 +142,6 @@ def test_python_adapts_as_the_command_does_and_what_is_loaded_acts_bitwise_alike
         better.save(tmp_path / "python")
     with pytest.raises(cl.UserError, match="not loaded because a file names it"):
         cl.load_policy(tmp_path / "python")
-
-
-@pytest.mark.long
-def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
-    file = adapted / "labels-45deg.parquet"
-    assert len(label_files.read(file).seeds) == 80
-    command = [*CODE, "--bound-deg", "45", "--labels", "20", "80", "--labels-from", str(file)]
-    assert main([*command, "--out", str(tmp_path / "again")]) == 0
-    code = importlib.import_module("own_turned").straight
-    both = [cl.load_policy(f, task="own_turned:TASK", base=code).policy for f in (adapted, tmp_path / "again")]
-    models = [policy.model for policy in both if isinstance(policy, Guided)]
-    assert len(models) == 2
-    chex.assert_trees_all_equal(*models)
-    assert (tmp_path / "again" / "labels.parquet").exists()
 
 
 def test_a_scenario_says_how_unless_another_kind_or_judge_is_asked_for():

@@ -104,11 +104,6 @@ def test_a_lane_that_is_not_there_is_refused(refused, copy, tmp_path):
     refused(["render", copy, "--labels", "7", "--guidance", "relative"], "labels 10, 20", tmp_path)
 
 
-def test_a_run_without_checkpoints_is_refused(refused, copy):
-    shutil.rmtree(copy / "none" / "checkpoints")
-    refused(["evaluate", copy, "--guidance", "none"], "no checkpoint", copy)
-
-
 def test_labels_that_do_not_fit_are_refused(refused, copy, tmp_path):
     """By the command line; what else does not fit is in tests/runs/test_given_labels.py."""
     file, new = copy / "relative" / "labels.parquet", ["--out", tmp_path / "new"]

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import pytest
 from probes import edit_json
-from small_runs import SMALL, listing, rows, stopping_at
+from small_runs import SMALL, listing, rows
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
@@ -96,28 +96,6 @@ def test_a_piece_that_is_missing_is_named(pieces, measured, tmp_path):
     assert main(["render", str(pieces), "--seed", "9", "--out", str(tmp_path / "film")]) == 2
     shutil.rmtree(pieces / "shard-1-of-2" / "none" / "checkpoints")
     assert main(["evaluate", str(pieces)]) == 2
-
-
-@pytest.mark.long
-def test_a_piece_that_was_stopped_goes_on_with_the_same_command(sweeps, tmp_path):
-    command = [*SWEEP, "--shard", "1/2", "--out", str(tmp_path)]
-    with stopping_at(1):
-        assert main(command) == 130
-    assert main(command) == 0
-    assert rows(tmp_path) == [row for row in rows(sweeps / "whole") if row["seed"] < 9]
-
-
-@pytest.mark.long
-def test_pieces_are_of_one_sweep_though_one_was_begun_before_a_field_existed(pieces, refused):
-    """By the command line: evaluated together, and a piece that is finished is found so."""
-    for file in (pieces / "shard-2-of-2").rglob("digests/metadata"):  # checkpoints did not name their run then
-        edit_json(file, lambda told: told.pop("run"))
-    for group, name in (("sizes", "frame"), ("agent", "polyak"), ("scalars", "answer"), ("task", "mirrors")):
-        edit_json(pieces / "shard-2-of-2" / "config.json", lambda told, group=group, name=name: told[group].pop(name))
-    assert main(["evaluate", str(pieces), "--steps", "20", "--envs", "20"]) == 0
-    assert main([*SWEEP, "--shard", "1/2", "--out", str(pieces)]) == 0
-    edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["sizes"].update(frame="action"))
-    refused([*SWEEP, "--shard", "1/2", "--out", pieces], "is a shard of a sweep with another sizes.frame", pieces)
 
 
 def test_pieces_that_do_not_fit_together_are_refused(pieces, refused, tmp_path):

@@ -168,12 +168,6 @@ def refused(capsys, command, says):
 
 
 @pytest.mark.long
-def test_a_run_folder_alone_loads_no_code(runs, capsys):
-    refused(capsys, ["evaluate", runs / "reach"], "add --task examples.reach:TASK if you trust that code")
-    refused(capsys, ["render", runs / "clone"], "add --task examples.reach:TASK if you trust that code")
-
-
-@pytest.mark.long
 def test_a_kind_from_outside_must_be_named_again(runs, capsys):
     command = ["evaluate", runs / "clone", "--task", "examples.reach:TASK"]
     refused(capsys, command, "--guidance package.module:NAME")
@@ -262,18 +256,6 @@ def test_the_late_arbiter_leaves_the_first_steps_to_the_agent():
     assert guided == [[False, False], [False, False], [False, True], [False, True], [True, True]]
     outcome = outcome._replace(done=jnp.ones(2, bool))
     assert not late.Config(2, 0.0).follow(state, outcome, probes.SCALARS, jax.random.key(0)).chosen.any()
-
-
-@pytest.mark.long
-def test_a_run_goes_on_with_the_same_command(runs, home):
-    described = (runs / "clone" / "config.json").read_text()
-    rows = results.read(runs / "clone").num_rows
-    command = at_home(documented("clone")[0], home)
-    with stranger():
-        assert main([*command, "--resume"]) == 0
-    assert ((runs / "clone" / "config.json").read_text(), results.read(runs / "clone").num_rows) == (described, rows)
-    assert json.loads(described)["grid"]["guidance"] == ["none", "clone"]
-    assert json.loads(described)["kinds"] == {"clone": {"way": 0.9}}
 
 
 @pytest.mark.long

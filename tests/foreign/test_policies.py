@@ -192,12 +192,6 @@ def test_a_model_sees_observations_normalised_as_in_its_training(gymnasium):
     np.testing.assert_allclose(acted(model), wanted, atol=1e-6)
 
 
-def test_a_recurrent_model_is_refused(gymnasium):
-    contrib, box = pytest.importorskip("sb3_contrib"), gymnasium.spaces.Box
-    env = env_of(gymnasium, box(-1, 1, (3,)), box(-1, 1, (2,)))
-    assert "gives a state beside its actions" in fault(model_of(contrib.RecurrentPPO, "MlpLstmPolicy", env))
-
-
 def test_a_model_of_dictionaries_takes_rows_in_the_order_of_its_keys(gymnasium):
     from stable_baselines3 import PPO
 

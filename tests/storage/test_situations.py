@@ -219,36 +219,3 @@ def test_a_lerobot_dataset_that_cannot_be_read_is_told(change, told, tmp_path):
     path.write_text(json.dumps(info))
     with pytest.raises(UserError, match=told):
         situations.read(tmp_path / "set")
-
-
-def test_episodes_that_begin_nowhere_are_told(tmp_path):
-    recorded.write_lerobot(tmp_path / "set")
-    episodes = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
-    stored = pq.read_table(episodes)
-    name = "videos/observation.images.front/from_timestamp"
-    place = stored.column_names.index(name)
-    pq.write_table(stored.set_column(place, name, pa.array([float("nan"), 0.5])), episodes)
-    found = situations.read(tmp_path / "set")
-    assert found.picture(5).kind == "image/png"
-    with pytest.raises(UserError, match="does not say where episode 0 begins"):
-        found.picture(0)
-    episodes.unlink()
-    with pytest.raises(UserError, match="does not say where episode 0 begins"):
-        situations.read(tmp_path / "set").picture(0)
-
-
-def test_a_camera_does_not_lead_out_of_a_dataset(tmp_path):
-    recorded.write_lerobot(tmp_path / "set")
-    path = tmp_path / "set/meta/info.json"
-    text = path.read_text().replace("observation.images.front", "../../../outside")
-    path.write_text(text)
-    episodes = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
-    stored = pq.read_table(episodes)
-    pq.write_table(
-        stored.rename_columns(
-            [name.replace("observation.images.front", "../../../outside") for name in stored.column_names]
-        ),
-        episodes,
-    )
-    with pytest.raises(UserError, match="leads out of"):
-        situations.read(tmp_path / "set").picture(0)
