@@ -37,6 +37,8 @@ from cuelearner_jax.errors import UserError
         ("schedule", {"guide_eval_every": 15}, "schedule.guide_eval_every is 15: give a multiple of sizes.labels"),
         ("sizes", {"ask_all": True}, "sizes.ask_all asks about every candidate: give sizes.candidates above 1 too"),
         ("sizes", {"ask_all": True, "candidates": 4}, "sizes.labels_per_round is 10: give a multiple of sizes.candi"),
+        ("agent", {"n_step": 2}, "agent.n_step is 2"),
+        ("agent", {"coarse_directions": 4, "peaks": 5}, "agent.peaks is 5: give at most"),
         ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
     ],
 )

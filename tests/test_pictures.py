@@ -104,14 +104,3 @@ def test_what_is_no_picture_is_named_in_one_line(image, words):
     with pytest.raises(UserError, match=re.escape(words)) as raised:
         pictures.sketch(image)
     assert "\n" not in str(raised.value)
-
-
-def test_films_of_nothing_are_refused(tmp_path):
-    for make in (lambda: pictures.still([], tmp_path / "x.png"), lambda: pictures.animate([], tmp_path / "x.gif")):
-        with pytest.raises(UserError, match="no frame"):
-            make()
-    with pytest.raises(UserError, match=r"\.gif or \.mp4"):
-        pictures.animate([plain(RED)], tmp_path / "x.avi")
-    with pytest.raises(UserError, match="differ in size"):
-        pictures.clip([plain(RED), plain(RED, 14, 20)], 0.1)
-    assert not list(tmp_path.iterdir())

@@ -53,12 +53,3 @@ def test_without_a_difference_the_policy_stays_as_it_was(world):
     with pytest.warns(UserWarning, match="not shown to be better"):
         same = adapted(world, lambda left, right: 0, judge_episodes=3)
     assert not same.used
-
-
-def test_another_answer_and_a_world_without_films_are_refused(world):
-    with pytest.raises(cl.UserError, match=r"judge_by gave 'left': give -1 \(left\), 0"):
-        adapted(world, lambda left, right: "left")
-    with pytest.raises(cl.UserError, match="a person compares films"):
-        adapted(world.env, lambda left, right: 0)
-    with pytest.raises(cl.UserError, match="a person compares films"):
-        adapted(world, "person")

@@ -14,9 +14,7 @@ from cuelearner_jax import loop
 from cuelearner_jax.agents.networks import Joined, as_function, q_network
 from cuelearner_jax.agents.replay import LaterSteps, Memory, StoredStep, Transition, buffer_for, n_step_return
 from cuelearner_jax.environment import spaces_of
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.run_config import check
 from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces.directions import evenly_spaced
 
@@ -198,21 +196,6 @@ def test_values_of_a_chain_that_is_truncated(weight):
     start, end = learned(True, weight)
     np.testing.assert_allclose(end, [2, 1, 0, 1], atol=0.12)
     np.testing.assert_allclose(start, np.array([0, 0.5, 0, -0.5]) + 1.0 - 0.5 * weight, atol=0.12)
-
-
-@pytest.mark.parametrize(
-    ("agent", "discount", "words"),
-    [
-        ({"n_step": 0}, 0.5, "agent.n_step is 0"),
-        ({"n_step": 2}, 0.0, "agent.n_step is 2"),
-        ({"n_step": 2, "n_step_weight": 1.5}, 0.5, "agent.n_step_weight is 1.5"),
-        ({"n_step": 2, "n_step_weight": -0.1}, 0.5, "agent.n_step_weight is -0.1"),
-    ],
-)
-def test_impossible_windows_and_weights_are_refused(agent, discount, words):
-    with pytest.raises(UserError, match=words):
-        check(probes.config(agent=agent, scalars={"discount": discount}))
-    check(probes.config(agent={"n_step": 2, "n_step_weight": 1.0}, scalars={"discount": 0.5}))
 
 
 # The first layer, which many actions of one observation share.

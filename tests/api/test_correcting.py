@@ -129,19 +129,6 @@ def test_it_can_be_corrected_again(better, tmp_path):
         cl.correct(better, asked(60), low=LOW, high=(1.0, 1.0, 1.0), **how)
 
 
-@pytest.mark.long
-def test_a_constant_change_is_found_by_a_reading():
-    @jax.jit
-    def compiled(obs):
-        means = [0.06 * obs[:, 0], 0.06 * obs[:, 1], 0.6 * jnp.tanh(obs[:, 2] * obs[:, 0])]
-        return jnp.stack(means, -1) + OFFSET[None]
-
-    found = cl.correct(compiled, asked(60, reach=0.1), low=LOW, high=HIGH, eps=EPS)
-    assert found.used
-    assert error(found) < 0.25 * ERROR
-    assert "shares" in found.words[0]
-
-
 def test_labels_of_a_file_say_their_own_space_and_strength(better, tmp_path):
     file = label_files.LabelFile({"name": "arm"}, "relative", better.actions, EPS, np.zeros(150), rows_of(asked(150)))
     label_files.write_file(tmp_path / "labels.parquet", file, "more")

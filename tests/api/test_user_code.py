@@ -105,10 +105,3 @@ def test_another_shape_is_refused_before_anything_is_compiled():
     one_line(lambda: wide(SEEN), r"policy .*lambda.* returned actions of shape \(4, 1\)")
     for odd in (None, [[1j, 0.0]] * 4):
         one_line(lambda odd=odd: cl.CallablePolicy(Opaque(lambda obs: odd, on_host=True))(SEEN), "returned")
-
-
-def test_a_refusal_of_the_package_within_a_policy_is_told_as_it_is():
-    def asking(obs):
-        raise cl.UserError("give another")
-
-    assert str(one_line(lambda: cl.CallablePolicy(asking)(SEEN), "give another")) == "give another"

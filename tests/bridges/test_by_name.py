@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -107,12 +106,6 @@ def test_a_simulator_of_another_layout_is_refused():
         world.reset(jax.random.key(0))
 
 
-def test_a_missing_package_is_told_with_its_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco_playground", None)
-    with pytest.raises(UserError, match=r"need the extra `playground`: pip install 'cuelearner-jax\[playground\]'"):
-        registry.resolve("playground:NoSuchTask")
-
-
 @pytest.mark.long
 def test_the_command_line_trains_seeds_and_reads_the_folder_by_the_familys_name(tmp_path, capsys):
     run = tmp_path / "run"
@@ -138,20 +131,6 @@ def test_cartpole_is_that_of_playground_step_for_step():
     simulator = suite.load("CartpoleBalance", config_overrides={"impl": "jax"})
     same_steps(dataclasses.replace(world, config=world.task.plain()), simulator, 5, tolerance=1e-4)
     check_environment(world.env, 8, tolerance=1e-4)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("NoSuchTask", "playground has no task 'NoSuchTask': choose one of AcrobotSwingup"),
-        ("PandaPickCube", "playground:PandaPickCube downloads its robot: make that environment yourself"),
-    ],
-)
-def test_a_task_that_playground_cannot_give_is_refused_in_one_line(name, says):
-    pytest.importorskip("mujoco_playground")
-    with pytest.raises(UserError, match=re.escape(says)):
-        cl.make(f"playground:{name}")
 
 
 @pytest.mark.long

@@ -104,15 +104,6 @@ def test_a_lane_that_is_not_there_is_refused(refused, copy, tmp_path):
     refused(["render", copy, "--labels", "7", "--guidance", "relative"], "labels 10, 20", tmp_path)
 
 
-def test_labels_that_do_not_fit_are_refused(refused, copy, tmp_path):
-    """By the command line; what else does not fit is in tests/runs/test_given_labels.py."""
-    file, new = copy / "relative" / "labels.parquet", ["--out", tmp_path / "new"]
-    refused([*QUICK, "--guidance", "none", "--labels-from", file, *new], "add --guidance relative", copy)
-    file.write_bytes(b"PAR1 no more")
-    refused([*QUICK, "--guidance", "relative", "--labels-from", file, *new], "not a label file", copy)
-    assert not (tmp_path / "new").exists()
-
-
 def test_pictures_and_measurements_are_not_replaced_unasked(refused, copy, tmp_path):
     for name in ("copy-heuristic.gif", "measured.json"):
         (tmp_path / name).write_text("{}")

@@ -118,11 +118,6 @@ def test_pictures_are_written(tmp_path):
         (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
         (["adapt", "model.zip", "--env", REACH], "and give my_policy:POLICY (module:NAME"),
         (["adapt", "./mine.py:policy", "--env", REACH], "give package.module:NAME, for instance my_code:MINE"),
-        (
-            ["evaluate", REACH, "--policy", "uniform", "--task.arguments", "[]"],
-            "task.arguments is '[]': give arguments",
-        ),
-        (["evaluate", REACH, "--policy", "uniform", "--task.max-steps", "0"], "task.max_steps is 0: give a whole"),
     ],
 )
 def test_wrong_commands_are_refused_in_one_line(command, says, refused, tmp_path, monkeypatch):

@@ -162,18 +162,6 @@ def test_a_reading_is_planned_with_what_may_have_changed(refused, tmp_path, monk
     refused(["label", *asks, "--bound-deg", "20", "--out", "labels"], "leave bound_deg out", tmp_path)
 
 
-def test_policies_that_cannot_be_had_are_refused(refused, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    refused(["label", OWN, "nowhere", "--out", "labels"], "nowhere is not a run folder", tmp_path)
-    refused(["label", OWN, "page_task:QUARTER", "--out", "labels"], "is no policy", tmp_path)
-    refused(["label", OWN, "page_task:NOTHING", "--out", "labels"], "has no 'NOTHING'", tmp_path)
-
-
-def test_a_file_of_something_else_is_refused(labelled, refused, tmp_path):
-    refused(["label", OWN, "--out", labelled / "two"], "another session.seed: give the same", labelled)
-    refused(["label", OWN, "page_task:left_of", "--out", labelled / "one"], "another session.", labelled)
-
-
 def test_a_run_of_another_task_is_no_policy_here(run_folder, refused, tmp_path):
     command = ["label", OWN, run_folder, "--out", tmp_path / "labels"]
     refused(command, "is a run of billiards, not of wandering", tmp_path)

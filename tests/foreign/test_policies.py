@@ -103,35 +103,6 @@ def test_a_module_of_rsl_rl_acts_by_act_inference(torch):
     np.testing.assert_allclose(acted(ActorCritic()), OBS[:, :2] / 2)
 
 
-def test_a_hidden_state_in_the_module_is_refused(torch):
-    class Memory(torch.nn.Module):  # as IsaacLab exports it
-        def __init__(self):
-            super().__init__()
-            torch.manual_seed(0)
-            self.cell, self.out = torch.nn.GRUCell(3, 8), torch.nn.Linear(8, 2)
-            self.register_buffer("hidden", torch.zeros(1, 8))
-
-        def forward(self, obs):
-            self.hidden[:] = self.cell(obs, self.hidden)[:1]
-            return self.out(self.hidden.expand(len(obs), 8))
-
-    assert "does not repeat itself" in fault(torch.jit.script(Memory()))
-
-
-def test_a_hidden_state_beside_the_action_is_refused(torch):
-    class Actor(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.rnn = torch.nn.GRU(3, 2)
-
-        def forward(self, obs):
-            action, hidden = self.rnn(obs[None])
-            return action[0], hidden
-
-    for given in (Actor(), torch.jit.script(Actor())):
-        assert "gives a state beside its actions" in fault(given)
-
-
 def test_a_module_is_the_same_policy_each_time(torch):
     module = network(torch)
     assert len({policy_of(module).function, policy_of(module).function}) == 1

@@ -124,25 +124,6 @@ def test_says_what_is_missing(runs, tmp_path):
     assert float(summary(tmp_path / "report")["relative", 500]["mean"]) == pytest.approx(0.6 * 15 / 50, abs=0.01)
 
 
-def test_a_configuration_that_cannot_be_read_is_said_and_nothing_is_called_complete(runs, tmp_path):
-    def missing(report_folder):
-        text = report(runs, tmp_path / report_folder).read_text()
-        return text.split("## Missing")[1].split("## Where")[0]
-
-    whole = {name: (runs / name / "config.json").read_bytes() for name in ("unguided", "relative-100", "relative-500")}
-    (runs / "unguided" / "config.json").write_bytes(whole["unguided"][:7])
-    (runs / "relative-100" / "config.json").write_bytes(b"{}")
-    (runs / "relative-500" / "config.json").unlink()
-    found = missing("one")
-    assert "complete" not in found
-    for name in ("unguided", "relative-100"):
-        assert f"the plan of {(runs / name).as_posix()} is unknown" in found
-    assert f"{(runs / 'relative-500').as_posix()}: has no config.json" in found
-    for name, contents in whole.items():
-        (runs / name / "config.json").write_bytes(contents)
-    assert "nothing: all runs are complete" in missing("two")
-
-
 def test_seeds_budgets_and_pieces_of_the_plan_without_results_are_named(runs, tmp_path):
     grid = {"guidance": ["none", "relative"], "seeds": list(range(10)), "labels": [100, 700]}
     planned(runs, total_steps=100, grid=grid)

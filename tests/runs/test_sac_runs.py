@@ -6,7 +6,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 import walk_task
 from small_runs import stopping_at
@@ -100,12 +99,7 @@ def test_a_policy_folder_can_keep_the_agent(whole):
     np.testing.assert_array_equal(*(policy.act(jax.random.key(0), None, obs) for policy in (agent, again)))
 
 
-# Lanes.
-
-
-@pytest.fixture(scope="module")
-def lanes():
-    """Two lanes after eight iterations: vmapped, as an accelerator has them, and each alone."""
+def test_replay_tells_ends_by_time_from_terminations_and_guided_steps():
     lane = loop.make_lane(CONFIG, registry.make("heuristic", CONFIG.sizes, ENV), ENV, 0)
 
     def iterated(state):
@@ -116,23 +110,8 @@ def lanes():
 
         return jax.lax.scan(one, (loop.start_clock(), state), length=8)[0][1]
 
-    init, alone = jax.jit(lambda key: lane.init(ENV, key, 0)), jax.jit(iterated)
-    start = [init(jax.random.fold_in(jax.random.key(0), seed)) for seed in range(2)]
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *start)
-    return jax.jit(jax.vmap(iterated))(both), [alone(state) for state in start]
-
-
-def test_side_by_side_lanes_are_those_of_single_seeds(lanes):
-    """On a CPU lanes are taken one by one, and are equal by the bit; vmapped, products are summed in another order."""
-    beside, alone = lanes
-    for index, single in enumerate(alone):
-        other = jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), single)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-4, atol=2e-5), probes.lane(beside, index), other)
-    assert int(np.asarray(beside.agent.guided).max()) > 0
-
-
-def test_replay_tells_ends_by_time_from_terminations_and_guided_steps(lanes):
-    _, (state, _) = lanes
+    start = jax.jit(lambda key: lane.init(ENV, key, 0))(jax.random.fold_in(jax.random.key(0), 0))
+    state = jax.jit(iterated)(start)
     columns = np.asarray(state.agent.replay)  # place, time, two entries, reward, discount, ended, next place and time
     discount, ended, place, time = columns[:, 5], columns[:, 6], columns[:, 7], columns[:, 8]
     off = np.abs(place) > walk_task.EDGE

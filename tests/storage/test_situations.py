@@ -147,20 +147,6 @@ def test_a_csv_file_of_any_program_is_read(text, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("observation,action.x,action.x\n1,2,3\n", "has two columns of one name"),
-        ("observation,action,reward\n1,2,3\n", "has an unknown column 'reward'"),
-        ("observation,action\n1,2,3\n", "Expected 2 columns, got 3"),
-    ],
-)
-def test_a_csv_file_of_other_columns_is_told(text, told, tmp_path):
-    (tmp_path / "situations.csv").write_text(text)
-    with pytest.raises(UserError, match=told):
-        situations.read(tmp_path)
-
-
-@pytest.mark.parametrize(
     ("name", "told"),
     [
         ("../secret.png", "leads out of"),

@@ -123,12 +123,8 @@ def test_a_full_disk_leaves_no_row_behind_and_takes_the_next_one(tmp_path):
     ("text", "says"),
     [
         ('{\n{"fish": "pike", "weights": [1.0]}\n', "is wet: dry it"),
-        ("[]\n", "is wet: dry it"),
         ('{"bird": 1}\n', "lacks the columns fish, weights: it is not a table of catches"),
         ('{"about": {}}\n{"constants": 3}\n{"fish": "pike"}\n', "is wet: dry it"),
-        ('{"fish": "pike", "weights": 3}\n', "is wet: dry it"),
-        ('{"fish": "pike"}\n', "lacks the columns weights"),
-        ("PAR1\n", "is wet: dry it"),
     ],
 )
 def test_what_cannot_be_read_is_said_in_one_line(tmp_path, text, says):

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from probes import CONFIG, Aimed, Chain, Expert, Window, WindowConfig, long_but, make_task
+from probes import CONFIG, Aimed, Chain, Window, WindowConfig, long_but, make_task
 
 from cuelearner_jax.environment import Features, Quantity
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.guides.relative import Relative
-from cuelearner_jax.policies import SHARED, Heuristic, Opaque, Taught, Uniform
+from cuelearner_jax.policies import SHARED, Opaque, Uniform
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import retract, rotate
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario
@@ -196,11 +196,7 @@ def test_a_broken_law_of_policies_is_found(law):
 
 OWN = {
     "chance": Uniform(),
-    "a teacher": Taught(Expert(Window())),
-    "a heuristic": Heuristic(Window()),
-    "a function": Opaque(lambda obs: -obs),
     "a function on the host": Opaque(np.negative, on_host=True),
-    "one of one's own": Turned(jnp.float32(1.0)),
     "drawn actions": Turned(change=lambda key, actions: DIRECTIONS.sample(key, (len(actions),))),
 }
 

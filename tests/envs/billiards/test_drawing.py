@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pictures import film, is_colour
+from pictures import is_colour
 
 from cuelearner_envs.billiards import Table, drawing, sketch, trace
 
 TABLE = Table.one_ball().replace(max_events=24)
-FRAME = 0.03  # of a GIF at 30 frames a second [s]
 
 
 @pytest.fixture(scope="module")
@@ -56,24 +55,3 @@ def test_still_is_a_picture_and_repeats(shot, tmp_path, suffix):
         image = imageio.imread(files[0])[..., :3] / 255
         for name, least in ((sketch.CLOTH, 0.3), (drawing.ARROW, 1e-4), (sketch.TARGETS[0], 1e-3)):
             assert is_colour(image, name).mean() > least
-
-
-def test_gif_has_the_frames_of_the_shot_and_lasts_as_long(shot, tmp_path):
-    held, speed = round(drawing.HOLD_BEFORE / FRAME) + round(drawing.HOLD_AFTER / FRAME), 2.0
-    drawing.animate(TABLE, [shot], tmp_path / "shot.gif", speed=speed)
-    pictures, durations = film(tmp_path / "shot.gif")
-    moving = math.ceil(float(shot.times[-1]) / speed / FRAME) + 1
-    assert durations.sum() == pytest.approx((held + moving) * FRAME)
-    assert 0.6 * moving < len(pictures) <= moving + 2  # equal pictures are stored once
-    assert durations[0] == pytest.approx(drawing.HOLD_BEFORE, abs=1.1 * FRAME)
-
-    def share(picture, name):
-        return is_colour(picture, name, 0.06).mean()
-
-    assert share(pictures[0], drawing.ARROW) > 1e-4  # before the shot only
-    assert share(pictures[-1], drawing.ARROW) < 2e-5
-    assert pictures[-1][-1, -1].tolist() == [1, 1, 1]  # white stays white on a page
-    below = int(pictures[0].shape[0] * 0.88)  # the tray: empty at first, then with the target
-    assert share(pictures[0][below:], sketch.TARGETS[0]) == 0
-    assert share(pictures[-1][below:], sketch.TARGETS[0]) > 1e-3
-    assert share(pictures[-1][:below], sketch.TARGETS[0]) == 0

@@ -7,13 +7,11 @@ import pytest
 import rooms
 
 from cuelearner_envs.anymal.environment import LeggedNavigation
-from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.geometry import line_clearance
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
 from cuelearner_envs.navigation.roadmap import make_teacher
 from cuelearner_envs.navigation.world import closed, count_passed
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
 
@@ -88,16 +86,3 @@ def test_a_teacher_passes_where_it_is_wanted(wish, side):
     found = walked(make_teacher(TWO, jnp.float32(side)), TWO)
     assert found["success"] == 1
     assert found[f"passed_{wish}"] == 1
-
-
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ({"style": "corridor", "preferred_side": "rigth"}, "task.preferred_side is 'rigth', did you mean 'right'?"),
-        ({"preferred_side": "left"}, "task.preferred_side is left: that needs --task.style corridor"),
-    ],
-)
-def test_a_wish_that_cannot_be_is_refused(changes, told):
-    with pytest.raises(UserError) as refused:
-        make_environment(NavigationConfig(**changes))
-    assert told in str(refused.value)
