@@ -1,7 +1,6 @@
 """The training loop on probes: values known by hand, who acts when, and what lanes owe each other (nothing)."""
 
 import dataclasses
-import math
 from functools import cache
 
 import jax
@@ -22,7 +21,6 @@ from cuelearner_jax.types import Step
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 MESH = lane_mesh()
-DEG = math.pi / 180
 q = as_function(q_network(probes.AGENT.q_layers))
 
 
@@ -193,7 +191,6 @@ def test_learning_begins_after_learn_after(learn_after, updates):
 
 BUDGETS = [15, 15, LARGEST, LARGEST]
 SEEDS = [1, 2, 1, 2]
-PARTS = ("obs", "action", "answer")
 
 
 def labelled(program, seeds, budgets, rounds=LARGEST // 10, scalars=probes.SCALARS):

@@ -162,18 +162,6 @@ def test_what_would_lead_to_wrong_numbers_is_refused_in_one_line(call, says):
     assert str(refused.value).isprintable()
 
 
-@pytest.mark.parametrize(
-    "way", [lambda rows: jax.numpy.asarray(rows, "bfloat16"), lambda rows: rows.astype(">f8"), np.ndarray.tolist]
-)
-def test_observations_of_every_make_are_the_same_and_actions_can_be_written_in(way):
-    acting = cl.CallablePolicy(Heuristic(WORLD.env), WORLD.env.observation)
-    few = np.float32([[1, 0], [0, 1], [-1, 0], [0, -1]])
-    actions = acting(way(few))
-    np.testing.assert_array_equal(actions, acting(few))
-    actions[:] = 0.0
-    assert acting(few).any()
-
-
 def rows_of(rows, columns):
     return sorted(tuple(str(row[name]) for name in columns) for row in rows)
 

@@ -15,18 +15,11 @@ from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.spaces import Box
-from cuelearner_jax.storage import results
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry, simulators
 from cuelearner_jax.testing import check_environment, check_task
 
 FAST = registry.resolve("brax:fast")
-TINY = [
-    *("--preset", "quickstart", "--agent.q-layers", "16", "--agent.directions", "16", "--agent.target-directions", "8"),
-    *("--sizes.lanes-per-block", "1", "--agent.batch-size", "8", "--schedule.random-steps", "20"),
-    *("--schedule.learn-after", "20", "--schedule.total-steps", "80", "--schedule.eval-every", "40"),
-    *("--schedule.checkpoint-every", "40", "--schedule.eval-steps", "40"),
-]
 
 
 def same_steps(world, simulator, steps, tolerance=0.0):
@@ -104,20 +97,6 @@ def test_a_simulator_of_another_layout_is_refused():
     says = "brax:inverted_pendulum has observations of 4 entries and actions of 1, the configuration 2 and 1"
     with pytest.raises(UserError, match=says):
         world.reset(jax.random.key(0))
-
-
-@pytest.mark.long
-def test_the_command_line_trains_seeds_and_reads_the_folder_by_the_familys_name(tmp_path, capsys):
-    run = tmp_path / "run"
-    assert main(["sweep", "brax:fast", *TINY, "--seeds", "2", "--out", str(run)]) == 0
-    found = results.read(run).to_pylist()
-    assert {(row["task"], row["seed"]) for row in found} == {("brax", 0), ("brax", 1)}
-    losses = {row["seed"]: row["train_loss"] for row in found}
-    assert losses[0] != losses[1]
-    assert main(["evaluate", str(run), "--envs", "2", "--steps", "8"]) == 0
-    assert "reward" in capsys.readouterr().out
-    policy = cl.load_policy(run)
-    assert policy(np.zeros((3, 2), np.float32)).shape == (3, 1)
 
 
 # Real physics, which takes tens of seconds to compile.

@@ -108,20 +108,6 @@ def test_a_state_that_was_left_is_taken_up_by_replaying_its_actions():
     assert branched[1].place.tolist() != states[3].place.tolist()
 
 
-def test_what_is_resumed_in_another_process_is_bitwise_the_same():
-    here = world(Adder)
-    actions = np.random.default_rng(1).uniform(-1, 0.3, (12, 1))
-    states, whole = walk(here, actions)
-    state, _ = here.reset(KEYS[0])
-    for number, action in enumerate(actions):
-        if number in (0, 3, 8):
-            pool.close_all()  # nothing is left of the instances
-            state = jax.tree.map(jnp.asarray, jax.device_get(state))  # as a checkpoint keeps it
-        state, step = here.step(KEYS[number + 1], state, np.float32(action))
-        same(step, whole[number])
-    same(state, states[-1])
-
-
 def test_lanes_that_share_a_state_each_get_an_instance():
     here = world(Adder)
     env, (state, _) = here.env, here.reset(KEYS[0])

@@ -1,6 +1,5 @@
 """Policies adapted on the command line: a run's, code's and adapted ones, in folders that every command takes."""
 
-import importlib
 import json
 import shutil
 import traceback
@@ -110,28 +109,6 @@ def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
     assert rewards[3] == 1.0
     (before,) = {row["reward"][0] for row in measured(tmp_path, adapted, *own(), "--policy", "base")}
     assert before == 0.0
-
-
-def test_python_adapts_as_a_scenario_says_and_what_is_loaded_acts_bitwise_alike(tmp_path):
-    """As the command does: tests/test_frozen.py."""
-    made, code = cl.make("own_turned:TASK", scenario="ruled"), importlib.import_module("own_turned").straight
-    better = cl.adapt(code, made, cl.teacher_of(made), labels=80, judge_episodes=20)
-    better.save(tmp_path / "python")
-    told = json.loads((tmp_path / "python" / "policy.json").read_text())
-    assert told["policy"]["guidance"] == "demonstration"
-    assert (told["judged"]["by"], told["policy"]["scalars"]["k_max"]) == ("hit", 7)
-    assert (better.used, better.judged) == (True, ("hit", 0.0, 1.0))
-    assert better.difference == (1.0, 1.0, 1.0)
-    assert f"difference +1 [+1, +1]; {better.rewarded_steps:,} rewarded steps)" in better.words[0]
-    assert len(better.labels.obs) == 80
-    loaded = cl.load_policy(tmp_path / "python", base=code)
-    np.testing.assert_array_equal(loaded(SEEN), better(SEEN))
-    np.testing.assert_array_equal(loaded(SEEN[0]), better(SEEN[0]))
-    np.testing.assert_allclose(loaded(SEEN[0]), better(SEEN)[0], atol=1e-6)  # another program: rounded otherwise
-    with pytest.raises(cl.UserError, match="is not empty: give --overwrite"):
-        better.save(tmp_path / "python")
-    with pytest.raises(cl.UserError, match="not loaded because a file names it"):
-        cl.load_policy(tmp_path / "python")
 
 
 def test_a_scenario_says_how_unless_another_kind_or_judge_is_asked_for():

@@ -67,12 +67,3 @@ def test_its_episodes_are_filmed_from_above_and_from_the_side(opengl, tmp_path):
     for half in np.split(pictures[0][..., :3], 2, axis=1):
         assert half.std() > 10
     assert imageio.imread(tmp_path / "navigation_agent-anymal-agent.png").std() > 10
-
-
-def test_where_nothing_can_be_rendered_one_line_says_what_to_install(monkeypatch):
-    def missing():
-        raise ImportError("no libEGL")
-
-    monkeypatch.setattr("cuelearner_envs.anymal.scene._gl_context", missing)
-    with pytest.raises(UserError, match=r"can't render here \(no libEGL\): install OpenGL for EGL"):
-        Studio(model.load(), 32, 32)

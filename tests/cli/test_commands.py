@@ -7,7 +7,6 @@ from xml.etree import ElementTree
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from small_runs import SMALL
 
 from cuelearner_jax.cli import dispatch, main
 from cuelearner_jax.storage import results
@@ -122,16 +121,6 @@ print(*sorted(slow & {name.partition(".")[0] for name in sys.modules}))
     assert first == "usage: cuelearner COMMAND ..."
     assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+", version)
     assert loaded == ""
-
-
-@pytest.mark.long
-def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path, capsys):
-    out = tmp_path / "tuned"
-    command = ["train", "billiards", "--preset", "quickstart", *SMALL, "--guidance", "none", "--seed", "2000"]
-    assert main([*command, "--tuning", "--out", str(out)]) == 0
-    assert {row["split"] for row in results.read(out).to_pylist()} == {"tuning"}
-    assert main(["report", str(out), "--out", str(tmp_path / "report")]) == 2
-    assert main(["report", str(out), "--split", "tuning", "--out", str(tmp_path / "report")]) == 0
 
 
 @pytest.mark.parametrize("command", ["sweep", "evaluate"])

@@ -1,12 +1,9 @@
 """Sweeps in pieces: together they are the whole; begun twice, stopped, on a full disk, and with a piece missing."""
 
 import json
-import resource
 import shutil
-import sys
 from pathlib import Path
 
-import jax
 import pytest
 from probes import edit_json
 from small_runs import SMALL, listing, rows
@@ -112,21 +109,3 @@ def test_pieces_that_do_not_fit_together_are_refused(pieces, refused, tmp_path):
     edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["scalars"].update(eps_deg=3.0))
     says = "are shards of different sweeps (they differ in scalars.eps_deg): give the folder"
     refused(["evaluate", pieces], says, pieces)
-
-
-def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path, capsys, monkeypatch):
-    """Every file but the shortest is too large for this process."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module that was cut would stay for later imports
-    bandit = ["sweep", "page_task:TASK", "--guidance", "none", "--seeds", "2"]  # whose programs are soon compiled
-    jax.config.update("jax_enable_compilation_cache", False)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, hard))
-    try:
-        status = main([*bandit, "--out", str(tmp_path / "run")])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        jax.config.update("jax_enable_compilation_cache", True)
-    assert status == 1
-    # Orbax's threads may complain beside it.
-    says = "error: the disk is full: free some, then go on with the same command and --resume"
-    assert says in capsys.readouterr().err

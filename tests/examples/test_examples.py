@@ -276,18 +276,6 @@ def test_the_parts_keep_the_laws(tmp_path):
 
 
 @pytest.mark.long
-def test_policies_of_ones_own_reach_the_buoy(tmp_path, capsys):
-    policy = importlib.import_module("examples.policy")
-    found = policy.main([str(tmp_path)], steps=8_000)
-    assert sorted(found) == sorted(policy.policies(None))
-    for metrics in found.values():
-        assert metrics["success"] > 0.9
-    for name in ("leaning.gif", "leaning.png"):
-        assert (tmp_path / name).stat().st_size > 1000
-    assert "wrote" in capsys.readouterr().out
-
-
-@pytest.mark.long
 def test_any_function_is_corrected(capsys):
     from examples.correct_a_policy import main as correct
 

@@ -199,13 +199,6 @@ def test_what_only_stablehlo_can_say_is_refused_of_the_others(tmp_path):
         write(policy, "stablehlo", tmp_path / "out")
 
 
-def test_without_onnx_its_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(UserError, match=r"cuelearner-jax\[onnx\]"):
-        write(agent(), "onnx", tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_golden_cases_are_those_that_rounding_does_not_turn():
     """A policy that jumps at the context (1, 0): only observations far from the jump are kept."""
     policy = Opaque(lambda obs: jnp.where(obs[:, 1:] > 0, 1.0, -1.0) * jnp.array([[0.6, 0.8]]))
@@ -235,11 +228,3 @@ def test_a_difference_that_no_episode_leads_to_is_noticed_when_the_file_is_writt
         with pytest.raises(UserError, match="golden cases differ by"):
             write(policy, format, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("given", [(np.nan, 0.0), (0.0, 0.0)])
-def test_a_decision_that_is_no_direction_is_refused(folder, monkeypatch, given):
-    decide = runner.Decision(folder / "numpy")
-    monkeypatch.setattr(decide, "_decide", lambda batch: np.tile(np.float32(given), (len(batch), 1)))
-    with pytest.raises(runner.ContractError, match="no direction"):
-        decide(np.zeros(2))

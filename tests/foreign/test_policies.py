@@ -54,18 +54,6 @@ def test_a_module_acts_in_evaluation_mode_and_keeps_its_own(torch):
     assert all(own.grad is None for own in module.parameters())
 
 
-def test_a_class_of_modules_is_made(torch):
-    class Actor(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.act = torch.nn.ReLU()  # a name that policies of ours have
-
-        def forward(self, obs):
-            return self.act(obs[:, :2])
-
-    np.testing.assert_allclose(acted(Actor), np.maximum(OBS[:, :2], 0))
-
-
 def test_faults_of_modules_are_told(torch):
     class Broken(torch.nn.Module):
         def forward(self, obs):
@@ -90,23 +78,6 @@ def deployed(torch, how):
 def test_deployed_modules_act(how, torch):
     module, given = deployed(torch, how)
     np.testing.assert_allclose(acted(given), acted(module), atol=1e-6)
-
-
-def test_a_module_of_rsl_rl_acts_by_act_inference(torch):
-    class ActorCritic(torch.nn.Module):
-        def forward(self):
-            raise NotImplementedError
-
-        def act_inference(self, obs):
-            return obs[:, :2] / 2
-
-    np.testing.assert_allclose(acted(ActorCritic()), OBS[:, :2] / 2)
-
-
-def test_a_module_is_the_same_policy_each_time(torch):
-    module = network(torch)
-    assert len({policy_of(module).function, policy_of(module).function}) == 1
-    assert policy_of(module).function != policy_of(network(torch)).function
 
 
 @pytest.fixture

@@ -26,7 +26,6 @@ from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import Checkpoints
-from cuelearner_jax.storage.folders import prepare_folder
 from cuelearner_jax.studies import train
 from cuelearner_jax.terminal import Interrupted
 
@@ -257,19 +256,6 @@ def refused(out, message):
     assert probes.files_of(out) == before
 
 
-def test_a_checkpoint_whose_lanes_had_another_state_is_refused(whole, tmp_path, monkeypatch):
-    out = copied(whole, tmp_path)
-    (out / "none" / results.PARQUET).unlink()
-    of_now = training.items
-
-    def of_a_newer_program(blocks, clock, wall):
-        made = of_now(blocks, clock, wall)
-        return {**made, "rest": [block.replace(arbiter=(block.arbiter, block.failed)) for block in made["rest"]]}
-
-    monkeypatch.setattr(training, "items", of_a_newer_program)
-    refused(out, "of another configuration or version of the program, use that one")
-
-
 def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(stopped, whole, tmp_path):
     out = copied(stopped, tmp_path)
     newest_folder = out / "relative" / "checkpoints" / str(6 + 48)
@@ -330,25 +316,3 @@ def test_a_part_that_was_exchanged_with_another_runs_is_refused(stopped, other, 
     else:
         shutil.copy(other / "relative" / part, mine)
     refused(out, "another run")
-
-
-@pytest.mark.parametrize(("resume", "says"), [(False, "not empty"), (True, "other values of scalars.eps_deg")])
-def test_a_folder_that_another_process_used_in_the_meantime_is_left_alone(stopped, tmp_path, resume, says):
-    out, other = copied(stopped, tmp_path), tmp_path / "other"
-    if resume:
-        prepare_folder(other, formats.read("config", out / "config.json"), clean=True)
-
-    @contextmanager
-    def late(folder):
-        """The folder becomes another run's between the first look and the lock."""
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(out, folder)
-        probes.edit_json(folder / "config.json", lambda values: values["scalars"].update(eps_deg=1.0))
-        yield
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "claimed", late)
-        with pytest.raises(UserError, match=says):
-            run(other, resume=resume)
-    assert formats.read("config", other / "config.json")["scalars"]["eps_deg"] == 1.0
-    assert read_labels(other)[0].shape == read_labels(out)[0].shape

@@ -70,14 +70,6 @@ def test_a_description_stays_with_a_table_through_every_change(tmp_path):
     assert (tmp_path / SCHEMA.jsonl).read_text().count("about") == 1
 
 
-def test_constants_hold_until_the_next_ones(tmp_path):
-    for name, boat in (("pike", 1.0), ("eel", 1.0), ("carp", 2.0)):
-        written(tmp_path, name, about=None, boat=boat)
-    assert read(tmp_path)["boat"].to_pylist() == [1.0, 1.0, 2.0]
-    assert tables.about_of(read(tmp_path)) is None
-    assert tables.about_of(tables.read(tables.finish(tmp_path, SCHEMA), SCHEMA)) is None
-
-
 @pytest.mark.parametrize("torn", [b'{"fish": "ca', b"\x00\x00", b'{"fish": "\xc3'])
 def test_a_torn_last_line_is_dropped_by_whoever_continues(tmp_path, torn):
     path = written(tmp_path, "pike", "eel")

@@ -3,23 +3,13 @@
 import math
 
 import imageio.v2 as imageio
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from pictures import is_colour
 
-from cuelearner_envs.billiards import Table, drawing, sketch, trace
+from cuelearner_envs.billiards import Table, drawing, sketch
 
 TABLE = Table.one_ball().replace(max_events=24)
-
-
-@pytest.fixture(scope="module")
-def shot():
-    """The cue ball at (0.1, -0.1) drives the target at (0.3, 0.1) along the diagonal into the corner (0.4, 0.2)."""
-    path = jax.jit(trace)(TABLE, jnp.array([[0.1, -0.1], [0.3, 0.1]]), jnp.zeros(2, bool), math.pi / 4)
-    assert path.pocketed[-1].tolist() == [False, True]
-    return path
 
 
 @pytest.mark.parametrize(("angle", "pocketed"), [(1.0, False), (-2.5, True)])
@@ -43,15 +33,3 @@ def test_a_question_shows_the_balls_and_the_shot_as_an_arrow(tmp_path, angle, po
         assert is_colour(image[int((top - place[1]) * dots), int((place[0] - left) * dots)], colour, 0.1)
     rows, _ = np.nonzero(is_colour(image, sketch.TARGETS[0]))
     assert (rows.min() > (top + 0.2) * dots) == pocketed  # then all of the ball is below the table
-
-
-@pytest.mark.parametrize("suffix", ["png", "svg"])
-def test_still_is_a_picture_and_repeats(shot, tmp_path, suffix):
-    files = [tmp_path / f"{name}.{suffix}" for name in ("one", "two")]
-    for file in files:
-        drawing.still(TABLE, shot, file)
-    assert files[0].read_bytes() == files[1].read_bytes()
-    if suffix == "png":
-        image = imageio.imread(files[0])[..., :3] / 255
-        for name, least in ((sketch.CLOTH, 0.3), (drawing.ARROW, 1e-4), (sketch.TARGETS[0], 1e-3)):
-            assert is_colour(image, name).mean() > least
