@@ -97,8 +97,7 @@ def test_a_film_shows_the_frames_at_their_rate(tmp_path, kind):
 
 
 @pytest.mark.parametrize(
-    ("image", "words"),
-    [(np.zeros((4, 4, 3), np.float32), "float32 (4, 4, 3)"), (b"no picture", "cannot be read")],
+    ("image", "words"), [(np.zeros((4, 4, 3), np.float32), "float32 (4, 4, 3)"), (b"no picture", "cannot be read")]
 )
 def test_what_is_no_picture_is_named_in_one_line(image, words):
     with pytest.raises(UserError, match=re.escape(words)) as raised:

@@ -4,7 +4,6 @@ import dataclasses
 import re
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax import envs
@@ -13,7 +12,6 @@ import cuelearner_jax as cl
 from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry, simulators
@@ -110,26 +108,6 @@ def test_cartpole_is_that_of_playground_step_for_step():
     simulator = suite.load("CartpoleBalance", config_overrides={"impl": "jax"})
     same_steps(dataclasses.replace(world, config=world.task.plain()), simulator, 5, tolerance=1e-4)
     check_environment(world.env, 8, tolerance=1e-4)
-
-
-@pytest.mark.long
-def test_pictures_are_of_the_models_bodies(tmp_path):
-    """The pendulum moves, and the film begins where the episode does."""
-    world = cl.make("brax:inverted_pendulum", backend="positional", max_steps=50)
-    drawn = world.task.pictures()
-    state, obs = world.reset(jax.random.key(0))
-    first = drawn.sketch(world.env, state)
-    assert first.box[2:] == (480, 360)
-    found = drawn.reel(world.env, state, jnp.ones(1))
-    assert len(found.pictures) == 6
-    assert len(set(found.pictures)) == 6
-    frames, rewards = drawn.record(world.env, uniform_in(world.env), jax.random.key(0), 4)
-    assert len(frames) == len(rewards) == 4
-    assert np.abs(frames[0].astype(int) - frames[3].astype(int)).max() > 50
-    drawn.still(world.env, frames, tmp_path / "still.png")
-    drawn.question(world.env, state, obs, jnp.ones(1), tmp_path / "question.png")
-    assert (tmp_path / "still.png").stat().st_size > 1000
-    assert (tmp_path / "question.png").stat().st_size > 1000
 
 
 def test_a_simulator_without_bodies_is_not_drawn():

@@ -161,31 +161,7 @@ def test_nested_observations_are_named_and_flattened_in_the_order_of_their_space
     np.testing.assert_array_equal(rows(steps, "final_obs")[:, -3:], np.eye(3))
 
 
-class Odd(gymnasium.Env):
-    """Takes its spaces as they are given."""
-
-    def __init__(self, seen, does):
-        self.observation_space, self.action_space = seen, does
-
-
-REAL = spaces.Box(-1, 1, (2,))
-IMAGE = spaces.Box(0, 255, (32, 32, 3), np.uint8)
 BOX = spaces.Box(-1, 1, (1,), np.float32)
-
-
-@pytest.mark.parametrize(
-    ("seen", "does", "told"),
-    [
-        (IMAGE, REAL, r"'observation' is an image of shape \(32, 32, 3\): give one with observations of numbers"),
-        (spaces.Text(4), REAL, "is a Text: give one of Box, Discrete"),
-        (REAL, spaces.MultiBinary(3), "its actions are a MultiBinary: wrap the environment"),
-        (REAL, spaces.Discrete(1), "there is only one action"),
-    ],
-)
-def test_spaces_that_are_not_served_are_told_in_one_line(seen, does, told):
-    with pytest.raises(UserError, match=told) as refused:
-        world(lambda: Odd(seen, does), max_steps=5)
-    assert "\n" not in str(refused.value)
 
 
 # --- wrong calls and wrong environments ------------------------------------------------------------------------------

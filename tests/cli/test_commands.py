@@ -15,11 +15,7 @@ from cuelearner_jax.storage import results
 def test_a_sweep_leaves_a_complete_folder(run_folder):
     described = json.loads((run_folder / "config.json").read_text())
     assert described["task"]["name"] == "billiards"
-    assert described["grid"] == {
-        "guidance": ["none", "relative"],
-        "seeds": [2000, 2001],
-        "labels": [10, 20],
-    }
+    assert described["grid"] == {"guidance": ["none", "relative"], "seeds": [2000, 2001], "labels": [10, 20]}
     for kind, lanes in (("none", 2), ("relative", 4)):
         rows = results.read(run_folder / kind).to_pylist()
         assert (run_folder / kind / "results.parquet").exists()

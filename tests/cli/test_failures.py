@@ -25,10 +25,7 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--policy", "agent"], "needs a trained run"),
     (["evaluate", "billiards", "--compare", "nowhere"], "--compare is 'nowhere': give a run folder, a policy folder"),
     (["evaluate", "billiards", "--compare", "heuristic"], "the policy that is evaluated: give another one"),
-    (
-        ["evaluate", "billiards", "--compare", "docs/data/navigation_agent"],
-        "not of billiards: give one of billiards",
-    ),
+    (["evaluate", "billiards", "--compare", "docs/data/navigation_agent"], "not of billiards: give one of billiards"),
     (["evaluate", "billiards", "--steps", "150"], "multiple of envs"),
     (["evaluate", "billiards", "--scenario"], "--scenario: expected one argument"),
     (["evaluate", "--compare", "billiards"], "evaluate needs a subject: name a task"),

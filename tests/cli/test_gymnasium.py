@@ -112,8 +112,6 @@ def test_pictures_are_written(tmp_path):
     ("command", "says"),
     [
         (["evaluate", "gymnasium"], "gymnasium is a family of tasks: name one of its environments, as gymnasium:NAME"),
-        (["evaluate", "gymnasium:gymnasium_worlds:Nope"], "gymnasium_worlds has no 'Nope'"),
-        (["train", REACH, "--env", "navigation"], "the task is named twice"),
         (["render", REACH, "--policy", "uniform", "--out", "film.gif"], "cannot be drawn"),
         (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
         (["adapt", "model.zip", "--env", REACH], "and give my_policy:POLICY (module:NAME"),

@@ -18,7 +18,6 @@ from cuelearner_jax.labelling.questions import Item
 from cuelearner_jax.reading import Reading
 from cuelearner_jax.spaces import UNSAID, Box, cues_from
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.types import Sketch
 
 pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
@@ -75,17 +74,6 @@ def test_cues_are_arrows_where_their_words_point_with_keys_and_words():
     assert arrows(drawn(box("right,left")))["+1"][0] == 0  # more may be to the right
     assert view.by_words(cues_from("left,up")[0]) is None
     assert view.by_words(cues_from("more to the left,less")[0]) == (-1.0, 0.0)
-
-
-def test_a_task_says_where_cues_point_in_its_pictures():
-    forward, left, up, fingers = fetch_layout.points_of("FetchReach-v4", "{}")
-    half, eighth = np.sqrt(0.5), np.sqrt(0.125)  # azimuth 45 degrees, and half of what leads away is up: sin 30 degrees
-    np.testing.assert_allclose([forward, left], [(half, -eighth), (-half, -eighth)], atol=1e-6)
-    assert (up, fingers) == ((0.0, -1.0), None)
-    assert fetch_layout.points_of("FetchReach-v4", '{"default_camera_config": {}}')[:2] == (None, None)
-    assert fetch_layout.points_of("Pendulum-v1", "{}") == ()
-    found = arrows(drawn(box(f"forward,back;{CUES}"), sketch=PHOTO._replace(points=(forward, left, up, None))))
-    assert (found["pick-0-more"][0], found["pick-1-more"][0], found["pick-2-less"][0]) == (27, 153, -90)
 
 
 def test_one_press_about_one_cue_says_nothing_of_the_others():

@@ -11,11 +11,7 @@ from box_task import EPS, SCALARS, SMALL
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
-from cuelearner_jax.feedback.answers import (
-    RELATIVE,
-    human_answer,
-    relative_feedback,
-)
+from cuelearner_jax.feedback.answers import RELATIVE, human_answer, relative_feedback
 from cuelearner_jax.spaces import UNSAID, Box, Cue, cues_from, from_json
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Label

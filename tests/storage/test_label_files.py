@@ -170,11 +170,7 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("other", "named"),
-    [
-        ({"answers": "scalar", "eps_deg": None}, "answers"),
-        ({"eps_deg": 5.0}, "eps"),
-    ],
+    ("other", "named"), [({"answers": "scalar", "eps_deg": None}, "answers"), ({"eps_deg": 5.0}, "eps")]
 )
 def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named):
     said(tmp_path, range(3))
