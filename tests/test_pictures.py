@@ -53,12 +53,6 @@ def test_a_file_is_passed_on_as_it_is(kind):
     assert uri == f"data:image/{kind.lower()};base64,{base64.b64encode(given).decode()}"
 
 
-def test_a_large_file_is_made_smaller_and_keeps_its_shape():
-    sketch = pictures.sketch(file_of(plain(GREEN, 1000, 2560)))
-    assert sketch.box[2:] == (1280, 500)
-    assert shown_by(sketch)[1].shape == (500, 1280, 3)
-
-
 def test_a_picture_of_a_turned_camera_stands_upright():
     image = np.concatenate([plain(RED, 16, 16), plain(BLUE, 16, 16)])  # red above blue
     exif = Image.Exif()

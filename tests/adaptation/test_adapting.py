@@ -203,8 +203,6 @@ def test_a_bound_is_narrowed_where_that_is_worth_more():
     ("bounds", "changes", "says"),
     [
         ([0.0], {}, "bound_deg is 0"),
-        ([float("nan")], {}, "bound_deg is nan"),
-        ([10.0, 10.0], {}, "each once"),
         ([0.3], {}, "labels of 5 degrees say nothing within a bound of 0.3"),
         ([10.0], {"eps_deg": 0.2}, "give scalars.tau_deg 0.01"),
     ],

@@ -153,13 +153,9 @@ def test_bounds_that_are_not_given_are_told():
         ({"labels": "absent", "low": None, "high": None, "cues": ""}, "no label file at absent"),
         ({"labels": cl.Labels(OTHERS[:20], wanted(OTHERS[:20]), np.zeros((20, 2)))}, r"give \(labels, 3\)"),
         ({"low": (0.0,) * 3}, "actions are no vectors between the bounds"),
-        ({"low": (0.0,) * 2, "high": (1.0,) * 2}, "low and high bound 2 and 2 entries: give 3"),
         ({"low": None}, "high is given alone"),
         ({"cues": "left,right"}, "give one cue an entry"),
-        ({"bound": 2.0}, "up to 1"),
-        ({"guidance": "shy"}, "shy"),
         ({"policy": lambda obs: obs[:, :2]}, "returned actions of shape"),
-        ({"policy": lambda obs: obs * np.nan}, "not finite"),
         ({"space": SPACE}, "cues is given beside space"),
     ],
 )

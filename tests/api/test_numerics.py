@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import probes
 import pytest
-from gymnasium_worlds import Adder
 
 import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
@@ -45,11 +44,6 @@ def test_measure_and_adapt_return_the_same_numbers_in_any_program(request):
         assert other.dtype == np.float32
         np.testing.assert_array_equal(own, other)
     assert jax.config.jax_enable_x64  # the program keeps its own settings
-
-
-def test_a_gymnasium_world_is_measured_while_nan_is_hunted(another_program):
-    world = cl.from_gymnasium(Adder, num_envs=2, processes=1, max_steps=5)
-    assert np.isfinite(cl.measure(lambda obs: np.full((len(obs), 1), 0.25), world, episodes=2).metrics["return"]).all()
 
 
 def test_a_command_sets_jax_up_for_all_its_threads(another_program, capsys):

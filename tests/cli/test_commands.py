@@ -1,7 +1,9 @@
 import json
 import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 from xml.etree import ElementTree
 
 import imageio.v2 as imageio
@@ -9,19 +11,23 @@ import numpy as np
 import pytest
 
 from cuelearner_jax.cli import dispatch, main
+from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.storage import results
+from cuelearner_jax.studies import train
+
+README = Path(__file__).resolve().parents[2] / "README.md"
 
 
 def test_a_sweep_leaves_a_complete_folder(run_folder):
     described = json.loads((run_folder / "config.json").read_text())
-    assert described["task"]["name"] == "billiards"
+    assert described["task"]["name"] == "bandit"
     assert described["grid"] == {"guidance": ["none", "relative"], "seeds": [2000, 2001], "labels": [10, 20]}
     for kind, lanes in (("none", 2), ("relative", 4)):
         rows = results.read(run_folder / kind).to_pylist()
         assert (run_folder / kind / "results.parquet").exists()
         assert len(rows) == lanes * 3  # steps 0, 100 and 200
         assert {row["step"] for row in rows} == {0, 100, 200}
-        assert {(row["episodes"], len(row["reward_each"])) for row in rows} == {(50, 20)}
+        assert {(row["episodes"], len(row["reward_each"])) for row in rows} == {(40, 20)}
         assert all(np.mean(row["reward_each"]) == pytest.approx(row["reward"], abs=1e-6) for row in rows)
     assert (run_folder / "relative" / "labels.parquet").exists()
 
@@ -77,6 +83,15 @@ def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, caps
     assert main(["render", *table, "--question", "--out", str(tmp_path)]) == 0
 
 
+def test_the_sweep_of_the_readme_would_begin(monkeypatch, tmp_path):
+    (line,) = re.findall(r"^cuelearner (sweep .*)$", README.read_text(encoding="utf-8"), re.MULTILINE)
+    orders = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
+    assert main(shlex.split(line)) == 0
+    assert orders[0].grid.guidance == ("none", "relative")
+
+
 def test_a_report_has_curves_and_tables(run_folder, tmp_path):
     out = tmp_path / "report"
     assert main(["report", str(run_folder), "--out", str(out)]) == 0
@@ -89,10 +104,10 @@ def test_a_report_has_curves_and_tables(run_folder, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("film", ["gif", "mp4"])
-def test_render_makes_a_film_and_a_still(run_folder, tmp_path, film):
-    command = ["render", str(run_folder), "--guidance", "relative", "--labels", "10", "--seed", "2001", "--film", film]
+def test_render_makes_a_film_and_a_still(tmp_path, film):
+    command = ["render", "shipped:billiards", "--film", film]
     assert main([*command, "--steps", "1", "--out", str(tmp_path)]) == 0
-    still, filmed = (tmp_path / f"small-agent.{end}" for end in ("png", film))
+    (still,), (filmed,) = (list(tmp_path.glob(f"*-agent.{end}")) for end in ("png", film))
     assert imageio.imread(still).std() > 1
     assert filmed.stat().st_size > 1000
 

@@ -83,7 +83,6 @@ def test_what_is_no_run_is_refused(refused, copy, tmp_path, command):
     out = ["--out", tmp_path / "new"]
     refused([command, empty, *out], "no config.json", tmp_path)
     refused([command, copy, "--policy", "expert", *out], "unknown policy", tmp_path)
-    refused([command, copy, "--task.table", "easy", *out], "options that keep its observations", tmp_path)
     refused([command, copy, "--guidance", "scalar", *out], "choose among none, relative", tmp_path)
     (copy / "config.json").write_text("{")
     refused([command, copy, *out], "damaged", tmp_path)

@@ -100,14 +100,6 @@ def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
     assert main([*again, "--episodes", "4"]) == 0
 
 
-def test_pictures_are_written(tmp_path):
-    command = ["render", "gymnasium:gymnasium_worlds:limited", "--policy", "uniform", "--steps", "3"]
-    assert main([*command, "--out", str(tmp_path / "film")]) == 0
-    assert sorted(file.suffix for file in (tmp_path / "film").iterdir()) == [".gif", ".png"]
-    assert main([*command, "--question", "--out", str(tmp_path / "asked")]) == 0
-    assert len(list((tmp_path / "asked").iterdir())) == 1
-
-
 @pytest.mark.parametrize(
     ("command", "says"),
     [

@@ -4,18 +4,19 @@ import sys
 import time
 from pathlib import Path
 
-from small_runs import SMALL, rows
+from small_runs import BANDIT, rows
 
 from cuelearner_jax.cli import main
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
-STEPS = 800
-LONG = [*SMALL, "--schedule.total-steps", str(STEPS), "--guidance", "none", "--seeds", "2"]
-COMMAND = ["sweep", "billiards", "--preset", "quickstart", *LONG]
+STEPS = 4000
+COMMAND = ["sweep", BANDIT, "--schedule.total-steps", str(STEPS), "--guidance", "none", "--seeds", "2"]
+TESTS = str(Path(__file__).resolve().parents[1])
 
 
 def start_and_wait_for(folder, step):
-    process = subprocess.Popen([*ENTRY, *COMMAND, "--out", str(folder)], stderr=subprocess.PIPE, text=True)
+    command = [*ENTRY, *COMMAND, "--out", str(folder)]
+    process = subprocess.Popen(command, cwd=TESTS, stderr=subprocess.PIPE, text=True)
     for _ in range(1200):
         file = folder / "none" / "results.jsonl"
         if file.exists() and f'"step": {step}' in file.read_text():

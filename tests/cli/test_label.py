@@ -148,19 +148,9 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
     assert words[words.index("--guidance") + 1] == "reading"
 
 
-def test_a_reading_is_planned_with_what_may_have_changed(refused, tmp_path, monkeypatch):
-    pytest.importorskip("nicegui")
-    asks = [OWN, "page_task:left_of"]
-    found, plan, _ = asked_for(monkeypatch, *asks, "--out", str(tmp_path))
-    assert plan.family == ()
-    assert found.sizes.labels_per_round == 10
-    monkeypatch.chdir(tmp_path)
-    refused(["label", *asks, "--bound-deg", "20", "--out", "labels"], "leave bound_deg out", tmp_path)
-
-
 def test_a_run_of_another_task_is_no_policy_here(run_folder, refused, tmp_path):
     command = ["label", OWN, run_folder, "--out", tmp_path / "labels"]
-    refused(command, "is a run of billiards, not of wandering", tmp_path)
+    refused(command, "is a run of bandit, not of wandering", tmp_path)
 
 
 def test_labels_are_inspected(labelled, capsys):

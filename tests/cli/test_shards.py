@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 from probes import edit_json
-from small_runs import SMALL, listing, rows
+from small_runs import BANDIT, listing, rows
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.shards import Shard
 
-SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]
-SWEEP += ["--guidance", "none"]
+SWEEP = ["sweep", BANDIT, "--seeds", "3", "--first-seed", "7", "--guidance", "none"]
 
 
 @pytest.fixture(scope="module")

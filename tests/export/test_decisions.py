@@ -23,7 +23,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, layers, uniform_in
 
 ENV = Aimed()
-ANGLES = np.linspace(0.0, 6.0, 40)
+ANGLES = np.linspace(0.0, 6.0, 20)
 DRAWN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
 
 
@@ -159,18 +159,6 @@ def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_
     (there / "decision.stablehlo").write_bytes(changed.serialize())
     edit_contract(there)
     with pytest.raises(UserError, match="calls Python functions"):
-        contract.replay_golden_cases(there)
-
-
-def test_what_this_program_cannot_run_is_told_in_one_line(folder, tmp_path):
-    there = copied(folder / "stablehlo", tmp_path)
-    (there / "decision.stablehlo").write_bytes((there / "decision.stablehlo").read_bytes()[:3000])
-    edit_contract(there, lambda told: told["artefact"].update(jax="0.99.1"))
-    with pytest.raises(UserError, match=r"exported with JAX 0\.99\.1, and JAX .* cannot call it") as refused:
-        contract.replay_golden_cases(there)
-    assert "\n" not in str(refused.value)
-    edit_contract(there, lambda told: told.update(version=runner.VERSION + 1))
-    with pytest.raises(UserError, match="newer cuelearner"):
         contract.replay_golden_cases(there)
 
 

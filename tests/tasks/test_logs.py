@@ -148,11 +148,8 @@ def test_it_is_named_by_its_folder(folder):
     ("given", "told"),
     [
         ({"cues": "left,right;up,down"}, "2 pairs of words for 3 entries"),
-        ({"low": (0.0, 0.0, 0.0)}, "given alone"),
         ({"low": (0.0,) * 3, "high": (0.1,) * 3}, "give bounds that hold the recorded actions"),
         ({"actions": "directions"}, r"\(directions, 2 entries\): give another kind"),
-        ({"actions": "choices"}, "give another kind of actions"),
-        ({"actions": "directions", "low": (0.0,), "high": (1.0,)}, "leave them out"),
         ({"actions": "boxes"}, "did you mean 'box'"),
     ],
 )
