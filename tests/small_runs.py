@@ -17,7 +17,6 @@ from cuelearner_jax.task import Preset
 SMALL = [
     *("--agent.q-layers", "16", "--sizes.feedback-layers", "16", "--agent.directions", "36"),
     *("--sizes.fit-steps", "20", "--task.search-directions", "90"),
-    # However many seeds a test takes, its programs are those of one lane, which the compilation cache then has.
     *("--sizes.lanes-per-block", "1"),
     *("--schedule.total-steps", "200", "--schedule.eval-every", "100", "--schedule.checkpoint-every", "100"),
 ]

@@ -108,10 +108,3 @@ def test_cartpole_is_that_of_playground_step_for_step():
     simulator = suite.load("CartpoleBalance", config_overrides={"impl": "jax"})
     same_steps(dataclasses.replace(world, config=world.task.plain()), simulator, 5, tolerance=1e-4)
     check_environment(world.env, 8, tolerance=1e-4)
-
-
-def test_a_simulator_without_bodies_is_not_drawn():
-    world = cl.make("brax:fast")
-    state, _ = world.reset(jax.random.key(0))
-    with pytest.raises(UserError, match="has no MuJoCo model to draw: evaluate a policy in it instead"):
-        world.task.pictures().sketch(world.env, state)

@@ -3,11 +3,10 @@ import importlib
 import shutil
 
 import pytest
-from small_runs import SMALL
 
 from cuelearner_jax.cli import main
 
-QUICK = ["sweep", "billiards", "--preset", "quickstart", *SMALL]
+QUICK = ["sweep", "billiards", "--preset", "quickstart"]
 
 ARGUMENTS = [
     (["evalute"], "did you mean 'evaluate'"),

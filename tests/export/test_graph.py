@@ -198,10 +198,3 @@ def test_what_no_pass_changes_is_done_once_before_a_loop():
     (loop,) = [op for op in ops if op[0] == "while"]
     assert "matmul" in [op[0] for op in ops]
     assert "matmul" not in [op[0] for op in loop[3]["body"]["ops"]]
-
-
-def test_what_was_done_is_not_done_again():
-    def twice(key, obs):
-        return jnp.sin(obs[:2]) * jnp.sin(obs[:2])
-
-    assert [op[0] for op in trace(twice, SIZE).graph.ops].count("sin") == 1
