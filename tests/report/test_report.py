@@ -124,6 +124,20 @@ def test_says_what_is_missing(runs, tmp_path):
     assert float(summary(tmp_path / "report")["relative", 500]["mean"]) == pytest.approx(0.6 * 15 / 50, abs=0.01)
 
 
+def test_seeds_budgets_and_pieces_of_the_plan_without_results_are_named(runs, tmp_path):
+    grid = {"guidance": ["none", "relative"], "seeds": list(range(10)), "labels": [100, 700]}
+    planned(runs, total_steps=100, grid=grid)
+    for name, index in (("unguided", 3), ("relative-100", 5)):
+        shard = {"index": index, "count": 1000, "seeds": list(range(1000))}
+        planned(runs / name, total_steps=100, shard=shard)
+    missing = report(runs, tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
+    for kind in grid["guidance"]:
+        assert f"no results of {kind} guidance with the seeds 8, 9" in missing
+    assert "no results of relative guidance with the label budgets 700" in missing
+    assert "none guidance with the label" not in missing
+    assert "shards not begun, of 1000: 1, 2, 4, 6, 7" in missing
+
+
 def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
     constants = {"run": "a", "task": "one_ball", "guidance": "none", "config_hash": "0f", "labels": 0}
     with TableWriter(tmp_path / "a", results.SCHEMA, constants) as writer:

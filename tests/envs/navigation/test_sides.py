@@ -25,9 +25,7 @@ STEPS = [  # ahead, before, after, (passed on the left, on the right)
     (1, (-0.1, 1.0), (0.1, 1.0), (1, 0)),  # toward larger x and above the box: it stays on the right
     (1, (-0.1, -1.0), (0.1, -1.0), (0, 1)),
     (-1, (0.1, 1.0), (-0.1, 1.0), (0, 1)),  # the other way round above is on the right
-    (-1, (0.1, -1.0), (-0.1, -1.0), (1, 0)),
     (1, (0.1, 1.0), (-0.1, 1.0), (0, 0)),  # backward
-    (1, (0.1, 1.0), (0.3, 1.0), (0, 0)),  # beside it, past its middle
     (1, (0.0, 1.0), (0.0, 1.4), (0, 0)),  # along the line itself
     (1, (-0.2, -0.5), (0.0, 1.0), (1, 0)),  # ends on the line, which counts once
     (1, (-0.1, -0.9), (0.1, 0.9), (0, 1)),  # crosses it at 0, which is below the box's middle
