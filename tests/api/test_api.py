@@ -201,9 +201,9 @@ def test_what_is_left_out_of_a_training_is_as_the_preset_has_it(monkeypatch):
     assert all(request.config == dataclasses.replace(preset.config, task=world.config) for request in asked)
 
 
-def test_a_label_file_answers_in_place_of_a_teacher(folder):
-    """Trained on the labels of a run, agents are those of that run."""
+def test_a_label_file_answers_in_place_of_a_teacher(folder, tmp_path):
+    """Trained on the labels of a run, an agent is what the command makes of `--labels-from`."""
     path = folder / "relative" / "labels.parquet"
-    run = cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], labels=path, seeds=[3, 5], progress=False)
-    columns = COLUMNS[:-1]
-    assert rows_of(run.results.to_pylist(), columns) == rows_of(results.read(folder).to_pylist(), columns)
+    train.run(Order(TASK, probes.CONFIG, Grid(("relative",), (3,), (10,)), tmp_path / "given", labels_from=path))
+    run = cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], labels=path, seeds=[3], progress=False)
+    assert rows_of(run.results.to_pylist(), COLUMNS) == rows_of(results.read(tmp_path / "given").to_pylist(), COLUMNS)
