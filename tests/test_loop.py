@@ -154,9 +154,9 @@ def test_first_uniform_then_guided_then_greedy():
     assert np.abs(turned - greedy).max(-1).min() > 1e-3  # so the three can be told apart
 
 
-@pytest.mark.parametrize(("kind", "probability"), [("heuristic", 0.0), ("none", 1.0), ("relative", 1.0)])
+@pytest.mark.parametrize(("kind", "probability"), [("heuristic", 0.0), ("none", 1.0)])
 def test_actions_that_nothing_guides_are_greedy_after_the_random_steps(kind, probability):
-    met, params = acted(kind, probability)  # the guide of relative labels is not fitted
+    met, params = acted(kind, probability)
     np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
 
 
