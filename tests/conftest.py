@@ -120,8 +120,8 @@ SLOW = sum(SECONDS.values()) / 150  # seconds above which `make test-quick` leav
 # Files that train or call the same compiled programs: one process runs them one after the other, and compiles once.
 SWEEPS = ("commands", "export", "failures", "interruption", "shards")
 SHARING = {
-    **dict.fromkeys(("tests/test_loop.py", "tests/test_asking.py", "tests/test_policies.py"), "loop"),
-    **{f"tests/cli/test_{name}.py": "sweeps of billiards" for name in SWEEPS},
+    **{f"tests/test_{name}.py": "loop" for name in ("loop", "asking", "policies", "evaluate")},
+    **{f"tests/cli/test_{name}.py": "small sweeps" for name in SWEEPS},
 }
 GROUPS = Counter()
 for file, seconds in SECONDS.items():

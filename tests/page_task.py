@@ -1,7 +1,6 @@
 """The bandit as a task that a page can show: a disc, and where the context lies."""
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +52,6 @@ TASK = Task(
     teacher=lambda config, env: probes.Expert(env),
     presets={"paper": Preset("tiny", dataclasses.replace(probes.CONFIG), guidance=("relative",), labels=(20,))},
 )
-QUARTER = math.pi / 2
 
 
 def left_of(obs):

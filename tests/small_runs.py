@@ -1,25 +1,35 @@
-"""The arguments of tiny runs, and what lies in a folder."""
+"""Tiny runs: their arguments and a task that compiles fast; what lies in a folder."""
 
+import dataclasses
 import re
 import shlex
 import threading
 from contextlib import contextmanager
-from pathlib import Path
 
+import page_task
+import probes
 import pytest
 
 from cuelearner_jax.storage import results
 from cuelearner_jax.studies import train
+from cuelearner_jax.task import Preset
 
 SMALL = [
     *("--agent.q-layers", "16", "--sizes.feedback-layers", "16", "--agent.directions", "36"),
     *("--sizes.fit-steps", "20", "--task.search-directions", "90"),
-    # However many seeds a test takes, its programs are those of one lane, which the compilation cache then has.
     *("--sizes.lanes-per-block", "1"),
     *("--schedule.total-steps", "200", "--schedule.eval-every", "100", "--schedule.checkpoint-every", "100"),
 ]
-SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--labels", "10", "20"]
-SWEEP += ["--guidance", "none", "relative"]
+CONFIG = probes.config(
+    sizes={"feedback_layers": (16,), "fit_steps": 20, "lanes_per_block": 1},
+    schedule={"total_steps": 200, "eval_every": 100, "checkpoint_every": 100, "eval_envs": 40, "eval_steps": 400},
+    agent={"q_layers": (16,)},
+)
+TASK = dataclasses.replace(
+    page_task.TASK, name="bandit", presets={"quickstart": Preset("tiny", CONFIG, first_seed=2000)}
+)
+BANDIT = "small_runs:TASK"  # as commands name it
+SWEEP = ["sweep", BANDIT, "--seeds", "2", "--labels", "10", "20", "--guidance", "none", "relative"]
 
 
 def rows(*folders):
@@ -29,13 +39,9 @@ def rows(*folders):
     return sorted(found, key=lambda row: tuple(str(row[name]).zfill(6) for name in names[:4]))
 
 
-def listing(folder: Path) -> dict[str, tuple[int, int]]:
+def listing(folder):
     """Every file below a folder with its size and time of change, but for the mark of who wrote last."""
-    files = (
-        [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock"]
-        if folder.exists()
-        else []
-    )
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
     return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 
 

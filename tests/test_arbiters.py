@@ -88,14 +88,11 @@ def sums(own, guided):
     [
         ((0, 0), (0, 0), 0.5, 0.5),  # nothing seen
         ((50, 50), (1, 0), 0.5, 0.5),  # hardly seen
-        ((50, 0), (50, 0), 0.5, 0.5),  # draws
         ((50, 20), (50, 20), 0.5, 0.5),
         ((50, 5), (50, 45), 0.5, 0.5),  # better
         ((50, 45), (50, 5), 0.5, 0.02),  # worse
-        ((50, 50), (50, 0), 0.5, 0.02),  # and neither varies
         ((50, 5), (50, 45), 1.0, 0.98),  # own episodes go on being seen
         ((50, 45), (50, 5), 0.0, 0.0),  # never more than unpaced
-        ((50, 45), (50, 5), 0.01, 0.01),
     ],
 )
 def test_the_share_of_known_sums(own, guided, most, expected):
@@ -116,11 +113,9 @@ def test_the_share_is_twice_the_chance_that_guidance_is_better():
     ("own", "guided", "expected"),
     [
         ((1000, 0), (1000, 500), 0.5),  # the whole lead
-        ((1000, 0), (1000, 800), 0.5),  # and more
         ((1000, 300), (1000, 500), 0.2),  # 0.2 of 0.5
         ((1000, 0), (1000, 100), 0.1),  # a weak guide of agents that know nothing
         ((1000, 500), (1000, 505), 0.02),  # a draw
-        ((1000, 500), (1000, 100), 0.02),
         ((1000, 0), (1, 0), 0.5),  # hardly seen
     ],
 )

@@ -8,9 +8,7 @@ import pytest
 from checked import LOOSE_RANKS
 from jaxtyping import TypeCheckError
 
-from cuelearner_envs.billiards import Table
 from cuelearner_envs.navigation.geometry import in_frame
-from cuelearner_envs.navigation.robot import Robot
 from cuelearner_jax.storage.label_files import found_in
 
 
@@ -25,12 +23,6 @@ def test_an_array_of_another_shape_than_the_signatures_is_refused():
 def test_functions_that_name_no_array_are_checked_too():
     with pytest.raises(TypeCheckError, match="place"):
         found_in("a string")  # pyright: ignore[reportArgumentType]
-
-
-def test_pytrees_may_hold_what_stands_for_arrays():
-    assert jax.tree.map(lambda _: None, Table.easy()).width is None
-    assert jax.eval_shape(lambda robot: robot, Robot()).speed.shape == ()
-    assert jax.vmap(lambda robot: robot.speed, (Robot(0, *[None] * 4),))(Robot(jnp.ones(3))).shape == (3,)
 
 
 def test_the_folders_of_loose_ranks_exist():

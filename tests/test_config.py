@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 
 import probes
 import pytest
@@ -17,26 +16,20 @@ from cuelearner_jax.errors import UserError
     ("group", "values", "message"),
     [
         ("sizes", {"num_envs": 0}, "sizes.num_envs is 0: give a positive number"),
-        ("sizes", {"lanes_per_block": -1}, "sizes.lanes_per_block is -1: give a number that is not negative"),
         ("agent", {"q_layers": ()}, "agent.q_layers is empty: give at least one layer"),
-        ("agent", {"q_layers": (32, 0)}, "agent.q_layers is (32, 0): give a positive number"),
         ("agent", {"q_layers": 32}, "agent.q_layers is 32: give a value of type"),
         ("agent", {"replay_capacity": 4001}, "agent.replay_capacity is 4001: give a multiple of sizes.num_envs"),
-        ("agent", {"learning_rate": math.nan}, "agent.learning_rate is nan: give a finite number"),
         ("sizes", {"fit_steps": 210}, "sizes.fit_steps is 210: give a multiple of sizes.validate_every"),
         ("scalars", {"eps_deg": 181.0}, "scalars.eps_deg is 181.0: give a number above 0 and up to 180"),
-        ("scalars", {"discount": 1.0}, "scalars.discount is 1.0"),
         ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': give best or nearest or shuffled"),
-        ("scalars", {"nearest_share": 1.1}, "scalars.nearest_share is 1.1: give a number from 0 to 1"),
-        ("scalars", {"teacher_bias_deg": -math.inf}, "scalars.teacher_bias_deg is -inf: give a finite number"),
         ("schedule", {"total_steps": 2**31}, "schedule.total_steps is 2147483648: give at most 2147483647"),
         ("schedule", {"eval_every": 18}, "schedule.eval_every is 18: give a multiple of sizes.num_envs"),
         ("schedule", {"total_steps": 50}, "schedule.total_steps is 50: give a multiple of schedule.eval_every"),
-        ("schedule", {"checkpoint_every": 24}, "schedule.checkpoint_every is 24: give a multiple"),
         ("schedule", {"eval_steps": 25}, "schedule.eval_steps is 25: give a multiple of schedule.eval_envs"),
-        ("schedule", {"guide_eval_every": 15}, "schedule.guide_eval_every is 15: give a multiple of sizes.labels"),
         ("sizes", {"ask_all": True}, "sizes.ask_all asks about every candidate: give sizes.candidates above 1 too"),
         ("sizes", {"ask_all": True, "candidates": 4}, "sizes.labels_per_round is 10: give a multiple of sizes.candi"),
+        ("agent", {"n_step": 2}, "agent.n_step is 2"),
+        ("agent", {"coarse_directions": 4, "peaks": 5}, "agent.peaks is 5: give at most"),
         ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
     ],
 )

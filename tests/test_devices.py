@@ -24,9 +24,6 @@ from cuelearner_jax.devices import (
     place,
     release_programs,
 )
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs.grid import load
-from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import results
 
 SCRIPT = Path(many_devices.__file__)
@@ -110,29 +107,6 @@ def test_a_run_begun_on_four_devices_goes_on_with_one(alone, tmp_path):
     on_four("run", out, 5)  # three rounds of labels, then in the middle of training
     many_devices.run(out, resume=True)
     assert_alike(measured(alone), measured(out))
-
-
-@pytest.mark.long
-def test_policies_of_four_devices_are_those_of_one(alone, shared):
-    found = []
-    for folder in (alone, shared):
-        task = many_devices.probes.make_task()
-        _, config, grid = load(folder, {task.name: task}.__getitem__)
-        found.append(PolicySource(task, config, grid, folder).load(("relative",))[0])
-    one, four = found
-    np.testing.assert_array_equal(one.seeds, four.seeds)
-    leaves = zip(*(many_devices.jax.tree.leaves(lanes.policies["params"]) for lanes in found), strict=True)
-    for mine, theirs in leaves:
-        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.long
-def test_a_checkpoint_of_fewer_lanes_is_refused(shared):
-    task = many_devices.probes.make_task()
-    _, config, _ = load(shared, {task.name: task}.__getitem__)
-    grid = many_devices.Grid(("relative",), tuple(range(9)), (30,))
-    with pytest.raises(UserError, match="holds 8 lanes, the run has 9"):
-        PolicySource(task, config, grid, shared).load(("relative",))
 
 
 def test_programs_are_forgotten_above_half_of_the_allowed_maps_and_compiled_again(tmp_path):

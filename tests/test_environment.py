@@ -26,11 +26,7 @@ from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 
 ROWS = 200
-PROBES = {
-    "window": probes.Window(),
-    "mirrored window": probes.Window(mirrors=True),
-    "chain": probes.Chain(),
-}
+PROBES = {"window": probes.Window(), "mirrored window": probes.Window(mirrors=True), "chain": probes.Chain()}
 SHAPES = {
     **{
         f"{task.name} {name}": shape_of(task, p.config.task)

@@ -10,7 +10,6 @@ import probes
 import pytest
 
 from cuelearner_jax.agents.replay import Memory, buffer_for
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs.program import make_program
@@ -109,15 +108,3 @@ def test_without_a_share_every_step_is_as_likely():
 
 
 # What is refused.
-
-
-@pytest.mark.parametrize(
-    ("sizes", "kind", "told"),
-    [
-        ({"store_labelled": True}, "scalar", "scalar answers name no action"),
-        ({"ask_from": "middle"}, "relative", "only a box has one, not directions"),
-    ],
-)
-def test_sizes_that_do_not_suit_are_refused(sizes, kind, told):
-    with pytest.raises(UserError, match=told):
-        probes.config(sizes=sizes).guide_in(ENV, kind)

@@ -1,7 +1,6 @@
 """The training loop on probes: values known by hand, who acts when, and what lanes owe each other (nothing)."""
 
 import dataclasses
-import math
 from functools import cache
 
 import jax
@@ -22,7 +21,6 @@ from cuelearner_jax.types import Step
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 MESH = lane_mesh()
-DEG = math.pi / 180
 q = as_function(q_network(probes.AGENT.q_layers))
 
 
@@ -156,9 +154,9 @@ def test_first_uniform_then_guided_then_greedy():
     assert np.abs(turned - greedy).max(-1).min() > 1e-3  # so the three can be told apart
 
 
-@pytest.mark.parametrize(("kind", "probability"), [("heuristic", 0.0), ("none", 1.0), ("relative", 1.0)])
+@pytest.mark.parametrize(("kind", "probability"), [("heuristic", 0.0), ("none", 1.0)])
 def test_actions_that_nothing_guides_are_greedy_after_the_random_steps(kind, probability):
-    met, params = acted(kind, probability)  # the guide of relative labels is not fitted
+    met, params = acted(kind, probability)
     np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
 
 
@@ -193,7 +191,6 @@ def test_learning_begins_after_learn_after(learn_after, updates):
 
 BUDGETS = [15, 15, LARGEST, LARGEST]
 SEEDS = [1, 2, 1, 2]
-PARTS = ("obs", "action", "answer")
 
 
 def labelled(program, seeds, budgets, rounds=LARGEST // 10, scalars=probes.SCALARS):

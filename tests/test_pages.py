@@ -69,11 +69,3 @@ def test_sentences_of_public_docstrings_are_short(package):
         for file in sorted(package.rglob("*.py"))
     }
     assert {name: sentences for name, sentences in found.items() if sentences} == {}
-
-
-def test_what_is_long_is_found():
-    long, wide = " ".join(["word"] * 41), "x" * 121
-    page = f"# Title\n\nShort.\nE.g. {long}\n\n```sh\n{wide} {long}\n```\n| {wide} |\n- `{wide}` [a](https://{wide})\n"
-    assert [*long_sentences(page)] == [f"E.g. {long}"]
-    assert [*long_lines(page + wide)] == [f"E.g. {long}", wide]
-    assert [*long_sentences("Do:\n\n    a = 1\n" + long)] == [f"a = 1 {long}"]

@@ -53,12 +53,6 @@ def test_a_file_is_passed_on_as_it_is(kind):
     assert uri == f"data:image/{kind.lower()};base64,{base64.b64encode(given).decode()}"
 
 
-def test_a_large_file_is_made_smaller_and_keeps_its_shape():
-    sketch = pictures.sketch(file_of(plain(GREEN, 1000, 2560)))
-    assert sketch.box[2:] == (1280, 500)
-    assert shown_by(sketch)[1].shape == (500, 1280, 3)
-
-
 def test_a_picture_of_a_turned_camera_stands_upright():
     image = np.concatenate([plain(RED, 16, 16), plain(BLUE, 16, 16)])  # red above blue
     exif = Image.Exif()
@@ -97,21 +91,9 @@ def test_a_film_shows_the_frames_at_their_rate(tmp_path, kind):
 
 
 @pytest.mark.parametrize(
-    ("image", "words"),
-    [(np.zeros((4, 4, 3), np.float32), "float32 (4, 4, 3)"), (b"no picture", "cannot be read")],
+    ("image", "words"), [(np.zeros((4, 4, 3), np.float32), "float32 (4, 4, 3)"), (b"no picture", "cannot be read")]
 )
 def test_what_is_no_picture_is_named_in_one_line(image, words):
     with pytest.raises(UserError, match=re.escape(words)) as raised:
         pictures.sketch(image)
     assert "\n" not in str(raised.value)
-
-
-def test_films_of_nothing_are_refused(tmp_path):
-    for make in (lambda: pictures.still([], tmp_path / "x.png"), lambda: pictures.animate([], tmp_path / "x.gif")):
-        with pytest.raises(UserError, match="no frame"):
-            make()
-    with pytest.raises(UserError, match=r"\.gif or \.mp4"):
-        pictures.animate([plain(RED)], tmp_path / "x.avi")
-    with pytest.raises(UserError, match="differ in size"):
-        pictures.clip([plain(RED), plain(RED, 14, 20)], 0.1)
-    assert not list(tmp_path.iterdir())

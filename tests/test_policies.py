@@ -38,7 +38,6 @@ from cuelearner_jax.spaces import DIRECTIONS, directions
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 OBS = directions.evenly_spaced(40)
-STATES = OBS  # the bandit's state is what it shows
 BEST = jax.jit(directions.rotate)(OBS, 0.6)
 KEY = jax.random.key(5)
 Q = q_network(probes.AGENT.q_layers)

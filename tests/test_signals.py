@@ -43,16 +43,6 @@ def test_a_command_with_nothing_to_save_ends_at_once_in_one_line(started, number
     assert told == "stopped at once; what was saved before is safe\n"
 
 
-def test_what_a_process_was_started_to_ignore_stays_ignored(started):
-    process = started(f"import signal; signal.signal(1, signal.SIG_IGN); {LISTEN} {BUSY}")
-    process.send_signal(signal.SIGHUP)
-    time.sleep(0.3)
-    assert process.poll() is None
-    process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=20)
-    assert process.returncode == 143
-
-
 def test_the_first_signal_is_told_at_once_and_a_second_ctrl_c_ends_compiled_code(started):
     process = started(f"{LISTEN} guard = signals.interruptible(); guard.__enter__(); {BUSY}")
     process.send_signal(signal.SIGTERM)

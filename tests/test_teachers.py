@@ -32,11 +32,6 @@ def test_it_comes_back_from_disk_in_half_precision(made, tmp_path):
     np.testing.assert_allclose(loaded.values(OBS[1], OBS), made.values(OBS[1], OBS), atol=5e-3)
 
 
-def test_a_folder_without_a_teacher_is_refused(tmp_path):
-    with pytest.raises(UserError, match="no teacher"):
-        teachers.load(tmp_path, ENV, 0.0, 0.0)
-
-
 def test_a_teacher_of_another_task_is_refused(made, tmp_path):
     teachers.save(tmp_path, made, ABOUT)
     probes.edit_json(tmp_path / "teacher.json", lambda about: about["config"].update(layers=[32]))

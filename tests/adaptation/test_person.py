@@ -47,18 +47,3 @@ def test_seven_clear_preferences_decide_and_films_change_sides(world):
     assert len(sides) == 7
     assert set(sides) == {-1, 1}
     assert "a person preferred the policy as it was in 0%, the corrected in 100%" in better.words[-1]
-
-
-def test_without_a_difference_the_policy_stays_as_it_was(world):
-    with pytest.warns(UserWarning, match="not shown to be better"):
-        same = adapted(world, lambda left, right: 0, judge_episodes=3)
-    assert not same.used
-
-
-def test_another_answer_and_a_world_without_films_are_refused(world):
-    with pytest.raises(cl.UserError, match=r"judge_by gave 'left': give -1 \(left\), 0"):
-        adapted(world, lambda left, right: "left")
-    with pytest.raises(cl.UserError, match="a person compares films"):
-        adapted(world.env, lambda left, right: 0)
-    with pytest.raises(cl.UserError, match="a person compares films"):
-        adapted(world, "person")

@@ -9,13 +9,11 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import run_config
 from cuelearner_jax.agents import choice as search
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.networks import as_function, q_network, widen_layers
 from cuelearner_jax.devices import Portions
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import evenly_spaced, from_angle
 
@@ -103,16 +101,3 @@ def test_units_that_fill_up_a_layer_add_exactly_nothing():
         as_function(q_network(layers))(wide, obs, options),
     )
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"coarse_directions": 7}, "agent.coarse_directions is 7: give a divisor of agent.directions"),
-        ({"coarse_directions": 4, "peaks": 5}, "agent.peaks is 5: give at most"),
-        ({"peaks": 0}, "agent.peaks is 0"),
-    ],
-)
-def test_a_search_that_cannot_work_is_refused(change, says):
-    with pytest.raises(UserError, match=says):
-        run_config.check(probes.config(agent={"directions": 16, **change}))

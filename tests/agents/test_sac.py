@@ -226,10 +226,3 @@ def test_other_spaces_are_refused_with_the_agent_that_serves_them(space):
     with pytest.raises(UserError, match=f"'sac' acts in boxes, not in {space.name}: give --agent ddqn") as told:
         SMALL.make("raw", Spaces(2, space))
     assert "\n" not in str(told.value)
-
-
-def test_options_that_do_not_fit_are_refused():
-    with pytest.raises(UserError, match=r"sizes\.frame is 'action', but the actor"):
-        SMALL.make("action", SPACES)
-    with pytest.raises(UserError, match=r"agent\.target_critics is 3: give at most agent\.critics \(2\)"):
-        dataclasses.replace(SMALL, target_critics=3).check(probes.SIZES, True)

@@ -9,7 +9,6 @@ import pytest
 from cuelearner_jax.agents import ddqn, networks
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Features, spaces_of
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.fitting import guide_model
 from cuelearner_jax.spaces import directions as geometry
 
@@ -66,8 +65,3 @@ def test_the_greedy_choice_turns_with_the_situation(coarse):
     directions = geometry.evenly_spaced(72)
     best = jax.vmap(lambda obs: agent.value(env, params, obs, directions).max())(OBS)
     np.testing.assert_allclose(agent.value(env, params, OBS, chosen), best, atol=1e-6)
-
-
-def test_an_environment_without_features_is_refused_in_the_actions_frame():
-    with pytest.raises(UserError, match=r"give --sizes\.frame raw"):
-        guide_model(SIZES, spaces_of(probes.Chain()))

@@ -129,19 +129,6 @@ def test_it_can_be_corrected_again(better, tmp_path):
         cl.correct(better, asked(60), low=LOW, high=(1.0, 1.0, 1.0), **how)
 
 
-@pytest.mark.long
-def test_a_constant_change_is_found_by_a_reading():
-    @jax.jit
-    def compiled(obs):
-        means = [0.06 * obs[:, 0], 0.06 * obs[:, 1], 0.6 * jnp.tanh(obs[:, 2] * obs[:, 0])]
-        return jnp.stack(means, -1) + OFFSET[None]
-
-    found = cl.correct(compiled, asked(60, reach=0.1), low=LOW, high=HIGH, eps=EPS)
-    assert found.used
-    assert error(found) < 0.25 * ERROR
-    assert "shares" in found.words[0]
-
-
 def test_labels_of_a_file_say_their_own_space_and_strength(better, tmp_path):
     file = label_files.LabelFile({"name": "arm"}, "relative", better.actions, EPS, np.zeros(150), rows_of(asked(150)))
     label_files.write_file(tmp_path / "labels.parquet", file, "more")
@@ -166,13 +153,9 @@ def test_bounds_that_are_not_given_are_told():
         ({"labels": "absent", "low": None, "high": None, "cues": ""}, "no label file at absent"),
         ({"labels": cl.Labels(OTHERS[:20], wanted(OTHERS[:20]), np.zeros((20, 2)))}, r"give \(labels, 3\)"),
         ({"low": (0.0,) * 3}, "actions are no vectors between the bounds"),
-        ({"low": (0.0,) * 2, "high": (1.0,) * 2}, "low and high bound 2 and 2 entries: give 3"),
         ({"low": None}, "high is given alone"),
         ({"cues": "left,right"}, "give one cue an entry"),
-        ({"bound": 2.0}, "up to 1"),
-        ({"guidance": "shy"}, "shy"),
         ({"policy": lambda obs: obs[:, :2]}, "returned actions of shape"),
-        ({"policy": lambda obs: obs * np.nan}, "not finite"),
         ({"space": SPACE}, "cues is given beside space"),
     ],
 )

@@ -1,25 +1,17 @@
 """A seed means one thing: JAX's switches for random numbers, precision and NaN change no result, and are on record."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from gymnasium_worlds import Adder
 
 import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import NUMERICS
-from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage.provenance import provenance
 
-OTHERS = {
-    "default_prng_impl": "rbg",
-    "threefry_partitionable": False,
-    "enable_x64": True,
-    "debug_nans": True,
-}
+OTHERS = {"default_prng_impl": "rbg", "threefry_partitionable": False, "enable_x64": True, "debug_nans": True}
 WORLD = cl.World(probes.make_task(), probes.WindowConfig())
 SIZES = GuideSizes(feedback_layers=(8,), fit_steps=20, fit_batch_size=8)
 
@@ -54,22 +46,9 @@ def test_measure_and_adapt_return_the_same_numbers_in_any_program(request):
     assert jax.config.jax_enable_x64  # the program keeps its own settings
 
 
-def test_threads_that_train_compute_as_their_caller(another_program):
-    assert LaneGroup.each(None, jnp.zeros, [1, 2])[1].dtype == np.float32
-
-
-def test_a_gymnasium_world_is_measured_while_nan_is_hunted(another_program):
-    world = cl.from_gymnasium(Adder, num_envs=2, processes=1, max_steps=5)
-    assert np.isfinite(cl.measure(lambda obs: np.full((len(obs), 1), 0.25), world, episodes=2).metrics["return"]).all()
-
-
 def test_a_command_sets_jax_up_for_all_its_threads(another_program, capsys):
     assert dispatch.main(["report", "nowhere"]) == 2
     assert {name: getattr(jax.config, f"jax_{name}") for name in NUMERICS} == NUMERICS
-
-
-def test_a_checkpoint_is_read(another_program):
-    assert cl.load_policy("shipped:navigation").actions.size == 2
 
 
 def test_the_settings_are_on_record(another_program):

@@ -2,10 +2,8 @@
 
 import dataclasses
 import re
-import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax import envs
@@ -14,20 +12,12 @@ import cuelearner_jax as cl
 from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.spaces import Box
-from cuelearner_jax.storage import results
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry, simulators
 from cuelearner_jax.testing import check_environment, check_task
 
 FAST = registry.resolve("brax:fast")
-TINY = [
-    *("--preset", "quickstart", "--agent.q-layers", "16", "--agent.directions", "16", "--agent.target-directions", "8"),
-    *("--sizes.lanes-per-block", "1", "--agent.batch-size", "8", "--schedule.random-steps", "20"),
-    *("--schedule.learn-after", "20", "--schedule.total-steps", "80", "--schedule.eval-every", "40"),
-    *("--schedule.checkpoint-every", "40", "--schedule.eval-steps", "40"),
-]
 
 
 def same_steps(world, simulator, steps, tolerance=0.0):
@@ -107,26 +97,6 @@ def test_a_simulator_of_another_layout_is_refused():
         world.reset(jax.random.key(0))
 
 
-def test_a_missing_package_is_told_with_its_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco_playground", None)
-    with pytest.raises(UserError, match=r"need the extra `playground`: pip install 'cuelearner-jax\[playground\]'"):
-        registry.resolve("playground:NoSuchTask")
-
-
-@pytest.mark.long
-def test_the_command_line_trains_seeds_and_reads_the_folder_by_the_familys_name(tmp_path, capsys):
-    run = tmp_path / "run"
-    assert main(["sweep", "brax:fast", *TINY, "--seeds", "2", "--out", str(run)]) == 0
-    found = results.read(run).to_pylist()
-    assert {(row["task"], row["seed"]) for row in found} == {("brax", 0), ("brax", 1)}
-    losses = {row["seed"]: row["train_loss"] for row in found}
-    assert losses[0] != losses[1]
-    assert main(["evaluate", str(run), "--envs", "2", "--steps", "8"]) == 0
-    assert "reward" in capsys.readouterr().out
-    policy = cl.load_policy(run)
-    assert policy(np.zeros((3, 2), np.float32)).shape == (3, 1)
-
-
 # Real physics, which takes tens of seconds to compile.
 
 
@@ -138,44 +108,3 @@ def test_cartpole_is_that_of_playground_step_for_step():
     simulator = suite.load("CartpoleBalance", config_overrides={"impl": "jax"})
     same_steps(dataclasses.replace(world, config=world.task.plain()), simulator, 5, tolerance=1e-4)
     check_environment(world.env, 8, tolerance=1e-4)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("NoSuchTask", "playground has no task 'NoSuchTask': choose one of AcrobotSwingup"),
-        ("PandaPickCube", "playground:PandaPickCube downloads its robot: make that environment yourself"),
-    ],
-)
-def test_a_task_that_playground_cannot_give_is_refused_in_one_line(name, says):
-    pytest.importorskip("mujoco_playground")
-    with pytest.raises(UserError, match=re.escape(says)):
-        cl.make(f"playground:{name}")
-
-
-@pytest.mark.long
-def test_pictures_are_of_the_models_bodies(tmp_path):
-    """The pendulum moves, and the film begins where the episode does."""
-    world = cl.make("brax:inverted_pendulum", backend="positional", max_steps=50)
-    drawn = world.task.pictures()
-    state, obs = world.reset(jax.random.key(0))
-    first = drawn.sketch(world.env, state)
-    assert first.box[2:] == (480, 360)
-    found = drawn.reel(world.env, state, jnp.ones(1))
-    assert len(found.pictures) == 6
-    assert len(set(found.pictures)) == 6
-    frames, rewards = drawn.record(world.env, uniform_in(world.env), jax.random.key(0), 4)
-    assert len(frames) == len(rewards) == 4
-    assert np.abs(frames[0].astype(int) - frames[3].astype(int)).max() > 50
-    drawn.still(world.env, frames, tmp_path / "still.png")
-    drawn.question(world.env, state, obs, jnp.ones(1), tmp_path / "question.png")
-    assert (tmp_path / "still.png").stat().st_size > 1000
-    assert (tmp_path / "question.png").stat().st_size > 1000
-
-
-def test_a_simulator_without_bodies_is_not_drawn():
-    world = cl.make("brax:fast")
-    state, _ = world.reset(jax.random.key(0))
-    with pytest.raises(UserError, match="has no MuJoCo model to draw: evaluate a policy in it instead"):
-        world.task.pictures().sketch(world.env, state)

@@ -6,11 +6,7 @@ import io
 import os
 import re
 import signal
-import subprocess
-import sys
-import textwrap
 import threading
-import time
 
 import jax
 import jax.numpy as jnp
@@ -116,85 +112,20 @@ def test_pictures_are_of_the_state_that_is_shown(tmp_path):
     assert not is_alive(drawn)
 
 
-def test_fetch_reach_is_what_plain_gymnasium_plays():
+def test_slices_of_fetch_reach_are_where_their_names_say():
+    """What it plays is plain Gymnasium's: tests/envs/arm/test_fetch.py."""
     world = cl.from_gymnasium("FetchReach-v4", num_envs=2, processes=2)
     assert world.config.max_steps == 50
     assert [cue.words for cue in world.actions.cues][1:3] == [("left", "right"), ("up", "down")]
     assert sum(quantity.size for quantity in world.observation) == 16
     assert {q.name for q in world.observation if q.unit == "m" and not q.kind} == {"desired goal"}
-    env = world.env
-    states, obs = jax.vmap(env.reset)(jax.random.split(KEY, 2))
-    actions = np.random.default_rng(2).uniform(-1, 1, (6, 2, 4)).astype(np.float32)
-    step = jax.jit(jax.vmap(env.step))
-    found = []
-    for number, action in enumerate(actions):
-        states, went = step(jax.random.split(jax.random.fold_in(KEY, number), 2), states, action)
-        found.append(jax.device_get(went))
-    for lane in range(2):
-        plain = source.make_registered("FetchReach-v4", {}, 0)
-        first, _ = plain.reset(seed=int(states.seed[lane]))
-        flat = lambda given: np.concatenate([given[name] for name in ("achieved_goal", "desired_goal", "observation")])  # noqa: E731
-        np.testing.assert_array_equal(obs[lane], flat(first).astype(np.float32))
-        for action, went in zip(actions, found, strict=True):
-            given, reward, _, _, info = plain.step(action[lane])
-            np.testing.assert_array_equal(went.final_obs[lane], flat(given).astype(np.float32))
-            assert (went.reward[lane], went.outcome["success"][lane]) == (reward, info["is_success"])
-        plain.close()
-    # The slices are where their names say.
+    state, obs = world.reset(KEY)
+    plain = source.make_registered("FetchReach-v4", {}, 0)
+    plain.reset(seed=int(state.seed))
     ends = np.cumsum([quantity.size for quantity in world.observation])
     place = [quantity.name for quantity in world.observation].index("gripper position")
     given = plain.unwrapped._utils.get_site_xpos(plain.unwrapped.model, plain.unwrapped.data, "robot0:grip")
-    np.testing.assert_array_equal(found[-1].final_obs[1, ends[place - 1] : ends[place]], given.astype(np.float32))
-
-
-SCRIPT = """
-    import os, time
-    import gymnasium, jax, numpy as np
-    import cuelearner_jax as cl
-    from cuelearner_jax.bridges.gymnasium import pool
-
-    class Slow(gymnasium.Env):
-        observation_space = action_space = gymnasium.spaces.Box(-1, 1, (2,))
-
-        def reset(self, *, seed=None, options=None):
-            return np.zeros(2, np.float32), {}
-
-        def step(self, action):
-            if abs(action[0] - 0.9) < 1e-6:
-                time.sleep(100)
-            return np.float32(action), 0.0, False, False, {}
-
-    print("begun")
-    world = cl.from_gymnasium(Slow, max_steps=5, processes=2)
-    state, _ = world.reset(jax.random.key(0))
-    (found,) = pool._pools.values()
-    print(*[host.child.pid for host in found.hosts.values()], flush=True)
-    world.step(jax.random.key(0), state, np.float32([0.9, 0]))
-"""
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
-def test_a_script_needs_no_guard_and_leaves_no_process_behind(end, tmp_path):
-    """The class lies in the script itself; the parent ends in the middle of a step that takes forever."""
-    file = tmp_path / "script.py"
-    file.write_text(textwrap.dedent(SCRIPT))
-    with subprocess.Popen([sys.executable, file], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as run:
-        assert run.stdout is not None
-        assert run.stdout.readline() == "begun\n"  # once: no process runs the script again
-        begun = list(map(int, run.stdout.readline().split()))
-        assert begun
-        assert all(map(is_alive, begun))
-        time.sleep(2)
-        run.send_signal(end)
-        if end == signal.SIGINT:
-            time.sleep(1)
-            run.kill()  # which waits inside a compiled program for a step without an end
-    for _ in range(50):
-        if not any(map(is_alive, begun)):
-            break
-        time.sleep(0.2)
-    assert not any(map(is_alive, begun))
+    np.testing.assert_array_equal(obs[ends[place - 1] : ends[place]], given.astype(np.float32))
 
 
 def test_a_factory_that_cannot_be_sent_is_told():

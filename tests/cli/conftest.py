@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from small_runs import SWEEP, listing
+from small_runs import BANDIT, SWEEP, listing
 
 from cuelearner_jax import terminal
 from cuelearner_jax.cli import main
@@ -18,9 +18,16 @@ def _no_progress_lines(monkeypatch):
     monkeypatch.setattr(terminal, "FIRST", 600.0)
 
 
+@pytest.fixture
+def run_folder(small_folder) -> Path:
+    """A run whose task is known to this process; nobody writes in it."""
+    registry.resolve(BANDIT)
+    return small_folder
+
+
 @pytest.fixture(scope="session")
-def run_folder(tmp_path_factory, worker_id) -> Path:
-    """Made by the first worker that asks; nobody writes in it."""
+def small_folder(tmp_path_factory, worker_id) -> Path:
+    """Made by the first worker that asks."""
     base = tmp_path_factory.getbasetemp()
     folder = (base if worker_id == "master" else base.parent) / "small"
     with open(folder.with_suffix(".lock"), "w") as lock:

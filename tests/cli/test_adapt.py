@@ -1,6 +1,5 @@
 """Policies adapted on the command line: a run's, code's and adapted ones, in folders that every command takes."""
 
-import importlib
 import json
 import shutil
 import traceback
@@ -8,7 +7,6 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
-import chex
 import numpy as np
 import pytest
 from test_house import ROW
@@ -16,8 +14,7 @@ from test_house import ROW
 import cuelearner_jax as cl
 from cuelearner_jax.cli import main
 from cuelearner_jax.guides import base
-from cuelearner_jax.policies import Guided
-from cuelearner_jax.storage import formats, label_files, policy_folders
+from cuelearner_jax.storage import formats
 from cuelearner_jax.studies.adapt import AdaptRequest
 from cuelearner_jax.tasks import registry
 
@@ -114,51 +111,6 @@ def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
     assert before == 0.0
 
 
-def test_python_adapts_as_the_command_does_and_what_is_loaded_acts_bitwise_alike(tmp_path):
-    command = ["adapt", "own_turned:straight", *TASK, "--scenario", "ruled", "--labels", "80"]
-    assert main([*command, "--judge-episodes", "20", "--out", str(tmp_path / "command")]) == 0
-    made, code = cl.make("own_turned:TASK", scenario="ruled"), importlib.import_module("own_turned").straight
-    better = cl.adapt(code, made, cl.teacher_of(made), labels=80, judge_episodes=20)
-    better.save(tmp_path / "python")
-    told = [json.loads((tmp_path / name / "policy.json").read_text()) for name in ("command", "python")]
-    for values in told:  # what was typed, and the digest of all that is told
-        del values["command"], values["digest"]
-    assert told[0] == told[1]  # with the digest of the arrays
-    assert told[0]["policy"]["guidance"] == "demonstration"
-    assert (told[0]["judged"]["by"], told[0]["policy"]["scalars"]["k_max"]) == ("hit", 7)
-    files = [tmp_path / name / "labels.parquet" for name in ("command", "python")]
-    chex.assert_trees_all_equal(*(label_files.read(file).labels for file in files))
-    (row,) = measured(tmp_path, tmp_path / "command", *own())  # and both measure alike
-    found = cl.measure(better, made, steps=2_000, envs=20).metrics
-    assert {name: values.tolist() for name, values in found.items()} == {name: row[name] for name in found}
-    assert (better.used, better.judged) == (True, ("hit", 0.0, 1.0))
-    assert better.difference == (1.0, 1.0, 1.0)
-    assert f"difference +1 [+1, +1]; {better.rewarded_steps:,} rewarded steps)" in better.words[0]
-    assert len(better.labels.obs) == 80
-    loaded = cl.load_policy(tmp_path / "command", base=code)
-    np.testing.assert_array_equal(loaded(SEEN), better(SEEN))
-    np.testing.assert_array_equal(loaded(SEEN[0]), better(SEEN[0]))
-    np.testing.assert_allclose(loaded(SEEN[0]), better(SEEN)[0], atol=1e-6)  # another program: rounded otherwise
-    with pytest.raises(cl.UserError, match="is not empty: give --overwrite"):
-        better.save(tmp_path / "python")
-    with pytest.raises(cl.UserError, match="not loaded because a file names it"):
-        cl.load_policy(tmp_path / "python")
-
-
-@pytest.mark.long
-def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
-    file = adapted / "labels-45deg.parquet"
-    assert len(label_files.read(file).seeds) == 80
-    command = [*CODE, "--bound-deg", "45", "--labels", "20", "80", "--labels-from", str(file)]
-    assert main([*command, "--out", str(tmp_path / "again")]) == 0
-    code = importlib.import_module("own_turned").straight
-    both = [cl.load_policy(f, task="own_turned:TASK", base=code).policy for f in (adapted, tmp_path / "again")]
-    models = [policy.model for policy in both if isinstance(policy, Guided)]
-    assert len(models) == 2
-    chex.assert_trees_all_equal(*models)
-    assert (tmp_path / "again" / "labels.parquet").exists()
-
-
 def test_a_scenario_says_how_unless_another_kind_or_judge_is_asked_for():
     task = registry.resolve("own_turned:TASK")
 
@@ -196,20 +148,6 @@ def test_lanes_of_a_run_are_adapted_one_each_and_again(home, tmp_path):
     np.testing.assert_array_equal(moved, cl.load_policy(out, seed=0)(SEEN))
 
 
-def test_a_model_that_makes_it_worse_is_not_used_and_said_to_be():
-    world = cl.World(registry.resolve("own_turned:TASK"), importlib.import_module("own_turned").Config(offset_deg=5.0))
-    code = importlib.import_module("own_turned").straight
-    labels = cl.Labels(SEEN, SEEN, np.ones(len(SEEN)))  # all true: more to the left; and silent on what lies there
-    with pytest.warns(UserWarning, match="not shown to be better, so the policy stays"):
-        kept = cl.adapt(
-            code, world, labels=labels, bound_deg=180.0, eps_deg=5.0, judge_episodes=20, guidance="relative"
-        )
-    assert not kept.used
-    assert kept.judged[1] == 1.0
-    assert kept.judged[2] < 0.5
-    np.testing.assert_allclose(kept(SEEN), SEEN, atol=1e-6)
-
-
 def test_the_traceback_of_a_policy_that_fails_stands_below_the_line(tmp_path, capsys):
     assert main(["adapt", "own_turned:failing", *TASK, "--out", str(tmp_path / "new")]) == 2
     first, *below = capsys.readouterr().err.splitlines()
@@ -223,20 +161,13 @@ def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path):
     refused(["adapt", "own_turned:straight", *new], "needs a task to act in: give one, for instance --task", tmp_path)
     plain = ["adapt", "own_turned:straight", *TASK, *new, "--guidance", "relative"]
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
-    refused([*plain, "--bound-deg", "200"], "bound_deg is 200: give numbers above 0, up to 180", tmp_path)
-    refused([*plain, "--bound-deg", "0.3"], "say nothing within a bound of 0.3", tmp_path)
-    refused([*plain[:-1], "none"], "asks no questions", tmp_path)
     refused([*plain, "--judge-by", "hits"], "not a metric of turned, did you mean 'hit'", tmp_path)
-    refused([*plain, "--judge-bounds", "0.5", "1.5"], "judge_bounds is 0.5 1.5: give shares", tmp_path)
     refused([*plain, "--judge-bounds", "0.5", "--judge-by", "labels"], "judge_bounds needs episodes", tmp_path)
     refused([*plain, "--base.seeds", "3"], "own_turned:straight is not a folder: leave it out", tmp_path)
-    refused([*plain, "--labels-from", tmp_path / "no.parquet"], "no label file at", tmp_path)
-    refused(["adapt", "own_turned:narrow", *TASK, *new], "returned actions of shape (1, 1)", tmp_path)
     refused([*CODE, "--out", adapted], "is not empty: give --overwrite", adapted)
     refused([*CODE, "--out", adapted.parent, "--overwrite"], "is not a policy folder", adapted)
     refused(["evaluate", adapted, *TASK], "add --base own_turned:straight if you trust that code", adapted)
     refused(["evaluate", adapted, *own(), "--policy", "agent"], "needs a trained run", adapted)
-    refused(["evaluate", "--task=own_turned:TASK", "--policy", "adapted"], "needs a policy folder", adapted)
     forget()
     refused(["evaluate", adapted], "add --task own_turned:TASK if you trust that code", adapted)
     load = partial(cl.load_policy, task="own_turned:TASK", base=lambda obs: obs)
@@ -250,12 +181,6 @@ def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path):
     formats.write("policy", mixed / "policy.json", {**values, "arrays": "0" * len(told["arrays"])})
     with pytest.raises(cl.UserError, match="holds the arrays of another policy"):
         load(mixed)
-
-
-def test_of_two_adaptations_at_once_the_second_is_refused_before_it_works(refused, tmp_path):
-    with policy_folders.place_of(tmp_path / "new", overwrite=False):
-        refused([*CODE, "--out", tmp_path / "new"], "is being written by another process", tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_way_from_the_command_line_to_the_fit_is_short(tmp_path, monkeypatch):

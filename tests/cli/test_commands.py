@@ -1,35 +1,33 @@
 import json
 import re
+import shlex
 import subprocess
 import sys
-from io import StringIO
+from pathlib import Path
 from xml.etree import ElementTree
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from rich.console import Console
-from small_runs import SMALL
 
-from cuelearner_jax import terminal
-from cuelearner_jax.cli import dispatch, evaluate, main
+from cuelearner_jax.cli import dispatch, main
+from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.storage import results
+from cuelearner_jax.studies import train
+
+README = Path(__file__).resolve().parents[2] / "README.md"
 
 
 def test_a_sweep_leaves_a_complete_folder(run_folder):
     described = json.loads((run_folder / "config.json").read_text())
-    assert described["task"]["name"] == "billiards"
-    assert described["grid"] == {
-        "guidance": ["none", "relative"],
-        "seeds": [2000, 2001],
-        "labels": [10, 20],
-    }
+    assert described["task"]["name"] == "bandit"
+    assert described["grid"] == {"guidance": ["none", "relative"], "seeds": [2000, 2001], "labels": [10, 20]}
     for kind, lanes in (("none", 2), ("relative", 4)):
         rows = results.read(run_folder / kind).to_pylist()
         assert (run_folder / kind / "results.parquet").exists()
         assert len(rows) == lanes * 3  # steps 0, 100 and 200
         assert {row["step"] for row in rows} == {0, 100, 200}
-        assert {(row["episodes"], len(row["reward_each"])) for row in rows} == {(50, 20)}
+        assert {(row["episodes"], len(row["reward_each"])) for row in rows} == {(40, 20)}
         assert all(np.mean(row["reward_each"]) == pytest.approx(row["reward"], abs=1e-6) for row in rows)
     assert (run_folder / "relative" / "labels.parquet").exists()
 
@@ -85,15 +83,13 @@ def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, caps
     assert main(["render", *table, "--question", "--out", str(tmp_path)]) == 0
 
 
-def test_an_evaluation_says_how_far_it_is(run_folder, monkeypatch):
-    """On a terminal: a bar for each kind of guidance, that moves between the first step and the last."""
-    shown = StringIO()
-    console = Console(file=shown, force_terminal=True, color_system=None, width=100)
-    for module in (terminal, evaluate):
-        monkeypatch.setattr(module, "console", console)
-    assert main(["evaluate", str(run_folder), "--steps", "100", "--envs", "10"]) == 0
-    for kind, lanes in (("none", 2), ("relative", 4)):
-        assert re.search(rf"{kind} .*{5 * lanes}/{5 * lanes} ", shown.getvalue())
+def test_the_sweep_of_the_readme_would_begin(monkeypatch, tmp_path):
+    (line,) = re.findall(r"^cuelearner (sweep .*)$", README.read_text(encoding="utf-8"), re.MULTILINE)
+    orders = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
+    assert main(shlex.split(line)) == 0
+    assert orders[0].grid.guidance == ("none", "relative")
 
 
 def test_a_report_has_curves_and_tables(run_folder, tmp_path):
@@ -108,10 +104,10 @@ def test_a_report_has_curves_and_tables(run_folder, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("film", ["gif", "mp4"])
-def test_render_makes_a_film_and_a_still(run_folder, tmp_path, film):
-    command = ["render", str(run_folder), "--guidance", "relative", "--labels", "10", "--seed", "2001", "--film", film]
+def test_render_makes_a_film_and_a_still(tmp_path, film):
+    command = ["render", "shipped:billiards", "--film", film]
     assert main([*command, "--steps", "1", "--out", str(tmp_path)]) == 0
-    still, filmed = (tmp_path / f"small-agent.{end}" for end in ("png", film))
+    (still,), (filmed,) = (list(tmp_path.glob(f"*-agent.{end}")) for end in ("png", film))
     assert imageio.imread(still).std() > 1
     assert filmed.stat().st_size > 1000
 
@@ -128,7 +124,7 @@ def test_what_needs_no_jax_does_not_load_it():
 import sys
 from cuelearner_jax.cli import main
 assert main(["--help"]) == main(["--version"]) == 0
-slow = {"jax", "numpy", "tyro", "rich", "cuelearner_envs"}
+slow = {"jax", "numpy", "matplotlib", "tyro", "rich", "cuelearner_envs"}
 print(*sorted(slow & {name.partition(".")[0] for name in sys.modules}))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -136,28 +132,6 @@ print(*sorted(slow & {name.partition(".")[0] for name in sys.modules}))
     assert first == "usage: cuelearner COMMAND ..."
     assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+", version)
     assert loaded == ""
-
-
-def test_the_task_may_be_named_by_an_option(run_folder, tmp_path):
-    """The same run either way; a run folder beside its own task is no contradiction."""
-    out = tmp_path / "one"
-    command = ["train", "--preset", "quickstart", *SMALL, "--guidance", "none", "--seed", "2000"]
-    assert main([*command, "--task", "billiards", "--out", str(out)]) == 0
-    rewards = [row["reward"] for row in results.read(out).to_pylist()]
-    beside = [row["reward"] for row in results.read(run_folder / "none").to_pylist() if row["seed"] == 2000]
-    assert rewards == beside
-    given = ["--task", "billiards", "--policy", "uniform", "--steps", "20", "--envs", "10"]
-    assert main(["evaluate", str(run_folder), *given]) == 0
-
-
-@pytest.mark.long
-def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path, capsys):
-    out = tmp_path / "tuned"
-    command = ["train", "billiards", "--preset", "quickstart", *SMALL, "--guidance", "none", "--seed", "2000"]
-    assert main([*command, "--tuning", "--out", str(out)]) == 0
-    assert {row["split"] for row in results.read(out).to_pylist()} == {"tuning"}
-    assert main(["report", str(out), "--out", str(tmp_path / "report")]) == 2
-    assert main(["report", str(out), "--split", "tuning", "--out", str(tmp_path / "report")]) == 0
 
 
 @pytest.mark.parametrize("command", ["sweep", "evaluate"])

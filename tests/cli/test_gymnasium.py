@@ -100,29 +100,14 @@ def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
     assert main([*again, "--episodes", "4"]) == 0
 
 
-def test_pictures_are_written(tmp_path):
-    command = ["render", "gymnasium:gymnasium_worlds:limited", "--policy", "uniform", "--steps", "3"]
-    assert main([*command, "--out", str(tmp_path / "film")]) == 0
-    assert sorted(file.suffix for file in (tmp_path / "film").iterdir()) == [".gif", ".png"]
-    assert main([*command, "--question", "--out", str(tmp_path / "asked")]) == 0
-    assert len(list((tmp_path / "asked").iterdir())) == 1
-
-
 @pytest.mark.parametrize(
     ("command", "says"),
     [
         (["evaluate", "gymnasium"], "gymnasium is a family of tasks: name one of its environments, as gymnasium:NAME"),
-        (["evaluate", "gymnasium:gymnasium_worlds:Nope"], "gymnasium_worlds has no 'Nope'"),
-        (["train", REACH, "--env", "navigation"], "the task is named twice"),
         (["render", REACH, "--policy", "uniform", "--out", "film.gif"], "cannot be drawn"),
         (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
         (["adapt", "model.zip", "--env", REACH], "and give my_policy:POLICY (module:NAME"),
         (["adapt", "./mine.py:policy", "--env", REACH], "give package.module:NAME, for instance my_code:MINE"),
-        (
-            ["evaluate", REACH, "--policy", "uniform", "--task.arguments", "[]"],
-            "task.arguments is '[]': give arguments",
-        ),
-        (["evaluate", REACH, "--policy", "uniform", "--task.max-steps", "0"], "task.max_steps is 0: give a whole"),
     ],
 )
 def test_wrong_commands_are_refused_in_one_line(command, says, refused, tmp_path, monkeypatch):

@@ -1,7 +1,6 @@
 """`cuelearner label` and `cuelearner labels`: the real command, what it refuses, and what takes its files."""
 
 import csv
-import dataclasses
 import shlex
 import signal
 import socket
@@ -17,7 +16,6 @@ from sessions import OWN, expert, plan, served
 from cuelearner_jax.cli import label, main
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry as tasks
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -80,8 +78,6 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--labels", "0"], "--labels is 0: give a number from 1"),
         (["--guidance", "heuristic"], "guidance 'heuristic' asks for no labels: give --guidance relative or"),
         (["--sizes.candidates", "3", "--sizes.ensemble", "2"], "--sizes.candidates is above 1"),
-        (["--bound-deg", "0"], "--bound-deg is 0: give a number above 0 and up to 180"),
-        (["--base.seed", "1"], "--base.… chooses a folder's lane, but no folder is given"),
         (["--again", "nothing"], "no label file at nothing"),
         (["--questions", "near_aims"], "--questions is near_aims, but wandering has no aims in this world"),
         (["--guidance", "reading"], "reading asks about a policy: name one after the task"),
@@ -152,31 +148,9 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
     assert words[words.index("--guidance") + 1] == "reading"
 
 
-def test_a_reading_is_planned_with_what_may_have_changed(refused, tmp_path, monkeypatch):
-    pytest.importorskip("nicegui")
-    asks = [OWN, "page_task:left_of"]
-    found, plan, _ = asked_for(monkeypatch, *asks, "--out", str(tmp_path))
-    assert plan.family == ()
-    assert found.sizes.labels_per_round == 10
-    monkeypatch.chdir(tmp_path)
-    refused(["label", *asks, "--bound-deg", "20", "--out", "labels"], "leave bound_deg out", tmp_path)
-
-
-def test_policies_that_cannot_be_had_are_refused(refused, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    refused(["label", OWN, "nowhere", "--out", "labels"], "nowhere is not a run folder", tmp_path)
-    refused(["label", OWN, "page_task:QUARTER", "--out", "labels"], "is no policy", tmp_path)
-    refused(["label", OWN, "page_task:NOTHING", "--out", "labels"], "has no 'NOTHING'", tmp_path)
-
-
-def test_a_file_of_something_else_is_refused(labelled, refused, tmp_path):
-    refused(["label", OWN, "--out", labelled / "two"], "another session.seed: give the same", labelled)
-    refused(["label", OWN, "page_task:left_of", "--out", labelled / "one"], "another session.", labelled)
-
-
 def test_a_run_of_another_task_is_no_policy_here(run_folder, refused, tmp_path):
     command = ["label", OWN, run_folder, "--out", tmp_path / "labels"]
-    refused(command, "is a run of billiards, not of wandering", tmp_path)
+    refused(command, "is a run of bandit, not of wandering", tmp_path)
 
 
 def test_labels_are_inspected(labelled, capsys):
@@ -207,12 +181,3 @@ def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
     refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
     refused(["labels", "inspect", both, "--teacher"], "replay its situations", tmp_path)
     refused(["labels", "mend"], "Available subcommands: inspect, merge, export", tmp_path)
-
-
-def test_the_file_names_another_robot_and_that_one_has_a_page():
-    task = tasks.find("navigation")
-    assert [label._robot(task, name) for name in (None, "simple", "anymal")] == ["", "", "anymal"]
-    env = shape_of(plan().task, plan().config.task)
-    assert "robot" not in plan().session(env)
-    assert dataclasses.replace(plan(), robot="anymal").session(env)["robot"] == "anymal"
-    assert task.on("anymal").pictures().sketch is task.pictures().sketch

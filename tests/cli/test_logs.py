@@ -78,28 +78,6 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(capsys):
     assert "or the correction alone (--only-correction" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("command", "told"),
-    [
-        (["adapt", "own_arm:policy", "--out", "p"], "needs a task to act in: give one"),
-        (["adapt", "own_arm:policy", "--labels-from", "absent", "--out", "p"], "no label file at absent"),
-        (["adapt", "own_arm:narrow", "--labels-from", "labels", "--out", "p", *SMALL], "returned actions of shape"),
-        (["evaluate", "own_arm:policy", "--labels-from", "labels", "--steps", "5"], "leave out --steps"),
-        (["evaluate", "logs:absent"], "there is no folder of situations at absent"),
-        (
-            ["export", "logs:situations", "--policy", "uniform", "--only-correction", "--out", "p"],
-            "has no correction",
-        ),
-    ],
-)
-def test_what_cannot_be_is_told_in_one_line(command, told, there, capsys):
-    assert main(command) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("bounds of the actions")]
-    assert len(lines) == 1, lines
-    assert told in lines[0]
-    assert not (there / "p").exists()
-
-
 def test_proposed_actions_are_corrected_by_their_labels_alone(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     observations, actions = recorded.arrays(40)

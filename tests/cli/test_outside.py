@@ -81,8 +81,6 @@ def test_what_cannot_be_is_refused(run, forget, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
     refused(["render", "own_window:TASK", "--policy", "uniform", *new], "window has no pictures of point", tmp_path)
     refused(["train", "own_window:MUTE", "--guidance", "relative", *new], "mute has no teacher to ask", tmp_path)
-    refused(["train", "own_window:TASKS", *new], "own_window has no 'TASKS', did you mean 'TASK'", tmp_path)
-    refused(["evaluate", "own_window:TASK", "--scenario", "narow"], "did you mean 'narrow'", tmp_path)
     forget()
     refused(["evaluate", run, "--task", "own_window:MUTE"], "add --task own_window:TASK", run)
     registry.resolve("own_window:TASK")

@@ -1,22 +1,18 @@
 """Sweeps in pieces: together they are the whole; begun twice, stopped, on a full disk, and with a piece missing."""
 
 import json
-import resource
 import shutil
-import sys
 from pathlib import Path
 
-import jax
 import pytest
 from probes import edit_json
-from small_runs import SMALL, listing, rows, stopping_at
+from small_runs import BANDIT, listing, rows
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.shards import Shard
 
-SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]
-SWEEP += ["--guidance", "none"]
+SWEEP = ["sweep", BANDIT, "--seeds", "3", "--first-seed", "7", "--guidance", "none"]
 
 
 @pytest.fixture(scope="module")
@@ -98,28 +94,6 @@ def test_a_piece_that_is_missing_is_named(pieces, measured, tmp_path):
     assert main(["evaluate", str(pieces)]) == 2
 
 
-@pytest.mark.long
-def test_a_piece_that_was_stopped_goes_on_with_the_same_command(sweeps, tmp_path):
-    command = [*SWEEP, "--shard", "1/2", "--out", str(tmp_path)]
-    with stopping_at(1):
-        assert main(command) == 130
-    assert main(command) == 0
-    assert rows(tmp_path) == [row for row in rows(sweeps / "whole") if row["seed"] < 9]
-
-
-@pytest.mark.long
-def test_pieces_are_of_one_sweep_though_one_was_begun_before_a_field_existed(pieces, refused):
-    """By the command line: evaluated together, and a piece that is finished is found so."""
-    for file in (pieces / "shard-2-of-2").rglob("digests/metadata"):  # checkpoints did not name their run then
-        edit_json(file, lambda told: told.pop("run"))
-    for group, name in (("sizes", "frame"), ("agent", "polyak"), ("scalars", "answer"), ("task", "mirrors")):
-        edit_json(pieces / "shard-2-of-2" / "config.json", lambda told, group=group, name=name: told[group].pop(name))
-    assert main(["evaluate", str(pieces), "--steps", "20", "--envs", "20"]) == 0
-    assert main([*SWEEP, "--shard", "1/2", "--out", str(pieces)]) == 0
-    edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["sizes"].update(frame="action"))
-    refused([*SWEEP, "--shard", "1/2", "--out", pieces], "is a shard of a sweep with another sizes.frame", pieces)
-
-
 def test_pieces_that_do_not_fit_together_are_refused(pieces, refused, tmp_path):
     refused([*SWEEP, "--shard", "1/4", "--out", tmp_path / "run"], "3 seeds cannot be divided into 4 shards", tmp_path)
     other = ["--scalars.eps-deg", "3"]
@@ -134,21 +108,3 @@ def test_pieces_that_do_not_fit_together_are_refused(pieces, refused, tmp_path):
     edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["scalars"].update(eps_deg=3.0))
     says = "are shards of different sweeps (they differ in scalars.eps_deg): give the folder"
     refused(["evaluate", pieces], says, pieces)
-
-
-def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path, capsys, monkeypatch):
-    """Every file but the shortest is too large for this process."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module that was cut would stay for later imports
-    bandit = ["sweep", "page_task:TASK", "--guidance", "none", "--seeds", "2"]  # whose programs are soon compiled
-    jax.config.update("jax_enable_compilation_cache", False)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, hard))
-    try:
-        status = main([*bandit, "--out", str(tmp_path / "run")])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        jax.config.update("jax_enable_compilation_cache", True)
-    assert status == 1
-    # Orbax's threads may complain beside it.
-    says = "error: the disk is full: free some, then go on with the same command and --resume"
-    assert says in capsys.readouterr().err

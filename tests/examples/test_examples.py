@@ -168,12 +168,6 @@ def refused(capsys, command, says):
 
 
 @pytest.mark.long
-def test_a_run_folder_alone_loads_no_code(runs, capsys):
-    refused(capsys, ["evaluate", runs / "reach"], "add --task examples.reach:TASK if you trust that code")
-    refused(capsys, ["render", runs / "clone"], "add --task examples.reach:TASK if you trust that code")
-
-
-@pytest.mark.long
 def test_a_kind_from_outside_must_be_named_again(runs, capsys):
     command = ["evaluate", runs / "clone", "--task", "examples.reach:TASK"]
     refused(capsys, command, "--guidance package.module:NAME")
@@ -265,18 +259,6 @@ def test_the_late_arbiter_leaves_the_first_steps_to_the_agent():
 
 
 @pytest.mark.long
-def test_a_run_goes_on_with_the_same_command(runs, home):
-    described = (runs / "clone" / "config.json").read_text()
-    rows = results.read(runs / "clone").num_rows
-    command = at_home(documented("clone")[0], home)
-    with stranger():
-        assert main([*command, "--resume"]) == 0
-    assert ((runs / "clone" / "config.json").read_text(), results.read(runs / "clone").num_rows) == (described, rows)
-    assert json.loads(described)["grid"]["guidance"] == ["none", "clone"]
-    assert json.loads(described)["kinds"] == {"clone": {"way": 0.9}}
-
-
-@pytest.mark.long
 def test_the_parts_keep_the_laws(tmp_path):
     reach, clone, brax, policy = (
         importlib.import_module(f"examples.{name}") for name in ("reach", "clone", "brax_task", "policy")
@@ -291,18 +273,6 @@ def test_the_parts_keep_the_laws(tmp_path):
     check_environment(brax.make_environment(brax.PendulumConfig(max_steps=4)), steps=12, tolerance=1e-4)
     with pytest.raises(UserError, match=r"task\.wind is -1"):
         reach.make_environment(dataclasses.replace(config, wind=-1))
-
-
-@pytest.mark.long
-def test_policies_of_ones_own_reach_the_buoy(tmp_path, capsys):
-    policy = importlib.import_module("examples.policy")
-    found = policy.main([str(tmp_path)], steps=8_000)
-    assert sorted(found) == sorted(policy.policies(None))
-    for metrics in found.values():
-        assert metrics["success"] > 0.9
-    for name in ("leaning.gif", "leaning.png"):
-        assert (tmp_path / name).stat().st_size > 1000
-    assert "wrote" in capsys.readouterr().out
 
 
 @pytest.mark.long

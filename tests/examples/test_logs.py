@@ -56,15 +56,3 @@ def test_the_node_corrects_what_the_base_says_and_passes_it_on_in_doubt(made):
     for given in (lambda: beside.hear([0.0], 3.0), lambda: beside.action([0.0], 3.0)):
         with pytest.raises(ValueError, match="the contract says 3"):
             given()
-
-
-def test_the_node_refuses_a_whole_policy(monkeypatch):
-    class Whole:
-        contract = {}  # noqa: RUF012
-
-        def __init__(self, folder):
-            pass
-
-    monkeypatch.setattr(ros2_correction, "Decision", Whole)
-    with pytest.raises(ValueError, match="with --only-correction"):
-        ros2_correction.Beside("whole")

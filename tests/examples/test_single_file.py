@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import chex
 import jax
@@ -123,10 +122,6 @@ def test_one_update_of_double_dqn(discount):
         return learned, single_file.value_targets(cfg, agent, batch), loss
 
     chex.assert_trees_all_close(by_the_single_file(jax.random.key(4)), by_the_package(jax.random.key(4)), atol=1e-5)
-
-
-def test_it_is_short_enough_to_be_read():
-    assert len(Path(single_file.__file__).read_text(encoding="utf-8").splitlines()) <= 330
 
 
 def test_its_parameters_are_those_of_the_quickstart():

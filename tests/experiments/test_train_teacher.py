@@ -4,7 +4,6 @@ import dataclasses
 import json
 import math
 from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -101,20 +100,3 @@ def test_a_training_that_diverges_stops_and_keeps_what_was_finite(begun, monkeyp
         train(begun, resume=True)
     assert probes.files_of(newest) == before
     assert not (begun / "teacher.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--eval-steps", "150"], "beyond 100 a multiple"),
-        (["--preset", "no"], "unknown --preset 'no'"),
-        (["--out", "."], "not empty"),
-    ],
-    ids=str,
-)
-def test_its_command_refuses_in_one_line(arguments, says, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("thesis.txt").write_text("mine")
-    assert train_teacher.main(["billiards", *arguments]) == 2
-    assert says in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["thesis.txt"]

@@ -91,23 +91,6 @@ def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
     assert len(json.loads((tmp_path / "wild" / "policy.json").read_text())["history"]["rows"]) == 2
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["evaluate", "nowhere"], "no walking policy in nowhere: train one with"),
-        (["evaluate", "--robots", "0"], "--robots is 0: give a positive number"),
-        (["evaluate", "--out", "kept.json"], "exists: give another --out"),
-        (["train", "--out", "."], "not empty: give another --out"),
-    ],
-)
-def test_its_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments, says):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "kept.json").write_text("mine")
-    assert train_walking.main(arguments) == 2
-    assert says in capsys.readouterr().err
-    assert (tmp_path / "kept.json").read_text() == "mine"
-
-
 def test_a_policy_is_measured_trial_by_trial(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(tracking, "TRIALS", {"clean": tracking.TRIALS["clean"]})
     monkeypatch.setattr(tracking, "STEPS", 200)

@@ -14,7 +14,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Guided, Opaque
 
 ENV = Reach(GRIPPER)
-ANGLES = np.linspace(0.0, 6.0, 24)
+ANGLES = np.linspace(0.0, 6.0, 8)
 DRAWN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
 
 

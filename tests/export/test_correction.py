@@ -86,9 +86,8 @@ def test_a_reading_is_exported_whole_and_alone_unless_its_base_sees_something_el
     correction = read.policy.correction
     correction = correction.replace(alpha=0.01 * jnp.ones_like(correction.alpha))  # so few labels leave no remainder
     read = dataclasses.replace(read, policy=read.policy.replace(correction=correction))
-    for format in ("numpy", "onnx"):
-        cl.export_policy(read, tmp_path / format, format=format)
-        np.testing.assert_allclose(cl.load_exported(tmp_path / format)(OTHERS), read(OTHERS), atol=1e-5)
+    cl.export_policy(read, tmp_path / "numpy", format="numpy")
+    np.testing.assert_allclose(cl.load_exported(tmp_path / "numpy")(OTHERS), read(OTHERS), atol=1e-5)
     with pytest.raises(ContractError, match="holds a whole policy: leave out"):
         cl.load_exported(tmp_path / "numpy")(OTHERS, base(OTHERS))
     aside = correction.replace(change=correction.change.replace(theta=correction.change.theta + 0.1))

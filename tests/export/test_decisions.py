@@ -23,7 +23,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, layers, uniform_in
 
 ENV = Aimed()
-ANGLES = np.linspace(0.0, 6.0, 40)
+ANGLES = np.linspace(0.0, 6.0, 20)
 DRAWN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
 
 
@@ -162,18 +162,6 @@ def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_
         contract.replay_golden_cases(there)
 
 
-def test_what_this_program_cannot_run_is_told_in_one_line(folder, tmp_path):
-    there = copied(folder / "stablehlo", tmp_path)
-    (there / "decision.stablehlo").write_bytes((there / "decision.stablehlo").read_bytes()[:3000])
-    edit_contract(there, lambda told: told["artefact"].update(jax="0.99.1"))
-    with pytest.raises(UserError, match=r"exported with JAX 0\.99\.1, and JAX .* cannot call it") as refused:
-        contract.replay_golden_cases(there)
-    assert "\n" not in str(refused.value)
-    edit_contract(there, lambda told: told.update(version=runner.VERSION + 1))
-    with pytest.raises(UserError, match="newer cuelearner"):
-        contract.replay_golden_cases(there)
-
-
 @pytest.mark.parametrize(
     ("policy", "says"),
     [
@@ -197,13 +185,6 @@ def test_what_only_stablehlo_can_say_is_refused_of_the_others(tmp_path):
     assert write(policy, "stablehlo", tmp_path / "out")["difference"] == 0.0
     with pytest.raises(UserError, match="is not empty"):
         write(policy, "stablehlo", tmp_path / "out")
-
-
-def test_without_onnx_its_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(UserError, match=r"cuelearner-jax\[onnx\]"):
-        write(agent(), "onnx", tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_golden_cases_are_those_that_rounding_does_not_turn():
@@ -235,11 +216,3 @@ def test_a_difference_that_no_episode_leads_to_is_noticed_when_the_file_is_writt
         with pytest.raises(UserError, match="golden cases differ by"):
             write(policy, format, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("given", [(np.nan, 0.0), (0.0, 0.0)])
-def test_a_decision_that_is_no_direction_is_refused(folder, monkeypatch, given):
-    decide = runner.Decision(folder / "numpy")
-    monkeypatch.setattr(decide, "_decide", lambda batch: np.tile(np.float32(given), (len(batch), 1)))
-    with pytest.raises(runner.ContractError, match="no direction"):
-        decide(np.zeros(2))

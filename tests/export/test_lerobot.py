@@ -132,16 +132,6 @@ def test_a_checkpoint_of_another_robot_is_refused(robot, more, told, env, policy
     assert not (tmp_path / "after").exists()
 
 
-def test_what_is_no_correction_of_proposed_actions_is_refused(env, policy):
-    for other, told in (
-        (policy.replace(family=()), "is no correction of proposed actions"),
-        (policy.base, "is no correction of proposed actions"),
-        (unread(policy.base, env.actions, ACTIONS_ALONE, env.obs_size), "asked for no change"),
-    ):
-        with pytest.raises(UserError, match=told):
-            lerobot.arrays_of(other, env)
-
-
 def evaluation(folder, successes):
     """Write what `lerobot-eval` writes of one task."""
     folder.mkdir()

@@ -54,18 +54,6 @@ def test_a_module_acts_in_evaluation_mode_and_keeps_its_own(torch):
     assert all(own.grad is None for own in module.parameters())
 
 
-def test_a_class_of_modules_is_made(torch):
-    class Actor(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.act = torch.nn.ReLU()  # a name that policies of ours have
-
-        def forward(self, obs):
-            return self.act(obs[:, :2])
-
-    np.testing.assert_allclose(acted(Actor), np.maximum(OBS[:, :2], 0))
-
-
 def test_faults_of_modules_are_told(torch):
     class Broken(torch.nn.Module):
         def forward(self, obs):
@@ -90,52 +78,6 @@ def deployed(torch, how):
 def test_deployed_modules_act(how, torch):
     module, given = deployed(torch, how)
     np.testing.assert_allclose(acted(given), acted(module), atol=1e-6)
-
-
-def test_a_module_of_rsl_rl_acts_by_act_inference(torch):
-    class ActorCritic(torch.nn.Module):
-        def forward(self):
-            raise NotImplementedError
-
-        def act_inference(self, obs):
-            return obs[:, :2] / 2
-
-    np.testing.assert_allclose(acted(ActorCritic()), OBS[:, :2] / 2)
-
-
-def test_a_hidden_state_in_the_module_is_refused(torch):
-    class Memory(torch.nn.Module):  # as IsaacLab exports it
-        def __init__(self):
-            super().__init__()
-            torch.manual_seed(0)
-            self.cell, self.out = torch.nn.GRUCell(3, 8), torch.nn.Linear(8, 2)
-            self.register_buffer("hidden", torch.zeros(1, 8))
-
-        def forward(self, obs):
-            self.hidden[:] = self.cell(obs, self.hidden)[:1]
-            return self.out(self.hidden.expand(len(obs), 8))
-
-    assert "does not repeat itself" in fault(torch.jit.script(Memory()))
-
-
-def test_a_hidden_state_beside_the_action_is_refused(torch):
-    class Actor(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.rnn = torch.nn.GRU(3, 2)
-
-        def forward(self, obs):
-            action, hidden = self.rnn(obs[None])
-            return action[0], hidden
-
-    for given in (Actor(), torch.jit.script(Actor())):
-        assert "gives a state beside its actions" in fault(given)
-
-
-def test_a_module_is_the_same_policy_each_time(torch):
-    module = network(torch)
-    assert len({policy_of(module).function, policy_of(module).function}) == 1
-    assert policy_of(module).function != policy_of(network(torch)).function
 
 
 @pytest.fixture
@@ -190,12 +132,6 @@ def test_a_model_sees_observations_normalised_as_in_its_training(gymnasium):
     wanted = model.predict(env.normalize_obs(OBS), deterministic=True)[0]
     assert np.abs(wanted - model.predict(OBS, deterministic=True)[0]).max() > 0.01
     np.testing.assert_allclose(acted(model), wanted, atol=1e-6)
-
-
-def test_a_recurrent_model_is_refused(gymnasium):
-    contrib, box = pytest.importorskip("sb3_contrib"), gymnasium.spaces.Box
-    env = env_of(gymnasium, box(-1, 1, (3,)), box(-1, 1, (2,)))
-    assert "gives a state beside its actions" in fault(model_of(contrib.RecurrentPPO, "MlpLstmPolicy", env))
 
 
 def test_a_model_of_dictionaries_takes_rows_in_the_order_of_its_keys(gymnasium):

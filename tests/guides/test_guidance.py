@@ -89,11 +89,6 @@ def table(monkeypatch):
     return copy
 
 
-def test_an_unknown_kind_is_a_user_error_that_names_the_nearest_and_the_way_to_ones_own():
-    with pytest.raises(UserError, match=r"unknown guidance 'relativ', did you mean 'relative'.*package\.module:NAME"):
-        guidance.find("relativ")
-
-
 def test_a_kind_can_be_added_again_but_not_another_of_its_name(table):
     calm, other = (type("Calm", (NoGuide,), {"name": name, "needs": ("mirror",)}) for name in ("calm", "none"))
     for _ in range(2):
@@ -103,12 +98,6 @@ def test_a_kind_can_be_added_again_but_not_another_of_its_name(table):
         plugins.add(table, other, "guidance")
     with pytest.raises(UserError, match="'calm' needs an environment with `mirror`"):
         guidance.make("calm", probes.SIZES, probes.Chain())
-
-
-@pytest.mark.parametrize("name", ["", "Calm", "a/b", "a:b"])
-def test_names_that_are_no_folders_are_refused(name):
-    with pytest.raises(ValueError, match="lower-case letters"):
-        type("Own", (NoGuide,), {"name": name})
 
 
 @pytest.mark.parametrize("kind", ["none", "relative"])
@@ -136,10 +125,5 @@ def test_a_kind_brings_options_of_its_own_which_a_run_keeps():
     # The code of a kind from outside is not loaded.
     elsewhere = run_config.from_json(None, {**values, "kinds": {"from-outside": {"way": 0.5}}})
     assert run_config.to_json(elsewhere)["kinds"] == {"from-outside": {"way": 0.5}}
-    for name, wrong, says in (
-        ("intent", {"aim_doubt": -1.0}, "intent.aim_doubt"),
-        ("intent", {"doubt": 1.0}, "doubt"),
-        ("relative", {"aim_doubt": 1.0}, "no options"),
-    ):
-        with pytest.raises(UserError, match=says):
-            run_config.from_json(None, {**values, "kinds": {name: wrong}})
+    with pytest.raises(UserError, match=r"intent\.aim_doubt"):
+        run_config.from_json(None, {**values, "kinds": {"intent": {"aim_doubt": -1.0}}})

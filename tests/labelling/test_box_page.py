@@ -96,13 +96,6 @@ def test_what_a_page_cannot_ask_is_refused():
         controls.check(RELATIVE, twice)
 
 
-def test_cues_for_which_no_keys_are_left_have_buttons_alone():
-    hand = Box((0.0,) * 26, (1.0,) * 26)
-    controls.check(RELATIVE, hand)
-    about = [control for control in controls.controls(RELATIVE, hand, one_cue=True).values() if control.cue == 25]
-    assert [(control.words, control.keys) for control in about] == [("more", ()), ("less", ())]
-
-
 def test_agreement_counts_the_cues_of_which_both_say_something():
     env = TASK.environment(TASK.presets["paper"].config.task)
     one = np.array([[1, 0, UNSAID], [1, 0, 0], [0, 0, 0]], np.float32)

@@ -116,34 +116,3 @@ def test_pointing_shows_what_to_do_instead(browser, tmp_path):
         assert f"--out {folder}" in page.locator("#popup code").inner_text()
     (row,) = label_files.history(folder / label_files.JSONL)
     np.testing.assert_allclose(row["answer"], [0.5, math.sqrt(0.75)], atol=0.02)
-
-
-@pytest.mark.long
-def test_every_press_is_saved_or_told_and_the_end_outlives_the_command(browser, tmp_path):
-    folder = tmp_path / "labels"
-    dropped = "() => cue.dropped"
-    with served(folder) as (process, address):
-        page = entered(browser, address)
-        page.wait_for_function(f"({ITEM})() === 0 && cue.ready()")
-        for number in range(30):  # faster than anybody sees and answers, whatever the page shows
-            page.keyboard.press(["ArrowLeft", "ArrowDown"][number % 2])
-            page.wait_for_timeout(25)
-        page.wait_for_function("() => cue.ready()")
-        saved, told = page.evaluate(ITEM), page.evaluate(dropped)
-        assert (saved + told, told > 0) == (30, True)
-        assert f"So far {told} press" in page.locator(".dropped").inner_text()
-        page.keyboard.press("h")
-        page.locator(".q-dialog").wait_for()
-        page.keyboard.press("ArrowLeft")
-        assert (page.evaluate(ITEM), page.evaluate(dropped)) == (saved, told + 1)
-        page.keyboard.press("h")
-        page.wait_for_function("() => cue.ready()")
-        page.locator(".answers button").first.dblclick()
-        moved(page, saved)
-        assert (page.evaluate(ITEM), page.evaluate(dropped)) == (saved + 1, told + 2)
-        page.get_by_role("button", name="finish").click()
-        page.locator(".saved").wait_for()
-        assert process.wait(30) == 0
-        assert str(folder / label_files.PARQUET) in page.locator(".saved").inner_text()
-        assert "cuelearner train page_task:TASK" in page.locator("#next").inner_text()
-    assert len(label_files.history(folder / label_files.PARQUET)) == saved + 1

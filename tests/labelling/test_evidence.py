@@ -14,12 +14,7 @@ from cuelearner_jax.policies import Opaque
 STRAIGHT = Base(Opaque(lambda obs: obs, on_host=True), "straight")  # the expert means 0.6 rad, 34.4 degrees, beside
 EPS_DEG = 5.0
 CONFIG = dataclasses.replace(probes.CONFIG, scalars=dataclasses.replace(probes.SCALARS, eps_deg=EPS_DEG))
-SETTINGS = {
-    "kind": "reading",
-    "base": STRAIGHT,
-    "config": CONFIG,
-    "labels": 30,
-}
+SETTINGS = {"kind": "reading", "base": STRAIGHT, "config": CONFIG, "labels": 30}
 LINE = re.compile(r"action: turn: (\S+) \[(\S+), (\S+)\] degrees")
 
 

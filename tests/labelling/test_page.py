@@ -191,34 +191,6 @@ def test_arrows_point_where_actions_do(opened):
     np.testing.assert_allclose(turned_by(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
 
 
-def test_small_turns_are_drawn_larger_and_the_page_says_so(opened):
-    session = opened()
-    asked = session.item._replace(action=np.float32([0.6, 0.8]))
-    hair = asked.sketch.box[2] / 400
-
-    def drawn(name, eps, item=asked):
-        """Degrees from the arrow in question to another one, and how far apart their tips are at least."""
-        svg = view.picture(item, RELATIVE, eps)
-        one, other = (tip(svg, each) * [1, -1] for each in (name, "asked"))
-        turn = math.degrees(math.atan2(one[1], one[0]) - math.atan2(other[1], other[0]))
-        return (turn + 180) % 360 - 180, float(np.linalg.norm(one - other))
-
-    times = view.magnification_of(asked, 0.1)
-    assert view.note(asked, RELATIVE, 0.1) == f"turns are drawn {times} times as large: 0.1° as {0.1 * times:g}°"
-    for way, name in ((1, "left"), (-1, "right")):
-        turn, apart = drawn(name, 0.1)
-        assert turn == pytest.approx(way * 0.1 * times, abs=0.05)
-        assert apart >= 0.95 * view.TIPS * hair
-    assert drawn("left", 15.0)[0] == pytest.approx(15.0, abs=0.05)
-    assert (view.magnification_of(asked, 15.0), view.note(asked, RELATIVE, 15.0)) == (1, "")
-    assert view.note(asked, DEMONSTRATION, 0.1) == ""
-    near = asked._replace(sketch=asked.sketch._replace(box=(-0.1, -0.3, 2.0, 2.0)))  # the picture ends close by
-    assert view.magnification_of(near, 0.1) > times
-    for refined, seen in ((0.3, 0.3 * times), (20.0, 60.0), (100.0, 100.0)):  # never past what it is, or 60
-        item = asked._replace(refined=turned_by(asked.action, refined))
-        assert drawn("refined", 0.1, item)[0] == pytest.approx(seen, abs=0.1)
-
-
 def test_a_film_shows_what_the_action_leads_to(opened):
     session = opened()
     item, made = session.item, session.questions

@@ -18,7 +18,6 @@ from cuelearner_jax.labelling.questions import Item
 from cuelearner_jax.reading import Reading
 from cuelearner_jax.spaces import UNSAID, Box, cues_from
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.types import Sketch
 
 pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
@@ -75,46 +74,6 @@ def test_cues_are_arrows_where_their_words_point_with_keys_and_words():
     assert arrows(drawn(box("right,left")))["+1"][0] == 0  # more may be to the right
     assert view.by_words(cues_from("left,up")[0]) is None
     assert view.by_words(cues_from("more to the left,less")[0]) == (-1.0, 0.0)
-
-
-def test_arrows_stay_in_the_picture_and_two_that_point_alike_lie_apart():
-    svg = drawn(box("up,down;higher,lower"))
-    discs = np.array(re.findall(r'<circle cx="(\S+)" cy="(\S+)" r="(\S+)"', svg), float)
-    assert len(discs) == 4
-    x, y, radius = discs.T
-    assert (x - radius).min() >= 0
-    assert (y - radius).min() >= 0
-    assert (x + radius).max() <= 640
-    assert (y + radius).max() <= 480
-    assert np.hypot(x[0] - x[2], y[0] - y[2]) > 2 * radius[0]
-
-
-def test_a_task_says_where_cues_point_in_its_pictures():
-    forward, left, up, fingers = fetch_layout.points_of("FetchReach-v4", "{}")
-    half, eighth = np.sqrt(0.5), np.sqrt(0.125)  # azimuth 45 degrees, and half of what leads away is up: sin 30 degrees
-    np.testing.assert_allclose([forward, left], [(half, -eighth), (-half, -eighth)], atol=1e-6)
-    assert (up, fingers) == ((0.0, -1.0), None)
-    assert fetch_layout.points_of("FetchReach-v4", '{"default_camera_config": {}}')[:2] == (None, None)
-    assert fetch_layout.points_of("Pendulum-v1", "{}") == ()
-    found = arrows(drawn(box(f"forward,back;{CUES}"), sketch=PHOTO._replace(points=(forward, left, up, None))))
-    assert (found["pick-0-more"][0], found["pick-1-more"][0], found["pick-2-less"][0]) == (27, 153, -90)
-
-
-def test_the_action_and_its_correction_are_arrows_from_the_middle_and_the_correction_is_told_in_words():
-    space = box(CUES)
-    action, refined = np.float32([-0.5, 0.0, 0.0]), np.float32([0.0, 0.4, -1.0])
-    svg = drawn(space, action, refined=refined)
-    ends = {
-        name: tuple(map(float, ends))
-        for name, *ends in re.findall(r'class="arrow (asked|refined)"><line[^>]*x1="(\S+)" y1="(\S+)"[^>]*', svg)
-    }
-    assert ends == {"asked": (320.0, 240.0), "refined": (320.0, 240.0)}
-    tips = re.findall(r'class="arrow (?:asked|refined)">.*?points="([\d.]+),([\d.]+)', svg)
-    # Half of the way to the end of the range is half of the reach; more of the cue is to the left.
-    np.testing.assert_allclose(np.array(tips, float), [(380, 240), (320, 192)], atol=0.01)
-    told = view.note(Item(0, None, action, PHOTO, refined), RELATIVE, 0.1, space)
-    assert told.endswith("The correction: left by 25%, up by 20%, close by 50% of the range")
-    assert drawn(space).count('class="arrow asked"') == 0  # the middle is nowhere to point to
 
 
 def test_one_press_about_one_cue_says_nothing_of_the_others():

@@ -186,18 +186,6 @@ def test_files_of_something_else_are_refused(opened, tmp_path):
         assert (tmp_path / "labels" / JSONL).read_bytes() == before
 
 
-def test_situations_that_come_out_otherwise_are_followed_by_a_new_episode(opened, tmp_path, monkeypatch):
-    session = opened()
-    give(session, 4)
-    session.close()
-    monkeypatch.setattr("cuelearner_jax.labelling.session.replay", lambda *told: iter(()))
-    again = opened()
-    assert again.number == 4
-    assert not again.undo(4)  # nobody knows where that was
-    give(again, 1)
-    assert label_files.read(tmp_path / "labels").people.item.tolist() == [0, 1, 2, 3, 4]
-
-
 def test_a_policy_is_asked_about_within_a_bound(opened):
     session = opened(base=Base(Opaque(page_task.left_of, on_host=True), "mine"), bound_deg=5.0)
     items = give(session, 10)

@@ -91,30 +91,6 @@ def test_places_turn_about_their_origin_and_differences_follow():
     np.testing.assert_array_equal(undo_observation((turn,), jnp.zeros(1), shown), shown)
 
 
-@pytest.mark.parametrize(
-    ("slices", "said"),
-    [
-        (
-            (Quantity("cup", 1, "m", origin=(0.0, 0.0)),),
-            "'cup' has an origin but is not a place: give x and y in metres",
-        ),
-        (
-            (Quantity("cup", 3, "1", origin=(0.0, 0.0)),),
-            "'cup' has an origin but is not a place: give x and y in metres",
-        ),
-        (
-            (Quantity("way", 3, "m", follows="cup"),),
-            "'way' follows 'cup', which is not a slice of the observation: name one",
-        ),
-    ],
-)
-def test_slices_that_cannot_turn_are_refused(slices, said):
-    table = Table()
-    table.observation = slices
-    with pytest.raises(UserError, match=said):
-        declared_distortions(table)
-
-
 def test_beams_between_two_are_interpolated_and_nothing_is_seen_beyond_the_last():
     (lidar,) = [one for one in declared_distortions(Navigation(worlds=None)) if one.name == "lidar: turn"]  # pyright: ignore
     obs = jnp.zeros(280).at[:271].set(jnp.arange(271.0))

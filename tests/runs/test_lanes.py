@@ -5,11 +5,10 @@ import dataclasses
 import chex
 import jax
 import numpy as np
-from probes import CONFIG, Window, compilations
+from probes import CONFIG, Window
 
-from cuelearner_jax.devices import SHARED, compiler_options, place
+from cuelearner_jax.devices import compiler_options
 from cuelearner_jax.guides import registry as guidance
-from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes
 from cuelearner_jax.runs.grid import Grid
 
@@ -49,14 +48,3 @@ def test_blocks_of_another_cut_are_cut_anew(monkeypatch):
     (joined,) = after.recut(blocks)
     chex.assert_trees_all_equal(joined, *after.start())
     chex.assert_trees_all_equal(after.recut([joined]), [joined])
-
-
-def test_training_is_compiled_once():
-    group = group_of(1)
-    clock = place(group.mesh, start_clock(), SHARED)
-    (state,) = group.start()
-    compiled = []
-    for _ in range(2):  # other tests may have compiled the same program for more lanes
-        clock, state, _ = group.program.train(Window(), CONFIG.settings, clock, state, 4)
-        compiled.append(compilations(group.program.train))
-    assert compiled[0] == compiled[1]

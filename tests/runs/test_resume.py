@@ -26,7 +26,6 @@ from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import Checkpoints
-from cuelearner_jax.storage.folders import prepare_folder
 from cuelearner_jax.studies import train
 from cuelearner_jax.terminal import Interrupted
 
@@ -168,17 +167,13 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
 
 def test_a_run_that_is_cut_short_again_and_again_while_it_asks_goes_on_as_one(whole, tmp_path):
     out = tmp_path / "run"
-    with killed_at(1, "_label"), pytest.raises(Killed):  # nothing was saved
-        run(out)
     with stopping_at(3), pytest.raises(Interrupted, match="--resume"):
-        run(out, resume=True)
+        run(out)
     assert newest(out, "relative")[1] == 3
     # Round 4 is saved, round 5 is asked, then the process dies.
     with killed_at(2, "_stop_if_asked"), pytest.raises(Killed):
         run(out, resume=True)
     assert newest(out, "relative")[1] == 4
-    with stopping_at(2), pytest.raises(Interrupted):  # in the last round
-        run(out, resume=True)
     assert not (out / "relative" / "labels.parquet").exists()
     with killed_at(1, "_train"), pytest.raises(Killed):  # all labels are there, and no row
         run(out, resume=True)
@@ -206,8 +201,6 @@ def test_a_run_that_is_cut_short_again_and_again_while_it_trains_goes_on_as_one(
     assert (out / "relative" / results.PARQUET).exists()
     assert newest(out, "none")[1] == 32
     assert max(row["step"] for row in rows(out) if row["guidance"] == "none") == 64
-    with stopping_at(4), pytest.raises(Interrupted):  # after the last step
-        run(out, resume=True)
     run(out, resume=True)
     assert_same_run(out, whole)
     before = probes.files_of(out)
@@ -239,9 +232,7 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
         raise AssertionError("a teacher was made although the labels are given")
 
     task = dataclasses.replace(TASK, teacher=refuse)
-    with stopping_at(2), pytest.raises(Interrupted):
-        train.run(Order(task, CONFIG, grid, out, labels_from=path))
-    train.run(Order(task, CONFIG, grid, out, labels_from=path, resume=True))
+    train.run(Order(task, CONFIG, grid, out, labels_from=path))
     state, _ = newest(out, "relative", grid)
     labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.guide.labels for block in state["rest"]))
     for lane, (seed, budget) in enumerate([(1, 35), (0, 35), (1, 60), (0, 60)]):
@@ -263,19 +254,6 @@ def refused(out, message):
         run(out, resume=True)
     assert "\n" not in str(refusal.value)
     assert probes.files_of(out) == before
-
-
-def test_a_checkpoint_whose_lanes_had_another_state_is_refused(whole, tmp_path, monkeypatch):
-    out = copied(whole, tmp_path)
-    (out / "none" / results.PARQUET).unlink()
-    of_now = training.items
-
-    def of_a_newer_program(blocks, clock, wall):
-        made = of_now(blocks, clock, wall)
-        return {**made, "rest": [block.replace(arbiter=(block.arbiter, block.failed)) for block in made["rest"]]}
-
-    monkeypatch.setattr(training, "items", of_a_newer_program)
-    refused(out, "of another configuration or version of the program, use that one")
 
 
 def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(stopped, whole, tmp_path):
@@ -338,25 +316,3 @@ def test_a_part_that_was_exchanged_with_another_runs_is_refused(stopped, other, 
     else:
         shutil.copy(other / "relative" / part, mine)
     refused(out, "another run")
-
-
-@pytest.mark.parametrize(("resume", "says"), [(False, "not empty"), (True, "other values of scalars.eps_deg")])
-def test_a_folder_that_another_process_used_in_the_meantime_is_left_alone(stopped, tmp_path, resume, says):
-    out, other = copied(stopped, tmp_path), tmp_path / "other"
-    if resume:
-        prepare_folder(other, formats.read("config", out / "config.json"), clean=True)
-
-    @contextmanager
-    def late(folder):
-        """The folder becomes another run's between the first look and the lock."""
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(out, folder)
-        probes.edit_json(folder / "config.json", lambda values: values["scalars"].update(eps_deg=1.0))
-        yield
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "claimed", late)
-        with pytest.raises(UserError, match=says):
-            run(other, resume=resume)
-    assert formats.read("config", other / "config.json")["scalars"]["eps_deg"] == 1.0
-    assert read_labels(other)[0].shape == read_labels(out)[0].shape

@@ -1,14 +1,11 @@
 """Finished files that were emptied, cut, changed by a bit or exchanged are refused in one line; no file runs code."""
 
+import contextlib
 import json
-import pickle
-import shutil
 import sys
-import threading
 
 import jax
 import jax.numpy as jnp
-import json_ways
 import numpy as np
 import probes
 import pytest
@@ -134,67 +131,27 @@ def test_damage_is_refused_in_one_line_or_changes_nothing(written):
     assert refusals > 0
 
 
-# Files written to run code: no string of a file that is read reaches an import, a pickle or a process.
+# Files written to run code: no string of a file that is read is imported.
 
-HOSTILE = "hostile:KIND"
-STARTING = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn")
-heard = []
-armed = threading.Event()
+HOSTILE = "hostile_module:KIND"
 
 
-def hear(event, arguments):
-    """A hook of the interpreter; hooks cannot be taken away again, so this one only listens while it is armed."""
-    if armed.is_set() and (event == "pickle.find_class" or (event in STARTING and "hostile" in str(arguments))):
-        heard.append(f"{event} {arguments[:2]}")
-
-
-class Finder:
-    """Takes note of every module of the attacker's that is looked for."""
-
-    @staticmethod
-    def find_spec(name, path=None, target=None):
-        if name.partition(".")[0] == "hostile":
-            heard.append(f"import {name}")
-
-
-@pytest.fixture(scope="module")
-def hook():
-    sys.addaudithook(hear)
-
-
-@pytest.fixture
-def listening(hook, tmp_path, monkeypatch):
-    """In a folder with the attacker's module, which would be imported."""
-    (tmp_path / "hostile.py").write_text("from cuelearner_jax.guides.base import NoGuide as KIND\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
-    heard.clear()
-    armed.set()
-    yield
-    armed.clear()
-    sys.modules.pop("hostile", None)
-
-
-def test_what_is_listened_to_is_heard(listening):
-    assert guidances.resolve(HOSTILE).name == "none"
-    pickle.loads(pickle.dumps(shutil.which))
-    assert [one.split()[0] for one in heard[:2]] == ["import", "pickle.find_class"]
+def strings(values):
+    """Yield (container, name) of every string in nested JSON values."""
+    for name, value in values.items() if isinstance(values, dict) else enumerate(values):
+        if isinstance(value, str):
+            yield values, name
+        elif isinstance(value, dict | list):
+            yield from strings(value)
 
 
 @pytest.mark.parametrize(
-    ("kind", "file", "harmless"),
-    [
-        (
-            "policy",
-            "policy.json",
-            {"of", "conventions", "commit", "versions", "hardware", "command", "observation", "judged", "arrays"},
-        ),
-        ("teacher", "teacher.json", set()),
-        ("run", "config.json", {"split"}),
-    ],
+    ("kind", "file"), [("policy", "policy.json"), ("teacher", "teacher.json"), ("run", "config.json")]
 )
-def test_no_string_of_a_description_is_imported(kind, file, harmless, listening, tmp_path):
+def test_no_string_of_a_description_is_imported(kind, file, tmp_path, monkeypatch):
+    (tmp_path / "hostile_module.py").write_text("from cuelearner_jax.guides.base import NoGuide as KIND\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     write, read = KINDS[kind]
     folder = tmp_path / "folder"
     if kind == "run":
@@ -202,16 +159,12 @@ def test_no_string_of_a_description_is_imported(kind, file, harmless, listening,
     write(folder)
     values = json.loads((folder / file).read_text())
     values.pop("digest")
-    taken = set()
-    for way in json_ways.ways(values):
-        if not isinstance(json_ways.at(values, way), str):
-            continue
-        spoiled = json_ways.changed(values, way, HOSTILE)
-        (folder / file).write_text(json.dumps({**spoiled, "digest": configuration.digest(spoiled)}))
-        try:
+    for container, name in list(strings(values)):
+        before, container[name] = container[name], HOSTILE
+        (folder / file).write_text(json.dumps({**values, "digest": configuration.digest(values)}))
+        with contextlib.suppress(Exception):
             read(folder)
-            taken.add(way[0])
-        except Exception:
-            pass
-    assert heard == []
-    assert taken <= harmless
+        container[name] = before
+    assert "hostile_module" not in sys.modules
+    assert guidances.resolve(HOSTILE).name == "none"  # the user may name it
+    del sys.modules["hostile_module"]

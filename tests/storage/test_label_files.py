@@ -4,13 +4,11 @@ import json
 
 import numpy as np
 import probes
-import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files as files
-from cuelearner_jax.storage.table import META
 
 TASK = {"name": "window", "half_width_deg": 28.0}
 EPS = 20.0
@@ -54,15 +52,6 @@ def test_only_labels_that_count_are_written(path):
     file = files.read(path)
     assert file.seeds.tolist() == [4] * 3
     np.testing.assert_array_equal(file.labels.obs, labels.obs[0, :3])
-
-
-def test_what_the_numbers_mean_is_written_in_the_file(path):
-    written(path)
-    meta = json.loads(pq.read_schema(path).metadata[META])
-    assert meta["format"] == 1
-    assert (meta["space"]["name"], meta["space"]["cues"][0]["unit"], meta["eps"]) == ("directions", "degrees", EPS)
-    assert meta["space"]["cues"][0]["words"] == ["counterclockwise", "clockwise"]
-    assert set(meta["conventions"]) >= set(NAMES)
 
 
 def test_lanes_get_their_own_seeds_labels_padded(path):
@@ -170,11 +159,7 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("other", "named"),
-    [
-        ({"answers": "scalar", "eps_deg": None}, "answers"),
-        ({"eps_deg": 5.0}, "eps"),
-    ],
+    ("other", "named"), [({"answers": "scalar", "eps_deg": None}, "answers"), ({"eps_deg": 5.0}, "eps")]
 )
 def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named):
     said(tmp_path, range(3))

@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 import cuelearner_jax
-from cuelearner_jax.storage import provenance as origin
 from cuelearner_jax.storage.provenance import provenance
 
 ROOT = Path(cuelearner_jax.__file__).resolve().parents[1]
@@ -28,8 +27,3 @@ def test_the_commit_is_that_of_the_checkout_or_empty():
     head = subprocess.run(["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout
     assert len(commit) == 12
     assert head.startswith(commit)
-
-
-def test_outside_a_checkout_there_is_no_commit(monkeypatch, tmp_path):
-    monkeypatch.setattr(origin, "__file__", str(tmp_path / "package" / "records" / "provenance.py"))
-    assert provenance()["commit"] == ""

@@ -1,8 +1,6 @@
 """Curves for trackers: what is written of an evaluation, by the trackers and by a run that is followed."""
 
 import struct
-import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,18 +56,6 @@ def test_a_followed_run_has_its_results_as_points_for_tensorboard(tmp_path):
     }
     found = points(tmp_path / "run" / "none" / "tensorboard")
     assert {key: found[key] for key in wanted} == pytest.approx(wanted, rel=1e-6)
-
-
-def test_wandb_is_asked_to_stay_offline(tmp_path, monkeypatch):
-    asked, logged, ended = {}, [], []
-    run = SimpleNamespace(log=lambda metrics, step: logged.append((step, metrics)), finish=lambda: ended.append(True))
-    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **named: asked.update(named) or run))
-    with tracking.open_tracker("wandb", tmp_path / "run" / "relative", {"seeds": 3}, 0) as tracker:
-        tracker.log(100, {"reward": 1.0})
-        assert not ended
-    assert (asked["mode"], asked["group"], asked["name"]) == ("offline", "run", "run relative")
-    assert (asked["config"], asked["settings"]) == ({"seeds": 3}, {"silent": True})
-    assert (logged, ended) == ([(100, {"reward": 1.0})], [True])
 
 
 def test_unknown_and_missing_trackers_are_refused_and_none_is_fine(tmp_path, monkeypatch):

@@ -90,18 +90,6 @@ def test_a_second_writer_is_refused_while_the_first_works(tmp_path):
     assert names(tmp_path) == ["link", "out"]
 
 
-@pytest.mark.parametrize(("made", "overwrite"), [("theirs", True), ("ours", False)])
-def test_what_was_made_meanwhile_stays(tmp_path, made, overwrite):
-    def meanwhile():
-        (tmp_path / "out").mkdir()
-        (tmp_path / "out" / made).write_text("theirs")
-
-    with pytest.raises((UserError, OSError), match=r"is not ours|not empty"):
-        write(tmp_path / "out", "mine", overwrite, meanwhile)
-    assert (tmp_path / "out" / made).read_text() == "theirs"
-    assert names(tmp_path) == ["out"]
-
-
 def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(tmp_path, monkeypatch):
     changing = [(os, "rename"), (shutil, "rmtree"), (Path, "mkdir"), (Path, "unlink")]
     steps, found = 0, set()

@@ -72,9 +72,7 @@ def test_a_task_from_outside_is_known_once_it_is_named(tmp_path):
 
 
 REFUSED = [
-    ("own_here:TASKK", "own_here has no 'TASKK', did you mean 'TASK'?"),
     ("own_here:NUMBER", "own_here:NUMBER is of type int: a task is a cuelearner_jax.task.Task"),
-    ("own_broken:TASK", "own_broken fails to import (ZeroDivisionError: division by zero): mend it first"),
     ("own_taken:TASK", "there is a task 'billiards' already: give this one another name"),
     ("billards", "unknown task 'billards', did you mean 'billiards'?"),
 ]
@@ -84,7 +82,6 @@ REFUSED = [
 def test_what_names_no_task_is_refused_in_one_line(tmp_path, text, says):
     (tmp_path / "own_here.py").write_text(OWN.format(name="mine"))
     (tmp_path / "own_taken.py").write_text(OWN.format(name="billiards"))
-    (tmp_path / "own_broken.py").write_text("1 / 0\n")
     with pytest.raises(UserError) as refusal:
         registry.resolve(text)
     assert says in str(refusal.value)

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from probes import CONFIG, Aimed, Chain, Expert, Window, WindowConfig, long_but, make_task
+from probes import CONFIG, Aimed, Chain, Window, WindowConfig, long_but, make_task
 
 from cuelearner_jax.environment import Features, Quantity
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.guides.relative import Relative
-from cuelearner_jax.policies import SHARED, Heuristic, Opaque, Taught, Uniform
+from cuelearner_jax.policies import SHARED, Opaque, Uniform
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import retract, rotate
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario
@@ -50,12 +50,6 @@ def stepping(change, base=Window):
     return other(base, step=step)
 
 
-def altered_step(**changes):
-    """The bandit with other fields of what its step returns."""
-    change = lambda step: step.replace(**{name: one(step) for name, one in changes.items()})  # noqa: E731
-    return stepping(lambda state, after, step: (after, change(step)))
-
-
 class Outside(Window):
     def reset(self, key):
         state, obs = super().reset(key)
@@ -87,8 +81,6 @@ ENVIRONMENTS = {
         other(features=lambda self, obs, action: Features(action.ravel()[:1], action)),
         "`features` hold values in `own` that depend on the action",
     ),
-    "an integer": (altered_step(reward=lambda step: jnp.array(1)), "Step.reward is int32 of shape (): make it float32"),
-    "an identity": (mirrored(lambda which, obs, v: (-obs, -v)), "`mirror` 0 is not the identity"),
     "no group": (mirrored(lambda which, *both: tuple(rotate(v, which * 1.0) for v in both)), "no symmetry undoes"),
 }
 
@@ -107,20 +99,15 @@ def test_the_probes_keep_the_laws(env):
 # Guidances.
 
 
-def guide(form=lambda form: form, **changes):
+def guide(**changes):
     """The paper's kind with other methods, each made from the one that is there: (method) -> method."""
     methods = {name: change(getattr(Relative, name)) for name, change in changes.items()}
-    return type("Altered", (Relative,), {**methods, "form": form(Relative.form)})
+    return type("Altered", (Relative,), methods)
 
 
 def result(change):
     """A method whose result is changed."""
     return lambda method: lambda *given: change(method(*given))
-
-
-def long_answers(form):
-    answer = lambda *given: (jnp.tile((both := form.answer(*given))[0], 2), both[1])  # noqa: E731
-    return form._replace(answer=answer)
 
 
 def unfitted_too(act):
@@ -131,7 +118,6 @@ def unfitted_too(act):
 
 
 GUIDANCES = {
-    "a long answer": (guide(form=long_answers), "an answer has shape (2,)"),
     "a flat target": (guide(target=result(lambda target: target.sum())), "`target` of one label has shape ()"),
     "no fit": (
         guide(fit=result(lambda model: model.replace(fitted=jnp.array(False)))),
@@ -196,11 +182,7 @@ def test_a_broken_law_of_policies_is_found(law):
 
 OWN = {
     "chance": Uniform(),
-    "a teacher": Taught(Expert(Window())),
-    "a heuristic": Heuristic(Window()),
-    "a function": Opaque(lambda obs: -obs),
     "a function on the host": Opaque(np.negative, on_host=True),
-    "one of one's own": Turned(jnp.float32(1.0)),
     "drawn actions": Turned(change=lambda key, actions: DIRECTIONS.sample(key, (len(actions),))),
 }
 
@@ -243,10 +225,6 @@ def write(*given):
 DRAWN = Pictures(lambda env, policy, key, steps: ([None] * steps, [0.0] * steps), write, write, write)
 BY_WIDTH = with_environment(lambda config, split: Window() if config.half_width_deg > 10 else Wider())
 TASKS = {
-    "nobody to ask": (
-        dataclasses.replace(with_preset(guidance=("none", "relative")), teacher=None),
-        "preset 'small' compares guidance ['relative'], which it cannot have",
-    ),
     "a wider scenario": (
         dataclasses.replace(BY_WIDTH, scenarios={"narrow": Scenario("", {"half_width_deg": 5.0})}),
         "scenario 'narrow' has observations of 3 entries, not 2",

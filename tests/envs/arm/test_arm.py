@@ -102,9 +102,7 @@ def test_the_teacher_sees_true_places_and_the_heuristic_what_is_seen():
     [
         ({"skill": "throw"}, "task.skill is 'throw'"),
         ({"friction": 0.0}, "task.friction is 0.0: give a finite number from 0.01 up to 10"),
-        ({"camera_offset": (0.0, 2.0, 0.0)}, "task.camera_offset is 2.0: give a finite number from -1 up to 1"),
         ({"preferred_side": "left", "skill": "pick"}, "that needs --task.skill push and its post"),
-        ({"within": 0.0}, "task.within is 0.0: give a positive number"),
     ],
 )
 def test_what_makes_no_world_is_refused_in_one_line(changes, said):

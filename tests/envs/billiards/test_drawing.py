@@ -3,24 +3,13 @@
 import math
 
 import imageio.v2 as imageio
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from pictures import film, is_colour
+from pictures import is_colour
 
-from cuelearner_envs.billiards import Table, drawing, sketch, trace
+from cuelearner_envs.billiards import Table, drawing, sketch
 
 TABLE = Table.one_ball().replace(max_events=24)
-FRAME = 0.03  # of a GIF at 30 frames a second [s]
-
-
-@pytest.fixture(scope="module")
-def shot():
-    """The cue ball at (0.1, -0.1) drives the target at (0.3, 0.1) along the diagonal into the corner (0.4, 0.2)."""
-    path = jax.jit(trace)(TABLE, jnp.array([[0.1, -0.1], [0.3, 0.1]]), jnp.zeros(2, bool), math.pi / 4)
-    assert path.pocketed[-1].tolist() == [False, True]
-    return path
 
 
 @pytest.mark.parametrize(("angle", "pocketed"), [(1.0, False), (-2.5, True)])
@@ -44,36 +33,3 @@ def test_a_question_shows_the_balls_and_the_shot_as_an_arrow(tmp_path, angle, po
         assert is_colour(image[int((top - place[1]) * dots), int((place[0] - left) * dots)], colour, 0.1)
     rows, _ = np.nonzero(is_colour(image, sketch.TARGETS[0]))
     assert (rows.min() > (top + 0.2) * dots) == pocketed  # then all of the ball is below the table
-
-
-@pytest.mark.parametrize("suffix", ["png", "svg"])
-def test_still_is_a_picture_and_repeats(shot, tmp_path, suffix):
-    files = [tmp_path / f"{name}.{suffix}" for name in ("one", "two")]
-    for file in files:
-        drawing.still(TABLE, shot, file)
-    assert files[0].read_bytes() == files[1].read_bytes()
-    if suffix == "png":
-        image = imageio.imread(files[0])[..., :3] / 255
-        for name, least in ((sketch.CLOTH, 0.3), (drawing.ARROW, 1e-4), (sketch.TARGETS[0], 1e-3)):
-            assert is_colour(image, name).mean() > least
-
-
-def test_gif_has_the_frames_of_the_shot_and_lasts_as_long(shot, tmp_path):
-    held, speed = round(drawing.HOLD_BEFORE / FRAME) + round(drawing.HOLD_AFTER / FRAME), 2.0
-    drawing.animate(TABLE, [shot], tmp_path / "shot.gif", speed=speed)
-    pictures, durations = film(tmp_path / "shot.gif")
-    moving = math.ceil(float(shot.times[-1]) / speed / FRAME) + 1
-    assert durations.sum() == pytest.approx((held + moving) * FRAME)
-    assert 0.6 * moving < len(pictures) <= moving + 2  # equal pictures are stored once
-    assert durations[0] == pytest.approx(drawing.HOLD_BEFORE, abs=1.1 * FRAME)
-
-    def share(picture, name):
-        return is_colour(picture, name, 0.06).mean()
-
-    assert share(pictures[0], drawing.ARROW) > 1e-4  # before the shot only
-    assert share(pictures[-1], drawing.ARROW) < 2e-5
-    assert pictures[-1][-1, -1].tolist() == [1, 1, 1]  # white stays white on a page
-    below = int(pictures[0].shape[0] * 0.88)  # the tray: empty at first, then with the target
-    assert share(pictures[0][below:], sketch.TARGETS[0]) == 0
-    assert share(pictures[-1][below:], sketch.TARGETS[0]) > 1e-3
-    assert share(pictures[-1][:below], sketch.TARGETS[0]) == 0

@@ -1,18 +1,7 @@
-from typing import Literal
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from billiards_scenes import (
-    BATCH,
-    EASY,
-    KEY,
-    SCENE,
-    balls,
-    observe,
-    step_many,
-    toward,
-)
+from billiards_scenes import BATCH, EASY, KEY, SCENE, balls, observe, step_many, toward
 
 from cuelearner_envs.billiards import simulate
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
@@ -20,8 +9,6 @@ from cuelearner_envs.billiards.sketch import record
 from cuelearner_envs.billiards.table import rack
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.spaces import directions
-
-TABLES: list[Literal["one_ball", "easy", "regulation"]] = ["one_ball", "easy", "regulation"]
 
 step = jax.jit(lambda env, key, state, action: env.step(key, state, action))
 reset = jax.jit(lambda env, key: env.reset(key))

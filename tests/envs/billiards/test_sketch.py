@@ -8,7 +8,7 @@ import pytest
 
 from cuelearner_envs.billiards import Table
 from cuelearner_envs.billiards.environment import Balls, Billiards
-from cuelearner_envs.billiards.sketch import reel, sketch, trails
+from cuelearner_envs.billiards.sketch import reel, sketch
 
 ENV = Billiards(Table.one_ball().replace(max_events=24))
 
@@ -37,21 +37,6 @@ def test_balls_and_the_arrow_are_where_they_should_be_with_y_downwards():
     gone = sketch(ENV, balls([[0.1, -0.1], [0.3, 0.15]], (False, True)))
     assert gone.words == "0 of 1 on the table"
     assert gone.places["ball-1"][1] < -0.2  # beside the table
-
-
-def test_trails_tell_what_becomes_of_the_balls_after_each_action():
-    at = [math.pi / 4, math.pi / 4 + 0.5, -0.75 * math.pi]
-    drawn = trails(ENV, balls([[0.1, -0.1], [0.3, 0.1]]), jnp.array([[math.cos(x), math.sin(x)] for x in at]))
-    ways = [[*ElementTree.fromstring(f"<g>{one}</g>")] for one in drawn]
-    lines = [[one for one in way if one.tag == "polyline"] for way in ways]
-    assert ["dasharray" in line.get("style") for line in lines[0]] == [False, True]
-    places = [[float(part) for part in corner.split(",")] for corner in lines[0][1].get("points").split()]
-    assert places[0] == pytest.approx([0.3, -0.1])
-    assert places[-1] == pytest.approx([0.4, -0.2], abs=0.02)  # y points down: the corner pocket
-    assert "currentColor" in ways[0][-1].get("style")  # where the target fell
-    assert [len(each) for each in lines] == [2, 2, 1]  # the last one hits nothing
-    miss = [[float(part) for part in corner.split(",")] for corner in lines[2][0].get("points").split()]
-    assert 3 <= len(miss) <= 8  # straight lines and their corners
 
 
 def test_a_film_ends_as_the_shot_does():

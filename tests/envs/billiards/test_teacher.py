@@ -15,7 +15,7 @@ from cuelearner_jax.spaces import directions
 from cuelearner_jax.tasks.billiards import BILLIARDS, SHIPPED_TEACHERS, make_teacher
 from cuelearner_jax.teachers import LearnedTeacher
 
-RACKS, DIRECTIONS = 50, 1440
+RACKS, DIRECTIONS = 30, 1440
 ONE = make_environment(BilliardsConfig("one_ball"))
 STATES, OBS = jax.jit(jax.vmap(ONE.reset))(jax.random.split(jax.random.key(3), RACKS))
 AIM, HABIT = jnp.deg2rad(0.5), jnp.array(0.2)

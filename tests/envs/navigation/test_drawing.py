@@ -23,10 +23,7 @@ def environment(start, goal):
     return Navigation(worlds=jax.tree.map(lambda leaf: leaf[None], room([start], [goal])))
 
 
-ENVIRONMENTS = {
-    "success": environment([-3.5, 0.0], [4.0, 0.0]),
-    "collision": environment([-5.5, 2.0], [4.0, 2.0]),
-}
+ENVIRONMENTS = {"success": environment([-3.5, 0.0], [4.0, 0.0]), "collision": environment([-5.5, 2.0], [4.0, 2.0])}
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +83,8 @@ def test_still_shows_solids_way_end_and_goal(records, tmp_path, name):
     assert not is_colour(pixel(*between), drawing.FLOOR, 0.1)
 
 
-@pytest.mark.parametrize("turn", [0.5, -2.0])
-def test_a_question_shows_the_first_situation_and_the_direction_in_question(records, tmp_path, turn):
+def test_a_question_shows_the_first_situation_and_the_direction_in_question(records, tmp_path):
+    turn = -2.0
     env, first = ENVIRONMENTS["success"], records["success"][0]
     state, _ = env.reset(jax.random.split(jax.random.key(1))[0])
     frame = situation(env, state, ahead(turn))

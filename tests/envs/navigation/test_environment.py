@@ -172,10 +172,9 @@ def test_every_split_has_worlds_of_its_own_and_always_the_same():
     ("name", "value", "words"),
     [
         ("style", "maze", "task.style is 'maze': choose one of clutter, rooms, corridor"),
-        ("worlds", 1 << 25, "up to 16,777,216"),
-        ("max_range", math.inf, "task.max_range is inf: give a positive number (metres)"),
         ("lidar_dropout", 2.0, "task.lidar_dropout is 2.0: give a finite number from 0 up to 1 (a probability)"),
-        ("lidar_rotation_deg", math.nan, "task.lidar_rotation_deg is nan: give a finite number"),
+        ("preferred_side", "rigth", "task.preferred_side is 'rigth', did you mean 'right'?"),
+        ("preferred_side", "left", "task.preferred_side is left: that needs --task.style corridor"),
     ],
 )
 def test_what_makes_no_world_is_refused_in_one_line(name, value, words):

@@ -158,9 +158,7 @@ def assert_mostly_close(found, expected):
 def test_changed_worlds_compile_nothing_new():
     chex.clear_trace_counter()  # it counts by hash, which a function of an earlier test may have had
     counted = jax.jit(chex.assert_max_traces(lambda env, state, action: env.step(KEY, state, action), n=1))
-    env = worlds().replace(
-        robot=jax.tree.map(jnp.float32, worlds().robot),
-    )
+    env = worlds().replace(robot=jax.tree.map(jnp.float32, worlds().robot))
     lidars = [
         env.lidar.replace(**{name: jnp.float32(value)})
         for name, value in (("max_range", 3.0), ("rotation", 0.2), ("noise", 0.1), ("dropout", 0.2))

@@ -41,16 +41,6 @@ def test_what_lies_ahead_is_above_and_what_lies_to_the_left_is_on_the_left():
     assert any(abs(low - 4.0) < 1e-3 for low in lows)
 
 
-def test_beams_end_where_the_lidar_says_they_do():
-    state = standing(-2.0, 0.0, 0.5, [4.0, 0.0])
-    (free,) = shapes(sketch(ENV, state), "free")
-    ends = np.array([[float(part) for part in point.split(",")] for point in free.get("points").split()])[1:]
-    np.testing.assert_allclose(np.linalg.norm(ends, axis=-1), ENV.ranges(state), atol=2e-3)
-    middle = ends[135]  # straight ahead
-    assert middle[1] < 0
-    assert abs(middle[0]) < 1e-3
-
-
 def test_a_film_walks_where_the_direction_leads():
     state = standing(-4.0, 0.0, 0.0, [4.0, 0.0])
     left = jnp.array([0.0, 1.0])
