@@ -56,14 +56,14 @@ def check_request(format: str, out: Path) -> None:
 def write(
     policy: Policy,
     env: Any,
-    drawn: Callable[[], Float[np.ndarray, "n obs"]],
+    draw: Callable[[], Float[np.ndarray, "n obs"]],
     format: str,
     out: Path,
     source: dict[str, Any],
 ) -> dict[str, Any]:
     """Write a policy's decision and replay its golden cases; the folder appears completely or not at all.
 
-    `drawn` returns observations of the environment, from which golden cases are chosen. `source` is copied to the
+    `draw` returns observations of the environment, from which golden cases are chosen. `source` is copied to the
     contract.
 
     Returns the contract, with "difference": the largest difference among the golden cases in this replay. Raises
@@ -74,7 +74,7 @@ def write(
         base = getattr(env, "base_size", 0)  # only for a correction alone
         traced = trace_policy(policy, env.obs_size)
         file, contents, about = _artefact(format, policy, traced, env.obs_size, actions_of(env).size, base)
-        golden, cases = golden_cases(policy, drawn(), traced), io.BytesIO()
+        golden, cases = golden_cases(policy, draw(), traced), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {file: contents, runner.GOLDEN: cases.getvalue(), "decide.py": inspect.getsource(runner).encode()}
         ends = list(itertools.accumulate(quantity.size for quantity in env.observation))
@@ -92,7 +92,7 @@ def write(
             "policy": describe(policy),
             "source": source,
             "golden": {"cases": len(golden.obs), "tolerance": TOLERANCE}
-            | {"drawn": golden.drawn, "steady": golden.steady, "extreme": golden.extreme},
+            | {"drawn": golden.candidates, "steady": golden.steady, "extreme": golden.extreme},
             "files": {name: hashlib.sha256(contents).hexdigest() for name, contents in files.items()},
             **provenance(),
         }
@@ -100,8 +100,8 @@ def write(
         sealed = json.dumps({**contract, runner.DIGEST: runner.digest(contract)}, indent=1) + "\n"
         with place.writing() as folder:
             for name, contents in {**files, runner.CONTRACT: sealed.encode()}.items():
-                with replacing(folder / name, "wb") as written:
-                    written.write(contents)
+                with replacing(folder / name, "wb") as stream:
+                    stream.write(contents)
             return {**contract, "difference": replay_golden_cases(folder)}
 
 
@@ -126,7 +126,7 @@ def _artefact(
         decide, (count,) = row_by_row(policy), jax.export.symbolic_shape("n")
         parts = [obs_size - base_size, base_size] if base_size else [obs_size]
         shapes = [jax.ShapeDtypeStruct((count, size), jnp.float32) for size in parts]
-        together = jax.jit(lambda *seen: decide(jnp.concatenate(seen, -1)))
+        together = jax.jit(lambda *parts: decide(jnp.concatenate(parts, -1)))
         exported = jax.export.export(together if base_size else jax.jit(decide), platforms=PLATFORMS)(*shapes)
         about = {"needs": "jax", "jax": jax.__version__, "platforms": list(PLATFORMS)}
         return "decision.stablehlo", bytes(exported.serialize()), about

@@ -211,7 +211,7 @@ def test_golden_cases_are_those_that_rounding_does_not_turn():
     policy = Opaque(lambda obs: jnp.where(obs[:, 1:] > 0, 1.0, -1.0) * jnp.array([[0.6, 0.8]]))
     drawn = np.concatenate([np.stack([np.ones(20), np.linspace(-1e-8, 1e-8, 20)], -1), DRAWN[1:]]).astype(np.float32)
     golden = decisions.golden_cases(policy, drawn, decisions.trace_policy(policy, 2))
-    assert golden.drawn == len(drawn)
+    assert golden.candidates == len(drawn)
     assert len(DRAWN) - 1 <= golden.steady <= len(DRAWN) + 8  # of the twenty near the jump, chance may leave a few
     with pytest.raises(UserError, match="change with the last digits"):
         decisions.golden_cases(policy, drawn[9:11], decisions.trace_policy(policy, 2))
