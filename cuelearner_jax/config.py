@@ -80,9 +80,9 @@ Layers = Annotated[tuple[int, ...], POSITIVE]  # hidden widths of a network
 @dataclass_transform(frozen_default=True)
 def part(kind: type[PartT]) -> type[PartT]:
     """Make a class a frozen dataclass of options, and a pytree of its floats."""
-    made = dataclasses.dataclass(frozen=True)(kind)
-    register(made)
-    return made
+    options_class = dataclasses.dataclass(frozen=True)(kind)
+    register(options_class)
+    return options_class
 
 
 def register(kind: type, *traced_too: type) -> None:
@@ -127,8 +127,8 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
 
 def normalize_options(group: PartT, prefix: str) -> PartT:
     """Return a configuration with its values as `check_types` returns them. Raises UserError likewise."""
-    changed = {name: value for name, value in check_types(group, prefix).items() if value is not getattr(group, name)}
-    return dataclasses.replace(group, **changed) if changed else group  # pyright: ignore[reportArgumentType]
+    changes = {name: value for name, value in check_types(group, prefix).items() if value is not getattr(group, name)}
+    return dataclasses.replace(group, **changes) if changes else group  # pyright: ignore[reportArgumentType]
 
 
 def check_part(group: Any, prefix: str) -> None:

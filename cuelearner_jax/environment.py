@@ -223,8 +223,8 @@ def check_layout(whose: str, observation: Sequence[Quantity], actions: Space, en
         raise UserError(f"{whose} observes {len(before)} entries, this world has {len(now)}: {wanted}")
     for number, (own, other) in enumerate(zip(before, now, strict=True), 1):
         if own and other and own != other and (own[1] == UNKNOWN_UNIT) == (other[1] == UNKNOWN_UNIT):
-            seen, there = (f"{name!r} ({unit})" for name, unit in (own, other))
-            raise UserError(f"{whose} observes {seen} as entry {number}, this world has {there}: {wanted}")
+            here, there = (f"{name!r} ({unit})" for name, unit in (own, other))
+            raise UserError(f"{whose} observes {here} as entry {number}, this world has {there}: {wanted}")
     if (own := action_words(actions)) != (other := action_words(actions_of(env))):
         raise UserError(f"{whose} gives actions {own}, this world takes actions {other}: {wanted}")
 

@@ -173,13 +173,13 @@ MOST_STRETCHES = 25  # most stretches of a roll-out with progress
 Tell = Callable[[int, int], None]  # (done, of how many): called between stretches; what it raises ends the evaluation
 
 
-def ignore_progress(done: int, count: int) -> None:
+def ignore_progress(count_so_far: int, count: int) -> None:
     """Ignore progress."""
 
 
 def part_of(tell: Tell, number: int, parts: int) -> Tell:
     """Return a progress callback for part `number` (from 0) of as many equal parts, one after the other."""
-    return lambda done, count: tell(number * count + done, parts * count)
+    return lambda count_so_far, count: tell(number * count + count_so_far, parts * count)
 
 
 def rollout_with_progress(

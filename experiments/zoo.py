@@ -30,7 +30,7 @@ from cuelearner_jax.reading import fitting
 from cuelearner_jax.reading.fitting import Fit, Hypothesis, Reader
 from cuelearner_jax.reading.linear import RelativeLabels
 from cuelearner_jax.reading.posterior import PRIORS, habits
-from cuelearner_jax.reading.session import BATCHES, FIRST, MOST_WRONG, USED
+from cuelearner_jax.reading.session import BATCHES, FIRST, LEAST_EVIDENCE, MOST_WRONG
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 from cuelearner_jax.storage.provenance import provenance
 
@@ -228,7 +228,7 @@ def measure(robots: Any, cells: list[Cell], labels: int) -> list[dict[str, Any]]
         state = each_lane(read)(worlds, *labelled, state.plain, state.smooth)
     values = jax.tree.map(np.asarray, _played(worlds, state))
     evidence = np.asarray(state.evidence)
-    used = (evidence >= USED) & (np.asarray(_wrong(state.fit)) < MOST_WRONG)
+    used = (evidence >= LEAST_EVIDENCE) & (np.asarray(_wrong(state.fit)) < MOST_WRONG)
     judged = [
         {end: values[f"{name} {end}"][:, :JUDGED] for end in ("success", "return")} for name in ("before", "after")
     ]

@@ -254,9 +254,9 @@ class SoftActorCritic:
         key: PRNGKeyArray,
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the means of temperature * log p(a) - Q(s, a) and of log p(a) over the actor's draws."""
-        drawn = self.draw(actor, obs, key)
-        loss = temperature * drawn.log_density - self._climbed(critics, obs, drawn.unit)
-        return loss.mean(), drawn.log_density.mean()
+        draws = self.draw(actor, obs, key)
+        loss = temperature * draws.log_density - self._climbed(critics, obs, draws.unit)
+        return loss.mean(), draws.log_density.mean()
 
     def targets(
         self,
@@ -274,9 +274,9 @@ class SoftActorCritic:
         if not self.bootstraps:
             return batch.reward
         k_act, k_critics = jax.random.split(key)
-        drawn, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
-        own = self.values(judges, batch.next_obs, drawn.unit).min(0)
-        value = own - temperature * drawn.log_density if self.options.entropy_in_targets else own
+        draws, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
+        own = self.values(judges, batch.next_obs, draws.unit).min(0)
+        value = own - temperature * draws.log_density if self.options.entropy_in_targets else own
         return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
 
     def _judges(self, target_critics: Params, key: PRNGKeyArray) -> Params:
@@ -284,8 +284,8 @@ class SoftActorCritic:
         own = self.options
         if own.target_critics == own.critics:
             return target_critics
-        chosen = jax.random.permutation(key, own.critics)[: own.target_critics]
-        return jax.tree.map(lambda leaf: leaf[chosen], target_critics)
+        subset = jax.random.permutation(key, own.critics)[: own.target_critics]
+        return jax.tree.map(lambda leaf: leaf[subset], target_critics)
 
     def _climbed(
         self, critics: Params, obs: Float[Array, "n obs"], unit: Float[Array, "n action"]

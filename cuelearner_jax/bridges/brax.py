@@ -128,12 +128,12 @@ def model_of(simulator: Any) -> Any:
 
 def _entries_of(simulator: Any, size: int) -> tuple[str, ...]:
     """Return a name for each entry of an action: of the MuJoCo model's actuator or its joint, else its number."""
-    model, named = model_of(simulator), []
+    model, names = model_of(simulator), []
     if model is not None and model.nu == size:
         joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
-        named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
-    if named and all(named) and len(set(named)) == size:
-        return tuple(named)
+        names = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
+    if names and all(names) and len(set(names)) == size:
+        return tuple(names)
     return tuple(f"entry {number}" for number in range(1, size + 1))
 
 

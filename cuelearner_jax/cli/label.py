@@ -20,7 +20,7 @@ import tyro
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.options import (
-    Changed,
+    ChangedWorld,
     Flag,
     Word,
     about,
@@ -60,7 +60,7 @@ UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(Changed):
+class LabelOptions(ChangedWorld):
     """Label actions in a browser: uniform ones, a policy's, or recorded ones.
 
     Name a policy after the task: a run folder, a policy folder, or package.module:NAME of a function of observations.
@@ -299,7 +299,7 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
 
     `config`: the preset's configuration.
     """
-    name, out, policy = task.origin or task.named or task.name, str(options.out), options.policy
+    name, out, policy = task.origin or task.command_name or task.name, str(options.out), options.policy
     if options.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
     if policy is None and options.questions == PROPOSED and _has_proposals(task, options.task):

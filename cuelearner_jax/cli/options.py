@@ -87,7 +87,7 @@ class RunParts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Changed(Outside):
+class ChangedWorld(Outside):
     """The world that a finished policy meets."""
 
     task: Any = field(default_factory=Unnamed)
@@ -102,7 +102,7 @@ class Changed(Outside):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finished(Changed, RunParts):
+class Finished(ChangedWorld, RunParts):
     """A finished policy's code, which is never loaded because a file names it, and its world."""
 
     code: Annotated[str | None, tyro.conf.arg(name="base")] = None

@@ -116,13 +116,13 @@ def source_in(folder: Path, task: Task | None, code: Any, path: str | None) -> P
     """
 
     def find(name: str) -> Task:
-        return task if task is not None and task.name == name and not task.named else registry.find(name)
+        return task if task is not None and task.name == name and not task.command_name else registry.find(name)
 
     source = PolicySource.of_folder(folder, find, code, None if path is None else changes.load(path))
     if task is not None and task.name != source.task.name:
         what = "a run" if source.grid else "a policy"
         raise UserError(f"{folder} is {what} of {source.task.name}, not of {task.name}: give one of {task.name}")
-    if task is None or not task.named:
+    if task is None or not task.command_name:
         return source
     before = shape_of(task, source.config.task)
     check_layout(f"{folder}", before.observation, actions_of(before), shape_of(task, task.plain()))

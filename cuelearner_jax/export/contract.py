@@ -30,7 +30,7 @@ from cuelearner_jax.export.graph import Traced
 from cuelearner_jax.policies import Policy, describe
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
-from cuelearner_jax.storage.whole import is_used, place_of, replacing
+from cuelearner_jax.storage.whole import is_occupied, place_of, replacing
 
 BASE = (
     "a correction alone: the last slice of the observation is the action of a base that is elsewhere, given beside the "
@@ -49,7 +49,7 @@ def check_request(format: str, out: Path) -> None:
     """Raise UserError unless a decision in that format can be written to a folder."""
     if format not in FORMATS:
         raise UserError(f"unknown format {format!r}{suggestion(format, FORMATS)}")
-    if is_used(out):
+    if is_occupied(out):
         raise UserError(f"{out} is not empty: give another --out")
 
 

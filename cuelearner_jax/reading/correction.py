@@ -32,11 +32,18 @@ class Correction(struct.PyTreeNode):
 
 
 def correction_of(
-    fitted: Posterior, change: Change, frame: ObservationFrame, known: Float[Array, "n z"], eps: Any, priors: Priors
+    fitted: Posterior,
+    change: Change,
+    frame: ObservationFrame,
+    situations: Float[Array, "n z"],
+    eps: Any,
+    priors: Priors,
 ) -> Correction:
     """Return what is needed to act by a posterior."""
     alpha = posterior.amplitudes(fitted.hyper, priors)[None] ** 2 * fitted.alpha
-    return Correction(change, frame, known, alpha, posterior.lengths(fitted.hyper, priors), jnp.float32(SCALE * eps))
+    return Correction(
+        change, frame, situations, alpha, posterior.lengths(fitted.hyper, priors), jnp.float32(SCALE * eps)
+    )
 
 
 def corrected(

@@ -85,8 +85,8 @@ def unfitted(space: Space, family: Family, obs_size: int) -> tuple[Hypothesis, H
     change = linear.no_change(space, family, obs_size)
 
     def one(names: tuple[str, ...], process: bool) -> Hypothesis:
-        used = jnp.array([float(part in names) for part in PARTS])[kinds]
-        return Hypothesis(ModelParts(used, process), change, hyper)
+        in_use = jnp.array([float(part in names) for part in PARTS])[kinds]
+        return Hypothesis(ModelParts(in_use, process), change, hyper)
 
     stack = lambda each: jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)  # noqa: E731
     return stack([one(names, False) for names in HYPOTHESES]), stack([one((), True)] * WITH_PROCESS)
@@ -286,8 +286,8 @@ def _best(changes: Change, worth: Array) -> tuple[Change, Array]:
 def _replace_worse(changes: Change, own: Array, change: Change, worth: Array) -> Change:
     """Return the estimates of all hypotheses with their own worth, in which another estimate replaces worse ones."""
     better = (worth > own + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
-    chosen = jax.vmap(jnp.where, (0, None, 0))
-    return jax.tree.map(lambda own, other: chosen(better, other, own), changes, change)
+    choose = jax.vmap(jnp.where, (0, None, 0))
+    return jax.tree.map(lambda own, other: choose(better, other, own), changes, change)
 
 
 @partial(jax.jit, static_argnames="family")

@@ -22,7 +22,7 @@ from cuelearner_jax.types import EnvState
 KIND = "reading"
 
 
-class Read(PolicyNode):
+class ReadingPolicy(PolicyNode):
     """Another policy, corrected; without a change it acts as its base."""
 
     base: Any  # a policy
@@ -30,7 +30,7 @@ class Read(PolicyNode):
     bound: Float[Array, ""]  # largest change along a cue, in the unit of `space.log`; infinite: none
     space: Space = struct.field(pytree_node=False)
     family: Family = struct.field(pytree_node=False)  # empty: shifts and mixings of entries
-    named: str = struct.field(pytree_node=False, default="")  # reference of the family's code; empty: declared
+    reference: str = struct.field(pytree_node=False, default="")  # reference of the family's code; empty: declared
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the base's actions, corrected."""
@@ -46,7 +46,7 @@ class Read(PolicyNode):
         return bool(np.any(np.asarray(change.theta)) or np.any(np.asarray(change.mix)))
 
     @property
-    def axes(self) -> Read:
+    def axes(self) -> ReadingPolicy:
         """Lane axes: each lane has its own base, and its own correction where there is more than one."""
         lanes = SHARED if jnp.ndim(self.correction.scale) == 0 else BY_LANE
         return self.replace(base=self.base.axes, correction=lanes, bound=lanes)
@@ -60,7 +60,7 @@ class Read(PolicyNode):
             "guidance": KIND,
             "changes": [{"name": one.name, "unit": one.unit, "value": value} for one, value in values],
             "distortions": [one.name for one in self.family],
-            "code": self.named,
+            "code": self.reference,
             "labels": int(own.known.shape[-2]),
             "mixed": int(own.frame.mixed.shape[-1]),
             "base": describe(self.base),
@@ -77,8 +77,8 @@ def _bounded(
 
 
 def unread(
-    base: Any, space: Space, family: Family, obs_size: int, labels: int = 0, mixed: int = 0, named: str = ""
-) -> Read:
+    base: Any, space: Space, family: Family, obs_size: int, labels: int = 0, mixed: int = 0, reference: str = ""
+) -> ReadingPolicy:
     """Return a policy without a correction, with arrays of the shapes that `describe` tells."""
     change, zeros = linear.no_change(space, family, obs_size), jnp.zeros
     z = obs_size + space.size
@@ -89,4 +89,4 @@ def unread(
     correction = Correction(
         change, frame, zeros((labels, z)), zeros((labels, len(space.cues))), jnp.ones(z), jnp.float32(0)
     )
-    return Read(base, correction, jnp.float32(jnp.inf), space, family, named)
+    return ReadingPolicy(base, correction, jnp.float32(jnp.inf), space, family, reference)

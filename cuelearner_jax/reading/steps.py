@@ -37,10 +37,10 @@ def steps_of(
         thetas = jnp.zeros((1 + len(sizes), len(unknowns_of(family)))).at[1:, place].set(jnp.asarray(sizes))
         before = _undone(family, thetas, obs)
         actions = acts(before.reshape(-1, before.shape[-1])).reshape(*before.shape[:2], -1)
-        moved = np.asarray(_moved(space, family, thetas, before, actions))
-        moved = np.minimum(moved, 3 * target).mean(1)
-        enough = np.flatnonzero(moved >= min(target, 0.5 * max(moved.max(), 1e-12)))
-        steps.append(float(sizes[enough[0]]) if moved.max() > 0 else float(sizes[-1]))
+        effects = np.asarray(_effects(space, family, thetas, before, actions))
+        effects = np.minimum(effects, 3 * target).mean(1)
+        enough = np.flatnonzero(effects >= min(target, 0.5 * max(effects.max(), 1e-12)))
+        steps.append(float(sizes[enough[0]]) if effects.max() > 0 else float(sizes[-1]))
     return jnp.asarray(steps, jnp.float32)
 
 
@@ -50,6 +50,6 @@ def _undone(family: Family, thetas: Array, obs: Array) -> Array:
 
 
 @partial(jax.jit, static_argnames=("space", "family"))
-def _moved(space: Space, family: Family, thetas: Array, before: Array, actions: Array) -> Array:
+def _effects(space: Space, family: Family, thetas: Array, before: Array, actions: Array) -> Array:
     whole = jax.vmap(partial(linear.meant, family))(thetas, before, actions)
     return jnp.abs(space.log(whole[:1], whole[1:])).max(-1)

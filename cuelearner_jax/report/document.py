@@ -85,7 +85,7 @@ def report(
         figures["label_efficiency"] = draw_label_efficiency(variants, title, metric)
     added = study(variants) if study else Study((), {})
     every = pa.concat_tables([group.all_rows for group in groups], **PERMISSIVE)
-    missing = extent.missing(folders, every) + extent.shown(groups, variants, metric, split)
+    missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
     lines = [f"# {markdown(title)}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
     lines += [*tables.summary_lines(rows), "", NOTE, *added.lines]
     lines += ["", "## Missing", "", *(f"- {markdown(line)}" for line in missing or ["nothing: all runs are complete"])]
@@ -110,8 +110,8 @@ def _range(name: str, counts: Sequence[int]) -> str:
 
 def _origins(table: pa.Table, command: str) -> list[str]:
     """Return lines about where the numbers come from."""
-    found = [("report made by", command)] if command else []
+    origins = [("report made by", command)] if command else []
     for column, name in ORIGINS.items():
         values = set(table[column].to_pylist()) if column in table.column_names else set()
-        found += [(name, value) for value in sorted(filter(None, values))] or [(name, "not recorded")]
-    return [f"- {name}: {code(value)}" for name, value in found]
+        origins += [(name, value) for value in sorted(filter(None, values))] or [(name, "not recorded")]
+    return [f"- {name}: {code(value)}" for name, value in origins]

@@ -70,19 +70,19 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
 
     Raises UserError for a row without a counterpart.
     """
-    found = []
+    result = []
     for row in rows:
         alike = others if len(others) == 1 else [other for other in others if variant(other) == variant(row)]
         if len(alike) != 1:
-            known, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
+            variants, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
             raise UserError(
-                f"--compare has {len(others)} variants ({known}), but not {wanted}: give a policy of one variant"
+                f"--compare has {len(others)} variants ({variants}), but not {wanted}: give a policy of one variant"
             )
         both = row, alike[0]
         shared = [name for name in row.metrics if name in both[1].metrics]
         finite = [name for name in shared if all(np.isfinite(one.metrics[name]).all() for one in both)]
-        found.append(Difference(*both, over(*both), {name: _less(*both, name) for name in finite}))
-    return found
+        result.append(Difference(*both, over(*both), {name: _less(*both, name) for name in finite}))
+    return result
 
 
 def _less(row: Measured, other: Measured, name: str) -> Interval:
@@ -93,8 +93,8 @@ def _less(row: Measured, other: Measured, name: str) -> Interval:
     groups = [group_means(one.each[name][rows]) for one, rows in zip((row, other), both, strict=True)]
     if is_single(row) or is_single(other) or np.array_equal(row.seeds, other.seeds):
         return interval(mine - its, groups[0] - groups[1])
-    drawn = resampled(groups[0], seed=0) - resampled(groups[1], seed=1)
-    return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(drawn, [0.025, 0.975]))
+    draws = resampled(groups[0], seed=0) - resampled(groups[1], seed=1)
+    return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(draws, [0.025, 0.975]))
 
 
 def _plain(values: Sequence[Any] | np.ndarray | None) -> list[float | None] | None:

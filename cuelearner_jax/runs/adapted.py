@@ -42,7 +42,7 @@ class AdaptedLanes:
     folder: Path
     values: dict[str, Any]  # the contents of policy.json
     lanes: Lanes
-    used: np.ndarray  # (lanes,) bool
+    in_use: np.ndarray  # (lanes,) bool
     rows: int | None  # number of base policies, one per lane; None: the lanes share one
     code: Any  # the policy that the folder names as code; None: not given
     changes: Any = None  # the user's own distortions, as `changes.family_of` takes them; None: not given
@@ -101,8 +101,8 @@ def open_folder(
     path = folder / policy_folders.POLICY
     values = formats.read("policy", path)
     task, world = world_of(values["task"], find, path)
-    *columns, is_used = (np.array(values["lanes"][name]) for name in COLUMNS)
-    return task, world, AdaptedLanes(folder, values, Lanes(*columns), is_used, values["rows"], code, changes)
+    *columns, in_use = (np.array(values["lanes"][name]) for name in COLUMNS)
+    return task, world, AdaptedLanes(folder, values, Lanes(*columns), in_use, values["rows"], code, changes)
 
 
 def write(
@@ -111,7 +111,7 @@ def write(
     task: Task,
     world: Any,
     origin: dict[str, Any],
-    used: dict[str, str | None] | None = None,
+    inputs: dict[str, str | None] | None = None,
 ) -> None:
     """Write a policy folder.
 
@@ -120,12 +120,12 @@ def write(
         result: the lanes.
         task, world: in which the lanes were adapted.
         origin: the base policies in plain values: "folder" and which lanes of it, or "code".
-        used: further inputs by name: the label file, another robot.
+        inputs: further inputs by name: the label file, another robot.
 
     Raises:
         UserError: something appeared at the place meanwhile, or the policy cannot be written.
     """
-    lanes, judgement, env = result.lanes, result.judged, shape_of(task, world)
+    lanes, judgement, env = result.lanes, result.judgement, shape_of(task, world)
     block = replace(result.policy(env), base=result.of.bases)
     values, arrays = serialization.to_json(block, origin.get("code")), serialization.arrays_of(block)
     contents = {
@@ -139,7 +139,7 @@ def write(
             "seeds": lanes.seed.tolist(),
             "labels": lanes.budget.tolist(),
             "bounds_deg": [float(f"{bound:g}") for bound in lanes.bound_deg],
-            "used": judgement.used.tolist(),
+            "used": judgement.in_use.tolist(),
         },
         "judged": {
             "by": judgement.by,
@@ -151,7 +151,7 @@ def write(
             "rewarded_steps": judgement.rewarded_steps.tolist(),
         },
         **({"reading": [one.to_json() for one in result.results]} if result.results else {}),
-        **{name: value for name, value in (used or {}).items() if value},
+        **{name: value for name, value in (inputs or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,
         **provenance(),

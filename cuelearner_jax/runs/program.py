@@ -26,7 +26,7 @@ from cuelearner_jax.loop import Clock, Parts, TrainState, lane_of, parts_of
 from cuelearner_jax.run_config import RunConfig, Settings
 from cuelearner_jax.types import Label, Teacher
 
-PROGRAMS_KEPT = 8  # compiled programs that a process keeps for its next runs
+MOST_PROGRAMS = 8  # compiled programs that a process keeps for its next runs
 
 
 class Program(NamedTuple):
@@ -77,7 +77,7 @@ def make_program(
     )
 
 
-@lru_cache(maxsize=PROGRAMS_KEPT)
+@lru_cache(maxsize=MOST_PROGRAMS)
 def _program_of(
     sizes: Sizes,
     parts: Parts,

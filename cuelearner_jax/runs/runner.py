@@ -101,7 +101,7 @@ class Runner:
         now = self.training
         store.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
 
-    def _stop_if_asked(self, store: Checkpoints) -> None:
+    def _stop_on_signal(self, store: Checkpoints) -> None:
         if self.stopping.is_set():
             self._save(store)
             step = self.training.step
@@ -145,7 +145,7 @@ class Runner:
                         guides.append(**row)
                     if number % ROUNDS_A_CHUNK == 0:
                         self._save(store)
-                    self._stop_if_asked(store)
+                    self._stop_on_signal(store)
         self._write_labels()
         if asks:
             self._save(store)
@@ -173,4 +173,4 @@ class Runner:
             self.bars.update(self._bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(store)
-            self._stop_if_asked(store)
+            self._stop_on_signal(store)

@@ -35,32 +35,32 @@ from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher
 
 
-class Named(NamedTuple):
+class PolicyEntry(NamedTuple):
     """A policy that can be chosen by name."""
 
     about: str
-    trained: bool = False  # whether the policy needs a run
+    from_run: bool = False  # whether the policy needs a run
     adapted: bool = False  # whether the policy needs a policy folder
     taught: bool = False  # whether the policy asks the teacher
     needs: tuple[str, ...] = ()  # optional members of an environment that the policy needs
 
     @property
-    def kept(self) -> bool:
+    def from_folder(self) -> bool:
         """Whether the policy comes from a folder."""
-        return self.trained or self.adapted
+        return self.from_run or self.adapted
 
 
-POLICIES: dict[str, Named] = {
-    "agent": Named("the trained agent", trained=True),
-    "guide": Named("guidance of uniform actions", trained=True),
-    "guided": Named("guidance of the agent's actions", trained=True),
-    "corrected": Named("the teacher's own feedback on the agent's actions", trained=True, taught=True),
-    "adapted": Named("the adapted policy", adapted=True),
-    "base": Named("the policy that was adapted", adapted=True),
-    "teacher": Named("the teacher", taught=True),
-    "heuristic": Named("the task's obvious action", needs=("heuristic",)),
-    "uniform": Named("chance"),
-    "own": Named("code of your own, package.module:NAME, named first"),
+POLICIES: dict[str, PolicyEntry] = {
+    "agent": PolicyEntry("the trained agent", from_run=True),
+    "guide": PolicyEntry("guidance of uniform actions", from_run=True),
+    "guided": PolicyEntry("guidance of the agent's actions", from_run=True),
+    "corrected": PolicyEntry("the teacher's own feedback on the agent's actions", from_run=True, taught=True),
+    "adapted": PolicyEntry("the adapted policy", adapted=True),
+    "base": PolicyEntry("the policy that was adapted", adapted=True),
+    "teacher": PolicyEntry("the teacher", taught=True),
+    "heuristic": PolicyEntry("the task's obvious action", needs=("heuristic",)),
+    "uniform": PolicyEntry("chance"),
+    "own": PolicyEntry("code of your own, package.module:NAME, named first"),
 }
 
 
@@ -128,8 +128,8 @@ class PolicySource:
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{suggestion(policy, POLICIES)}")
         entry, after = POLICIES[policy], shape_of(self.task, world)
-        if entry.trained and not self.grid:
-            others = [name for name, one in POLICIES.items() if not one.kept or (one.adapted and self.adapted)]
+        if entry.from_run and not self.grid:
+            others = [name for name, one in POLICIES.items() if not one.from_folder or (one.adapted and self.adapted)]
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
         if entry.adapted and not self.adapted:
             raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` wrote")
@@ -137,7 +137,7 @@ class PolicySource:
             raise UserError("policy 'own' is code: name it first, as package.module:NAME --env TASK")
         if absent := [need for need in entry.needs if not offers(after, need)]:
             raise UserError(f"{self.task.name} has no {absent[0]}: choose another policy")
-        if not entry.kept:
+        if not entry.from_folder:
             check_no_lane(policy, guidance)
             return
         what, own = "run" if self.grid else "policy", shape_of(self.task, self.config.task)
@@ -282,7 +282,7 @@ def several(
         env = source.task.environment(world)
     teacher = source.task.make_teacher(world, env) if entry.taught else None
     view = source.task.view(world) if env is None else view_of(env)
-    if not entry.kept:
+    if not entry.from_folder:
         check_no_lane(name, kind, labels, seeds, bound_deg)
         return [source.alone(name, view, teacher)], [{"seed": 0}]
     kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()

@@ -25,7 +25,7 @@ from jax.tree_util import keystr, tree_leaves_with_path, tree_map_with_path
 
 from cuelearner_jax.errors import UserError, first_line
 
-KEPT = 2  # number of checkpoints of a run that stay on disk
+MOST_CHECKPOINTS = 2  # number of checkpoints of a run that stay on disk
 DIGESTS = "digests"
 # Remedy in the message about a checkpoint that cannot be read.
 REMEDY = (
@@ -87,7 +87,7 @@ class Checkpoints(AbstractContextManager):
         self._remedy, self._run, self._folder = remedy, run, folder.resolve()
         for name in ("absl", "asyncio"):  # what Orbax's threads log is raised anyway
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        writing = {} if read_only else {"max_to_keep": KEPT, "enable_async_checkpointing": False}
+        writing = {} if read_only else {"max_to_keep": MOST_CHECKPOINTS, "enable_async_checkpointing": False}
         options = ocp.CheckpointManagerOptions(read_only=read_only, **writing)
         self._manager = ocp.CheckpointManager(self._folder, options=options)
 

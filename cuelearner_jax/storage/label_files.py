@@ -11,7 +11,7 @@ every kind of guidance with this form of answers. A file holds one set of labels
 | action  | list of floats | the action asked about                                                               |
 | answer  | list of floats | what the teacher said; the file names the form of it; absent where nothing was said  |
 | item    | int            | people: number of the question, from 0                                               |
-| said    | string         | people: one of `SAID`; the last row of an item counts                            |
+| said    | string         | people: one of `RESPONSES`; the last row of an item counts                            |
 | seconds | float          | people: from the question on the screen to the answer [s]                            |
 | who     | string         | people: a name                                                                       |
 | when    | string         | people: time of the answer, ISO 8601 in UTC                                          |
@@ -40,7 +40,7 @@ from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.folders import differences
 from cuelearner_jax.types import Label
 
-ANSWERED, UNSURE, UNDONE = SAID = ("answer", "unsure", "undone")  # an answer, "don't know", an answer taken back
+ANSWERED, UNSURE, UNDONE = RESPONSES = ("answer", "unsure", "undone")  # an answer, "don't know", an answer taken back
 ROW = ("obs", "action", "answer")  # columns that hold lists
 PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of a person's rows
 SCHEMA = tables.Schema(
@@ -81,7 +81,7 @@ class LabelFile(NamedTuple):
     labels: Label  # rows (labels, ...) that still count, in the order they were given
     people: People | None = None  # None: the labels of a simulated teacher, or a merge that includes such labels
     session: dict[str, Any] | None = None  # settings of the page that asked, see `labelling.session`
-    said: dict[str, int] | None = None  # number of rows of each kind in `SAID`, all rows counted
+    counts: dict[str, int] | None = None  # number of rows of each kind in `RESPONSES`, all rows counted
 
     @property
     def budget(self) -> int:
@@ -203,7 +203,7 @@ def read(path: Path) -> LabelFile:
     if file is None or not file.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
     table, head = _table_and_head(file)
-    said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
+    counts = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
     table = _standing(table)
     if head is None or not table.num_rows:
         raise UserError(f"{file} holds no labels: collect some first")
@@ -217,7 +217,7 @@ def read(path: Path) -> LabelFile:
     people = None
     if "item" in columns and not (columns["item"] < 0).any():
         people = People(*(columns[name] for name in People._fields))
-    rest = {"people": people, "session": head.get("session"), "said": said}
+    rest = {"people": people, "session": head.get("session"), "counts": counts}
     return LabelFile(**about, eps=eps, seeds=columns["seed"], labels=labels, **rest)
 
 
@@ -228,8 +228,10 @@ def _standing(table: pa.Table) -> pa.Table:
     last: dict[Any, int] = {}
     for row, (seed, item) in enumerate(zip(*(table[name].to_pylist() for name in ("seed", "item")), strict=True)):
         last[seed, row if item is None else item, item is None] = row
-    said = table["said"].to_pylist()
-    rows = [row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if said[row] in (None, ANSWERED)]
+    responses = table["said"].to_pylist()
+    rows = [
+        row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if responses[row] in (None, ANSWERED)
+    ]
     return table.take(pa.array(rows, pa.int64()))
 
 

@@ -42,7 +42,7 @@ from cuelearner_jax.storage.picture_files import Picture, read_picture
 STEM = "situations"
 SUFFIXES = (".parquet", ".csv", ".npz")
 OBSERVATION, ACTION, PICTURE, TEXT, PHASE = "observation", "action", "picture", "text", "phase"
-MOST_NAMED = 64  # largest number of observation entries that each get a slice of their own
+MOST_SLICES = 64  # largest number of observation entries that each get a slice of their own
 
 
 class Situations(NamedTuple):
@@ -113,7 +113,7 @@ def _situations_of(
                 f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave these rows out"
             )
     slices = (Quantity(OBSERVATION, own, "1", "as recorded"),)
-    if len(names) == own <= MOST_NAMED:
+    if len(names) == own <= MOST_SLICES:
         slices = tuple(Quantity(name, 1, "1", "as recorded") for name in names)
     if is_proposed:
         places = () if phase is None else (Quantity(PHASE, 1, "1", "place in the chunk"),)

@@ -62,7 +62,7 @@ def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[A
         temporary.unlink(missing_ok=True)
 
 
-def is_used(folder: Path) -> bool:
+def is_occupied(folder: Path) -> bool:
     """Whether a path holds anything but an empty folder."""
     return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
@@ -96,7 +96,7 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
 
     def tidy() -> None:
         shutil.rmtree(new, ignore_errors=True)
-        if old.exists() and is_used(target):
+        if old.exists() and is_occupied(target):
             shutil.rmtree(old)
         elif old.exists():
             os.rename(old, target)
@@ -107,7 +107,7 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
         try:
             yield new
             check(folder)
-            if overwrite and is_used(target):
+            if overwrite and is_occupied(target):
                 os.rename(target, old)
             os.rename(new, target)
         finally:

@@ -113,7 +113,7 @@ def in_memory(
     groups = _groups(request, place(lane_mesh(), env, SHARED))
     teacher = _teacher(request, groups, labels, lambda: teacher)
     rows, trainings = [], {}
-    with progress_bars(shown=progress) as bars:
+    with progress_bars(visible=progress) as bars:
         for group in groups:
             name, training = group.guidance.name, Training(group, examined, request.split)
             training.begin()
@@ -122,9 +122,9 @@ def in_memory(
             bar = bars.add_task(name, total=request.config.schedule.total_steps, note="")
             if not training.labelled:
                 assert teacher is not None  # checked above
-                asked = bars.add_task(f"{name}: labels", total=group.rounds, note="")
-                for done in training.label_rounds(teacher):
-                    bars.update(asked, completed=done)
+                label_bar = bars.add_task(f"{name}: labels", total=group.rounds, note="")
+                for count in training.label_rounds(teacher):
+                    bars.update(label_bar, completed=count)
             for row in training.stretches():
                 rows.append(_table(group, row))
                 bars.update(bar, completed=training.step, note=f"reward {mean_of_finite(row['reward'])}")
@@ -136,8 +136,8 @@ def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
     """Return the columns of one evaluation as a table with a row per lane."""
     count = len(group.seeds)
     columns = {name: value if np.ndim(value) else np.full(count, value) for name, value in row.items()}
-    told = {
+    arrays = {
         name: pa.array(values if values.ndim == 1 else list(values), from_pandas=True)
         for name, values in columns.items()
     }
-    return pa.table({"guidance": pa.array([group.guidance.name] * len(group.seeds)), **told})
+    return pa.table({"guidance": pa.array([group.guidance.name] * len(group.seeds)), **arrays})

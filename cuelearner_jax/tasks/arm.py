@@ -26,10 +26,10 @@ def observation_of(skill: str) -> tuple[Quantity, ...]:
     """Return the slices of a skill's observation: Fetch's, with the centre of the camera's rotation."""
     layout = fetch_layout.layout_of(FETCH[skill])
     assert layout is not None
-    return tuple(_seen(quantity) for quantity in layout)
+    return tuple(_declared(quantity) for quantity in layout)
 
 
-def _seen(quantity: Quantity) -> Quantity:
+def _declared(quantity: Quantity) -> Quantity:
     if quantity.name in PLACES and quantity.kind != OWN:
         return quantity._replace(origin=BASE)
     return quantity._replace(follows="object position") if quantity.name == RELATIVE else quantity
@@ -71,7 +71,7 @@ def _wants(config: ArmConfig) -> str:
     }[config.skill]
 
 
-def _judged(*arguments: Any) -> dict[str, Any]:
+def _rollout(*arguments: Any) -> dict[str, Any]:
     from cuelearner_envs.arm.judged import rollout
 
     return rollout(*arguments)
@@ -96,7 +96,7 @@ GRIPPER = Body(
     name="gripper",
     about="three slides and two fingers with contacts, simulated by MJX",
     environment=make_environment,
-    engines={"mujoco": _judged},
+    engines={"mujoco": _rollout},
     pictures=_pictures,
 )
 

@@ -101,7 +101,7 @@ class SituationState(struct.PyTreeNode):
     """Position in a walk over the situations."""
 
     row: Int[Array, ""]  # of the situation
-    met: Int[Array, ""]  # number of situations before it in this episode
+    count: Int[Array, ""]  # number of situations before it in this episode
 
 
 class Logs(WholeObservations, struct.PyTreeNode):
@@ -148,10 +148,10 @@ class Logs(WholeObservations, struct.PyTreeNode):
         self, key: PRNGKeyArray, state: SituationState, action: Float[Array, " action"]
     ) -> tuple[SituationState, Step]:
         """Return the next situation, whatever the action; after all of them a random one."""
-        following = SituationState((state.row + 1) % len(self.rows), state.met + 1)
+        following = SituationState((state.row + 1) % len(self.rows), state.count + 1)
         final_obs, (anew, first) = self.rows[following.row], self.reset(key)
         change = self.actions.to_unit(self.actions.distance(self.recorded[state.row], action))
-        ended = following.met >= len(self.rows)
+        ended = following.count >= len(self.rows)
         state, obs = jax.tree.map(partial(jnp.where, ended), (anew, first), (following, final_obs))
         reward = jnp.zeros(())
         return state, Step(obs, final_obs, final_obs, reward, jnp.array(False), ended, {"change": change}, {})
@@ -192,7 +192,7 @@ def task_of(
     Raises:
         UserError: the situations cannot be read, or bounds or cues do not fit their actions.
     """
-    recording = _read(Path(folder))
+    recording = _recording(Path(folder))
     if actions not in get_args(Actions):
         raise UserError(f"actions is {actions!r}{suggestion(actions, get_args(Actions))}")
     size, names = recording.actions.shape[1], ()
@@ -277,7 +277,7 @@ def bounds_of(
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path) -> Situations:
+def _recording(path: Path) -> Situations:
     """Read situations once."""
     return situations.read(path)
 
@@ -311,7 +311,7 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     """
     if not config.path:
         raise UserError("no situations are given: name their folder, as logs:FOLDER or by --task.path")
-    recording, layout = _read(Path(config.path)), filled(config)
+    recording, layout = _recording(Path(config.path)), filled(config)
     if config.digest not in ("", recording.digest):
         raise UserError(f"{config.path} holds other situations than before: restore the folder, or collect new labels")
     sizes = (recording.observations.shape[1], recording.actions.shape[1])
@@ -332,7 +332,7 @@ def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
     if not env.path:
         raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
     place = int(env.places[row])
-    picture = _read(Path(env.path)).picture(place)
+    picture = _recording(Path(env.path)).picture(place)
     if picture is None:
         raise UserError(f"{env.path} has no picture of row {place}: add a column `picture` with the name of its file")
     if picture.kind.startswith("image/") and picture.kind != "image/gif":
@@ -342,13 +342,13 @@ def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
         film = imageio.mimread(io.BytesIO(picture.data), format=suffix, memtest=False)  # pyright: ignore
     except Exception as error:  # film readers raise many exception types
         raise UserError(f"a clip cannot be read ({' '.join(str(error).split())[:80]}): give GIF or MP4") from error
-    chosen = np.unique(np.linspace(0, len(film) - 1, min(len(film), CLIP_FRAMES)).round().astype(int))
-    return [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in chosen], place
+    numbers = np.unique(np.linspace(0, len(film) - 1, min(len(film), CLIP_FRAMES)).round().astype(int))
+    return [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in numbers], place
 
 
 def _sketch(env: Logs, state: SituationState) -> Sketch:
     frames, place = _frames(env, state.row)
-    text = _read(Path(env.path)).text(place)
+    text = _recording(Path(env.path)).text(place)
     return pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
 
 

@@ -80,7 +80,7 @@ def resolve(text: str) -> Task:
         return find(text)
     family, _, environment = text.partition(":")
     if family in FAMILIES:
-        return dataclasses.replace(_built_in(FAMILIES[family])(environment), named=text)
+        return dataclasses.replace(_built_in(FAMILIES[family])(environment), command_name=text)
     task = dataclasses.replace(_loaded(text), origin=text)
     installed = _installed().get(task.name)
     return find(task.name) if installed and installed.value == text else register(task)

@@ -58,7 +58,7 @@ class Process:
             str(os.getpid()),
         ]
         paths = os.pathsep.join([str(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])
-        environ = {**os.environ, "PYTHONPATH": paths, **(drawing_variables() if source.drawn else {})}
+        environ = {**os.environ, "PYTHONPATH": paths, **(drawing_variables() if source.draws else {})}
         # An environment's prints must not mix with our output.
         self.child = subprocess.Popen(
             command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2, env=environ
