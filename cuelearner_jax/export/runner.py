@@ -196,8 +196,8 @@ def _of_stablehlo(path: Path, contract: dict[str, Any]) -> Batch:
     except Exception:
         version = contract["artefact"]["jax"]
         raise ContractError(
-            f"this decision was exported with JAX {version}, and JAX {jax.__version__} on {jax.default_backend()} cannot "
-            f"call it: use JAX {version}, or export the policy anew with this one"
+            f"this decision was exported with JAX {version}, and JAX {jax.__version__} on {jax.default_backend()} "
+            f"cannot call it: use JAX {version}, or export the policy anew with this one"
         ) from None
     return lambda *batch: np.asarray(call(*batch))
 

@@ -74,7 +74,7 @@ class Result(NamedTuple):
 
 
 def describe_fit(
-    fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity], met: Float[Floats, "m z"]
+    fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity], walk: Float[Floats, "m z"]
 ) -> tuple[tuple[Estimate, ...], float, float | None, float]:
     """Return the entries of `Result` from `estimates` to `wrong`.
 
@@ -82,7 +82,7 @@ def describe_fit(
         fitted: one hypothesis.
         space, family, eps: as for `Reading`; eps in the unit of `space.log`.
         observation: slices of the observation; empty: entries have numbers alone.
-        met: situations that the policy met, as `linear.inputs` has them.
+        walk: situations that the policy met, as `linear.inputs` has them.
     """
     weights = np.asarray(linear.weights_of(fitted.frame, fitted.hypothesis.change), np.float64)
     root = np.asarray(fitted.posterior.root, np.float64) * np.asarray(fitted.hypothesis.parts.weights)[:, None]
@@ -100,8 +100,8 @@ def describe_fit(
     depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
     depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
     near = None
-    if len(met):
-        alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(met), inputs[valid])
+    if len(walk):
+        alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(walk), inputs[valid])
         near = float((alike.max(1) >= ALIKE_SITUATION).mean())
     wrong = float(posterior.habits(hyper, 1 / SCALE, priors).lapse)
     return tuple(estimates), depends, near, wrong

@@ -106,8 +106,8 @@ class Reading:
             base, spread = self._acts(rows), jnp.full((count, len(self.space.cues)), FIRST * self.eps)
         else:
             base, spread = self._reader.act(self.fit, rows), self._reader.spread(self.fit, rows)
-        is_asked = jnp.array([cue.is_asked for cue in self.space.cues])
-        return index, np.asarray(_near(self.space, k_action, base, is_asked[None] * jnp.maximum(spread, self.eps / 2)))
+        asks = jnp.array([cue.is_asked for cue in self.space.cues])
+        return index, np.asarray(_near(self.space, k_action, base, asks[None] * jnp.maximum(spread, self.eps / 2)))
 
     def learn(
         self,

@@ -11,7 +11,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
-from cuelearner_envs.playing import played
 from cuelearner_jax import pictures, user_code
 from cuelearner_jax.bridges.brax import JaxEnvironment, SimulatorState, model_of
 from cuelearner_jax.errors import UserError
@@ -60,7 +59,7 @@ def pictures_of(
 
     def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
         see = lambda env, state, action, step: (drawable(state), action, step.reward)  # noqa: E731
-        states, actions, rewards = played(env, policy, key, steps, see)
+        states, actions, rewards = record_steps(env, policy, key, steps, see)
         user_code.tell()
         return film(env, states, actions), rewards.tolist()
 
