@@ -101,8 +101,6 @@ def static(options: PartT) -> PartT:
 def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
     """Return values for a configuration's fields: NumPy's numbers as Python's, lists as tuples.
 
-    Raises UserError for no such field, or a value of another type than its field's.
-
     Args:
         group: a configuration, or its class.
         prefix: name of the group in messages.

@@ -21,7 +21,10 @@ def first_line(error: object) -> str:
 
 
 class UserError(Exception):
-    """Bad input: one line that says what is wrong and what to do, for exit status 2 without a traceback."""
+    """Bad input: one line that says what is wrong and what to do, for exit status 2 without a traceback.
+
+    Whatever reads or checks input may raise it. A docstring names the cases only where its caller needs them.
+    """
 
     def __init__(self, message: object = "") -> None:
         """Store the message on one line, without escape sequences that a path or a name in it may hold."""

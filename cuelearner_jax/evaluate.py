@@ -185,10 +185,7 @@ def part_of(tell: Tell, number: int, parts: int) -> Tell:
 def rollout_with_progress(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = ignore_progress
 ) -> Rollout:
-    """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,).
-
-    Raises UserError, which names the policy, once one of its actions is not finite.
-    """
+    """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,)."""
     return _in_stretches(env, None, policy, key, num_envs, steps, tell, policy_name(policy))
 
 

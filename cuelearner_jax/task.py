@@ -208,10 +208,7 @@ class Task:
         self.check_whole(config.task, config.schedule.eval_envs, config.schedule.eval_steps, *options)
 
     def on(self, body: str | None) -> Task:
-        """Return the task with that body first (None: unchanged); NAME:FOLDER adds the user's files in a folder.
-
-        Raises UserError if there is no such body, or the folder has no files for it.
-        """
+        """Return the task with that body first (None: unchanged); NAME:FOLDER adds the user's files in a folder."""
         if body is None:
             return self
         robot, (body, _, folder) = body, body.partition(":")

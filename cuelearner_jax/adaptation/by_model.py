@@ -115,9 +115,6 @@ def adapt(
         labels: rows (lanes, slots, ...) in place of questions, fitted at once.
         mesh: devices that share the lanes (default: all of this process's).
         watch: takes the name of a piece of work, returns its progress callback.
-
-    Raises:
-        UserError: all lanes failed for their policy or their teacher, or labels cannot judge.
     """
     mesh, count = mesh or lane_mesh(), lanes.number
     # the block is filled up with repeats of the last lane, which are dropped in the end

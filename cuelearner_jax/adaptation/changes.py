@@ -35,8 +35,6 @@ def load(reference: str) -> Any:
 def family_of(changes: Any, env: Any) -> Family:
     """Return the family of a user's distortions: one, a list of them, or a function of the environment that returns one
     of these.
-
-    Raises UserError for something else, or a family that makes no sense.
     """
     if callable(changes):
         changes = changes(env)
@@ -75,9 +73,6 @@ def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Fami
         layer: the policy's plain values from the file.
         env: the world that the policy acts in.
         changes: code of the user's own distortions, as `family_of` takes it; None: none was named.
-
-    Raises:
-        UserError: code that was not given, or distortions that this world or code does not have.
     """
     code, names = layer["code"], layer["distortions"]
     if code and changes is None:

@@ -91,10 +91,7 @@ class Judge:
         self.mesh = mesh if mesh.size > 1 else None
 
     def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
-        """Return the judgement of the finished lanes, and the lanes with the bounds that are used.
-
-        Raises UserError if labels cannot judge.
-        """
+        """Return the judgement of the finished lanes, and the lanes with the bounds that are used."""
         how, lanes = self.how, self.lanes
         if how.by == LABELS:
             if self.of.guidance.by_evidence:
@@ -224,9 +221,6 @@ def judge_by_labels(of: Adaptation, block: LaneState) -> tuple[np.ndarray, np.nd
     """Return before, after and used of a `Judgement`: "already right" always, and a model, on every fifth label.
 
     The model in use is fitted to all labels; a second one is fitted for this comparison alone.
-
-    Raises:
-        UserError: answers that say nothing about turning an action, or fewer than five.
     """
     form = of.guidance.form
     if form is None or not form.by_eps:

@@ -75,9 +75,6 @@ def from_json(values: dict[str, Any], env: Any, code: Any = None, changes: Any =
         env: the world; shapes in place of its arrays will do.
         code: the policy that stands for code in it; None: none was given.
         changes: the user's own distortions in it, as `changes.family_of` takes them; None: none were given.
-
-    Raises:
-        UserError: the policy's code was not given, or it needs what the environment has not.
     """
     kind, key = values["policy"], jax.random.key(0)
     if kind == "agent":

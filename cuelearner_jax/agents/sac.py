@@ -77,10 +77,7 @@ class SACConfig:
     """Rate at which the target critics follow."""
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> SoftActorCritic:
-        """Return the agent for an environment's spaces.
-
-        Raises UserError if actions are not of a box, or the frame is not raw.
-        """
+        """Return the agent for an environment's spaces."""
         if not isinstance(spaces.actions, Box):
             raise UserError(
                 f"agent 'sac' acts in boxes, not in {spaces.actions.name}: give --agent ddqn, which serves any space"

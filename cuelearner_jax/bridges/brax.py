@@ -97,10 +97,7 @@ class Interface(NamedTuple):
 
 
 def layout_of(simulator: Any, name: str) -> Interface:
-    """Return the layout of a simulator without compiling. `name`: the simulator's, for messages.
-
-    Raises UserError for a batch of several, a hidden end of episodes, or images.
-    """
+    """Return the layout of a simulator without compiling. `name`: the simulator's, for messages."""
     shapes = jax.eval_shape(simulator.reset, jax.random.key_data(jax.random.key(0)))
     if shapes.reward.shape:
         raise UserError(f"{name}: it is a batch of shape {shapes.reward.shape}: give a single environment")
@@ -150,9 +147,6 @@ def from_brax(
         max_steps: an episode is truncated after this many steps.
         heuristic: observation -> the obvious action. Without this the guidance "heuristic" is refused.
         cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
-
-    Raises:
-        UserError: observations or actions do not fit.
     """
     name = type(env.unwrapped).__name__
     layout, steps = layout_of(env, name), jnp.array(max_steps, jnp.int32)

@@ -73,9 +73,6 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
     code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code. Code
     without a task acts in the situations of --labels-from; without code their proposed actions are the policy.
     `is_policy`: code without a task is a policy, not a task.
-
-    Raises:
-        UserError: the folder or task does not exist or is not available.
     """
     word, task, code = ahead.words[0] if ahead.words else None, _task_by_option(ahead), None
     if word is task is None and ahead.labels_from is not None:
@@ -111,8 +108,6 @@ def source_in(folder: Path, task: Task | None, code: Any, path: str | None) -> P
     """Return the policies of a run or policy folder, for a family of tasks in the environment named beside it.
 
     `code`, `path`: code of a policy folder (an object, and package.module:NAME).
-
-    Raises UserError for another kind of folder, another task than named, or other observations or actions.
     """
 
     def find(name: str) -> Task:
@@ -176,10 +171,7 @@ def _recording_task(subject: str, path: str | None) -> Task:
 
 
 def _with_teacher(task: Task, reference: str | None) -> Task:
-    """Return the task with the teacher that `package.module:NAME` leads to: a teacher, or a policy used as one.
-
-    Raises UserError if there is none.
-    """
+    """Return the task with the teacher that `package.module:NAME` leads to: a teacher, or a policy used as one."""
     if reference is None:
         return task
     code = plugins.load(reference, object, "a teacher")

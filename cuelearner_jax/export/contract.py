@@ -66,8 +66,7 @@ def write(
     `draw` returns observations of the environment, from which golden cases are chosen. `source` is copied to the
     contract.
 
-    Returns the contract, with "difference": the largest difference among the golden cases in this replay. Raises
-    UserError for an unknown format, a folder in use, or a policy that cannot be exported.
+    Returns the contract, with "difference": the largest difference among the golden cases in this replay.
     """
     with place_of(out, partial(check_request, format)) as place:
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
@@ -146,10 +145,7 @@ def _artefact(
 
 
 def replay_golden_cases(folder: Path) -> float:
-    """Replay a folder's golden cases; return the largest difference.
-
-    Raises UserError for a folder that is damaged, cannot be run here, or gives other actions.
-    """
+    """Replay a folder's golden cases; return the largest difference."""
     try:
         return runner.Decision(folder).check()
     except runner.ContractError as error:

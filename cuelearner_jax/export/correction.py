@@ -60,10 +60,7 @@ def _over(policy: Any, base: Any) -> Any:
 
 
 def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Any]:
-    """Return a policy's correction alone, and what export needs to know of its input and output in place of a world.
-
-    Raises UserError for a policy without a correction, or one that changes its base's observations.
-    """
+    """Return a policy's correction alone, and what export needs to know of its input and output in place of a world."""
     if getattr(policy, "base", None) is None:
         raise UserError("this policy has no correction: give a corrected policy, or export the whole policy")
     layer = policy

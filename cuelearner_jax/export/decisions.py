@@ -31,10 +31,7 @@ CALLBACKS = {"pure_callback", "io_callback", "python_callback"}
 
 
 def decision_of(policy: Policy) -> Callable[[PRNGKeyArray, Array], Array]:
-    """Return a policy's decision as a function (key, observation (obs,)) -> action (action,).
-
-    Raises UserError for a policy that needs more than observations.
-    """
+    """Return a policy's decision as a function (key, observation (obs,)) -> action (action,)."""
     if any(layer.get("asks") for layer in layers(describe(policy))):
         raise UserError("this policy asks a teacher, who needs the true state: export a policy without a teacher")
     return lambda key, obs: policy.act(key, None, obs[None])[0]
@@ -64,10 +61,7 @@ def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS)
 
 
 def trace_policy(policy: Policy, obs_size: int) -> Traced:
-    """Trace a policy's decision as a graph.
-
-    Raises UserError for a policy with random actions, or with code other than JAX's.
-    """
+    """Trace a policy's decision as a graph."""
     traced = trace(decision_of(policy), obs_size)
     if CALLBACKS & set(traced.missing):
         raise UserError(
@@ -123,8 +117,6 @@ def golden_cases(policy: Policy, candidates: Float[np.ndarray, "n obs"], traced:
     An argmax jumps where two values tie, and another machine may choose the other one, so such cases verify nothing.
     Up to a quarter of the cases are extreme observations, where a policy may give no action; none if its graph is
     incomplete.
-
-    Raises UserError if there is no insensitive case among the drawn observations.
     """
     candidates = np.asarray(candidates, np.float32)
     beyond = extreme_observations(candidates)[: 0 if traced.missing else most // 4]

@@ -24,8 +24,7 @@ BASE = "base_action"  # the second input of a correction alone
 def serialize(traced: Traced, obs_size: int, action_size: int, base_size: int = 0) -> bytes:
     """Return the bytes of a model with input `obs` (n, obs_size) and output `action` (n, action_size).
 
-    For a correction alone, the last `base_size` entries of the input are a second input, `base_action`. Raises
-    UserError if the package onnx is missing.
+    For a correction alone, the last `base_size` entries of the input are a second input, `base_action`.
     """
     try:
         from onnx import TensorProto, checker, helper, numpy_helper

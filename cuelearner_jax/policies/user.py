@@ -174,10 +174,6 @@ def policy_of(source: Any, space: Space | None = None) -> Any:
             observations: one that `jax.jit` made is compiled with what calls it, any other gets NumPy arrays; a
             `torch.nn.Module`; a model or policy of Stable-Baselines3, or its `predict`; or the path of a file in ONNX.
         space: the space of the actions of a function (None: not known yet).
-
-    Raises:
-        UserError: the object is none of these, a policy that is not a pytree, a file that cannot be run, or a model
-            that is known to give other actions than those of the space.
     """
     function = _foreign(source)
     if function is None and not _acts(source) and _required(source) == []:

@@ -53,9 +53,6 @@ class Reading:
         eps_deg: strength of an answer, in the space's unit.
         labels: expected number of labels, for which programs are compiled.
         observation: slices of the observation, for words.
-
-    Raises:
-        UserError: the space has no cues.
     """
 
     def __init__(

@@ -64,8 +64,6 @@ def report(
         study: called with the variants; returns additions to the report.
         overwrite: replaces an existing report.
         command: command line that makes this report, recorded in it.
-
-    Raises UserError if `out` exists, or if the results cannot be reported (`read_groups`, `variants_of`).
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)

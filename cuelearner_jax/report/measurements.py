@@ -67,8 +67,6 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
 
     Two single policies are paired by episode, and rows of equal seeds by seed. A single policy is subtracted from each
     seed of several. Of rows with different seeds these are resampled independently, the episodes alike.
-
-    Raises UserError for a row without a counterpart.
     """
     result = []
     for row in rows:

@@ -73,11 +73,7 @@ class Group(NamedTuple):
 
 
 def read_groups(folders: Sequence[PathLike], metric: str, split: str, by_run: bool) -> list[Group]:
-    """Read the results of folders, together or (`by_run`) each folder by itself under its name.
-
-    Raises UserError if results are missing, damaged, of several tasks, without the metric or the split, or have failed
-    lanes only; or if two folders that are to be reported separately have one name.
-    """
+    """Read the results of folders, together or (`by_run`) each folder by itself under its name."""
     folders_of = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
     if by_run and len(folders_of) < len(folders):
         raise UserError("--by-run: several folders have the same name: give them different names")
@@ -112,10 +108,7 @@ def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Tabl
 
 
 def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
-    """Return the variants in the legend's order: for each group unguided first, then by guidance and label budget.
-
-    Raises UserError if a seed occurs twice, or the seeds of a variant have no step in common.
-    """
+    """Return the variants in the legend's order: for each group unguided first, then by guidance and label budget."""
     entries = []
     for group in groups:
         failed = results.failures(group.failed)

@@ -94,9 +94,6 @@ def open_folder(
         find: see `grid.load`.
         code: the policy that the folder names as code; None: not given.
         changes: the user's own distortions in it, as `changes.family_of` takes them; None: not given.
-
-    Raises:
-        UserError: the folder cannot be read, is damaged, or belongs to an unknown task.
     """
     path = folder / policy_folders.POLICY
     values = formats.read("policy", path)
@@ -121,9 +118,6 @@ def write(
         task, world: in which the lanes were adapted.
         origin: the base policies in plain values: "folder" and which lanes of it, or "code".
         inputs: further inputs by name: the label file, another robot.
-
-    Raises:
-        UserError: something appeared at the place meanwhile, or the policy cannot be written.
     """
     lanes, judgement, env = result.lanes, result.judgement, shape_of(task, world)
     block = replace(result.policy(env), base=result.of.bases)

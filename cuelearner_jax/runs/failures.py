@@ -39,10 +39,7 @@ def summary(table: pa.Table) -> str:
 
 
 def without_failed(groups: Sequence[Any]) -> list[Any]:
-    """Drop the failed lanes of trained lanes (`run_folders.RunLanes`) and name them on the console.
-
-    Raises UserError if no lane is left.
-    """
+    """Drop the failed lanes of trained lanes (`run_folders.RunLanes`) and name them on the console."""
     rest = []
     for lanes in groups:
         mask = np.asarray(lanes.policies["failed"])

@@ -124,10 +124,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
 
 
 def world_of(values: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:
-    """Return the task and the world (a configuration) that a folder's file describes.
-
-    Raises UserError if the task is unknown; the message says how to name a task from outside the package.
-    """
+    """Return the task and the world (a configuration) that a folder's file describes."""
     origin = values.get("from")
     try:
         task = find(values["name"])

@@ -94,8 +94,7 @@ class PolicySource:
     ) -> PolicySource:
         """Return the policies of a run, whole or in shards (`open_run`), or of a policy folder (`open_folder`).
 
-        `code`, `changes`: the code that a policy folder names. Raises UserError if the folder is neither, cannot be
-        read, or needs no code where some is given.
+        `code`, `changes`: the code that a policy folder names.
         """
         if not policy_folders.is_one(folder):
             task, config, grid, pieces = open_run(folder, find)
@@ -153,10 +152,7 @@ class PolicySource:
             )
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[RunLanes]:
-        """Return the lanes of a run's kinds of guidance (none named: all), grouped by step.
-
-        Raises UserError for a kind that the run lacks, or if there is no checkpoint.
-        """
+        """Return the lanes of a run's kinds of guidance (none named: all), grouped by step."""
         assert self.grid is not None  # ensured by `check`
         groups = []
         for name in kinds or self.grid.guidance:
@@ -273,9 +269,6 @@ def several(
         seeds: the lanes' seeds (empty: the first).
         bound_deg: bound of a policy folder's lanes (None: the largest).
         env: that world's environment, for a teacher (default: with its training episodes).
-
-    Raises:
-        UserError: there is no such lane.
     """
     entry = POLICIES[name]
     if entry.taught and env is None:

@@ -105,10 +105,7 @@ class Checkpoints(AbstractContextManager):
         self._manager.wait_until_finished()
 
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
-        """Return the newest checkpoint's items named in `like` (trees of arrays or shapes), on the default device.
-
-        Raises UserError if there is no checkpoint, it cannot be read, it is another run's, or its shapes differ.
-        """
+        """Return the newest checkpoint's items named in `like` (trees of arrays or shapes), on the default device."""
         number = self.latest()
         if number is None:
             raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first checkpoint")

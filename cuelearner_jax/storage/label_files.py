@@ -195,10 +195,7 @@ def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = Tru
 
 
 def read(path: Path) -> LabelFile:
-    """Read the labels that still count from a Parquet or JSONL file, or from the folder of one.
-
-    Raises UserError if the file is missing, damaged, of another format, or holds no labels.
-    """
+    """Read the labels that still count from a Parquet or JSONL file, or from the folder of one."""
     file = found_in(path)
     if file is None or not file.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
@@ -243,8 +240,7 @@ def digest(path: Path) -> str:
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:
     """Return the lanes' label sets, padded: rows (lanes, slots, ...).
 
-    A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget. Raises
-    UserError for a seed without labels, or with fewer than a lane's budget.
+    A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget.
     """
     own_seeds = np.unique(file.seeds)
     sets = []

@@ -46,8 +46,6 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str
     without entries where the dataset has pictures alone, and actions (n, action); and the names of the entries of each,
     empty where the dataset names none. Last comes a function from a row to the first camera's picture, None without a
     camera.
-
-    Raises UserError if the dataset has another version of the format, is damaged, or lacks vectors of either.
     """
     features = _features(path)
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
@@ -75,10 +73,7 @@ def _damage_error(path: Path, why: object) -> UserError:
 
 
 def _parts(path: Path, features: dict[str, Any], name: str, cameras: list[str]) -> list[str]:
-    """Return the features of numbers called `name` or `name.PART`; none for observations by `cameras` alone.
-
-    Raises UserError if there are none.
-    """
+    """Return the features of numbers called `name` or `name.PART`; none for observations by `cameras` alone."""
     vectors = [key for key, feature in features.items() if _is_vector(feature)]
     parts = [name] if name in vectors else [key for key in vectors if key.startswith(f"{name}.")]
     others = {key for key in features if key.startswith(name)} - {*cameras}

@@ -114,8 +114,6 @@ def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
     Returns:
         A table with the columns listed at the top of this module and `folder`, the folder of the row's run. A column
         that a run lacks is null for that run.
-
-    Raises UserError if a path is missing, holds no rows or is damaged, or the runs are of several tasks.
     """
     files = find(paths, schema)
     parts = []

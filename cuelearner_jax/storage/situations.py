@@ -61,11 +61,7 @@ class Situations(NamedTuple):
 
 
 def read(path: Path) -> Situations:
-    """Read a folder of situations, its table alone, or a LeRobot dataset folder.
-
-    Raises:
-        UserError: nothing to read, missing columns, sizes that do not fit, or a number that is not finite.
-    """
+    """Read a folder of situations, its table alone, or a LeRobot dataset folder."""
     if lerobot.is_dataset(path):
         return _situations_of(path, *lerobot.read(path))
     table = _table_in(path)
@@ -179,10 +175,7 @@ def _columns(table: Path) -> dict[str, Any]:
 
 
 def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.ndarray, "n size"], tuple[str, ...]]:
-    """Return the numbers (n, size) of a column of lists, or of one column per entry, and the names of the entries.
-
-    Raises UserError for a missing column, or sizes that do not fit.
-    """
+    """Return the numbers (n, size) of a column of lists, or of one column per entry, and the names of the entries."""
     entries = tuple(column.partition(".")[2] for column in columns if column.startswith(f"{name}."))
     if (name in columns) == bool(entries):
         raise UserError(

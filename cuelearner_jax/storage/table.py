@@ -152,10 +152,7 @@ def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> N
 
 
 def finish(folder: PathLike, schema: Schema) -> Path:
-    """Convert a folder's JSONL table to Parquet, unless it is finished already; return the Parquet file.
-
-    Raises UserError if there is no table, or it has no rows or cannot be read.
-    """
+    """Convert a folder's JSONL table to Parquet, unless it is finished already; return the Parquet file."""
     path, target = (Path(folder) / name for name in (schema.jsonl, schema.parquet))
     if path.exists():
         table = read(path, schema)
@@ -195,10 +192,7 @@ def digest(table: pa.Table) -> str:
 
 
 def read(path: Path, schema: Schema) -> pa.Table:
-    """Read one file of a table with its column types; a table that has just begun has no rows and no columns.
-
-    Raises UserError if the file is damaged or is not a table of this schema.
-    """
+    """Read one file of a table with its column types; a table that has just begun has no rows and no columns."""
     try:
         if path.suffix == ".jsonl":
             table = _growing(path, schema)

@@ -22,10 +22,7 @@ from cuelearner_jax.errors import UserError
 
 @contextmanager
 def hold(lock: Path, what: Path) -> Iterator[None]:
-    """Hold a lock file that claims the folder `what`; the lock ends however the process ends.
-
-    Raises UserError if another process holds the lock.
-    """
+    """Hold a lock file that claims the folder `what`; the lock ends however the process ends."""
     file_lock = FileLock(lock, blocking=False)
     try:
         file_lock.acquire()
@@ -85,9 +82,6 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
         check: raises UserError for an existing folder that may not be replaced; called now, and again before the
             replacement.
         overwrite: whether an existing folder may be replaced at all.
-
-    Raises:
-        UserError: as `check`, or another process has claimed the place.
     """
     check(folder)
     target = folder.resolve()

@@ -70,8 +70,7 @@ class Subject(NamedTuple):
 def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str | None = None) -> Subject:
     """Return the source's policies, or its code, in a world of its task.
 
-    `reference`: package.module:NAME of code that acts or is in the folder. Raises UserError if the policies cannot act
-    there.
+    `reference`: package.module:NAME of code that acts or is in the folder.
     """
     env = source.task.environment(world)
     if source.code is not None:

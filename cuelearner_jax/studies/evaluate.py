@@ -76,10 +76,7 @@ class Measured(NamedTuple):
 
 
 def amount(task: Task, request: EvaluateRequest[Any]) -> tuple[int, int]:
-    """Return the number of environments and the number of steps that they share.
-
-    Raises UserError for invalid numbers, or steps that cut episodes short.
-    """
+    """Return the number of environments and the number of steps that they share."""
     longest = None if task.longest is None else task.longest(request.task)
     if request.episodes is not None:
         if request.steps is not None or request.envs is not None:

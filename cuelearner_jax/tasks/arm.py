@@ -41,10 +41,7 @@ def make_environment(config: ArmConfig, split: str = "training") -> Environment:
 
 
 def make_fetch(config: ArmConfig, split: str = "training") -> Environment:
-    """Return the world of a configuration in Fetch, run by the Gymnasium bridge in separate processes.
-
-    Raises UserError for a change that Fetch does not support, or where Gymnasium-Robotics is not installed.
-    """
+    """Return the world of a configuration in Fetch, run by the Gymnasium bridge in separate processes."""
     from cuelearner_envs.arm import fetch
     from cuelearner_jax.bridges.gymnasium.environment import GymnasiumTask
     from cuelearner_jax.bridges.gymnasium.source import Source

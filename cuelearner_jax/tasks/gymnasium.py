@@ -189,9 +189,6 @@ def task_from(
         arguments: arguments of the environment, by name.
         called: name of code in messages and files (default: its module:NAME).
         num_envs, max_steps, processes, cues, observation, units: see `cl.from_gymnasium`.
-
-    Raises:
-        UserError: the environment cannot be made, or its spaces are not supported.
     """
     check_installed()
     if max_steps is not None:

@@ -188,9 +188,6 @@ def task_of(
         low, high: bounds of the actions, one per entry (default: the recorded actions' range, reported by `note`).
         actions: kind of action space, "box", "directions" or "choices".
         note: called with one line about each value that had to be chosen.
-
-    Raises:
-        UserError: the situations cannot be read, or bounds or cues do not fit their actions.
     """
     recording = _recording(Path(folder))
     if actions not in get_args(Actions):
@@ -259,10 +256,7 @@ def bounds_of(
     entries: Sequence[str] = (),
     note: Callable[[str], None] = console.print,
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the bounds of a box of actions: the given ones, or the range of the actions, reported by `note`.
-
-    Raises UserError for one bound without the other, or an entry that never changes.
-    """
+    """Return the bounds of a box of actions: the given ones, or the range of the actions, reported by `note`."""
     if low is not None and high is not None:
         return low, high
     if low is not None or high is not None:
@@ -283,10 +277,7 @@ def _recording(path: Path) -> Situations:
 
 
 def filled(config: LogsConfig, observations: Any = None, actions: Any = None) -> Logs:
-    """Return the environment of situations (n, obs) and (n, action) in their order; zeros where none are given.
-
-    Raises UserError for an invalid configuration.
-    """
+    """Return the environment of situations (n, obs) and (n, action) in their order; zeros where none are given."""
     space, size = space_of(config), sum(config.entries)
     sound = len(config.names) == len(config.entries) and min((*config.entries, config.rows, *config.spread)) > 0
     if not sound or not all(len(part) in (0, size) for part in (config.centre, config.spread)):
@@ -305,10 +296,7 @@ def filled(config: LogsConfig, observations: Any = None, actions: Any = None) ->
 
 
 def _environment(config: LogsConfig, split: str) -> Logs:
-    """Return the situations of a configuration, which are equal in every split.
-
-    Raises UserError where they are missing, or differ from the configuration's digest.
-    """
+    """Return the situations of a configuration, which are equal in every split."""
     if not config.path:
         raise UserError("no situations are given: name their folder, as logs:FOLDER or by --task.path")
     recording, layout = _recording(Path(config.path)), filled(config)
@@ -325,10 +313,7 @@ def _environment(config: LogsConfig, split: str) -> Logs:
 
 
 def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
-    """Return the frames of a row's picture or clip, and the row's place in the recording.
-
-    Raises UserError if there is none, or if it cannot be read.
-    """
+    """Return the frames of a row's picture or clip, and the row's place in the recording."""
     if not env.path:
         raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
     place = int(env.places[row])

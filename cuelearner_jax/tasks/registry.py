@@ -72,9 +72,6 @@ def resolve(text: str) -> Task:
     """Return the task that the user names: by its name, as FAMILY:ENVIRONMENT (`FAMILIES`), or as package.module:name.
 
     A task from outside is registered. The current folder is searched for modules last.
-
-    Raises:
-        UserError: no such task, or its code cannot be loaded.
     """
     if ":" not in text:
         return find(text)

@@ -113,10 +113,7 @@ def _from_playground(name: str) -> Any:
 
 
 def make_environment(family: str, config: Any, split: str = "training") -> JaxEnvironment:
-    """Return the environment of a configuration; the simulator is made at the first step or reset.
-
-    Raises UserError for a value that makes none.
-    """
+    """Return the environment of a configuration; the simulator is made at the first step or reset."""
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     if backend := getattr(config, "backend", ""):
         check_word("backend", backend, get_args(Backend))

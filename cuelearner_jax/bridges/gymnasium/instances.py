@@ -71,10 +71,7 @@ class Leaf(NamedTuple):
 
 
 def leaves_of(whose: str, space: Any, path: tuple[Any, ...] = ()) -> tuple[Leaf, ...]:
-    """Return the entries of a space of observations, in the order of the space.
-
-    Raises UserError for images and for spaces that have no vectors; `whose`: for the message.
-    """
+    """Return the entries of a space of observations, in the order of the space; `whose`: for the message."""
     kind = type(space).__name__
     if kind in ("Dict", "Tuple"):
         parts = space.spaces.items() if kind == "Dict" else enumerate(space.spaces)

@@ -81,10 +81,7 @@ def check_installed() -> None:
 
 
 def registry_spec(name: str) -> Any:
-    """Return the specification of an id in Gymnasium's registry, without importing the id's module.
-
-    Raises UserError for an id that is not there.
-    """
+    """Return the specification of an id in Gymnasium's registry, without importing the id's module."""
     check_installed()
     if ":" in name:
         raise UserError(
