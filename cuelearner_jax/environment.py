@@ -210,12 +210,7 @@ def check_layout(whose: str, observation: Sequence[Quantity], actions: Space, en
     """Raise UserError where a world has another layout of observations or actions than a policy was made for.
 
     Names and units of slices are compared where both sides come from the same sort of source: either both give units,
-    or neither.
-
-    Args:
-        whose: the policy in the message, for instance "the run".
-        observation, actions: the layout that the policy was made for.
-        env: the world, or what `task.shape_of` gives for it.
+    or neither. `whose`: the policy in the message, for instance "the run". `env`: what `task.shape_of` gives will do.
     """
     wanted = "give the world that it was made for, or options that keep its observations and actions"
     before, now = _entries(observation), _entries(env.observation)

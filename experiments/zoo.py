@@ -212,7 +212,7 @@ def worlds_of(robots: Any, cells: list[Cell]) -> tuple[Any, jax.Array]:
     own = jax.tree.map(lambda leaf: leaf[rows[0]], robots)
     root = jax.random.key(5)
     keys = jax.vmap(lambda robot, error: jax.random.fold_in(jax.random.fold_in(root, robot), error))(*rows)
-    worlds = jax.vmap(zoo.changed)(keys, own, rows[1])
+    worlds = jax.vmap(zoo.change)(keys, own, rows[1])
     return worlds, jax.vmap(jax.random.fold_in)(keys, jnp.array([cell.seed for cell in cells]))
 
 

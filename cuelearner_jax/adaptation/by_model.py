@@ -107,14 +107,9 @@ def adapt(
 ) -> AdaptationResult:
     """Ask for labels, fit a model and judge the corrected policy in every lane.
 
-    Args:
-        of: settings that all lanes share: the kind of guidance, the world, the base policies.
-        lanes: the lanes to adapt.
-        how: settings of the judgement.
-        teacher: the teacher who answers in rounds; None where labels are given.
-        labels: rows (lanes, slots, ...) in place of questions, fitted at once.
-        mesh: devices that share the lanes (default: all of this process's).
-        watch: takes the name of a piece of work, returns its progress callback.
+    `teacher`: who answers in rounds; or `labels`: rows (lanes, slots, ...) in place of questions, fitted at once.
+    `mesh`: devices that share the lanes (default: all of this process's). `watch`: takes the name of a piece of work,
+    returns its progress callback.
     """
     mesh, count = mesh or lane_mesh(), lanes.number
     # the block is filled up with repeats of the last lane, which are dropped in the end

@@ -67,12 +67,9 @@ def check_acts(family: Family, env: Environment) -> None:
 
 
 def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
-    """Return the distortions of a policy that was read from a file.
+    """Return the distortions of a policy that was read from a file, `layer` being its plain values.
 
-    Args:
-        layer: the policy's plain values from the file.
-        env: the world that the policy acts in.
-        changes: code of the user's own distortions, as `family_of` takes it; None: none was named.
+    `changes`: code of the user's own distortions, as `family_of` takes it; None: none was named.
     """
     code, names = layer["code"], layer["distortions"]
     if code and changes is None:

@@ -70,11 +70,8 @@ def with_arrays(policy: Any, arrays: Any) -> Any:
 def from_json(values: dict[str, Any], env: Any, code: Any = None, changes: Any = None) -> Any:
     """Return the policy of plain values, with shapes in place of its arrays (`with_arrays`), to act in a world.
 
-    Args:
-        values: the policy's plain values.
-        env: the world; shapes in place of its arrays will do.
-        code: the policy that stands for code in it; None: none was given.
-        changes: the user's own distortions in it, as `changes.family_of` takes them; None: none were given.
+    `env`: the world; shapes in place of its arrays will do. `code`, `changes`: what stands for code in the values, and
+    the user's own distortions, as `changes.family_of` takes them; None: none were given.
     """
     kind, key = values["policy"], jax.random.key(0)
     if kind == "agent":

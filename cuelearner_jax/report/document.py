@@ -62,7 +62,6 @@ def report(
         lower_is_better: smaller values of the metric are better, for the best value and for reaching a value.
         by_run: reports each folder separately, under its name, as needed where the runs' configurations differ.
         study: called with the variants; returns additions to the report.
-        overwrite: replaces an existing report.
         command: command line that makes this report, recorded in it.
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)

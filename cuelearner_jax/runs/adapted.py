@@ -89,11 +89,8 @@ def open_folder(
 ) -> tuple[Task, Any, AdaptedLanes]:
     """Open a policy folder; return its task, world (a configuration) and lanes.
 
-    Args:
-        folder: the folder.
-        find: see `grid.load`.
-        code: the policy that the folder names as code; None: not given.
-        changes: the user's own distortions in it, as `changes.family_of` takes them; None: not given.
+    `find`: see `grid.load`. `code`, `changes`: what the folder names as code, and the user's own distortions in it, as
+    `changes.family_of` takes them; None: not given.
     """
     path = folder / policy_folders.POLICY
     values = formats.read("policy", path)
@@ -110,14 +107,10 @@ def write(
     origin: dict[str, Any],
     inputs: dict[str, str | None] | None = None,
 ) -> None:
-    """Write a policy folder.
+    """Write a policy folder of lanes that were adapted in a task's world.
 
-    Args:
-        place: the target; the folder appears once it is complete.
-        result: the lanes.
-        task, world: in which the lanes were adapted.
-        origin: the base policies in plain values: "folder" and which lanes of it, or "code".
-        inputs: further inputs by name: the label file, another robot.
+    `origin`: the base policies in plain values: "folder" and which lanes of it, or "code". `inputs`: further inputs by
+    name: the label file, another robot.
     """
     lanes, judgement, env = result.lanes, result.judgement, shape_of(task, world)
     block = replace(result.policy(env), base=result.of.bases)

@@ -53,16 +53,11 @@ def make_program(
     mesh: Mesh | None = None,
     lanes: int = 1,
 ) -> Program:
-    """Compile (on first use) the loop for one kind of guidance.
+    """Compile (on first use) the loop for one kind of guidance; only the shapes of `env` count.
 
     Another run of the same sizes, guidance and shapes in this process is given the same program, compiled already.
-
-    Args:
-        config: the configuration that shapes the program; its `settings` are passed at each call.
-        env: gives shapes; any environment of the same structure may be passed at the calls.
-        largest_budget: labels that the largest lane may use.
-        mesh: devices that share the lanes, whose number they must divide into (default: the first device alone).
-        lanes: expected number of lanes on each device; only speed depends on it.
+    `mesh`: devices that share the lanes, whose number they must divide into (default: the first device alone). `lanes`:
+    expected number of lanes on each device; only speed depends on it.
     """
     leaves, structure = jax.tree.flatten(jax.eval_shape(lambda env: env, env))
     return _program_of(

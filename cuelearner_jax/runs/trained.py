@@ -258,17 +258,10 @@ def several(
 ) -> tuple[list[Any], list[dict[str, Any]]]:
     """Return single policies of a folder's lanes that differ only in their seeds, and what chooses each lane.
 
-    That is its "guidance", "labels" and "seed"; a policy of the task alone has the seed 0.
+    That is its "guidance", "labels" and "seed"; a policy of the task alone has the seed 0. What is not given is the
+    run's last kind, the largest budget, the first seed and the largest bound.
 
-    Args:
-        source: the policies' origin.
-        world: the world they are to act in.
-        name: name of the policy.
-        kind: kind of guidance (None: the run's last).
-        labels: budget (None: the largest).
-        seeds: the lanes' seeds (empty: the first).
-        bound_deg: bound of a policy folder's lanes (None: the largest).
-        env: that world's environment, for a teacher (default: with its training episodes).
+    `env`: the world's environment, for a teacher (default: with its training episodes).
     """
     entry = POLICIES[name]
     if entry.taught and env is None:

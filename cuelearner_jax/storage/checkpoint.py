@@ -78,11 +78,8 @@ class Checkpoints(AbstractContextManager):
     def __init__(self, folder: Path, read_only: bool = False, remedy: str = REMEDY, run: str = "") -> None:
         """Open a folder of checkpoints.
 
-        Args:
-            folder: the folder of the checkpoints.
-            read_only: change nothing on disk.
-            remedy: the remedy in the message about a checkpoint that cannot be read.
-            run: the key of the run that the checkpoints belong to (`grid.run_key`); empty: of none.
+        `read_only`: change nothing on disk. `remedy`: of a checkpoint that cannot be read. `run`: the key of the run
+        that the checkpoints belong to (`grid.run_key`); empty: of none.
         """
         self._remedy, self._run, self._folder = remedy, run, folder.resolve()
         for name in ("absl", "asyncio"):  # what Orbax's threads log is raised anyway

@@ -103,16 +103,10 @@ class LabelWriter(tables.TableWriter):
         session: dict[str, Any] | None = None,
         **more: Any,
     ) -> None:
-        """Open the file, creating it and the folder where needed.
+        """Open the file, creating it and the folder where needed; labels of another kind there are refused unchanged.
 
-        Args:
-            folder: the file's folder.
-            task, answers, space, eps, session: see `LabelFile`.
-            meaning: meaning of an answer's numbers, written into the file.
-            more: further entries of a new file's head, such as the versions that wrote it.
-
-        Raises:
-            UserError: the folder holds labels of another kind, or unreadable ones; nothing has been changed.
+        `task`, `answers`, `space`, `eps`, `session`: see `LabelFile`. `meaning`: of an answer's numbers, for the file.
+        `more`: further entries of a new file's head, such as the versions that wrote it.
         """
         about = _about(task, answers, space, eps, meaning, session)
         if (there := found_in(folder)) and (before := _table_and_head(there)[1]):

@@ -91,10 +91,8 @@ class TableWriter(contextlib.AbstractContextManager):
     ) -> None:
         """Open the table in `folder`, creating both where needed.
 
-        Args:
-            folder, schema: the table's folder and kind.
-            constants: columns with one value for all rows to come; None: no such columns.
-            about: the description written at the head of a new table; an existing table keeps its own.
+        `constants`: columns with one value for all rows to come. `about`: the description written at the head of a new
+        table; an existing table keeps its own.
         """
         self.path, self._schema = Path(folder) / schema.jsonl, schema
         self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -39,10 +39,7 @@ def hold(lock: Path, what: Path) -> Iterator[None]:
 def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[Any]]:
     """Open a file that replaces `path` atomically once complete and on disk; text is UTF-8.
 
-    Args:
-        path: the file.
-        mode: "w" or "wb".
-        fresh: make folders as needed, and raise UserError if the file exists.
+    `mode`: "w" or "wb". `fresh`: make folders as needed, and raise UserError if the file exists.
     """
     if fresh and os.path.lexists(path):
         raise UserError(f"{path} exists: give another --out")
@@ -77,11 +74,8 @@ class Place(NamedTuple):
 def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = False) -> Iterator[Place]:
     """Claim the place of a folder for this process while its new contents are prepared (`Place.writing`).
 
-    Args:
-        folder: the target; links are followed.
-        check: raises UserError for an existing folder that may not be replaced; called now, and again before the
-            replacement.
-        overwrite: whether an existing folder may be replaced at all.
+    `folder`: links are followed. `check`: raises UserError for an existing folder that may not be replaced; called now,
+    and again before the replacement. `overwrite`: whether an existing folder may be replaced at all.
     """
     check(folder)
     target = folder.resolve()

@@ -101,12 +101,9 @@ def run(
     request: EvaluateRequest[Any],
     watch: Callable[[str], Tell] = lambda kind: ignore_progress,
 ) -> list[Measured]:
-    """Return metrics of a policy on validation episodes of a world, for each guidance and budget.
+    """Return metrics of a policy on validation episodes of the request's world, for each guidance and budget.
 
-    Args:
-        source: the policy's origin.
-        request: the request, whose `task` is the world (a configuration).
-        watch: given a kind of guidance, returns the function that reports the progress of its lanes.
+    `watch`: given a kind of guidance, returns the function that reports the progress of its lanes.
     """
     release_programs()
     task, world, name = source.task, request.task, request.policy
@@ -167,14 +164,10 @@ class Agreement(NamedTuple):
 
 
 def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = None) -> Agreement:
-    """Return the share of answers that a policy agrees with. Labels that say nothing of any cue do not count.
+    """Return the share of relative answers that a policy agrees with, called with observations only.
 
-    Args:
-        policy: the acting policy, see `types.Policy`, called with observations only.
-        rows: relative labels (labels, ...) as arrays.
-        space: the actions' space.
-        eps: strength of an answer, in the space's unit.
-        base: the policy before its correction; None: unknown.
+    Labels that say nothing of any cue do not count. `eps`: strength of an answer, in the space's unit. `base`: the
+    policy before its correction; None: unknown.
     """
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(says_something(rows.answer))], rows)
     if not len(rows.obs):

@@ -95,13 +95,7 @@ def run(order: Order) -> None:
 def in_memory(
     request: TrainRequest, env: Environment, examined: Environment, teacher: Teacher | None, progress: bool = True
 ) -> tuple[pa.Table, dict[str, Training]]:
-    """Train every lane of the grid; write nothing.
-
-    Args:
-        request: what to train.
-        env, examined: environments of the request's world, for learning and for evaluations.
-        teacher: who answers; None where no kind asks.
-        progress: show progress bars on standard error.
+    """Train every lane of the grid; write nothing. `env`, `examined`: environments for learning and for evaluations.
 
     Returns:
         A row per lane and evaluation (guidance, labels, seed, step, wall_s, failed and metrics); and the trainings by

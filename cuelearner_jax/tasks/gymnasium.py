@@ -184,11 +184,7 @@ def task_from(
 ) -> Task:
     """Return an environment as a task. One instance is made and plays an episode, to find out its layout.
 
-    Args:
-        source: an id of Gymnasium's registry, or a class or function that returns an environment.
-        arguments: arguments of the environment, by name.
-        called: name of code in messages and files (default: its module:NAME).
-        num_envs, max_steps, processes, cues, observation, units: see `cl.from_gymnasium`.
+    `called`: name of code in messages and files (default: its module:NAME). For the others see `cl.from_gymnasium`.
     """
     check_installed()
     if max_steps is not None:

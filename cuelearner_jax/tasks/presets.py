@@ -21,12 +21,9 @@ GROUPS = [field.name for field in dataclasses.fields(RunConfig)]
 
 
 def read(name: str, config: Any, space: Space = DIRECTIONS) -> dict[str, Any]:
-    """Return `presets` and `scenarios` of a task: fields of `task.Task`.
+    """Return `presets` and `scenarios` of a task from the file of a name: fields of `task.Task`.
 
-    Args:
-        name: of the file.
-        config: the task's default configuration.
-        space: of the actions, in whose unit scalars are.
+    `config`: the task's default configuration. `space`: of the actions, in whose unit scalars are.
     """
     tables = tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
     presets, scenarios = {}, {}
