@@ -11,25 +11,27 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
-from cuelearner_jax.adaptation.person import Person, preferences
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
-from cuelearner_jax.policies import PolicyNode
+from cuelearner_jax.policies import Policy, PolicyNode
 from cuelearner_jax.spaces import is_answered
+from cuelearner_jax.task import Pictures
 
 HELD_OUT = 5  # every fifth label is held out
 LABELS = "labels"  # `Judging.by` where held-out labels judge in place of a metric
@@ -40,6 +42,16 @@ AT_ONCE = 10  # episodes between two looks
 STAKES = np.array([0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # lambda of the sequential test
 DECIDED = 20.0  # value of the test martingale that decides
 SHARES = ("success", "finished")  # metrics within [0, 1]
+
+# films of the same start -> -1: the left one is better, 0: neither, 1: the right one
+Prefer = Callable[[Path, Path], int]
+
+
+class Person(NamedTuple):
+    """Who compares films, and how these are drawn."""
+
+    prefer: Prefer
+    pictures: Pictures
 
 
 @dataclass(frozen=True)
@@ -260,3 +272,48 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
 def bounds_of(of: Adaptation, block: Any) -> np.ndarray:
     """Return the bounds (lanes,) of a block of lanes, in the space's unit."""
     return actions_of(of.env).to_unit(np.asarray(block.bound), np)
+
+
+def preferences(
+    person: Person, env: Environment, policies: tuple[Policy, Policy], key: PRNGKeyArray, steps: int
+) -> Generator[int, None, None]:
+    """Yield, for one start after another, 1 where the second policy is preferred, -1 where the first is, else 0.
+
+    Films change sides by chance. `steps`: of an episode, at most. Raises UserError for another answer.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        number = 0
+        while True:
+            start = jax.random.fold_in(key, number)
+            films = [Path(folder, f"{number}{name}.gif") for name in "ab"]
+            for policy, file in zip(policies, films, strict=True):
+                frames, _ = person.pictures.record(env, policy, start, int(_length(env, policy, start, steps)))
+                person.pictures.animate(env, frames, file)
+            swapped = bool(jax.random.bernoulli(jax.random.fold_in(start, 1)))
+            answer = person.prefer(*(films[::-1] if swapped else films))
+            if answer not in (-1, 0, 1):
+                raise UserError(f"judge_by gave {format_value(answer)}: give -1 (left), 0 (no difference) or 1 (right)")
+            yield -answer if swapped else answer
+            for file in films:
+                file.unlink()
+            number += 1
+
+
+@jax.jit
+def _length(env: Environment, policy: Policy, key: PRNGKeyArray, steps: Int[Array, ""] | int) -> Int[Array, ""]:
+    """Return the steps of an episode that begins by a key, with the random numbers of `Pictures.record`."""
+    k_reset, k_play = jax.random.split(key)
+
+    def unfinished(carry: tuple[Any, ...]) -> Array:
+        number, *_, ended = carry
+        return (number < steps) & ~ended
+
+    def advance(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        number, state, obs, _ = carry
+        k_act, k_step = jax.random.split(jax.random.fold_in(k_play, number))
+        action = policy.act(k_act, jax.tree.map(lambda leaf: leaf[None], state), obs[None])[0]
+        following, step = env.step(k_step, state, action)
+        return number + 1, following, step.obs, step.terminated | step.truncated
+
+    first = (jnp.zeros((), jnp.int32), *env.reset(k_reset), jnp.array(False))
+    return jax.lax.while_loop(unfinished, advance, first)[0]

@@ -20,9 +20,8 @@ import numpy as np
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.adaptation.judging import LABELS, PERSON
+from cuelearner_jax.adaptation.judging import LABELS, PERSON, Prefer
 from cuelearner_jax.adaptation.lanes import blame
-from cuelearner_jax.adaptation.person import Prefer
 from cuelearner_jax.api.labels import Labels, labels_from_file, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, config_of, load_policy
 from cuelearner_jax.api.worlds import World, numbers, teacher_of_world

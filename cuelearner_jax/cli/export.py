@@ -12,8 +12,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions, lerobot
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.runs import trained
-from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.studies.lanes import LaneChoice
+from cuelearner_jax.runs.trained import LaneChoice, PolicySource
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +37,7 @@ def run(arguments: list[str]) -> None:
     if any(word.partition("=")[0] == "--check" for word in arguments):
         options = parse(Export, arguments, "export", Export())
         folder = options.check
-        difference = contract.replay_golden_cases(folder)
+        difference = contract.open_decision(folder)[1]
         out.print(f"{folder} is unchanged since its export; golden cases replayed, largest difference {difference:.1e}")
         return
     more = f"\n\nformats (--format):\n{rows({**contract.FORMATS, lerobot.NAME: lerobot.ABOUT})}"

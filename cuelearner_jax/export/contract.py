@@ -101,7 +101,7 @@ def write(
             for name, contents in {**files, runner.CONTRACT: sealed.encode()}.items():
                 with replacing(folder / name, "wb") as stream:
                     stream.write(contents)
-            return {**contract, "difference": replay_golden_cases(folder)}
+            return {**contract, "difference": open_decision(folder)[1]}
 
 
 def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
@@ -144,9 +144,10 @@ def _artefact(
     return "decision.npz", stored.getvalue(), {"needs": "numpy"}
 
 
-def replay_golden_cases(folder: Path) -> float:
-    """Replay a folder's golden cases; return the largest difference."""
+def open_decision(folder: Path) -> tuple[runner.Decision, float]:
+    """Return a folder's decision, and the largest difference of its golden cases, which were replayed."""
     try:
-        return runner.Decision(folder).check()
+        decide = runner.Decision(folder)
+        return decide, decide.check()
     except runner.ContractError as error:
         raise UserError(str(error)) from error

@@ -199,11 +199,6 @@ def _expm1(w: _Writer, x: str) -> str:
     return w.node("Mul", half, w.node("Add", w.node("Exp", x), w.number(1.0)))
 
 
-def _logistic(w: _Writer, x: str) -> str:
-    """Compute 1 / (1 + exp(-x)): the Sigmoid of onnxruntime is 0 from -18 on."""
-    return w.node("Reciprocal", w.node("Add", w.node("Exp", w.node("Neg", x)), w.number(1.0)))
-
-
 def _atan2(w: _Writer, y: str, x: str) -> str:
     """Compute atan2 from atan, which ONNX has; exact to a few units in the last place."""
     zero = w.number(0.0)
@@ -221,14 +216,6 @@ def _atan2(w: _Writer, y: str, x: str) -> str:
     return w.node("Where", steep, straight, turned)
 
 
-def _finite(w: _Writer, x: str) -> str:
-    return w.node("Not", w.node("Or", w.node("IsInf", x), w.node("IsNaN", x)))
-
-
-def _padded(w: _Writer, x: str, value: str, low: list[int], high: list[int]) -> str:
-    return w.node("Pad", x, w.whole([*low, *high]), value)
-
-
 def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[int]) -> str:
     return w.node("Slice", x, w.whole(start), w.whole(stop), w.whole(range(len(start))), w.whole(step))
 
@@ -242,8 +229,9 @@ NODES: dict[str, Callable[..., str]] = {
     "expm1": _expm1,
     "rsqrt": lambda w, x: w.node("Reciprocal", w.node("Sqrt", x)),
     "square": lambda w, x: w.node("Mul", x, x),
-    "logistic": _logistic,
-    "is_finite": _finite,
+    # the Sigmoid of onnxruntime is 0 from -18 on
+    "logistic": lambda w, x: w.node("Reciprocal", w.node("Add", w.node("Exp", w.node("Neg", x)), w.number(1.0))),
+    "is_finite": lambda w, x: w.node("Not", w.node("Or", w.node("IsInf", x), w.node("IsNaN", x))),
     "rem": _plain("Mod", fmod=1),
     "atan2": _atan2,
     "eq": _plain("Equal"),
@@ -259,7 +247,7 @@ NODES: dict[str, Callable[..., str]] = {
     "broadcast": lambda w, x, shape: w.node("Expand", x, w.whole(shape)),
     "concatenate": lambda w, *parts, axis: w.node("Concat", *parts, axis=axis),
     "slice": _sliced,
-    "pad": _padded,
+    "pad": lambda w, x, value, low, high: w.node("Pad", x, w.whole([*low, *high]), value),
     "take": lambda w, x, places: w.node("Gather", x, places, axis=0),
     "matmul": _plain("MatMul"),
     "sum": _sum,

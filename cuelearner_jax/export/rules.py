@@ -61,13 +61,10 @@ def kind_in(value: Operand) -> str:
 
 # --- numbers, entry by entry and along axes ---
 
+one("clamp")(lambda b, e, x, shape, kind: b.add("min", [b.add("max", x[1::-1], shape, kind), x[2]], shape, kind))
 one("copy", "copy_p", "stop_gradient")(lambda b, equation, inputs, shape, kind: inputs[0])
+one(*SAME)(lambda b, equation, inputs, shape, kind: b.add(equation.primitive.name, inputs, shape, kind))
 one("select_n")(lambda b, equation, inputs, shape, kind: select_case(b, inputs[0], inputs[1:], shape, kind))
-
-
-@one(*SAME)
-def _same(builder: Builder, equation: Any, inputs: list[Operand], shape: Shape, kind: str) -> Operand:
-    return builder.add(equation.primitive.name, inputs, shape, kind)
 
 
 @one("and", "or", "xor", "not")
@@ -168,11 +165,6 @@ def select_case(builder: Builder, which: Operand, cases: list[Operand], shape: S
         here = builder.add("le", [which, np.asarray(number, np.int32)], tuple(which.shape), "bool")
         result = select(builder, here, case, result, shape, kind)
     return result
-
-
-@one("clamp")
-def _clamp(builder: Builder, equation: Any, inputs: list[Operand], shape: Shape, kind: str) -> Operand:
-    return builder.add("min", [builder.add("max", inputs[1::-1], shape, kind), inputs[2]], shape, kind)
 
 
 @one("round")
@@ -396,7 +388,5 @@ def _cond(builder: Builder, equation: Any, inputs: list[Operand]) -> list[Operan
         branch = branches[int(np.clip(int(which), 0, len(branches) - 1))]
         return builder.inlined(branch.jaxpr, branch.consts, operands)
     results = [builder.inlined(branch.jaxpr, branch.consts, operands) for branch in branches]
-    return [
-        select_case(builder, which, list(each), *output(equation, n))
-        for n, each in enumerate(zip(*results, strict=True))
-    ]
+    cases = enumerate(zip(*results, strict=True))
+    return [select_case(builder, which, list(each), *output(equation, number)) for number, each in cases]

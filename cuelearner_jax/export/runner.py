@@ -255,10 +255,6 @@ def _reduction(function: np.ufunc) -> Callable[..., Any]:
     return lambda axes: lambda x, axis=tuple(axes): function.reduce(x, axis, x.dtype)
 
 
-def _slices(start: list[int], stop: list[int], step: list[int]) -> Callable[..., Any]:
-    return operator.itemgetter(tuple(slice(*each) for each in zip(start, stop, step, strict=True)))
-
-
 def _quotient(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Divide; integers round toward zero."""
     return np.asarray(np.trunc(np.true_divide(x, y)), x.dtype) if x.dtype.kind in "iu" else np.divide(x, y)
@@ -287,7 +283,7 @@ SETTLED: dict[str, Callable[..., Callable[..., Any]]] = {
     "transpose": lambda axes: operator.methodcaller("transpose", tuple(axes)),
     "broadcast": lambda shape: lambda x: np.broadcast_to(x, shape),
     "concatenate": lambda axis: lambda *parts: np.concatenate(parts, axis),
-    "slice": _slices,
+    "slice": lambda start, stop, step: operator.itemgetter(tuple(map(slice, start, stop, step))),
     "pad": lambda low, high: lambda x, value: np.pad(x, list(zip(low, high, strict=True)), constant_values=value),
     **{"sum": _reduction(np.add), "largest": _reduction(np.maximum)},
     **{"smallest": _reduction(np.minimum), "all": _reduction(np.logical_and), "any": _reduction(np.logical_or)},

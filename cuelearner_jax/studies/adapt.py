@@ -19,9 +19,8 @@ import numpy as np
 from cuelearner_jax.adaptation import by_model, by_reading, changes, judging, serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.by_reading import ReadingAdaptation
-from cuelearner_jax.adaptation.judging import Judging
+from cuelearner_jax.adaptation.judging import Judging, Person, Prefer
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, product, side_by_side
-from cuelearner_jax.adaptation.person import Person, Prefer
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.devices import release_programs
@@ -38,10 +37,9 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import adapted, trained
 from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
 from cuelearner_jax.runs.order import read_labels
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.trained import BaseLanes, PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
-from cuelearner_jax.studies.lanes import BaseLanes
 from cuelearner_jax.task import Scenario, Task
 from cuelearner_jax.types import Label, Teacher
 
