@@ -22,20 +22,10 @@ import dataclasses
 import hashlib
 import json
 import math
+import typing
 from dataclasses import dataclass
 from types import UnionType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    TypeVar,
-    Union,
-    dataclass_transform,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -77,7 +67,7 @@ SHARE = Bounds(0, 1)
 Layers = Annotated[tuple[int, ...], POSITIVE]  # hidden widths of a network
 
 
-@dataclass_transform(frozen_default=True)
+@typing.dataclass_transform(frozen_default=True)
 def part(kind: type[PartT]) -> type[PartT]:
     """Make a class a frozen dataclass of options, and a pytree of its floats."""
     options_class = dataclasses.dataclass(frozen=True)(kind)

@@ -19,17 +19,7 @@ import tyro
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import changes
-from cuelearner_jax.cli.options import (
-    ChangedWorld,
-    Flag,
-    Word,
-    about,
-    as_options,
-    check_numbers,
-    look_ahead_of,
-    out,
-    parse,
-)
+from cuelearner_jax.cli.options import Flag, NewWorld, Word, about, as_options, check_numbers, look_ahead_of, out, parse
 from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, source_in, with_cues
 from cuelearner_jax.cli.train import asking_kind
 from cuelearner_jax.config import GuideScalars, GuideSizes
@@ -59,7 +49,7 @@ UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(ChangedWorld):
+class LabelOptions(NewWorld):
     """Label actions in a browser: uniform ones, a policy's, or recorded ones.
 
     Name a policy after the task: a run folder, a policy folder, or package.module:NAME of a function of observations.

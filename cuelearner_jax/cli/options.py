@@ -87,7 +87,7 @@ class RunParts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChangedWorld(Outside):
+class NewWorld(Outside):
     """The world that a finished policy meets."""
 
     task: Any = field(default_factory=Unnamed)
@@ -102,7 +102,7 @@ class ChangedWorld(Outside):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finished(ChangedWorld, RunParts):
+class Finished(NewWorld, RunParts):
     """A finished policy's code, which is never loaded because a file names it, and its world."""
 
     code: Annotated[str | None, tyro.conf.arg(name="base")] = None

@@ -223,12 +223,7 @@ class Clic(Guide):
         return fit_model(key, rows, scalars, init=self.network.init, losses=losses, sizes=sizes, augment=augment)
 
     def minimise_energy(
-        self,
-        env: Any,
-        params: Params,
-        obs: Float[Array, " obs"],
-        base: Float[Array, " action"],
-        scalars: GuideScalars,
+        self, env: Any, params: Params, obs: Float[Array, " obs"], base: Float[Array, " action"], scalars: GuideScalars
     ) -> Float[Array, " action"]:
         """Return the action of least energy within tau_max of `base`, by a deterministic search."""
         space, cues = self.spaces.actions, len(self.spaces.actions.cues)

@@ -118,11 +118,7 @@ class Runner:
         self.failed = self.training.failed
 
     def _label(
-        self,
-        store: Checkpoints,
-        guides: TableWriter,
-        teacher: Teacher | None,
-        labels: label_files.LabelFile | None,
+        self, store: Checkpoints, guides: TableWriter, teacher: Teacher | None, labels: label_files.LabelFile | None
     ) -> None:
         """Take the labels of a file, or ask the teacher for missing ones; write the label file.
 

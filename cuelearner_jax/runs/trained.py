@@ -13,17 +13,7 @@ from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.environment import actions_of, check_layout, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import (
-    Agent,
-    Corrected,
-    Guided,
-    Heuristic,
-    Policy,
-    Taught,
-    asked_from,
-    policy_of,
-    uniform_in,
-)
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Taught, asked_from, policy_of, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
@@ -32,7 +22,7 @@ from cuelearner_jax.runs.run_folders import Piece, RunLanes, lanes_of, open_run
 from cuelearner_jax.storage import label_files, policy_folders
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
-from cuelearner_jax.types import Teacher
+from cuelearner_jax.types import Policy, Teacher
 
 
 class PolicyEntry(NamedTuple):

@@ -97,9 +97,7 @@ def amount(task: Task, request: EvaluateRequest[Any]) -> tuple[int, int]:
 
 
 def run(
-    source: PolicySource,
-    request: EvaluateRequest[Any],
-    watch: Callable[[str], Tell] = lambda kind: ignore_progress,
+    source: PolicySource, request: EvaluateRequest[Any], watch: Callable[[str], Tell] = lambda kind: ignore_progress
 ) -> list[Measured]:
     """Return metrics of a policy on validation episodes of the request's world, for each guidance and budget.
 
