@@ -319,10 +319,3 @@ def with_guide(lane: LaneT, guide: GuideState) -> LaneT:
     failed = lane.failed | ~all_finite((guide.model, guide.labels))
     guide = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, lane.guide)
     return lane.replace(guide=guide, failed=failed)
-
-
-def take_labels(
-    guidance: Guide, env: Environment, scalars: GuideScalars, labels: Label, guide: GuideState, lane_key: Any
-) -> GuideState:
-    """Return the guide with given labels (slots, ...) and a model fitted to them once."""
-    return fit(guidance, env, scalars, guide.replace(labels=labels, asked=guide.budget), lane_key)

@@ -138,7 +138,8 @@ class Lane(NamedTuple):
 
     def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
         """Return the lane with given labels in place of questions, and a model fitted to them."""
-        return asking.with_guide(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
+        guide = state.guide.replace(labels=labels, asked=state.guide.budget)
+        return asking.with_guide(state, asking.fit(self.guidance, env, scalars, guide, state.key))
 
     def keep_finite(self, state: TrainState, before: TrainState) -> TrainState:
         """Return a lane after a stretch; a lane that has failed keeps the parameters of `before`.

@@ -163,7 +163,8 @@ class Memory(NamedTuple):
             k_labelled, k_choice = jax.random.split(jax.random.fold_in(k_sample, 1))
             labelled = self.labelled._draw(k_labelled, size, n_step, discount, None)
             places = self._labelled_places(k_choice, size, guided_share)
-            batches = [_replaced(places, *both) for both in zip(labelled, batches, strict=True)]
+            pick = lambda one, other: jnp.where(places.reshape(-1, *[1] * (one.ndim - 1)), one, other)  # noqa: E731
+            batches = [jax.tree.map(pick, *both) for both in zip(labelled, batches, strict=True)]
         return [apply_symmetries(k_mirror, self.env, batch) for batch in batches]
 
     def _draw(self, key: PRNGKeyArray, size: int, n_step: int, discount: Any, guided_share: Any) -> list[Transition]:
@@ -205,12 +206,6 @@ class Memory(NamedTuple):
         end = self.buffer.read(self.rows, jnp.mod(numbers + last * self.num_envs, self.rows.shape[0]))
         next_obs = jax.vmap(self.env.recall_next)(end.obs, end.action, end.aftermath)
         return Transition(jax.vmap(self.env.recall)(first.obs), first.action, reward, factor, next_obs)
-
-
-def _replaced(places: Bool[Array, " n"], new: Transition, old: Transition) -> Transition:
-    """Return transitions (n, ...) with new ones in the chosen places."""
-    pick = lambda one, other: jnp.where(places.reshape(-1, *[1] * (one.ndim - 1)), one, other)  # noqa: E731
-    return jax.tree.map(pick, new, old)
 
 
 def count_guided(

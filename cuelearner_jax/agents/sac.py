@@ -252,8 +252,9 @@ class SoftActorCritic:
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the means of temperature * log p(a) - Q(s, a) and of log p(a) over the actor's draws."""
         draws = self.draw(actor, obs, key)
-        loss = temperature * draws.log_density - self._climbed(critics, obs, draws.unit)
-        return loss.mean(), draws.log_density.mean()
+        values = self.values(critics, obs, draws.unit)
+        value = values.mean(0) if self.options.critics > self.options.target_critics else values.min(0)
+        return (temperature * draws.log_density - value).mean(), draws.log_density.mean()
 
     def targets(
         self,
@@ -283,13 +284,6 @@ class SoftActorCritic:
             return target_critics
         subset = jax.random.permutation(key, own.critics)[: own.target_critics]
         return jax.tree.map(lambda leaf: leaf[subset], target_critics)
-
-    def _climbed(
-        self, critics: Params, obs: Float[Array, "n obs"], unit: Float[Array, "n action"]
-    ) -> Float[Array, " n"]:
-        """Return the value that the actor maximises."""
-        values = self.values(critics, obs, unit)
-        return values.mean(0) if self.options.critics > self.options.target_critics else values.min(0)
 
     def _gaussian(self, actor: Params, obs: Float[Array, "n obs"]) -> tuple[Array, Array]:
         mean, log_std = self._actor.apply(actor, obs)

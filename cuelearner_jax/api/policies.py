@@ -147,7 +147,8 @@ def load_policy(
     config = world.config if world else source.config.task
     source.check(name, config)
     shape = shape_of(own_task, config)
-    lane = trained.one_policy(source, config, name, guidance, labels, seed, bound_deg)
+    seeds = () if seed is None else (seed,)
+    (lane,), _ = trained.several(source, config, name, guidance, labels, seeds, bound_deg)
     where, taught = world or World(own_task, config), trained.POLICIES[name].taught
     return CallablePolicy(lane, shape.observation, taught, source.config, actions_of(shape), where)
 

@@ -93,7 +93,8 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
         raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
     assert path is not None
     kind = next(iter(options.guidance), None)
-    result = agreement(trained.one_policy(source, options.task, name, kind, None, None), path)
+    (policy,), _ = trained.several(source, options.task, name, kind)
+    result = agreement(policy, path)
     subject = options.subject if name == "own" else f"{source.folder}, {name}"
     title = f"{subject}: agreement with {result.labels} labels of {path}"
     table = Table("", "share of answers", "95% interval", title=title)

@@ -221,28 +221,13 @@ def check_no_lane(policy: str, *choices: Any) -> None:
         raise UserError(f"policy {policy!r} belongs to no lane of a run: leave out the options that choose a lane")
 
 
-def one_policy(
-    source: PolicySource,
-    world: Any,
-    name: str,
-    kind: str | None,
-    labels: int | None,
-    seed: int | None,
-    bound_deg: float | None = None,
-    env: Any = None,
-) -> Any:
-    """Return a single policy: of one lane of a folder, or of the task. Raises UserError without such a lane."""
-    seeds = () if seed is None else (seed,)
-    return several(source, world, name, kind, labels, seeds, bound_deg, env)[0][0]
-
-
 def several(
     source: PolicySource,
     world: Any,
     name: str,
     kind: str | None,
-    labels: int | None,
-    seeds: tuple[int, ...],
+    labels: int | None = None,
+    seeds: tuple[int, ...] = (),
     bound_deg: float | None = None,
     env: Any = None,
 ) -> tuple[list[Any], list[dict[str, Any]]]:
