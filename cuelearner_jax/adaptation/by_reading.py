@@ -101,8 +101,8 @@ def adapt(
         tell(total_before, total)
     block = ReadingLanes(
         base=jnp.asarray(lanes.base),
-        correction=_stacked([one.policy.correction for one in results]),
-        labels=_padded(rows) if labels is None else labels,
+        correction=_side_by_side([one.policy.correction for one in results]),
+        labels=_side_by_side(rows) if labels is None else labels,
         bound=jnp.asarray(space.from_unit(lanes.bound_deg)),
         corrects=jnp.asarray(np.array([one.changed for one in results])),
         evidence=np.array([one.evidence for one in results]),
@@ -135,22 +135,13 @@ def _ask(
     return Label(obs, action, np.where(valid[:, None], answer, 0), valid)  # pyright: ignore[reportArgumentType]
 
 
-def _stacked(corrections: list[Correction]) -> Correction:
-    """Return corrections side by side; those of fewer labels get situations without weight."""
-    most = max(len(one.known) for one in corrections)
+def _side_by_side(trees: list[Any]) -> Any:
+    """Return trees side by side; rows that one has fewer of are zero: without weight, or not valid."""
 
-    def filled(rows: Array) -> Array:
-        return jnp.concatenate([rows, jnp.zeros((most - len(rows), rows.shape[1]))])
+    def stack(*leaves: Any) -> Array:
+        if not np.ndim(leaves[0]):
+            return jnp.stack(leaves)
+        most, rest = max(map(len, leaves)), [(0, 0)] * (np.ndim(leaves[0]) - 1)
+        return jnp.stack([jnp.pad(jnp.asarray(leaf), [(0, most - len(leaf)), *rest]) for leaf in leaves])
 
-    each = [one.replace(known=filled(one.known), alpha=filled(one.alpha)) for one in corrections]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-
-
-def _padded(sets: list[Label]) -> Label:
-    """Return the labels of all lanes, padded to the same number of rows."""
-    most = max(len(rows.obs) for rows in sets)
-
-    def padded(leaf: Any) -> np.ndarray:
-        return np.pad(np.asarray(leaf), [(0, most - len(leaf)), *[(0, 0)] * (np.ndim(leaf) - 1)])
-
-    return jax.tree.map(lambda *leaves: np.stack([padded(leaf) for leaf in leaves]), *sets)
+    return jax.tree.map(stack, *trees)

@@ -23,6 +23,7 @@ from cuelearner_jax.runs.grid import world_of
 from cuelearner_jax.storage import formats, label_files, policy_folders
 from cuelearner_jax.storage.checkpoint import Checkpoints, digest
 from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.storage.table import plain
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.types import Label
@@ -131,10 +132,10 @@ def write(
         "judged": {
             "by": judgement.by,
             "split": SPLIT,
-            "before": _plain(judgement.before),
-            "after": _plain(judgement.after),
+            "before": plain(judgement.before.tolist()),
+            "after": plain(judgement.after.tolist()),
             "within_deg": [float(f"{bound:g}") for bound in judgement.within_deg],
-            "difference": [_plain(ends) for ends in judgement.difference],
+            "difference": plain(judgement.difference.tolist()),
             "rewarded_steps": judgement.rewarded_steps.tolist(),
         },
         **({"reading": [one.to_json() for one in result.results]} if result.results else {}),
@@ -148,10 +149,6 @@ def write(
             store.save(0, {"policy": arrays})
         formats.write("policy", folder / policy_folders.POLICY, {**contents, "arrays": digest(arrays)})
         _write_labels(folder, result, task, world)
-
-
-def _plain(values: np.ndarray) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _write_labels(folder: Path, result: AdaptationResult, task: Task, world: Any) -> None:

@@ -117,7 +117,7 @@ class TableWriter(contextlib.AbstractContextManager):
         many = {name for name, array in arrays.items() if array.ndim > self._schema.is_list(name)}
         (count,) = {len(arrays[name]) for name in many} or {1}
         # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
-        values = {name: _plain(array.tolist()) for name, array in arrays.items()}
+        values = {name: plain(array.tolist()) for name, array in arrays.items()}
         self._put(
             {name: value[row] if name in many else value for name, value in values.items()} for row in range(count)
         )
@@ -222,10 +222,10 @@ def _metadata(about: Row | None) -> dict[bytes, bytes]:
     return {} if about is None else {META: json.dumps(about).encode()}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
     if isinstance(value, list):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     value = float(value) if isinstance(value, bool) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
