@@ -31,7 +31,7 @@ from cuelearner_jax.policies import Agent, Corrected
 from cuelearner_jax.reading import declared_distortions
 from cuelearner_jax.report.statistics import interval
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.trained import PolicySource, several
+from cuelearner_jax.runs.policy_sources import PolicySource, several
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import Task

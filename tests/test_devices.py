@@ -26,7 +26,7 @@ from cuelearner_jax.devices import (
 )
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.grid import load
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.policy_sources import PolicySource
 from cuelearner_jax.storage import results
 
 SCRIPT = Path(many_devices.__file__)

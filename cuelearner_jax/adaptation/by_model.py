@@ -143,10 +143,8 @@ def result_of(judge: Judge, block: Any, count: int, results: tuple[Result, ...] 
 def check_bounds(space: Space, bounds: Sequence[float]) -> None:
     """Raise UserError for a bound that no action can reach, or that is given twice."""
     if not all(0 < bound <= space.reach for bound in bounds) or len(set(bounds)) < len(bounds):  # NaN is neither
-        bounds_text = " ".join(f"{bound:g}" for bound in bounds)
-        raise UserError(
-            f"bound_deg is {bounds_text}: give numbers above 0, up to {space.reach:g} ({space.unit}), each once"
-        )
+        text = " ".join(f"{bound:g}" for bound in bounds)
+        raise UserError(f"bound_deg is {text}: give numbers above 0, up to {space.reach:g} ({space.unit}), each once")
 
 
 def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> None:

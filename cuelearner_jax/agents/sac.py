@@ -91,9 +91,7 @@ class SACConfig:
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
         """Raise UserError for options that do not work together."""
         if self.target_critics > self.critics:
-            raise UserError(
-                f"agent.target_critics is {self.target_critics}: give at most agent.critics ({self.critics})"
-            )
+            raise UserError(f"agent.target_critics is {self.target_critics}: give up to agent.critics ({self.critics})")
 
 
 class Actor(nn.Module):

@@ -20,7 +20,7 @@ from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import FILES, Policy, call_policy, policy_name, policy_of
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs import trained
+from cuelearner_jax.runs import policy_sources
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
@@ -142,14 +142,14 @@ def load_policy(
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
     own = registry.resolve(task) if isinstance(task, str) else task
     find = lambda name: own if own and own.name == name else registry.find(name)  # noqa: E731
-    source = trained.PolicySource.of_folder(path, find, None if base is None else as_policy(base), changes)
+    source = policy_sources.PolicySource.of_folder(path, find, None if base is None else as_policy(base), changes)
     own_task, name = source.task, policy or source.default_policy
     config = world.config if world else source.config.task
     source.check(name, config)
     shape = shape_of(own_task, config)
     seeds = () if seed is None else (seed,)
-    (lane,), _ = trained.several(source, config, name, guidance, labels, seeds, bound_deg)
-    where, taught = world or World(own_task, config), trained.POLICIES[name].taught
+    (lane,), _ = policy_sources.several(source, config, name, guidance, labels, seeds, bound_deg)
+    where, taught = world or World(own_task, config), policy_sources.POLICIES[name].taught
     return CallablePolicy(lane, shape.observation, taught, source.config, actions_of(shape), where)
 
 
@@ -177,7 +177,7 @@ def measure(
         `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
     """
     code, name = as_policy_in(policy, world.env), Path(world.task.name)
-    source = trained.PolicySource(world.task, config_of(policy, world), None, name, code=code)
+    source = policy_sources.PolicySource(world.task, config_of(policy, world), None, name, code=code)
     request = EvaluateRequest(task=world.config, policy="own", episodes=episodes, steps=steps, envs=envs, engine=engine)
     (measured,) = evaluate.run(source, request)
     return measured

@@ -156,9 +156,7 @@ def action_in(value: Any, space: Space) -> Any:
     action = numbers("action", value)
     if action.shape != (space.size,) or not space.usable(action, np):
         example = np.asarray(space.spread(4))[0].round(2).tolist()
-        raise UserError(
-            f"action is {format_value(value)}: give an action of shape ({space.size},), for instance {example}"
-        )
+        raise UserError(f"action is {format_value(value)}: give an action of shape ({space.size},), as {example}")
     return action
 
 

@@ -15,7 +15,7 @@ from cuelearner_jax.cli.options import Finished, Flag, Kinds, about, look_ahead_
 from cuelearner_jax.cli.sources import source_of
 from cuelearner_jax.errors import NotFinite
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs.trained import BaseLanes
+from cuelearner_jax.runs.policy_sources import BaseLanes
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies.adapt import AdaptRequest, subject_of
 from cuelearner_jax.task import Task

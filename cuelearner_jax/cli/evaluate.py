@@ -15,8 +15,8 @@ from cuelearner_jax.cli.sources import source_and_options, source_in
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.measurements import Difference
-from cuelearner_jax.runs import trained
-from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.runs import policy_sources
+from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
@@ -93,7 +93,7 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
         raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
     assert path is not None
     kind = next(iter(options.guidance), None)
-    (policy,), _ = trained.several(source, options.task, name, kind)
+    (policy,), _ = policy_sources.several(source, options.task, name, kind)
     result = agreement(policy, path)
     subject = options.subject if name == "own" else f"{source.folder}, {name}"
     title = f"{subject}: agreement with {result.labels} labels of {path}"
@@ -117,9 +117,7 @@ def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
         other, policy = source, name
     else:
         names = ", ".join(POLICIES)
-        raise UserError(
-            f"--compare is {name!r}: give a run folder, a policy folder, a shipped agent, or one of {names}"
-        )
+        raise UserError(f"--compare is {name!r}: give a run folder, a policy folder, a shipped agent or one of {names}")
     if policy == options.policy and other.folder.absolute() == source.folder.absolute():
         raise UserError(f"--compare is {name!r}, the policy that is evaluated: give another one")
     other.check(policy, options.task)

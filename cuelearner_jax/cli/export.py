@@ -11,8 +11,8 @@ from cuelearner_jax.config import digest, to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions, lerobot
 from cuelearner_jax.policies import uniform_in
-from cuelearner_jax.runs import trained
-from cuelearner_jax.runs.trained import LaneChoice, PolicySource
+from cuelearner_jax.runs import policy_sources
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ def run(arguments: list[str]) -> None:
     if options.format == lerobot.NAME:
         return _into_checkpoint(source, options)
     name = options.name_in(source, options.task)
-    if trained.POLICIES[name].taught:
+    if policy_sources.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who needs the true state: choose another policy")
     contract.check_request(options.format, options.out)
     env = source.task.environment(options.task)
@@ -56,7 +56,7 @@ def run(arguments: list[str]) -> None:
     if options.only_correction:
         policy, view = correction.correction_of(policy, env)
         draw = lambda: correction.cases(env)  # noqa: E731
-    if trained.POLICIES[name].from_run:
+    if policy_sources.POLICIES[name].from_run:
         words = ", ".join(f"{option} {value}" for option, value in lane.items())
         out.print(f"the run's lane of {words}; choose by --guidance, --labels and --seed")
     origin = {
@@ -78,9 +78,7 @@ def run(arguments: list[str]) -> None:
 def _into_checkpoint(source: PolicySource, options: Export) -> None:
     """Write a LeRobot checkpoint with a correction. Raises UserError for a policy or checkpoint that does not fit."""
     if source.adapted is None or options.policy in (None, source.default_policy):
-        raise UserError(
-            "--format lerobot is for a policy folder and a checkpoint: give both, the checkpoint by --policy"
-        )
+        raise UserError("--format lerobot is for a policy folder and a checkpoint: give both, the latter by --policy")
     env = source.task.environment(options.task)
     policy = replace(options, policy=None).policy_in(source, options.task, env)
     names = tuple(getattr(options.task, "cue_names", ()))

@@ -33,7 +33,7 @@ from cuelearner_jax.policies import NearAims, policy_of, uniform_in
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
-from cuelearner_jax.runs.trained import LaneChoice, PolicySource
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.adapt import AdaptRequest

@@ -22,7 +22,7 @@ from rich.table import Table
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs.trained import POLICIES
+from cuelearner_jax.runs.policy_sources import POLICIES
 from cuelearner_jax.task import PAPER, Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import PLAIN

@@ -16,7 +16,7 @@ from cuelearner_jax.environment import actions_of, check_layout
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.policies import FILES, policy_of, teaching
 from cuelearner_jax.run_config import PARTS
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.policy_sources import PolicySource
 from cuelearner_jax.spaces import cues_from
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import PAPER, Preset, Task, shape_of

@@ -115,9 +115,7 @@ class Opaque(PolicyNode):
             actions = as_array(result)
         except Exception as error:  # PyTorch's own kinds too
             why = " ".join(str(error).split())[:200]
-            raise UserError(
-                f"{name} returned {format_value(result)} ({why}): return an array of shape {wanted}"
-            ) from error
+            raise UserError(f"{name} returned {format_value(result)} ({why}): return an array {wanted}") from error
         is_whole = jnp.issubdtype(actions.dtype, jnp.integer)
         if not is_whole and not jnp.issubdtype(actions.dtype, jnp.floating):
             raise UserError(f"{name} returned {actions.dtype} numbers: return real ones, of shape {wanted}")
@@ -184,7 +182,7 @@ def policy_of(source: Any, space: Space | None = None) -> Any:
         if any(leaf is policy for leaf in jax.tree.leaves(policy)):
             kind = type(policy).__name__
             raise UserError(
-                f"a {kind} has `act` but is not a pytree: make it a flax.struct.PyTreeNode, or give a function"
+                f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function"
             )
     elif callable(source) and not isinstance(source, type):
         if len(more := _required(source) or ()) > 1:

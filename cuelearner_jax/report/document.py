@@ -67,9 +67,7 @@ def report(
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
     if in_use(out) and not overwrite:
-        raise UserError(
-            f"{out} exists already: choose another folder (--out), or allow it to be overwritten (--overwrite)"
-        )
+        raise UserError(f"{out} exists already: give another --out, or --overwrite to replace it")
     groups = read_groups(folders, metric, split, by_run)
     variants = variants_of(groups, metric)
     rows = tables.summary(variants, lower_is_better)

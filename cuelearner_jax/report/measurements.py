@@ -15,7 +15,7 @@ from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import group_means, mean_interval
 from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
-from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.studies.evaluate import Measured
@@ -73,9 +73,7 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
         alike = others if len(others) == 1 else [other for other in others if variant(other) == variant(row)]
         if len(alike) != 1:
             variants, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
-            raise UserError(
-                f"--compare has {len(others)} variants ({variants}), but not {wanted}: give a policy of one variant"
-            )
+            raise UserError(f"--compare has {len(others)} variants ({variants}), not {wanted}: give one variant")
         both = row, alike[0]
         shared = [name for name in row.metrics if name in both[1].metrics]
         finite = [name for name in shared if all(np.isfinite(one.metrics[name]).all() for one in both)]

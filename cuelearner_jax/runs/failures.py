@@ -68,6 +68,4 @@ def _format_seeds(seeds: Sequence[str]) -> str:
 def check(out: Path, folders: Iterable[Path]) -> None:
     """Raise NotFinite if the results in these folders of a run at `out` contain failed lanes."""
     if words := summary(results.read(list(folders))):
-        raise NotFinite(
-            f"{words}: their rows in {out} are marked and excluded from reports; everything else is finished"
-        )
+        raise NotFinite(f"{words}: their rows in {out} are marked and excluded from reports; all else is finished")

@@ -166,9 +166,7 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
     if not any(map(any, pairs)) or not all(
         is_sound or pair == UNASKED for is_sound, pair in zip(sound, pairs, strict=True)
     ):
-        raise UserError(
-            f'cues is {format_value(words)}: give two words for each entry of an action, as "left,right;up,down"'
-        )
+        raise UserError(f'cues is {format_value(words)}: give two words an entry of an action, as "left,right;up,down"')
     if names and len(names) != len(pairs):
         raise UserError(
             f"cues are {len(pairs)} pairs of words for {len(names)} entries of an action: give one an entry"

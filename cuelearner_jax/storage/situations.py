@@ -106,7 +106,7 @@ def _situations_of(
             raise UserError(f"{path} holds no {name}s: record some situations first")
         if len(wrong := np.flatnonzero(~np.isfinite(rows).all(-1))):
             raise UserError(
-                f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave these rows out"
+                f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave them out"
             )
     slices = (Quantity(OBSERVATION, own, "1", "as recorded"),)
     if len(names) == own <= MOST_SLICES:
@@ -161,9 +161,7 @@ def _columns(table: Path) -> dict[str, Any]:
         rows: pa.Table = csv.read_csv(table) if table.suffix == ".csv" else pq.ParquetFile(table).read()
     except (pa.ArrowException, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         why = " ".join(str(error).split())[:120]
-        raise UserError(
-            f"{table} cannot be read ({why}): write the table anew, without Python objects in it"
-        ) from error
+        raise UserError(f"{table} cannot be read ({why}): write it anew, without Python objects in it") from error
     columns: dict[str, Any] = {
         name.strip(): column.to_pylist() for name, column in zip(rows.column_names, rows.columns, strict=True)
     }

@@ -34,10 +34,10 @@ from cuelearner_jax.guides.base import Guide, ReadingGuide
 from cuelearner_jax.policies import Common, lanes_in, policy_of
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs import adapted, trained
+from cuelearner_jax.runs import adapted, policy_sources
 from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
 from cuelearner_jax.runs.order import read_labels
-from cuelearner_jax.runs.trained import BaseLanes, PolicySource
+from cuelearner_jax.runs.policy_sources import BaseLanes, PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Scenario, Task
@@ -79,11 +79,13 @@ def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str
         policy = policy_of(source.code, actions_of(env))
         return Subject(env, Common(policy), origin={"code": reference}, task=source.task)
     name = base.name_in(source, world)
-    if trained.POLICIES[name].taught:
+    if policy_sources.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
     if len(set(base.seeds)) < len(base.seeds):
         raise UserError("--base.seeds: give each seed once")
-    policies, lanes = trained.several(source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env)
+    policies, lanes = policy_sources.several(
+        source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env
+    )
     seeds = tuple(lane["seed"] for lane in lanes)
     choices = {option: value for option, value in dataclasses.asdict(base).items() if value not in (None, ())}
     origin = {"folder": source.folder.name, **choices, "policy": name, "seeds": list(seeds)}

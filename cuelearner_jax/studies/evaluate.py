@@ -23,7 +23,7 @@ from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, mean_interv
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
-from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource
+from cuelearner_jax.runs.policy_sources import POLICIES, Block, PolicySource
 from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Label

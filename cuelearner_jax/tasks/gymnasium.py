@@ -292,6 +292,6 @@ def _with_names(
     names_there = {quantity.name for quantity in own}
     if unknown := sorted(set(units) - names_there):
         raise UserError(
-            f"units names {unknown[0]!r}, and the slices are {', '.join(sorted(names_there))}: name one of them"
+            f"units names {unknown[0]!r}, the slices are {', '.join(sorted(names_there))}: name one of them"
         )
     return tuple(quantity._replace(unit=units.get(quantity.name, quantity.unit)) for quantity in own)

@@ -282,7 +282,7 @@ def filled(config: LogsConfig, observations: Any = None, actions: Any = None) ->
     sound = len(config.names) == len(config.entries) and min((*config.entries, config.rows, *config.spread)) > 0
     if not sound or not all(len(part) in (0, size) for part in (config.centre, config.spread)):
         raise UserError(
-            "task.names, entries, rows, centre or spread do not describe situations: give the folder by logs:FOLDER"
+            "task.names, entries, rows, centre or spread are of no situations: give the folder by logs:FOLDER"
         )
     slices = [Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True)]
     if slices[-1].name == BASE and slices[-1].size == space.size:

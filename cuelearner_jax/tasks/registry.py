@@ -53,9 +53,7 @@ def find(name: str) -> Task:
     if name in _registered:
         return _registered[name]
     if (entry := _installed().get(name)) is None:
-        raise UserError(
-            f"unknown task {name!r}{suggestion(name, names())} (one of your own is named as package.module:NAME)"
-        )
+        raise UserError(f"unknown task {name!r}{suggestion(name, names())} (your own: package.module:NAME)")
     return dataclasses.replace(_loaded(entry.value), name=name)
 
 

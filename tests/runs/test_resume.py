@@ -21,7 +21,7 @@ from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes, runner, training
 from cuelearner_jax.runs.grid import Grid, run_key
 from cuelearner_jax.runs.order import Order
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.policy_sources import PolicySource
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
