@@ -53,9 +53,8 @@ class TrainState(struct.PyTreeNode):
     guide: GuideState
     arbiter: Any  # in which environments the guide's action is executed; see `arbiters`
     key: PRNGKeyArray
-    failed: Bool[
-        Array, ""
-    ]  # True once a loss, gradient or parameter was not finite; the lane then keeps its last finite state
+    # True once a loss, gradient or parameter was not finite; the lane then keeps its last finite state
+    failed: Bool[Array, ""]
 
 
 class Clock(struct.PyTreeNode):

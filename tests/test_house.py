@@ -181,7 +181,7 @@ PARTICIPLE = re.compile(  # besides `left`, the direction, and `done`, an episod
     re.IGNORECASE,
 )
 PUBLIC = {"api.adaptation": {"used", "judged"}, "api.policies": {"trained"}, "reading.result": {"used", "changed"}}
-STORED = {"reading.correction": {"known"}, "asking": {"asked"}, "guides.dcoach": {"learned"}}
+STORED = {"reading.policy": {"known"}, "asking": {"asked"}, "guides.dcoach": {"learned"}}
 OPTIONS = {"billiards.table": {"speed_kept"}}
 
 

@@ -24,10 +24,9 @@ from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.reading import Reading, ReadingPolicy, Walk
-from cuelearner_jax.reading.correction import Correction
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.fitting import pick
-from cuelearner_jax.reading.policy import unread
+from cuelearner_jax.reading.policy import Correction, unread
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.types import Label, Teacher
 

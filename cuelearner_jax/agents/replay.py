@@ -38,9 +38,8 @@ class Transition(struct.PyTreeNode):
     obs: Float[Array, " obs"]
     action: Float[Array, " action"]  # as executed
     reward: Float[Array, ""]
-    discount: Float[
-        Array, ""
-    ]  # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
+    # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
+    discount: Float[Array, ""]
     next_obs: Float[Array, " obs_or_0"]
 
 
@@ -62,9 +61,8 @@ class RingBuffer(NamedTuple):
     add: Callable[[Array, Array, StoredStep], Array]  # (rows, step, steps (n, ...)) -> rows
     draw: Callable[[PRNGKeyArray, Array, Array, int], Array]  # (key, rows, step, batch_size) -> rows' numbers
     read: Callable[[Array, Array], StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
-    follow: Callable[
-        [Array, Array, Array, int, int], LaterSteps
-    ]  # (rows, step, numbers (batch,), n, num_envs) -> Following
+    # (rows, step, numbers (batch,), n, num_envs) -> Following
+    follow: Callable[[Array, Array, Array, int, int], LaterSteps]
 
 
 @jax.custom_batching.custom_vmap

@@ -28,11 +28,10 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_name, policy_of
 from cuelearner_jax.reading import fitting, linear
 from cuelearner_jax.reading.families import Family
-from cuelearner_jax.reading.fitting import Fit, Reader
+from cuelearner_jax.reading.fitting import Fit, Reader, steps_of
 from cuelearner_jax.reading.linear import RelativeLabels
 from cuelearner_jax.reading.policy import ReadingPolicy, unread
 from cuelearner_jax.reading.result import Result, describe_fit
-from cuelearner_jax.reading.steps import steps_of
 from cuelearner_jax.spaces import Space
 
 BATCHES = 5  # in which a budget of labels is asked or read

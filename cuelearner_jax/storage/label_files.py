@@ -251,8 +251,8 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
                 f"the label file has {len(rows)} labels for seed {seed}, the budget is {budget}: "
                 "lower --labels or collect more"
             )
-        rows = rows[:budget]
-        sets.append(jax.tree.map(lambda leaf, rows=rows: _pad(leaf[rows], slots), file.labels))
+        pad = lambda leaf, own=rows[:budget]: np.pad(leaf[own], [(0, slots - len(own)), *[(0, 0)] * (leaf.ndim - 1)])  # noqa: E731
+        sets.append(jax.tree.map(pad, file.labels))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
 
 
@@ -287,7 +287,3 @@ def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
     if name in SCHEMA.integers:
         return np.array([-1 if value is None else value for value in column.to_pylist()], np.int64)
     return np.array(column.to_pylist(), np.float32)
-
-
-def _pad(rows: np.ndarray, slots: int) -> np.ndarray:
-    return np.concatenate([rows, np.zeros((slots - len(rows), *rows.shape[1:]), rows.dtype)])

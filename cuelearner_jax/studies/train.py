@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place, release_programs
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
@@ -26,7 +26,7 @@ from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
-from cuelearner_jax.storage import formats
+from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, prepare_folder
 from cuelearner_jax.task import Preset, Task, shape_of
 from cuelearner_jax.terminal import interruptible, progress_bars
@@ -89,7 +89,10 @@ def run(order: Order) -> None:
             bars.remove_task(waiting)
             for group in groups:
                 Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels)
-    failures.check(order.out, [order.out / group.guidance.name for group in groups])
+    if words := failures.summary(results.read([order.out / group.guidance.name for group in groups])):
+        raise NotFinite(
+            f"{words}: their rows in {order.out} are marked and excluded from reports; all else is finished"
+        )
 
 
 def in_memory(
