@@ -90,9 +90,7 @@ def run(order: Order) -> None:
             for group in groups:
                 Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels)
     if words := failures.summary(results.read([order.out / group.guidance.name for group in groups])):
-        raise NotFinite(
-            f"{words}: their rows in {order.out} are marked and excluded from reports; all else is finished"
-        )
+        raise NotFinite(f"{words}: their rows in {order.out} are marked and left out of reports; all else is finished")
 
 
 def in_memory(
