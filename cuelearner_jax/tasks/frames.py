@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
+from cuelearner_envs.playing import record_steps
 from cuelearner_jax import pictures, user_code
 from cuelearner_jax.bridges.brax import JaxEnvironment, SimulatorState, model_of
 from cuelearner_jax.errors import UserError
