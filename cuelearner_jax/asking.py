@@ -156,7 +156,7 @@ def record(
     """Return the guide with answers in its labels from row `position` on; `base`: uncorrected actions, if kept."""
     positions = position + jnp.arange(len(obs))
     rows = Label(obs, action, answer, answered & (positions < guide.budget), base)
-    put = lambda known, new: jax.lax.dynamic_update_slice_in_dim(known, new, position, 0)  # noqa: E731
+    put = lambda rows_before, new: jax.lax.dynamic_update_slice_in_dim(rows_before, new, position, 0)  # noqa: E731
     count = jnp.minimum(position + len(obs), guide.budget)
     return guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=count)
 
@@ -195,8 +195,8 @@ def fitted_labels(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> La
     """
     if getattr(scalars, "answer", "best") != "shuffled":
         return labels
-    drawn = jax.random.uniform(jax.random.fold_in(key, Stream.SHUFFLE), labels.valid.shape)
-    order = jnp.argsort(jnp.where(labels.valid, drawn, jnp.inf))  # valid labels first
+    order_keys = jax.random.uniform(jax.random.fold_in(key, Stream.SHUFFLE), labels.valid.shape)
+    order = jnp.argsort(jnp.where(labels.valid, order_keys, jnp.inf))  # valid labels first
     place, count = jnp.arange(len(order)), labels.valid.sum()
     after = jnp.where(place < count, (place + 1) % jnp.maximum(count, 1), place)
     return labels.replace(answer=labels.answer.at[order].set(labels.answer[order[after]]))
@@ -227,7 +227,7 @@ def ask(
         obs, about, first = guide.obs, actions, proposals
         answers, answered = jax.vmap(answer)(jax.random.split(keys.answer, len(obs)), guide.env, obs, about)
     else:
-        state, *there = _chosen(of, guide, actions, proposals)
+        state, *there = _choose(of, guide, actions, proposals)
         one = answer(keys.answer, state, there[0], there[1])
         obs, about, first, answers, answered = (row[None] for row in (*there, *one))
     recorded = record(guide, position, obs, about, answers, answered, first if of.guidance.sees_base else None)
@@ -245,7 +245,7 @@ def ask(
     return recorded.replace(env=state, obs=step.obs, stored=stored)
 
 
-def _chosen(
+def _choose(
     of: Inquiry,
     guide: GuideState,
     actions: Float[Array, "*candidates action"],
@@ -319,10 +319,3 @@ def with_guide(lane: LaneT, guide: GuideState) -> LaneT:
     failed = lane.failed | ~all_finite((guide.model, guide.labels))
     guide = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, lane.guide)
     return lane.replace(guide=guide, failed=failed)
-
-
-def take_labels(
-    guidance: Guide, env: Environment, scalars: GuideScalars, labels: Label, guide: GuideState, lane_key: Any
-) -> GuideState:
-    """Return the guide with given labels (slots, ...) and a model fitted to them once."""
-    return fit(guidance, env, scalars, guide.replace(labels=labels, asked=guide.budget), lane_key)

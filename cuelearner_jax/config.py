@@ -22,20 +22,10 @@ import dataclasses
 import hashlib
 import json
 import math
+import typing
 from dataclasses import dataclass
 from types import UnionType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    TypeVar,
-    Union,
-    dataclass_transform,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -77,12 +67,12 @@ SHARE = Bounds(0, 1)
 Layers = Annotated[tuple[int, ...], POSITIVE]  # hidden widths of a network
 
 
-@dataclass_transform(frozen_default=True)
+@typing.dataclass_transform(frozen_default=True)
 def part(kind: type[PartT]) -> type[PartT]:
     """Make a class a frozen dataclass of options, and a pytree of its floats."""
-    made = dataclasses.dataclass(frozen=True)(kind)
-    register(made)
-    return made
+    options_class = dataclasses.dataclass(frozen=True)(kind)
+    register(options_class)
+    return options_class
 
 
 def register(kind: type, *traced_too: type) -> None:
@@ -100,8 +90,6 @@ def static(options: PartT) -> PartT:
 
 def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
     """Return values for a configuration's fields: NumPy's numbers as Python's, lists as tuples.
-
-    Raises UserError for no such field, or a value of another type than its field's.
 
     Args:
         group: a configuration, or its class.
@@ -127,8 +115,8 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
 
 def normalize_options(group: PartT, prefix: str) -> PartT:
     """Return a configuration with its values as `check_types` returns them. Raises UserError likewise."""
-    changed = {name: value for name, value in check_types(group, prefix).items() if value is not getattr(group, name)}
-    return dataclasses.replace(group, **changed) if changed else group  # pyright: ignore[reportArgumentType]
+    changes = {name: value for name, value in check_types(group, prefix).items() if value is not getattr(group, name)}
+    return dataclasses.replace(group, **changes) if changes else group  # pyright: ignore[reportArgumentType]
 
 
 def check_part(group: Any, prefix: str) -> None:

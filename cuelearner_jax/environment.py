@@ -210,12 +210,7 @@ def check_layout(whose: str, observation: Sequence[Quantity], actions: Space, en
     """Raise UserError where a world has another layout of observations or actions than a policy was made for.
 
     Names and units of slices are compared where both sides come from the same sort of source: either both give units,
-    or neither.
-
-    Args:
-        whose: the policy in the message, for instance "the run".
-        observation, actions: the layout that the policy was made for.
-        env: the world, or what `task.shape_of` gives for it.
+    or neither. `whose`: the policy in the message, for instance "the run". `env`: what `task.shape_of` gives will do.
     """
     wanted = "give the world that it was made for, or options that keep its observations and actions"
     before, now = _entries(observation), _entries(env.observation)
@@ -223,8 +218,8 @@ def check_layout(whose: str, observation: Sequence[Quantity], actions: Space, en
         raise UserError(f"{whose} observes {len(before)} entries, this world has {len(now)}: {wanted}")
     for number, (own, other) in enumerate(zip(before, now, strict=True), 1):
         if own and other and own != other and (own[1] == UNKNOWN_UNIT) == (other[1] == UNKNOWN_UNIT):
-            seen, there = (f"{name!r} ({unit})" for name, unit in (own, other))
-            raise UserError(f"{whose} observes {seen} as entry {number}, this world has {there}: {wanted}")
+            here, there = (f"{name!r} ({unit})" for name, unit in (own, other))
+            raise UserError(f"{whose} observes {here} as entry {number}, this world has {there}: {wanted}")
     if (own := action_words(actions)) != (other := action_words(actions_of(env))):
         raise UserError(f"{whose} gives actions {own}, this world takes actions {other}: {wanted}")
 

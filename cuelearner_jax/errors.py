@@ -21,7 +21,10 @@ def first_line(error: object) -> str:
 
 
 class UserError(Exception):
-    """Bad input: one line that says what is wrong and what to do, for exit status 2 without a traceback."""
+    """Bad input: one line that says what is wrong and what to do, for exit status 2 without a traceback.
+
+    Whatever reads or checks input may raise it. A docstring names the cases only where its caller needs them.
+    """
 
     def __init__(self, message: object = "") -> None:
         """Store the message on one line, without escape sequences that a path or a name in it may hold."""
@@ -74,10 +77,10 @@ def format_value(value: Any) -> str:
     return one_line(reprlib.repr(value))
 
 
-def user_code_error(named: str, error: BaseException) -> UserCodeError:
-    """Return the error for an exception of the user's own code; `named`: the code, as "policy my_policy"."""
+def user_code_error(code: str, error: BaseException) -> UserCodeError:
+    """Return the error for an exception of the user's own code; `code`: the code, as "policy my_policy"."""
     words = " ".join(str(error).split())[:200]
-    return UserCodeError(f"{named} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
+    return UserCodeError(f"{code} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
 
 
 def format_numbers(numbers: Iterable[float]) -> str:
@@ -89,12 +92,12 @@ def format_numbers(numbers: Iterable[float]) -> str:
     return ", ".join(texts[:MOST_LISTED]) + (" and others" if len(texts) > MOST_LISTED else "")
 
 
-def suggestion(word: str, known: Iterable[str]) -> str:
+def suggestion(word: str, choices: Iterable[str]) -> str:
     """Return the end of a message about an unknown word: the probably intended word, or all known words."""
-    return near(word, known := list(known)) or f": choose one of {', '.join(known)}"
+    return near(word, choices := list(choices)) or f": choose one of {', '.join(choices)}"
 
 
-def near(word: str, known: Iterable[str]) -> str:
+def near(word: str, choices: Iterable[str]) -> str:
     """Return the end of a message that names the probably intended word; empty where none is near."""
-    nearest = difflib.get_close_matches(str(word)[:100], list(known), n=1)
+    nearest = difflib.get_close_matches(str(word)[:100], list(choices), n=1)
     return f", did you mean {nearest[0]!r}?" if nearest else ""

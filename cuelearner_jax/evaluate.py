@@ -173,22 +173,19 @@ MOST_STRETCHES = 25  # most stretches of a roll-out with progress
 Tell = Callable[[int, int], None]  # (done, of how many): called between stretches; what it raises ends the evaluation
 
 
-def ignore_progress(done: int, count: int) -> None:
+def ignore_progress(count_so_far: int, count: int) -> None:
     """Ignore progress."""
 
 
 def part_of(tell: Tell, number: int, parts: int) -> Tell:
     """Return a progress callback for part `number` (from 0) of as many equal parts, one after the other."""
-    return lambda done, count: tell(number * count + done, parts * count)
+    return lambda count_so_far, count: tell(number * count + count_so_far, parts * count)
 
 
 def rollout_with_progress(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = ignore_progress
 ) -> Rollout:
-    """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,).
-
-    Raises UserError, which names the policy, once one of its actions is not finite.
-    """
+    """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,)."""
     return _in_stretches(env, None, policy, key, num_envs, steps, tell, policy_name(policy))
 
 

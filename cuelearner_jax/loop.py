@@ -53,9 +53,8 @@ class TrainState(struct.PyTreeNode):
     guide: GuideState
     arbiter: Any  # in which environments the guide's action is executed; see `arbiters`
     key: PRNGKeyArray
-    failed: Bool[
-        Array, ""
-    ]  # True once a loss, gradient or parameter was not finite; the lane then keeps its last finite state
+    # True once a loss, gradient or parameter was not finite; the lane then keeps its last finite state
+    failed: Bool[Array, ""]
 
 
 class Clock(struct.PyTreeNode):
@@ -138,16 +137,19 @@ class Lane(NamedTuple):
 
     def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
         """Return the lane with given labels in place of questions, and a model fitted to them."""
-        return asking.with_guide(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
+        guide = state.guide.replace(labels=labels, asked=state.guide.budget)
+        return asking.with_guide(state, asking.fit(self.guidance, env, scalars, guide, state.key))
 
     def keep_finite(self, state: TrainState, before: TrainState) -> TrainState:
         """Return a lane after a stretch; a lane that has failed keeps the parameters of `before`.
 
         This is checked once a stretch, since a check at each gradient step would read all parameters again.
         """
-        learned = lambda lane: (lane.agent.params, lane.agent.training)  # noqa: E731
-        failed = state.failed | ~all_finite(learned(state))
-        params, training = jax.tree.map(lambda new, old: jnp.where(failed, old, new), learned(state), learned(before))
+        learned_state = lambda lane: (lane.agent.params, lane.agent.training)  # noqa: E731
+        failed = state.failed | ~all_finite(learned_state(state))
+        params, training = jax.tree.map(
+            lambda new, old: jnp.where(failed, old, new), learned_state(state), learned_state(before)
+        )
         return state.replace(agent=state.agent.replace(params=params, training=training), failed=failed)
 
     def advance(self, clock: Clock, schedule: Schedule) -> Clock:
@@ -169,10 +171,10 @@ class Lane(NamedTuple):
         acted = self.act(env, settings, clock, state, keys.act)
         k_envs = jax.random.split(keys.step, self.sizes.num_envs)
         env_state, step = jax.vmap(env.step)(k_envs, state.agent.env, acted.actions)
-        state, met = self.absorb(settings, clock, state, keys.absorb, acted, step)
+        state, step_metrics = self.absorb(settings, clock, state, keys.absorb, acted, step)
         state = state.replace(agent=state.agent.replace(env=env_state))
-        state, learned = self.learn(env, settings, clock, state, keys.learn)
-        return state, {**met, **learned}
+        state, learn_metrics = self.learn(env, settings, clock, state, keys.learn)
+        return state, {**step_metrics, **learn_metrics}
 
     def act(self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray) -> ActStep:
         """Return the actions to execute in each environment.
@@ -208,11 +210,11 @@ class Lane(NamedTuple):
         agent = agent.replace(replay=self.buffer.add(agent.replay, clock.step, stored), obs=step.obs)
         if agent.guided is not None:
             agent = agent.replace(guided=count_guided(agent.guided, clock.step, acted.passes > 0))
-        moved = acted.passes.astype(jnp.float32)
+        passes = acted.passes.astype(jnp.float32)
         metrics = {
             "reward": step.reward.mean(),
-            "passes": moved.mean(),
-            "guided_share": (moved > 0).astype(jnp.float32).mean(),
+            "passes": passes.mean(),
+            "guided_share": (passes > 0).astype(jnp.float32).mean(),
         }
         return state.replace(agent=agent, arbiter=arbiter), metrics
 
@@ -226,17 +228,17 @@ class Lane(NamedTuple):
             labelled = Memory(env, self.buffer, stored, state.guide.asked, 1, self.bootstraps)
             memory = memory._replace(labelled=labelled)
 
-        def update(learned: tuple[Any, Any], key: PRNGKeyArray, index: Array) -> tuple[tuple[Any, Any], Any]:
+        def update(carry: tuple[Any, Any], key: PRNGKeyArray, index: Array) -> tuple[tuple[Any, Any], Any]:
             count, own = clock.update + index + 1, jax.random.fold_in(key, index)
             params, training, loss, norm = self.learner.update(
-                env, settings.agent, settings.scalars, count, *learned, memory, own
+                env, settings.agent, settings.scalars, count, *carry, memory, own
             )
             return (params, training), (loss, norm)
 
-        def updates(learned: tuple[Any, Any], key: PRNGKeyArray) -> tuple[tuple[Any, Any], Array, Array]:
-            one = lambda learned, index: update(learned, key, index)  # noqa: E731
-            learned, (losses, norms) = jax.lax.scan(one, learned, jnp.arange(self.sizes.num_envs))
-            return learned, losses.mean(), all_finite((losses, norms))
+        def updates(carry: tuple[Any, Any], key: PRNGKeyArray) -> tuple[tuple[Any, Any], Array, Array]:
+            one = lambda carry, index: update(carry, key, index)  # noqa: E731
+            carry, (losses, norms) = jax.lax.scan(one, carry, jnp.arange(self.sizes.num_envs))
+            return carry, losses.mean(), all_finite((losses, norms))
 
         (params, training), loss, finite = jax.lax.cond(
             filled >= schedule.learn_after,

@@ -20,7 +20,7 @@ from cuelearner_jax.types import Reel, Sketch
 
 Picture = UInt8[np.ndarray, "height width 3"]
 Source = np.ndarray | bytes  # a `Picture`, or the bytes of a PNG or JPEG file
-SHOWN = {"PNG": "image/png", "JPEG": "image/jpeg"}  # readable file formats and their media types
+MEDIA_TYPES = {"PNG": "image/png", "JPEG": "image/jpeg"}  # readable file formats and their media types
 LARGEST = 1280  # longest side of a picture on the page, of a film there half of it [pixels]
 SHEET = 6  # frames of a film that its still shows
 TURNED = 0x0112  # the EXIF tag that says how a camera was held
@@ -53,11 +53,11 @@ def clip(frames: Sequence[Source], period: float, words: str = "") -> Reel:
 def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
     """Write up to six frames of a film, the first and the last among them, as one PNG."""
     places = np.unique(np.linspace(0, len(_some(frames)) - 1, SHEET).round().astype(int))
-    chosen = [pixels(frames[number]) for number in places]
-    height, width = chosen[0].shape[:2]
-    columns = min(3, len(chosen))
-    sheet = Image.new("RGB", (columns * width, -(-len(chosen) // columns) * height), "white")
-    for number, frame in enumerate(chosen):
+    pictures = [pixels(frames[number]) for number in places]
+    height, width = pictures[0].shape[:2]
+    columns = min(3, len(pictures))
+    sheet = Image.new("RGB", (columns * width, -(-len(pictures) // columns) * height), "white")
+    for number, frame in enumerate(pictures):
         sheet.paste(Image.fromarray(frame), (number % columns * width, number // columns * height))
     sheet.save(file, format="PNG")
 
@@ -94,7 +94,7 @@ def _opened(image: Any) -> tuple[Image.Image, str]:
             raise UserError(f"a picture is {image.dtype} {image.shape}: {wanted}")
         return Image.fromarray(image), ""
     try:
-        picture = Image.open(io.BytesIO(image), formats=tuple(SHOWN))
+        picture = Image.open(io.BytesIO(image), formats=tuple(MEDIA_TYPES))
         kind = picture.format or ""
         if picture.getexif().get(TURNED, 1) != 1:
             picture, kind = ImageOps.exif_transpose(picture), ""  # rotated, so the stored bytes are not reused
@@ -108,13 +108,13 @@ def _uri(image: Source, largest: int) -> tuple[str, tuple[int, int]]:
     """Return a picture as a data URI with its longer side at most `largest`, and its width and height [pixels]."""
     picture, kind = _opened(image)
     data = image if isinstance(image, bytes) else b""
-    if kind not in SHOWN or max(picture.size) > largest:
+    if kind not in MEDIA_TYPES or max(picture.size) > largest:
         picture = picture.convert("RGB")
         picture.thumbnail((largest, largest))
         file, kind = io.BytesIO(), "JPEG"
         picture.save(file, format=kind, quality=92, subsampling=0)
         data = file.getvalue()
-    return f"data:{SHOWN[kind]};base64,{base64.b64encode(data).decode()}", picture.size
+    return f"data:{MEDIA_TYPES[kind]};base64,{base64.b64encode(data).decode()}", picture.size
 
 
 def write_film(

@@ -18,8 +18,7 @@ T = TypeVar("T")
 def load(reference: str, kind: type[T], called: str) -> T:
     """Return the object that `package.module:NAME` leads to; modules of the current folder can be named too.
 
-    `kind`: class of the object. `called`: such an object in messages, as "a task". Raises UserError if there is none,
-    UserCodeError if the module fails to import.
+    `kind`: class of the object. `called`: such an object in messages, as "a task".
     """
     if not REFERENCE.fullmatch(reference):
         raise UserError(f"{reference!r} does not name {called}: give package.module:NAME, for instance my_code:MINE")

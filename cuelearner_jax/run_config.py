@@ -75,10 +75,7 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
         return guide
 
     def options_of(self, kind: str) -> Any:
-        """Return the options of a kind of guidance: None for its defaults, plain values for an unknown kind's.
-
-        Raises UserError for options of another kind.
-        """
+        """Return the options of a kind of guidance: None for its defaults, plain values for an unknown kind's."""
         kinds: Any = self.kinds
         if isinstance(own := kinds.get(kind), dict):
             return kind_from_json(kind, own)
@@ -127,10 +124,7 @@ def to_json(config: RunConfig) -> dict[str, Any]:
 
 
 def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
-    """Return the configuration of JSON values; code that a file names is never loaded.
-
-    Raises UserError for an unknown field or part, or a value of another type.
-    """
+    """Return the configuration of JSON values; code that a file names is never loaded."""
     shared = {name: configuration.from_json(kind, values[name]) for name, kind in GROUPS.items()}
     parts = {sort: part_from_json(sort, values[sort]) for sort in PARTS}
     kinds = {name: kind_from_json(name, own) for name, own in values["kinds"].items()}

@@ -130,7 +130,7 @@ class Task:
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
-    named: str = ""  # its name in commands, if other than `name`: "gymnasium:FetchReach-v4"
+    command_name: str = ""  # its name in commands, if other than `name`: "gymnasium:FetchReach-v4"
     origin: str = ""  # "package.module:name" of a task from outside, set by the code that resolved it
     robot: str = field(default="", compare=False)  # as `on` was asked for it; empty: the task's own
     default: Any = None  # the default configuration; None: `config()`
@@ -208,10 +208,7 @@ class Task:
         self.check_whole(config.task, config.schedule.eval_envs, config.schedule.eval_steps, *options)
 
     def on(self, body: str | None) -> Task:
-        """Return the task with that body first (None: unchanged); NAME:FOLDER adds the user's files in a folder.
-
-        Raises UserError if there is no such body, or the folder has no files for it.
-        """
+        """Return the task with that body first (None: unchanged); NAME:FOLDER adds the user's files in a folder."""
         if body is None:
             return self
         robot, (body, _, folder) = body, body.partition(":")

@@ -109,8 +109,6 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
     """Return the configuration of the world that a teacher learned in, who is asked in a task's configuration.
 
     `apart`: fields in which the two may differ, because they change nothing or the task handles them.
-
-    Raises UserError for no teacher, one of another task, or one that does not know a change of this world.
     """
     world = dict(read_about(folder)["task"])
     if (name := world.pop("name")) != task:

@@ -50,14 +50,14 @@ console = Console(file=cast(IO[str], _StandardError()), **PLAIN)
 
 
 @contextmanager
-def progress_bars(shown: bool = True) -> Iterator[Progress]:
-    """Show progress on standard error: bars on a terminal, lines elsewhere, nothing unless `shown`."""
-    if shown and not console.is_terminal:
+def progress_bars(visible: bool = True) -> Iterator[Progress]:
+    """Show progress on standard error: bars on a terminal, lines elsewhere, nothing unless `visible`."""
+    if visible and not console.is_terminal:
         yield ProgressLines()
         return
     name, note = (TextColumn(text, markup=False) for text in ("{task.description:<12}", "{task.fields[note]}"))
     columns = name, BarColumn(), MofNCompleteColumn(), note, TimeRemainingColumn()
-    with Progress(*columns, console=console, disable=not shown) as bars:
+    with Progress(*columns, console=console, disable=not visible) as bars:
         yield bars
 
 
@@ -79,9 +79,9 @@ class ProgressLines(Progress):
         self._next = time.monotonic() + EVERY
         task = self._tasks[task_id]
         amount = f"{task.completed:,.0f} of {task.total:,.0f}" if task.total else ""
-        left = f", about {task.time_remaining:.0f} s left" if task.time_remaining else ""
+        remaining = f", about {task.time_remaining:.0f} s left" if task.time_remaining else ""
         parts = ", ".join(filter(None, [task.description, amount, task.fields.get("note")]))
-        console.print(f"{parts}; after {task.elapsed or 0:.0f} s{left}")
+        console.print(f"{parts}; after {task.elapsed or 0:.0f} s{remaining}")
 
 
 def watched_by(bars: Progress) -> Callable[[str], Callable[[int, int], None]]:
@@ -89,6 +89,6 @@ def watched_by(bars: Progress) -> Callable[[str], Callable[[int, int], None]]:
 
     def watch(what: str) -> Callable[[int, int], None]:
         bar = bars.add_task(what, total=None, note="")
-        return lambda done, count: bars.update(bar, completed=done, total=count)
+        return lambda count_so_far, count: bars.update(bar, completed=count_so_far, total=count)
 
     return watch

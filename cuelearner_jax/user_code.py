@@ -18,24 +18,24 @@ from cuelearner_jax.errors import UserError
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_left: list[BaseException] = []  # errors left by functions on the host, which other threads call
+_errors: list[BaseException] = []  # errors left by functions on the host, which other threads call
 
 
 def leave(error: BaseException) -> None:
     """Keep the exception of a function on the host until `tell` is called."""
-    _left.append(error)
+    _errors.append(error)
 
 
 def is_waiting() -> bool:
     """Return whether a function on the host has failed since `tell` was last called."""
-    return bool(_left)
+    return bool(_errors)
 
 
 def tell() -> None:
     """Raise the first exception that a function on the host left, if there is one, and forget all of them."""
-    if _left:
-        first, *_ = _left
-        _left.clear()
+    if _errors:
+        first, *_ = _errors
+        _errors.clear()
         raise first
 
 
@@ -43,10 +43,10 @@ def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
     """Return a public function that computes with fixed numerics, and raises what functions on the host left."""
 
     @functools.wraps(function)
-    def wrapped(*arguments: P.args, **named: P.kwargs) -> T:
+    def wrapped(*arguments: P.args, **keywords: P.kwargs) -> T:
         try:
             with fixed_numerics():
-                return function(*arguments, **named)
+                return function(*arguments, **keywords)
         finally:
             tell()
 

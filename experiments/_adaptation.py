@@ -31,7 +31,7 @@ from cuelearner_jax.policies import Agent, Corrected
 from cuelearner_jax.reading import declared_distortions
 from cuelearner_jax.report.statistics import interval
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.trained import PolicySource, several
+from cuelearner_jax.runs.policy_sources import PolicySource, several
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import Task
@@ -192,9 +192,9 @@ def by_labels(bench: Bench) -> Iterator[Row]:
     after = by_model.adapt(of, lanes, judge, bench.task.make_teacher(bench.world, env))
     which = {"base": bench.seeds[lanes.base], "label_seed": lanes.seed, "labels": lanes.budget, "steps": 0}
     judged = {
-        "used": after.judged.used.astype(float),
-        "within_deg": after.judged.within_deg,
-        "rewarded_steps": after.judged.rewarded_steps.astype(float),
+        "used": after.judgement.in_use.astype(float),
+        "within_deg": after.judgement.within_deg,
+        "rewarded_steps": after.judgement.rewarded_steps.astype(float),
     }
     yield {**which, **judged, **bench.measured(after.policy(bench.env("validation")))}
 
@@ -209,7 +209,7 @@ def by_answers(bench: Bench) -> Iterator[Row]:
     of = by_reading.ReadingAdaptation(guidance, by_model.SIZES, scalars, env, bench.agents, family)
     after = by_reading.adapt(of, lanes, Judging(None, by=LABELS), bench.task.make_teacher(bench.world, env))
     which = {"base": bench.seeds[lanes.base], "label_seed": lanes.seed, "labels": lanes.budget, "steps": 0}
-    judged = {"used": after.judged.used.astype(float), "rewarded_steps": 0.0}
+    judged = {"used": after.judgement.in_use.astype(float), "rewarded_steps": 0.0}
     yield {**which, **judged, **bench.measured(after.policy(bench.env("validation")))}
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.tables import Row, named, unguided_of
+from cuelearner_jax.report.tables import Row, identity, unguided_of
 from cuelearner_jax.report.variants import Variant
 
 Samples = Float[np.ndarray, "samples"]
@@ -204,7 +204,7 @@ def _level(variants: Sequence[Variant], question: Question, shared: int) -> tupl
 def _row(own: Drawn, unguided: Drawn | None, level: float) -> Row:
     """Return a variant's row of `efficiency.csv`; ratios and differences are to the unguided agents'."""
     variant, steps = own.variant, own.steps_to(level)
-    row: Row = {**named(variant), "seeds": len(variant.seeds), "against": unguided.variant.name if unguided else ""}
+    row: Row = {**identity(variant), "seeds": len(variant.seeds), "against": unguided.variant.name if unguided else ""}
     row |= interval_columns("guide", NOTHING if variant.guide is None else statistics.interval(variant.guide))
     row |= columns("steps_to_level", steps, own) | {"reached": float(np.isfinite(steps.upper[1:]).mean())}
     mean = interval_columns("mean", variant.mean)

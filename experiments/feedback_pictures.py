@@ -100,7 +100,7 @@ def corrected(kind: str) -> tuple[Any, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a model is not used is no matter: its picture is wanted
         better = cl.adapt(before, Line(), teacher, labels=count, guidance=kind, eps_deg=EPS, seed=1, **bounded)
-    return better, jax.tree.map(lambda leaf: np.asarray(leaf[0]), better.outcome.found.labels)
+    return better, jax.tree.map(lambda leaf: np.asarray(leaf[0]), better.outcome.result.labels)
 
 
 def plot(kind: str, labels: Any, after: np.ndarray) -> Figure:

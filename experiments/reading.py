@@ -35,7 +35,7 @@ from cuelearner_jax.policies import policy_of
 from cuelearner_jax.reading import Distortion, Reading, Unknown, Walk, declared_distortions, simulator_distortion
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.report.statistics import RESAMPLES
-from cuelearner_jax.runs.trained import PolicySource, several
+from cuelearner_jax.runs.policy_sources import PolicySource, several
 from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry

@@ -30,7 +30,7 @@ from cuelearner_jax.reading import fitting
 from cuelearner_jax.reading.fitting import Fit, Hypothesis, Reader
 from cuelearner_jax.reading.linear import RelativeLabels
 from cuelearner_jax.reading.posterior import PRIORS, habits
-from cuelearner_jax.reading.session import BATCHES, FIRST, MOST_WRONG, USED
+from cuelearner_jax.reading.session import BATCHES, FIRST, LEAST_EVIDENCE, MOST_WRONG
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 from cuelearner_jax.storage.provenance import provenance
 
@@ -212,7 +212,7 @@ def worlds_of(robots: Any, cells: list[Cell]) -> tuple[Any, jax.Array]:
     own = jax.tree.map(lambda leaf: leaf[rows[0]], robots)
     root = jax.random.key(5)
     keys = jax.vmap(lambda robot, error: jax.random.fold_in(jax.random.fold_in(root, robot), error))(*rows)
-    worlds = jax.vmap(zoo.changed)(keys, own, rows[1])
+    worlds = jax.vmap(zoo.change)(keys, own, rows[1])
     return worlds, jax.vmap(jax.random.fold_in)(keys, jnp.array([cell.seed for cell in cells]))
 
 
@@ -228,7 +228,7 @@ def measure(robots: Any, cells: list[Cell], labels: int) -> list[dict[str, Any]]
         state = each_lane(read)(worlds, *labelled, state.plain, state.smooth)
     values = jax.tree.map(np.asarray, _played(worlds, state))
     evidence = np.asarray(state.evidence)
-    used = (evidence >= USED) & (np.asarray(_wrong(state.fit)) < MOST_WRONG)
+    used = (evidence >= LEAST_EVIDENCE) & (np.asarray(_wrong(state.fit)) < MOST_WRONG)
     judged = [
         {end: values[f"{name} {end}"][:, :JUDGED] for end in ("success", "return")} for name in ("before", "after")
     ]

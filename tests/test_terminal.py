@@ -53,6 +53,6 @@ def test_progress_that_is_piped_is_lines_few_and_without_carriage_returns(capsys
     assert 2 <= len(lines) <= 4  # of hundreds of updates
     assert "\r" not in told
     assert all(line.startswith("work, ") and " of 1,000, reward " in line for line in lines)
-    with progress_bars(shown=False) as bars:
+    with progress_bars(visible=False) as bars:
         bars.add_task("work", total=1, note="")
     assert capsys.readouterr().err == ""

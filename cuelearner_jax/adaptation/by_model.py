@@ -1,7 +1,7 @@
 """Adaptation by a feedback model, from the first question to the judged policies.
 
-found = adapt(Adaptation(guide, sizes, scalars, env, bases), lanes, Judging(tuning_env), teacher)
-found.judged.used, found.policy(env)
+result = adapt(Adaptation(guide, sizes, scalars, env, bases), lanes, Judging(tuning_env), teacher)
+result.judgement.in_use, result.policy(env)
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class AdaptationResult:
     of: Adaptation
     lanes: Lanes
     block: Any  # `LaneState`, or `by_reading.ReadingLanes`
-    judged: Judgement
+    judgement: Judgement
     results: tuple[Result, ...] = ()  # reading only: each lane's estimates
 
     @property
@@ -77,21 +77,21 @@ class AdaptationResult:
         return lines
 
     def _verdict(self, lane: int, unit: str) -> str:
-        judged, bound = self.judged, self.lanes.bound_deg[lane]
-        before, after, narrowed = (column[lane] for column in (judged.before, judged.after, judged.within_deg))
-        if judged.by == PERSON:
+        judgement, bound = self.judgement, self.lanes.bound_deg[lane]
+        before, after, narrowed = (column[lane] for column in (judgement.before, judgement.after, judgement.within_deg))
+        if judgement.by == PERSON:
             preferred = f"the policy as it was in {before:.0%}, the corrected in {after:.0%}"
             why = f"of pairs of films a person preferred {preferred}"
-        elif judged.by != LABELS:
-            difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*judged.difference[lane])
-            spent = f"difference {difference}; {judged.rewarded_steps[lane]:,} rewarded steps"
-            why = f"{judged.by} on tuning episodes {before:.4g} before, {after:.4g} after ({spent})"
+        elif judgement.by != LABELS:
+            difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*judgement.difference[lane])
+            spent = f"difference {difference}; {judgement.rewarded_steps[lane]:,} rewarded steps"
+            why = f"{judgement.by} on tuning episodes {before:.4g} before, {after:.4g} after ({spent})"
         elif self.results:
             factor = np.exp(min(after, 50.0))
             why = f"answers predicted before they were read: {factor:.3g} times as likely as without a change"
         else:
             why = f"predicts {after:.4g} of held-out answers, always 'already right' {before:.4g}"
-        if not judged.used[lane]:
+        if not judgement.in_use[lane]:
             return f"{why}; not shown to be better, so the policy stays as it was"
         return f"{why}; the correction is used" + (f" within {narrowed:g} {unit}" if narrowed < 0.999 * bound else "")
 
@@ -107,17 +107,9 @@ def adapt(
 ) -> AdaptationResult:
     """Ask for labels, fit a model and judge the corrected policy in every lane.
 
-    Args:
-        of: settings that all lanes share: the kind of guidance, the world, the base policies.
-        lanes: the lanes to adapt.
-        how: settings of the judgement.
-        teacher: the teacher who answers in rounds; None where labels are given.
-        labels: rows (lanes, slots, ...) in place of questions, fitted at once.
-        mesh: devices that share the lanes (default: all of this process's).
-        watch: takes the name of a piece of work, returns its progress callback.
-
-    Raises:
-        UserError: all lanes failed for their policy or their teacher, or labels cannot judge.
+    `teacher`: who answers in rounds; or `labels`: rows (lanes, slots, ...) in place of questions, fitted at once.
+    `mesh`: devices that share the lanes (default: all of this process's). `watch`: takes the name of a piece of work,
+    returns its progress callback.
     """
     mesh, count = mesh or lane_mesh(), lanes.number
     # the block is filled up with repeats of the last lane, which are dropped in the end
@@ -130,8 +122,8 @@ def adapt(
         block = take_labels(placed, place(mesh, rows, BY_LANE), block, mesh)
     else:
         asks, number, tell = place(mesh, teacher, SHARED), rounds(lanes, of.sizes), watch("labels")
-        for done in range(number):
-            tell(done, number)
+        for index in range(number):
+            tell(index, number)
             block = jax.block_until_ready(ask_round(placed, asks, block, mesh))
             if block.failed.all():
                 blame(placed, asks, block)
@@ -141,18 +133,18 @@ def adapt(
 
 def result_of(judge: Judge, block: Any, count: int, results: tuple[Result, ...] = ()) -> AdaptationResult:
     """Judge a block's first `count` lanes and take out corrections that are not used."""
-    judged, block = judge.judge_lanes(block)
-    block = judge.of.keep_used(block, jnp.asarray(judged.used))
+    judgement, block = judge.judge_lanes(block)
+    block = judge.of.drop_unused(block, jnp.asarray(judgement.in_use))
     block, lanes = jax.tree.map(lambda leaf: leaf[:count], block), Lanes(*(column[:count] for column in judge.lanes))
-    judged = Judgement(judged.by, *(column[:count] for column in judged[1:]))
-    return AdaptationResult(judge.of, lanes, block, judged, results)
+    judgement = Judgement(judgement.by, *(column[:count] for column in judgement[1:]))
+    return AdaptationResult(judge.of, lanes, block, judgement, results)
 
 
 def check_bounds(space: Space, bounds: Sequence[float]) -> None:
     """Raise UserError for a bound that no action can reach, or that is given twice."""
     if not all(0 < bound <= space.reach for bound in bounds) or len(set(bounds)) < len(bounds):  # NaN is neither
-        given = " ".join(f"{bound:g}" for bound in bounds)
-        raise UserError(f"bound_deg is {given}: give numbers above 0, up to {space.reach:g} ({space.unit}), each once")
+        text = " ".join(f"{bound:g}" for bound in bounds)
+        raise UserError(f"bound_deg is {text}: give numbers above 0, up to {space.reach:g} ({space.unit}), each once")
 
 
 def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> None:

@@ -1,8 +1,8 @@
 """Adaptation by a reading of relative answers, one lane after another, outside compiled programs.
 
 of = ReadingAdaptation(guide, sizes, scalars, env, bases, family)
-found = adapt(of, lanes, Judging(None, by="labels"), teacher)
-found.results[0].words(), found.policy(env)
+result = adapt(of, lanes, Judging(None, by="labels"), teacher)
+result.results[0].words(), result.policy(env)
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import Tell, ignore_progress
-from cuelearner_jax.reading import Read, Reading, Walk
-from cuelearner_jax.reading.correction import Correction
+from cuelearner_jax.reading import Reading, ReadingPolicy, Walk
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.fitting import pick
-from cuelearner_jax.reading.policy import unread
+from cuelearner_jax.reading.policy import Correction, unread
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.types import Label, Teacher
 
@@ -40,20 +39,20 @@ class ReadingAdaptation(Adaptation):
     """The world, base policies and family that all lanes of a reading share."""
 
     family: Family = struct.field(pytree_node=False)  # possible changes; empty: shifts of entries of the observation
-    named: str = struct.field(pytree_node=False, default="")  # the code of it; empty: the world declares it
+    reference: str = struct.field(pytree_node=False, default="")  # the code of it; empty: the world declares it
 
-    def policy(self, block: Any, env: Any = None) -> Read:
+    def policy(self, block: Any, env: Any = None) -> ReadingPolicy:
         """Return every lane's corrected policy."""
         base, space = self.bases.lane(block.base), actions_of(self.env)
-        return Read(base, block.correction, block.bound, space, self.family, self.named)
+        return ReadingPolicy(base, block.correction, block.bound, space, self.family, self.reference)
 
-    def keep_used(self, block: Any, used: Bool[Array, " lanes"]) -> Any:
+    def drop_unused(self, block: Any, in_use: Bool[Array, " lanes"]) -> Any:
         """Return the lanes, without a correction where it is not used."""
         nothing = self.unread(None, block.correction).correction
-        keep = jax.vmap(lambda used, own: jax.tree.map(partial(jnp.where, used), own, nothing))
-        return block.replace(correction=keep(jnp.asarray(used), block.correction))
+        keep = jax.vmap(lambda in_use, own: jax.tree.map(partial(jnp.where, in_use), own, nothing))
+        return block.replace(correction=keep(jnp.asarray(in_use), block.correction))
 
-    def unread(self, base: Any, like: Correction | None = None) -> Read:
+    def unread(self, base: Any, like: Correction | None = None) -> ReadingPolicy:
         """Return a policy that corrects nothing; `like`: a correction with the sizes of its arrays."""
         labels, mixed = (0, 0) if like is None else (like.known.shape[-2], like.frame.mixed.shape[-1])
         return unread(base, actions_of(self.env), self.family, self.env.obs_size, labels, mixed)
@@ -68,7 +67,7 @@ class ReadingLanes(struct.PyTreeNode):
     bound: Float[Array, " lanes"]
     corrects: Bool[Array, " lanes"]  # True where the answers show a change
     evidence: Any  # (lanes,) `Result.evidence`, as NumPy's
-    used: Any  # (lanes,) `Result.used`, the judgement where labels judge
+    in_use: Any  # (lanes,) `Result.used`, the judgement where labels judge
     failed: Bool[Array, " lanes"]
 
 
@@ -85,44 +84,44 @@ def adapt(
     Arguments as for `by_model.adapt`. `how.by` "labels": the answers decide, each batch predicted before it is read.
     """
     tell, total, space = watch("labels"), int(lanes.budget.sum()), actions_of(of.env)
-    rows, results, asked = [], [], 0
+    rows, results, total_before = [], [], 0
     for base, seed, budget, _ in zip(*(column.tolist() for column in lanes), strict=True):
         observation = getattr(of.env, "observation", ())
         reading = Reading(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation)
         if labels is None:
-            progress = lambda count, before=asked: tell(before + count, total)  # noqa: E731
-            own = _asked(of, reading, seed, budget, teacher, progress)
+            progress = lambda count, before=total_before: tell(before + count, total)  # noqa: E731
+            own = _ask(of, reading, seed, budget, teacher, progress)
         else:
             own = jax.tree.map(lambda leaf: np.asarray(leaf)[len(rows)], labels)
             reading.read_in_batches(*(part[own.valid] for part in (own.obs, own.action, own.answer)))
         rows.append(own)
         results.append(reading.result())
-        asked += budget
-        tell(asked, total)
+        total_before += budget
+        tell(total_before, total)
     block = ReadingLanes(
         base=jnp.asarray(lanes.base),
-        correction=_stacked([one.policy.correction for one in results]),
-        labels=_padded(rows) if labels is None else labels,
+        correction=_side_by_side([one.policy.correction for one in results]),
+        labels=_side_by_side(rows) if labels is None else labels,
         bound=jnp.asarray(space.from_unit(lanes.bound_deg)),
         corrects=jnp.asarray(np.array([one.changed for one in results])),
         evidence=np.array([one.evidence for one in results]),
-        used=np.array([one.used for one in results]),
+        in_use=np.array([one.used for one in results]),
         failed=jnp.zeros(lanes.number, bool),
     )
     judge = Judge(of, lanes, how, lane_mesh(jax.local_devices()[:1]), watch)
     return result_of(judge, block, lanes.number, tuple(results))
 
 
-def _asked(
+def _ask(
     of: ReadingAdaptation, reading: Reading, seed: int, budget: int, teacher: Any, tell: Callable[[int], None]
 ) -> Label:
     """Return one lane's labels, asked and read in batches."""
     walk, rows = Walk(of.env, teacher, of.scalars), []
     key, size = jax.random.key(seed), max(LEAST_BATCH, -(-budget // BATCHES))
-    for asked in range(0, budget, size):
-        tell(asked)
+    for start in range(0, budget, size):
+        tell(start)
         key, k_where, k_ask, k_answer = jax.random.split(key, 4)
-        count = min(size, budget - asked)
+        count = min(size, budget - start)
         states, obs = walk.situations(k_where, reading.policy(), CHOICE * size)
         index, action = reading.questions(np.asarray(obs), count, k_ask)
         states, obs = pick((states, obs), index)
@@ -135,22 +134,13 @@ def _asked(
     return Label(obs, action, np.where(valid[:, None], answer, 0), valid)  # pyright: ignore[reportArgumentType]
 
 
-def _stacked(corrections: list[Correction]) -> Correction:
-    """Return corrections side by side; those of fewer labels get situations without weight."""
-    most = max(len(one.known) for one in corrections)
+def _side_by_side(trees: list[Any]) -> Any:
+    """Return trees side by side; rows that one has fewer of are zero: without weight, or not valid."""
 
-    def filled(rows: Array) -> Array:
-        return jnp.concatenate([rows, jnp.zeros((most - len(rows), rows.shape[1]))])
+    def stack(*leaves: Any) -> Array:
+        if not np.ndim(leaves[0]):
+            return jnp.stack(leaves)
+        most, rest = max(map(len, leaves)), [(0, 0)] * (np.ndim(leaves[0]) - 1)
+        return jnp.stack([jnp.pad(jnp.asarray(leaf), [(0, most - len(leaf)), *rest]) for leaf in leaves])
 
-    each = [one.replace(known=filled(one.known), alpha=filled(one.alpha)) for one in corrections]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-
-
-def _padded(sets: list[Label]) -> Label:
-    """Return the labels of all lanes, padded to the same number of rows."""
-    most = max(len(rows.obs) for rows in sets)
-
-    def padded(leaf: Any) -> np.ndarray:
-        return np.pad(np.asarray(leaf), [(0, most - len(leaf)), *[(0, 0)] * (np.ndim(leaf) - 1)])
-
-    return jax.tree.map(lambda *leaves: np.stack([padded(leaf) for leaf in leaves]), *sets)
+    return jax.tree.map(stack, *trees)

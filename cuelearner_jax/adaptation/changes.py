@@ -32,18 +32,16 @@ def load(reference: str) -> Any:
     return plugins.load(reference, object, "changes of the world")
 
 
-def family_of(given: Any, env: Any) -> Family:
+def family_of(changes: Any, env: Any) -> Family:
     """Return the family of a user's distortions: one, a list of them, or a function of the environment that returns one
     of these.
-
-    Raises UserError for something else, or a family that makes no sense.
     """
-    if callable(given):
-        given = given(env)
-    several = (given,) if isinstance(given, Distortion) else given
+    if callable(changes):
+        changes = changes(env)
+    several = (changes,) if isinstance(changes, Distortion) else changes
     if not isinstance(several, list | tuple) or not all(isinstance(one, Distortion) for one in several):
         wanted = "give a cuelearner_jax.Distortion, several, or a function of the environment that returns them"
-        raise UserError(f"changes is {format_value(given)}: {wanted}")
+        raise UserError(f"changes is {format_value(changes)}: {wanted}")
     return check_family(several)
 
 
@@ -54,14 +52,14 @@ def check_acts(family: Family, env: Environment) -> None:
     obs, actions = jax.vmap(env.reset)(keys)[1], space.sample(k_action, (SITUATIONS,))
     for one in family:
         nothing = jnp.zeros(len(one.unknowns))
-        for name, given, found in (
+        for name, rows, result in (
             ("sees", obs, jax.vmap(partial(undo_observation, (one,), nothing))(obs)),
             ("acts", actions, jax.vmap(partial(undo_action, (one,), nothing))(actions)),
             ("plans", actions, jax.vmap(partial(undo_physics, (one,), nothing))(obs, actions)),
         ):
-            if found.shape != given.shape:
-                raise UserError(f"distortion {one.name!r}: {name} returns {found.shape[1:]}: give {given.shape[1:]}")
-            if not np.allclose(np.asarray(found), np.asarray(given), atol=SAME, rtol=SAME):
+            if result.shape != rows.shape:
+                raise UserError(f"distortion {one.name!r}: {name} returns {result.shape[1:]}: give {rows.shape[1:]}")
+            if not np.allclose(np.asarray(result), np.asarray(rows), atol=SAME, rtol=SAME):
                 raise UserError(
                     f"distortion {one.name!r}: {name} changes rows although all of its unknowns are "
                     "zero: let it change nothing at zero"
@@ -69,15 +67,9 @@ def check_acts(family: Family, env: Environment) -> None:
 
 
 def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
-    """Return the distortions of a policy that was read from a file.
+    """Return the distortions of a policy that was read from a file, `layer` being its plain values.
 
-    Args:
-        layer: the policy's plain values from the file.
-        env: the world that the policy acts in.
-        changes: code of the user's own distortions, as `family_of` takes it; None: none was named.
-
-    Raises:
-        UserError: code that was not given, or distortions that this world or code does not have.
+    `changes`: code of the user's own distortions, as `family_of` takes it; None: none was named.
     """
     code, names = layer["code"], layer["distortions"]
     if code and changes is None:
@@ -85,8 +77,8 @@ def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Fami
             f"this policy corrects changes of code, {code}, which is not loaded because a file names it: add "
             f"--changes {code} (from Python changes=...) if you trust that code"
         )
-    known = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env))}
-    family = tuple(known[name] for name in names if name in known)
+    by_name = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env))}
+    family = tuple(by_name[name] for name in names if name in by_name)
     units = [(one["name"], one["unit"]) for one in layer["changes"]]
     if len(family) < len(names) or [(one.name, one.unit) for one in unknowns_of(family)] != units:
         raise UserError(

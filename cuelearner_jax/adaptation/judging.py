@@ -11,25 +11,27 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
-from cuelearner_jax.adaptation.person import Person, preferences
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
-from cuelearner_jax.policies import PolicyNode
+from cuelearner_jax.policies import Policy, PolicyNode
 from cuelearner_jax.spaces import is_answered
+from cuelearner_jax.task import Pictures
 
 HELD_OUT = 5  # every fifth label is held out
 LABELS = "labels"  # `Judging.by` where held-out labels judge in place of a metric
@@ -40,6 +42,16 @@ AT_ONCE = 10  # episodes between two looks
 STAKES = np.array([0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # lambda of the sequential test
 DECIDED = 20.0  # value of the test martingale that decides
 SHARES = ("success", "finished")  # metrics within [0, 1]
+
+# films of the same start -> -1: the left one is better, 0: neither, 1: the right one
+Prefer = Callable[[Path, Path], int]
+
+
+class Person(NamedTuple):
+    """Who compares films, and how these are drawn."""
+
+    prefer: Prefer
+    pictures: Pictures
 
 
 @dataclass(frozen=True)
@@ -60,7 +72,7 @@ class Judgement(NamedTuple):
     by: str  # a metric; "labels": the share of held-out answers that are predicted; "person": of pairs preferred
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
-    used: np.ndarray  # (lanes,) bool: is the correction used? Only if it is shown to be better, and finite
+    in_use: np.ndarray  # (lanes,) bool: is the correction used? Only if it is shown to be better, and finite
     within_deg: np.ndarray  # (lanes,) how far corrections then lead from the base's actions [the space's unit]
     # (lanes, 3) after less before and the ends of its 95% interval over episodes, paired; nan by labels
     difference: np.ndarray
@@ -91,27 +103,24 @@ class Judge:
         self.mesh = mesh if mesh.size > 1 else None
 
     def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
-        """Return the judgement of the finished lanes, and the lanes with the bounds that are used.
-
-        Raises UserError if labels cannot judge.
-        """
+        """Return the judgement of the finished lanes, and the lanes with the bounds that are used."""
         how, lanes = self.how, self.lanes
         if how.by == LABELS:
             if self.of.guidance.by_evidence:
-                before_after_used = np.zeros(lanes.number), block.evidence, block.used
+                verdict = np.zeros(lanes.number), block.evidence, block.in_use
             else:
-                before_after_used = judged_by_labels(self.of, block)
+                verdict = judge_by_labels(self.of, block)
             unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
-            return Judgement(LABELS, *before_after_used, bounds_of(self.of, block), unknown, none), block
+            return Judgement(LABELS, *verdict, bounds_of(self.of, block), unknown, none), block
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
         if how.person is not None:
             return self._compared(how.person, block, usable), block
         block, steps = self._narrowed(block)
         test, values = PairedTest(lanes.number), []
         for number in range(-(-how.num_envs // AT_ONCE)):
-            pair, played = self._pair(block, number)
+            pair, own_steps = self._pair(block, number)
             values.append(pair)
-            steps += played
+            steps += own_steps
             test.add(differences(pair, how.by))
             if (test.decided | ~usable).all():
                 break
@@ -125,9 +134,9 @@ class Judge:
         assert self.lanes.number == 1  # `AdaptRequest`
         test, answers = PairedTest(1), []
         policies = self.of.bases.lane(0), self.of.policy(block, self.how.env).lane(0)
-        told = preferences(person, self.how.env, policies, episodes(SPLIT), self.how.steps)
-        with contextlib.closing(told):
-            for answer in itertools.islice(told, self.how.num_envs if usable[0] else 0):
+        answers_of_person = preferences(person, self.how.env, policies, episodes(SPLIT), self.how.steps)
+        with contextlib.closing(answers_of_person):
+            for answer in itertools.islice(answers_of_person, self.how.num_envs if usable[0] else 0):
                 answers.append(answer)
                 test.add(np.array([[float(answer)]]))
                 if test.decided[0]:
@@ -135,8 +144,8 @@ class Judge:
         each = np.array([answers], float).reshape(1, -1)
         before, after = (np.mean(each == which, -1) if answers else np.zeros(1) for which in (-1, 1))
         difference = mean_interval(each).T if answers else np.full((1, 3), np.nan)
-        used, steps = usable & test.better, np.zeros(1, int)
-        return Judgement(PERSON, before, after, used, bounds_of(self.of, block), difference, steps)
+        in_use, steps = usable & test.better, np.zeros(1, int)
+        return Judgement(PERSON, before, after, in_use, bounds_of(self.of, block), difference, steps)
 
     def _pair(self, block: Any, number: int) -> tuple[tuple[dict[str, np.ndarray], ...], np.ndarray]:
         """Play episodes by base and adapted policy; return the values of each (lanes, episodes), and the steps."""
@@ -146,7 +155,7 @@ class Judge:
         shared = len(next(iter(bases.each.values()))) == 1
         own = np.zeros(self.lanes.number, int) if shared else self.lanes.base
         pair = ({name: np.asarray(values)[own] for name, values in bases.each.items()}, after.each)
-        return pair, self._played(after, AT_ONCE) + self._played(bases, AT_ONCE)[own]
+        return pair, self._counted_steps(after, AT_ONCE) + self._counted_steps(bases, AT_ONCE)[own]
 
     def _narrowed(self, block: Any) -> tuple[Any, np.ndarray]:
         """Return lanes within the best share of their bounds, and the rewarded steps (lanes,) of this."""
@@ -156,7 +165,7 @@ class Judge:
             within = block.replace(bound=share * block.bound)
             what = f"the adapted policy within {share:g} of its bound"
             rollout = self._rolled(self.of.policy(within, self.how.env), what)
-            spent = spent + self._played(rollout, self.how.num_envs)
+            spent = spent + self._counted_steps(rollout, self.how.num_envs)
             better = np.asarray(rollout.means[self.how.by]) > value
             value = np.where(better, rollout.means[self.how.by], value)
             best = jnp.where(jnp.asarray(better), within.bound, best)
@@ -169,7 +178,7 @@ class Judge:
         key, envs = episodes(SPLIT) if key is None else key, num_envs or how.num_envs
         return rollout_lanes(how.env, policy, key, envs, envs * how.steps, self.watch(what), mesh)
 
-    def _played(self, rolled: Rollout, num_envs: int) -> np.ndarray:
+    def _counted_steps(self, rolled: Rollout, num_envs: int) -> np.ndarray:
         """Return the environment steps (lanes,) that count: where a metric is an outcome, those of first episodes."""
         first, whole = np.asarray(rolled.episode_steps), num_envs * self.how.steps
         return first.sum(-1) if self.how.by in _step_of(self.how.env).outcome else np.full(len(first), whole)
@@ -220,18 +229,15 @@ def differences(pair: tuple[dict[str, np.ndarray], ...], by: str) -> np.ndarray:
     return relative(by)
 
 
-def judged_by_labels(of: Adaptation, block: LaneState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def judge_by_labels(of: Adaptation, block: LaneState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return before, after and used of a `Judgement`: "already right" always, and a model, on every fifth label.
 
     The model in use is fitted to all labels; a second one is fitted for this comparison alone.
-
-    Raises:
-        UserError: answers that say nothing about turning an action, or fewer than five.
     """
     form = of.guidance.form
     if form is None or not form.by_eps:
-        told = form.name if form else "no"
-        raise UserError(f"{told} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
+        name = form.name if form else "no"
+        raise UserError(f"{name} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
     failed = np.asarray(block.failed)
     if np.asarray(block.guide.labels.valid).sum(-1)[~failed].min(initial=HELD_OUT) < HELD_OUT:
         raise UserError(f"fewer than {HELD_OUT} labels cannot judge a model: give more, or --judge-by a metric")
@@ -251,14 +257,14 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
         others = labels.replace(valid=labels.valid & ~held)
         model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
-        moved = guidance.refine_labelled_actions(model, env, labels, held, one_pass).actions
-        moves = space.log(labels.action, moved) / space.from_unit(of.scalars.eps_deg)
+        refined = guidance.refine_labelled_actions(model, env, labels, held, one_pass).actions
+        moves = space.log(labels.action, refined) / space.from_unit(of.scalars.eps_deg)
         # words about one cue each; of the other cues nothing is compared
-        told = is_answered(labels.answer) & held[:, None]
-        count = jnp.maximum(told.sum(), 1)
-        share = lambda flags: jnp.sum(flags, where=told) / count  # noqa: E731
+        counts = is_answered(labels.answer) & held[:, None]
+        count = jnp.maximum(counts.sum(), 1)
+        share = lambda flags: jnp.sum(flags, where=counts) / count  # noqa: E731
         right = share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer)
-        return share(labels.answer == 0), jnp.where(told.any(), right, jnp.nan)
+        return share(labels.answer == 0), jnp.where(counts.any(), right, jnp.nan)
 
     return each_lane(one)(block)
 
@@ -266,3 +272,48 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
 def bounds_of(of: Adaptation, block: Any) -> np.ndarray:
     """Return the bounds (lanes,) of a block of lanes, in the space's unit."""
     return actions_of(of.env).to_unit(np.asarray(block.bound), np)
+
+
+def preferences(
+    person: Person, env: Environment, policies: tuple[Policy, Policy], key: PRNGKeyArray, steps: int
+) -> Generator[int, None, None]:
+    """Yield, for one start after another, 1 where the second policy is preferred, -1 where the first is, else 0.
+
+    Films change sides by chance. `steps`: of an episode, at most. Raises UserError for another answer.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        number = 0
+        while True:
+            start = jax.random.fold_in(key, number)
+            films = [Path(folder, f"{number}{name}.gif") for name in "ab"]
+            for policy, file in zip(policies, films, strict=True):
+                frames, _ = person.pictures.record(env, policy, start, int(_length(env, policy, start, steps)))
+                person.pictures.animate(env, frames, file)
+            swapped = bool(jax.random.bernoulli(jax.random.fold_in(start, 1)))
+            answer = person.prefer(*(films[::-1] if swapped else films))
+            if answer not in (-1, 0, 1):
+                raise UserError(f"judge_by gave {format_value(answer)}: give -1 (left), 0 (no difference) or 1 (right)")
+            yield -answer if swapped else answer
+            for file in films:
+                file.unlink()
+            number += 1
+
+
+@jax.jit
+def _length(env: Environment, policy: Policy, key: PRNGKeyArray, steps: Int[Array, ""] | int) -> Int[Array, ""]:
+    """Return the steps of an episode that begins by a key, with the random numbers of `Pictures.record`."""
+    k_reset, k_play = jax.random.split(key)
+
+    def unfinished(carry: tuple[Any, ...]) -> Array:
+        number, *_, ended = carry
+        return (number < steps) & ~ended
+
+    def advance(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        number, state, obs, _ = carry
+        k_act, k_step = jax.random.split(jax.random.fold_in(k_play, number))
+        action = policy.act(k_act, jax.tree.map(lambda leaf: leaf[None], state), obs[None])[0]
+        following, step = env.step(k_step, state, action)
+        return number + 1, following, step.obs, step.terminated | step.truncated
+
+    first = (jnp.zeros((), jnp.int32), *env.reset(k_reset), jnp.array(False))
+    return jax.lax.while_loop(unfinished, advance, first)[0]

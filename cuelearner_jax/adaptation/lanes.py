@@ -110,10 +110,10 @@ class Adaptation(struct.PyTreeNode):
         base, view = self.bases.lane(block.base), view_of(self.env if env is None else env)
         return Guided(base, block.guide.model, view, self.scalars, self.guidance, block.bound, self.sizes)
 
-    def keep_used(self, block: LaneState, used: Bool[Array, " lanes"]) -> LaneState:
+    def drop_unused(self, block: LaneState, in_use: Bool[Array, " lanes"]) -> LaneState:
         """Return the lanes, without a fitted model where it is not used: actions are then unchanged."""
         model = block.guide.model
-        return block.replace(guide=block.guide.replace(model=model.replace(fitted=model.fitted & used)))
+        return block.replace(guide=block.guide.replace(model=model.replace(fitted=model.fitted & in_use)))
 
 
 def rounds(lanes: Lanes, sizes: GuideSizes) -> int:

@@ -23,18 +23,18 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, policy_of, uniform_in
 from cuelearner_jax.reading.policy import KIND as READING
-from cuelearner_jax.reading.policy import Read, unread
+from cuelearner_jax.reading.policy import ReadingPolicy, unread
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
 # the kinds that can be stored, and the arrays of those that have any
 STORED = ("agent", "guided", READING, "uniform", "heuristic", "code")
-ARRAYS = {Agent: ("params",), Guided: ("model", "bound"), Read: ("correction", "bound")}
+ARRAYS = {Agent: ("params",), Guided: ("model", "bound"), ReadingPolicy: ("correction", "bound")}
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # groups in a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other values and the arrays hold them already
 
 
-def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
-    """Return a policy, or a block of policies, as plain values; `named`: the reference of user code in it, if any.
+def to_json(policy: Any, reference: str | None = None) -> dict[str, Any]:
+    """Return a policy, or a block of policies, as plain values; `reference`: the reference of user code in it, if any.
 
     Raises UserError for a policy that cannot be stored.
     """
@@ -45,7 +45,7 @@ def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
         if layer["policy"] not in STORED or (layer["policy"] == "guided" and layer["sizes"] is None):
             raise UserError(f"a policy of kind {layer['policy']} cannot be stored in a folder: give another kind")
         if layer["policy"] == "code":
-            layer["named"] = named or "code"
+            layer["named"] = reference or "code"
         for change in layer.get("changes", ()):
             change.pop("value")
         for name in DERIVED:
@@ -70,14 +70,8 @@ def with_arrays(policy: Any, arrays: Any) -> Any:
 def from_json(values: dict[str, Any], env: Any, code: Any = None, changes: Any = None) -> Any:
     """Return the policy of plain values, with shapes in place of its arrays (`with_arrays`), to act in a world.
 
-    Args:
-        values: the policy's plain values.
-        env: the world; shapes in place of its arrays will do.
-        code: the policy that stands for code in it; None: none was given.
-        changes: the user's own distortions in it, as `changes.family_of` takes them; None: none were given.
-
-    Raises:
-        UserError: the policy's code was not given, or it needs what the environment has not.
+    `env`: the world; shapes in place of its arrays will do. `code`, `changes`: what stands for code in the values, and
+    the user's own distortions, as `changes.family_of` takes them; None: none were given.
     """
     kind, key = values["policy"], jax.random.key(0)
     if kind == "agent":
@@ -97,7 +91,7 @@ def from_json(values: dict[str, Any], env: Any, code: Any = None, changes: Any =
     if kind == READING:
         base, family = from_json(values["base"], env, code, changes), own_changes.rebuild_family(values, env, changes)
         sizes = values["labels"], values["mixed"]
-        return unread(base, actions_of(env), family, env.obs_size, *sizes, named=values["code"])
+        return unread(base, actions_of(env), family, env.obs_size, *sizes, reference=values["code"])
     if kind != "code":
         raise UserError(f"{kind!r} is not a kind of policy that this program knows: use the cuelearner that wrote it")
     if code is None:

@@ -66,10 +66,7 @@ class DDQNConfig:
     """Gradient steps between two moves of the target network."""
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> DoubleDQN:
-        """Return the agent for an environment's spaces.
-
-        Raises UserError for a frame or a search that does not fit the spaces.
-        """
+        """Return the agent for an environment's spaces."""
         if self.coarse_directions:
             check_directions(spaces.actions, "agent.coarse_directions", "give 0")
         widths(frame, spaces)

@@ -89,11 +89,8 @@ def network_inputs(
 ) -> tuple[Float[Array, "*n own"], Float[Array, "*m turned"]]:
     """Return a network's inputs for observation and action.
 
-    Args:
-        frame: "raw": the two as they are; "action": the environment's `features`.
-        env: provides the features; not used in the raw frame.
-        obs: one observation (obs,) with any number of actions, or n observations with one action each.
-        actions: (*m, action) or (n, action).
+    `frame`: "raw": the two as they are; "action": the features of `env`. `obs`: one observation (obs,) with any number
+    of actions (*m, action), or n observations with one action each.
     """
     if frame == "raw":
         return obs, actions

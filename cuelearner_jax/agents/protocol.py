@@ -93,8 +93,6 @@ class AgentOptions(Protocol):
         """Return the agent for an environment's spaces; floats of the options may be None.
 
         `bootstraps`: whether the discount is above 0.
-
-        Raises UserError for a frame in which the environment cannot be seen.
         """
         ...
 

@@ -38,9 +38,8 @@ class Transition(struct.PyTreeNode):
     obs: Float[Array, " obs"]
     action: Float[Array, " action"]  # as executed
     reward: Float[Array, ""]
-    discount: Float[
-        Array, ""
-    ]  # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
+    # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
+    discount: Float[Array, ""]
     next_obs: Float[Array, " obs_or_0"]
 
 
@@ -50,7 +49,7 @@ class LaterSteps(NamedTuple):
     rewards: Float[Array, "batch n"]
     discounts: Float[Array, "batch n"]
     ended: Float[Array, "batch n"]
-    known: Bool[Array, "batch n"]  # False past the newest step
+    exists: Bool[Array, "batch n"]  # False past the newest step
 
 
 class RingBuffer(NamedTuple):
@@ -62,9 +61,8 @@ class RingBuffer(NamedTuple):
     add: Callable[[Array, Array, StoredStep], Array]  # (rows, step, steps (n, ...)) -> rows
     draw: Callable[[PRNGKeyArray, Array, Array, int], Array]  # (key, rows, step, batch_size) -> rows' numbers
     read: Callable[[Array, Array], StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
-    follow: Callable[
-        [Array, Array, Array, int, int], LaterSteps
-    ]  # (rows, step, numbers (batch,), n, num_envs) -> Following
+    # (rows, step, numbers (batch,), n, num_envs) -> Following
+    follow: Callable[[Array, Array, Array, int, int], LaterSteps]
 
 
 @jax.custom_batching.custom_vmap
@@ -125,7 +123,7 @@ def ring_buffer(example: StoredStep) -> RingBuffer:
         places = jnp.mod(numbers[:, None] + further[None], capacity)
         # Three neighbouring numbers of each row, not the row.
         later = rows[places[..., None], reward_column + jnp.arange(3)[None, None]]
-        return LaterSteps(*jnp.moveaxis(later, -1, 0), known=further[None] <= newer[:, None])
+        return LaterSteps(*jnp.moveaxis(later, -1, 0), exists=further[None] <= newer[:, None])
 
     return RingBuffer(width, empty, pack, add, draw, read, follow)
 
@@ -158,15 +156,16 @@ class Memory(NamedTuple):
         to the other.
         """
         k_sample, k_mirror = jax.random.split(key)
-        batches = self._drawn(k_sample, size, n_step, discount, guided_share)
+        batches = self._draw(k_sample, size, n_step, discount, guided_share)
         if self.labelled is not None:
             k_labelled, k_choice = jax.random.split(jax.random.fold_in(k_sample, 1))
-            labelled = self.labelled._drawn(k_labelled, size, n_step, discount, None)
-            chosen = self._labelled_places(k_choice, size, guided_share)
-            batches = [_replaced(chosen, *both) for both in zip(labelled, batches, strict=True)]
+            labelled = self.labelled._draw(k_labelled, size, n_step, discount, None)
+            places = self._labelled_places(k_choice, size, guided_share)
+            pick = lambda one, other: jnp.where(places.reshape(-1, *[1] * (one.ndim - 1)), one, other)  # noqa: E731
+            batches = [jax.tree.map(pick, *both) for both in zip(labelled, batches, strict=True)]
         return [apply_symmetries(k_mirror, self.env, batch) for batch in batches]
 
-    def _drawn(self, key: PRNGKeyArray, size: int, n_step: int, discount: Any, guided_share: Any) -> list[Transition]:
+    def _draw(self, key: PRNGKeyArray, size: int, n_step: int, discount: Any, guided_share: Any) -> list[Transition]:
         """Return the batches of `batches`, of this memory's own rows and without symmetries."""
         if guided_share is None or self.guided is None:
             numbers = self.buffer.draw(key, self.rows, self.filled, size)
@@ -200,17 +199,11 @@ class Memory(NamedTuple):
         """Return the transitions that begin at rows `numbers` and span up to n steps of one episode."""
         after = self.buffer.follow(self.rows, self.filled, numbers, n, self.num_envs)
         summed = jax.vmap(partial(n_step_return, discount=discount))
-        reward, factor, last = summed(after.rewards, after.discounts, after.ended, after.known)
+        reward, factor, last = summed(after.rewards, after.discounts, after.ended, after.exists)
         first = self.buffer.read(self.rows, numbers)
         end = self.buffer.read(self.rows, jnp.mod(numbers + last * self.num_envs, self.rows.shape[0]))
         next_obs = jax.vmap(self.env.recall_next)(end.obs, end.action, end.aftermath)
         return Transition(jax.vmap(self.env.recall)(first.obs), first.action, reward, factor, next_obs)
-
-
-def _replaced(chosen: Bool[Array, " n"], new: Transition, old: Transition) -> Transition:
-    """Return transitions (n, ...) with new ones in the chosen places."""
-    pick = lambda one, other: jnp.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, other)  # noqa: E731
-    return jax.tree.map(pick, new, old)
 
 
 def count_guided(
@@ -261,17 +254,17 @@ def n_step_return(
     rewards: Float[Array, " n"],
     discounts: Float[Array, " n"],
     ended: Float[Array, " n"],
-    known: Bool[Array, " n"],
+    exists: Bool[Array, " n"],
     discount: Float[Array, ""] | float,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
     """Return the discounted rewards of up to n steps of one episode (Sutton and Barto, 2018, Eq. 7.1).
 
-    The sum stops with the episode's last step, or with the last step that is `known`; `discounts` is 0 at termination,
+    The sum stops with the episode's last step, or with the last step that is `exists`; `discounts` is 0 at termination,
     else 1. Returns the sum; the factor of the value of the last step's next observation, short of one `discount`, as
     `Transition.discount` has it; the last step's index.
     """
     before_end = jnp.cumprod(jnp.concatenate([jnp.ones(1), 1.0 - ended[:-1]]))
-    counts = before_end * known
+    counts = before_end * exists
     powers = jnp.power(jnp.asarray(discount, rewards.dtype), jnp.arange(rewards.shape[0]))
     last = counts.sum().astype(jnp.int32) - 1
     return jnp.sum(counts * powers * rewards), powers[last] * discounts[last], last

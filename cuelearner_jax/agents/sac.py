@@ -77,10 +77,7 @@ class SACConfig:
     """Rate at which the target critics follow."""
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> SoftActorCritic:
-        """Return the agent for an environment's spaces.
-
-        Raises UserError if actions are not of a box, or the frame is not raw.
-        """
+        """Return the agent for an environment's spaces."""
         if not isinstance(spaces.actions, Box):
             raise UserError(
                 f"agent 'sac' acts in boxes, not in {spaces.actions.name}: give --agent ddqn, which serves any space"
@@ -94,9 +91,7 @@ class SACConfig:
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
         """Raise UserError for options that do not work together."""
         if self.target_critics > self.critics:
-            raise UserError(
-                f"agent.target_critics is {self.target_critics}: give at most agent.critics ({self.critics})"
-            )
+            raise UserError(f"agent.target_critics is {self.target_critics}: give up to agent.critics ({self.critics})")
 
 
 class Actor(nn.Module):
@@ -254,9 +249,10 @@ class SoftActorCritic:
         key: PRNGKeyArray,
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the means of temperature * log p(a) - Q(s, a) and of log p(a) over the actor's draws."""
-        drawn = self.draw(actor, obs, key)
-        loss = temperature * drawn.log_density - self._climbed(critics, obs, drawn.unit)
-        return loss.mean(), drawn.log_density.mean()
+        draws = self.draw(actor, obs, key)
+        values = self.values(critics, obs, draws.unit)
+        value = values.mean(0) if self.options.critics > self.options.target_critics else values.min(0)
+        return (temperature * draws.log_density - value).mean(), draws.log_density.mean()
 
     def targets(
         self,
@@ -274,9 +270,9 @@ class SoftActorCritic:
         if not self.bootstraps:
             return batch.reward
         k_act, k_critics = jax.random.split(key)
-        drawn, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
-        own = self.values(judges, batch.next_obs, drawn.unit).min(0)
-        value = own - temperature * drawn.log_density if self.options.entropy_in_targets else own
+        draws, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
+        own = self.values(judges, batch.next_obs, draws.unit).min(0)
+        value = own - temperature * draws.log_density if self.options.entropy_in_targets else own
         return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
 
     def _judges(self, target_critics: Params, key: PRNGKeyArray) -> Params:
@@ -284,15 +280,8 @@ class SoftActorCritic:
         own = self.options
         if own.target_critics == own.critics:
             return target_critics
-        chosen = jax.random.permutation(key, own.critics)[: own.target_critics]
-        return jax.tree.map(lambda leaf: leaf[chosen], target_critics)
-
-    def _climbed(
-        self, critics: Params, obs: Float[Array, "n obs"], unit: Float[Array, "n action"]
-    ) -> Float[Array, " n"]:
-        """Return the value that the actor maximises."""
-        values = self.values(critics, obs, unit)
-        return values.mean(0) if self.options.critics > self.options.target_critics else values.min(0)
+        subset = jax.random.permutation(key, own.critics)[: own.target_critics]
+        return jax.tree.map(lambda leaf: leaf[subset], target_critics)
 
     def _gaussian(self, actor: Params, obs: Float[Array, "n obs"]) -> tuple[Array, Array]:
         mean, log_std = self._actor.apply(actor, obs)

@@ -20,9 +20,8 @@ import numpy as np
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.adaptation.judging import LABELS, PERSON
+from cuelearner_jax.adaptation.judging import LABELS, PERSON, Prefer
 from cuelearner_jax.adaptation.lanes import blame
-from cuelearner_jax.adaptation.person import Prefer
 from cuelearner_jax.api.labels import Labels, labels_from_file, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, config_of, load_policy
 from cuelearner_jax.api.worlds import World, numbers, teacher_of_world
@@ -54,39 +53,39 @@ class AdaptedPolicy(CallablePolicy):
     """
 
     outcome: AdaptedStudy
-    named: str  # the base, as Python calls it
+    base_name: str  # the base, as Python calls it
 
     @property
     def used(self) -> bool:
         """Whether the correction is used. It is only if it is shown to be better."""
-        return bool(self.outcome.found.judged.used[0])
+        return bool(self.outcome.result.judgement.in_use[0])
 
     @property
     def judged(self) -> tuple[str, float, float]:
         """The metric's name, and its value before and after the correction, on tuning episodes or held-out labels."""
-        of = self.outcome.found.judged
+        of = self.outcome.result.judgement
         return of.by, float(of.before[0]), float(of.after[0])
 
     @property
     def difference(self) -> tuple[float, float, float]:
         """The metric after less before, and its 95% interval over the tuning episodes; NaN where labels judge."""
-        estimate, lower, upper = (float(value) for value in self.outcome.found.judged.difference[0])
+        estimate, lower, upper = (float(value) for value in self.outcome.result.judgement.difference[0])
         return estimate, lower, upper
 
     @property
     def rewarded_steps(self) -> int:
         """Number of environment steps whose rewards decided whether the correction is used; 0 where labels judge."""
-        return int(self.outcome.found.judged.rewarded_steps[0])
+        return int(self.outcome.result.judgement.rewarded_steps[0])
 
     @property
     def labels(self) -> Labels:
         """The labels so far (relative feedback)."""
-        return labels_of(jax.tree.map(lambda leaf: leaf[0], self.outcome.found.labels))
+        return labels_of(jax.tree.map(lambda leaf: leaf[0], self.outcome.result.labels))
 
     @property
     def result(self) -> Result | None:
         """The verdict of a reading and its estimates with intervals. None where a feedback model was fitted."""
-        return next(iter(self.outcome.found.results), None)
+        return next(iter(self.outcome.result.results), None)
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -96,7 +95,7 @@ class AdaptedPolicy(CallablePolicy):
     @property
     def words(self) -> list[str]:
         """The lines that `cuelearner adapt` prints of this result."""
-        return self.outcome.found.words
+        return self.outcome.result.words
 
     @user_code.report_user_errors
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
@@ -106,7 +105,7 @@ class AdaptedPolicy(CallablePolicy):
         """
         if self.world is None:
             raise UserError("a policy folder names its world, and an environment has no name: adapt in one of cl.make")
-        subject = self.outcome.subject._replace(origin={"code": self.named})
+        subject = self.outcome.subject._replace(origin={"code": self.base_name})
         with policy_folders.place_of(Path(folder), overwrite) as place:
             self.outcome._replace(subject=subject).write(place)
 
@@ -161,11 +160,11 @@ def adapt(
     """
     if hasattr(world, "observation_space"):
         raise UserError("world is an environment of Gymnasium: give cl.from_gymnasium(its id, class or function)")
-    known = world if isinstance(world, World) else None
+    own_world = world if isinstance(world, World) else None
     env = world.env if isinstance(world, World) else world
     space = actions_of(env)
-    if known is not None:
-        config = config_of(policy, known)
+    if own_world is not None:
+        config = config_of(policy, own_world)
     else:
         config = getattr(policy, "trained", None) or RunConfig(None, scalars=plain_scalars(space))
     file = Path(labels) if isinstance(labels, str | os.PathLike) else None
@@ -175,29 +174,29 @@ def adapt(
     elif file is None and rows is None:
         raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
     scalars, eps_deg = scalars and normalize_options(scalars, "scalars"), eps_deg and float(eps_deg)
-    task, scenario = (known.task, known.scenario) if known else (None, None)
-    given = {
+    task, scenario = (own_world.task, own_world.scenario) if own_world else (None, None)
+    optional = {
         "labels": (labels,) if file is None and rows is None and labels is not None else None,
         "sizes": sizes and normalize_options(sizes, "sizes"),
         "bound_deg": None if bound_deg is None else (float(bound_deg),),
         "judge_bounds": None if judge_bounds is None else tuple(map(float, judge_bounds)),
     }
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    options: dict[str, Any] = {name: value for name, value in optional.items() if value is not None}
     options |= {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
     prefer, judge_by = (judge_by, PERSON) if callable(judge_by) else (None, judge_by)
     request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, scalars)
     about = {"task": task, "teacher": teacher, "rows": rows, "changes": changes, "prefer": prefer}
     subject = Subject(env, Common(as_policy_in(policy, env)), **about)
     outcome = dataclasses.replace(request, **options).run(subject)
-    result = outcome.found
+    result = outcome.result
     if result.failed.any():
         blame(result.of, teacher, result.block)
         raise UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")
-    if not result.judged.used.all():
+    if not result.judgement.in_use.all():
         warnings.warn(result.words[-1], stacklevel=3)
     inner, observation = result.policy(env).lane(0), getattr(env, "observation", ())
-    about = {"trained": RunConfig(config.task), "actions": space, "world": known}
-    return AdaptedPolicy(inner, observation, **about, outcome=outcome, named=_called(policy))
+    about = {"trained": RunConfig(config.task), "actions": space, "world": own_world}
+    return AdaptedPolicy(inner, observation, **about, outcome=outcome, base_name=_called(policy))
 
 
 def _called(policy: Any) -> str:
@@ -247,18 +246,18 @@ def correct(
         policy = load_policy(policy)
     before = getattr(getattr(policy, "trained", None), "task", None)
     before = before if isinstance(before, LogsConfig) else None
-    label_set = _labels(labels, space, cues, low, high, before)
-    if label_set.eps is not None:
-        if eps is not None and not math.isclose(eps, label_set.eps, rel_tol=1e-6):
-            raise UserError(f"the label file holds answers of {label_set.eps:g} {label_set.space.unit}: leave out eps")
-        eps = label_set.eps
+    file = _labels(labels, space, cues, low, high, before)
+    if file.eps is not None:
+        if eps is not None and not math.isclose(eps, file.eps, rel_tol=1e-6):
+            raise UserError(f"the label file holds answers of {file.eps:g} {file.space.unit}: leave out eps")
+        eps = file.eps
     own = as_policy(policy)
-    acting = CallablePolicy(policy_of(own, label_set.space), actions=label_set.space)
-    acting(label_set.labels.obs)  # refuses what gives no actions
+    acting = CallablePolicy(policy_of(own, file.space), actions=file.space)
+    acting(file.labels.obs)  # refuses what gives no actions
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
-        world_of(label_set, before),
-        labels=labels_of(label_set.labels),
+        world_of(file, before),
+        labels=labels_of(file.labels),
         bound_deg=bound,
         eps_deg=eps,
         guidance=guidance,
@@ -293,13 +292,13 @@ def agreement(
         if not isinstance(policy, CallablePolicy):
             raise UserError("space is None, and arrays of labels name none: give space=, or a label file")
         space = policy.actions
-    label_set = _labels(labels, space)
-    eps = label_set.eps if eps is None else eps
+    file = _labels(labels, space)
+    eps = file.eps if eps is None else eps
     if eps is None:
-        eps = float((getattr(own, "scalars", None) or plain_scalars(label_set.space)).eps_deg)
+        eps = float((getattr(own, "scalars", None) or plain_scalars(file.space)).eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base)
-    base = None if base is None else policy_of(base, label_set.space)
-    return agreement_of(policy_of(own, label_set.space), label_set.labels, label_set.space, eps, base)
+    base = None if base is None else policy_of(base, file.space)
+    return agreement_of(policy_of(own, file.space), file.labels, file.space, eps, base)
 
 
 def _labels(
@@ -310,15 +309,15 @@ def _labels(
     Raises UserError for labels that do not fit their space.
     """
     options = {"space": space, "cues": cues or None, "low": low, "high": high}
-    chosen = [name for name, value in options.items() if value is not None]
+    names = [name for name, value in options.items() if value is not None]
     if isinstance(labels, str | os.PathLike):
-        if chosen:
-            raise UserError(f"{labels} says its own space of actions: leave out {chosen[0]}")
+        if names:
+            raise UserError(f"{labels} says its own space of actions: leave out {names[0]}")
         return labels_from_file(Path(labels))
     rows, note = rows_of(labels), partial(warnings.warn, stacklevel=5)
-    if space is not None and len(chosen) > 1:
-        raise UserError(f"{chosen[1]} is given beside space, which says it already: leave out one of them")
-    if before is not None and not chosen:
+    if space is not None and len(names) > 1:
+        raise UserError(f"{names[1]} is given beside space, which says it already: leave out one of them")
+    if before is not None and not names:
         space = logs.space_of(before)
     if space is None:
         low, high = (None if end is None else numbers("low and high", end).tolist() for end in (low, high))
@@ -330,14 +329,14 @@ def _labels(
     return LabelFile({}, RELATIVE.name, space, None, np.zeros(len(rows.obs)), rows)
 
 
-def world_of(label_set: LabelFile, before: LogsConfig | None = None) -> World:
+def world_of(file: LabelFile, before: LogsConfig | None = None) -> World:
     """Return the situations of labels as a world of the task `logs`, which names no folder.
 
     Networks of a policy that was corrected `before` keep their view. Raises UserError where that cannot be.
     """
-    size, obs, space = label_set.labels.obs.shape[1], np.asarray(label_set.labels.obs), label_set.space
-    own = {name: value for name, value in label_set.task.items() if name not in ("name", "from")}
-    config = from_json(LogsConfig, own) if label_set.task.get("name") == logs.NAME else None
+    size, obs, space = file.labels.obs.shape[1], np.asarray(file.labels.obs), file.space
+    own = {name: value for name, value in file.task.items() if name not in ("name", "from")}
+    config = from_json(LogsConfig, own) if file.task.get("name") == logs.NAME else None
     if before is not None:
         if logs.space_of(before) != space:
             raise UserError(
@@ -361,5 +360,5 @@ def world_of(label_set: LabelFile, before: LogsConfig | None = None) -> World:
         )
     if logs.space_of(config).to_json() != space.to_json():
         raise UserError(f"the space {space.name!r} is not one that a recording can have: give a box with plain cues")
-    filled = lambda config, split: logs.filled(config, obs, label_set.labels.action)  # noqa: E731
+    filled = lambda config, split: logs.filled(config, obs, file.labels.action)  # noqa: E731
     return World(logs.configured(config, dataclasses.replace(logs.BODY, environment=filled)), config)

@@ -31,8 +31,8 @@ class Labels(NamedTuple):
 
 def labels_of(rows: Label) -> Labels:
     """Return a lane's valid labels as arrays."""
-    given = jax.device_get(rows)
-    obs, action, answer = (np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer))
+    arrays = jax.device_get(rows)
+    obs, action, answer = (np.asarray(part)[arrays.valid] for part in (arrays.obs, arrays.action, arrays.answer))
     return Labels(obs, action, answer[:, 0] if answer.shape[1] == 1 else answer)
 
 
@@ -48,10 +48,10 @@ def rows_of(labels: Labels) -> Label:
             "actions (n, action) and answers (n,), or (n, cues) where there are several"
         )
     answer = answer[:, None] if answer.ndim == 1 else answer
-    said = np.asarray(says_something(answer))
-    if not said.any():
+    has_answer = np.asarray(says_something(answer))
+    if not has_answer.any():
         raise UserError("labels say nothing of any cue: give labels with answers")
-    return Label(obs[said], action[said], answer[said], np.ones(said.sum(), bool))  # pyright: ignore[reportArgumentType]
+    return Label(obs[has_answer], action[has_answer], answer[has_answer], np.ones(has_answer.sum(), bool))  # pyright: ignore[reportArgumentType]
 
 
 def labels_from_file(path: Path) -> LabelFile:

@@ -20,7 +20,7 @@ from cuelearner_jax.environment import Quantity, actions_of, check_layout
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import FILES, Policy, call_policy, policy_name, policy_of
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs import trained
+from cuelearner_jax.runs import policy_sources
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
@@ -69,9 +69,9 @@ class CallablePolicy:
         batch = rows[None] if rows.ndim == 1 else rows
         key = jax.random.key(0) if key is None else key
         # A copy, which the caller may write in.
-        chosen = np.array(_act(self.policy, key, jnp.asarray(batch), self.actions))
-        user_code.check_actions(chosen, policy_name(self.policy))
-        return chosen[0] if rows.ndim == 1 else chosen
+        result = np.array(_act(self.policy, key, jnp.asarray(batch), self.actions))
+        user_code.check_actions(result, policy_name(self.policy))
+        return result[0] if rows.ndim == 1 else result
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Act as `types.Policy.act`."""
@@ -87,18 +87,18 @@ def observations(value: Any, size: int | None) -> Float[np.ndarray, "*n obs"]:
     return rows
 
 
-def as_policy(given: Any) -> Policy:
+def as_policy(source: Any) -> Policy:
     """Return a policy of a `CallablePolicy`, of a policy folder, or of anything that `policies.policy_of` takes."""
-    if isinstance(given, str | os.PathLike) and not str(given).endswith(FILES):
-        given = load_policy(given)
-    return given.policy if isinstance(given, CallablePolicy) else policy_of(given)
+    if isinstance(source, str | os.PathLike) and not str(source).endswith(FILES):
+        source = load_policy(source)
+    return source.policy if isinstance(source, CallablePolicy) else policy_of(source)
 
 
-def as_policy_in(given: Any, env: Any) -> Policy:
+def as_policy_in(source: Any, env: Any) -> Policy:
     """Return `as_policy` for a world. Raises UserError for a policy of other observations or actions."""
-    policy = policy_of(as_policy(given), actions_of(env))
-    if isinstance(given, CallablePolicy) and given.observation:
-        check_layout("the policy", given.observation, given.actions, env)
+    policy = policy_of(as_policy(source), actions_of(env))
+    if isinstance(source, CallablePolicy) and source.observation:
+        check_layout("the policy", source.observation, source.actions, env)
     return policy
 
 
@@ -142,14 +142,15 @@ def load_policy(
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
     own = registry.resolve(task) if isinstance(task, str) else task
     find = lambda name: own if own and own.name == name else registry.find(name)  # noqa: E731
-    source = trained.PolicySource.of_folder(path, find, None if base is None else as_policy(base), changes)
-    known, name = source.task, policy or source.default_policy
-    changed = world.config if world else source.config.task
-    source.check(name, changed)
-    shape = shape_of(known, changed)
-    found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
-    where, taught = world or World(known, changed), trained.POLICIES[name].taught
-    return CallablePolicy(found, shape.observation, taught, source.config, actions_of(shape), where)
+    source = policy_sources.PolicySource.of_folder(path, find, None if base is None else as_policy(base), changes)
+    own_task, name = source.task, policy or source.default_policy
+    config = world.config if world else source.config.task
+    source.check(name, config)
+    shape = shape_of(own_task, config)
+    seeds = () if seed is None else (seed,)
+    (lane,), _ = policy_sources.several(source, config, name, guidance, labels, seeds, bound_deg)
+    where, taught = world or World(own_task, config), policy_sources.POLICIES[name].taught
+    return CallablePolicy(lane, shape.observation, taught, source.config, actions_of(shape), where)
 
 
 @user_code.report_user_errors
@@ -176,10 +177,10 @@ def measure(
         `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
     """
     code, name = as_policy_in(policy, world.env), Path(world.task.name)
-    source = trained.PolicySource(world.task, config_of(policy, world), None, name, code=code)
+    source = policy_sources.PolicySource(world.task, config_of(policy, world), None, name, code=code)
     request = EvaluateRequest(task=world.config, policy="own", episodes=episodes, steps=steps, envs=envs, engine=engine)
-    (found,) = evaluate.run(source, request)
-    return found
+    (measured,) = evaluate.run(source, request)
+    return measured
 
 
 @user_code.report_user_errors
@@ -204,8 +205,8 @@ def export_policy(
     contract.check_request(format, out)
     env = world.env
     acting = as_policy_in(policy, env)
-    drawn = lambda: decisions.observations(env, acting)  # noqa: E731
-    return contract.write(acting, env, drawn, format, out, _about(policy, world))
+    draw = lambda: decisions.observations(env, acting)  # noqa: E731
+    return contract.write(acting, env, draw, format, out, _about(policy, world))
 
 
 @user_code.report_user_errors
@@ -228,8 +229,8 @@ def export_correction(policy: Any, out: str | Path, world: World | None = None, 
 
     world, out = _world_of(policy, world), Path(out)
     contract.check_request(format, out)
-    alone, seen = correction.correction_of(as_policy(policy), world.env)
-    return contract.write(alone, seen, lambda: correction.cases(world.env), format, out, _about(policy, world))
+    alone, interface = correction.correction_of(as_policy(policy), world.env)
+    return contract.write(alone, interface, lambda: correction.cases(world.env), format, out, _about(policy, world))
 
 
 def _world_of(policy: Any, world: World | None) -> World:
@@ -249,11 +250,6 @@ def load_exported(folder: str | Path) -> Any:
 
     `decide.contract` is its contract, `decide.check()` replays the golden cases again.
     """
-    from cuelearner_jax.export import runner
+    from cuelearner_jax.export import contract
 
-    try:
-        decide = runner.Decision(Path(folder))
-        decide.check()
-    except runner.ContractError as error:
-        raise UserError(str(error)) from error
-    return decide
+    return contract.open_decision(Path(folder))[0]

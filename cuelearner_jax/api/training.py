@@ -56,11 +56,11 @@ class Run:
         group = training.group
         budget = int(group.budgets.max()) if labels is None else labels
         wanted = int(group.seeds[0]) if seed is None else seed
-        found = np.flatnonzero((group.seeds == wanted) & (group.budgets == budget))
-        if not len(found):
+        lanes = np.flatnonzero((group.seeds == wanted) & (group.budgets == budget))
+        if not len(lanes):
             raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
         agents = training.policies(view_of(group.env))
-        return CallablePolicy(agents.lane(int(found[0])), self.world.observation, actions=self.world.actions)
+        return CallablePolicy(agents.lane(int(lanes[0])), self.world.observation, actions=self.world.actions)
 
 
 @user_code.report_user_errors

@@ -139,27 +139,25 @@ def teacher_of(source: World | Policy) -> Teacher:
 
 def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
     """Return numbers of any shape, all finite in single precision."""
-    found = np.asarray(value)
-    if found.dtype.kind not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):  # NumPy lacks bfloat16's kind
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu" and not jnp.issubdtype(array.dtype, jnp.floating):  # NumPy lacks bfloat16's kind
         raise UserError(f"{name} is {format_value(value)}: give an array of real numbers")
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise UserError(f"{name} is an array with masked numbers: leave these rows out")
-    if not (np.abs(found.astype(np.float64)) <= LARGEST_FLOAT).all():
+    if not (np.abs(array.astype(np.float64)) <= LARGEST_FLOAT).all():
         raise UserError(f"{name} holds numbers that are not finite (in single precision): leave these rows out")
-    return found.astype(np.float32)
+    return array.astype(np.float32)
 
 
 def action_in(value: Any, space: Space) -> Any:
     """Return one action, which may be traced."""
     if isinstance(value, Tracer):
         return value
-    found = numbers("action", value)
-    if found.shape != (space.size,) or not space.usable(found, np):
+    action = numbers("action", value)
+    if action.shape != (space.size,) or not space.usable(action, np):
         example = np.asarray(space.spread(4))[0].round(2).tolist()
-        raise UserError(
-            f"action is {format_value(value)}: give an action of shape ({space.size},), for instance {example}"
-        )
-    return found
+        raise UserError(f"action is {format_value(value)}: give an action of shape ({space.size},), as {example}")
+    return action
 
 
 def teacher_of_world(value: Any, space: Space) -> Teacher:

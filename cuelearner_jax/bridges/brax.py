@@ -97,10 +97,7 @@ class Interface(NamedTuple):
 
 
 def layout_of(simulator: Any, name: str) -> Interface:
-    """Return the layout of a simulator without compiling. `name`: the simulator's, for messages.
-
-    Raises UserError for a batch of several, a hidden end of episodes, or images.
-    """
+    """Return the layout of a simulator without compiling. `name`: the simulator's, for messages."""
     shapes = jax.eval_shape(simulator.reset, jax.random.key_data(jax.random.key(0)))
     if shapes.reward.shape:
         raise UserError(f"{name}: it is a batch of shape {shapes.reward.shape}: give a single environment")
@@ -128,12 +125,12 @@ def model_of(simulator: Any) -> Any:
 
 def _entries_of(simulator: Any, size: int) -> tuple[str, ...]:
     """Return a name for each entry of an action: of the MuJoCo model's actuator or its joint, else its number."""
-    model, named = model_of(simulator), []
+    model, names = model_of(simulator), []
     if model is not None and model.nu == size:
         joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
-        named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
-    if named and all(named) and len(set(named)) == size:
-        return tuple(named)
+        names = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
+    if names and all(names) and len(set(names)) == size:
+        return tuple(names)
     return tuple(f"entry {number}" for number in range(1, size + 1))
 
 
@@ -150,9 +147,6 @@ def from_brax(
         max_steps: an episode is truncated after this many steps.
         heuristic: observation -> the obvious action. Without this the guidance "heuristic" is refused.
         cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
-
-    Raises:
-        UserError: observations or actions do not fit.
     """
     name = type(env.unwrapped).__name__
     layout, steps = layout_of(env, name), jnp.array(max_steps, jnp.int32)

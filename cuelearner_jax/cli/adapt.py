@@ -15,9 +15,9 @@ from cuelearner_jax.cli.options import Finished, Flag, Kinds, about, look_ahead_
 from cuelearner_jax.cli.sources import source_of
 from cuelearner_jax.errors import NotFinite
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.runs.policy_sources import BaseLanes
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies.adapt import AdaptRequest, subject_of
-from cuelearner_jax.studies.lanes import BaseLanes
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import logs
 from cuelearner_jax.terminal import progress_bars, watched_by
@@ -51,15 +51,15 @@ def run(arguments: list[str]) -> None:
         subject = subject_of(source.on(options.robot), options.task, options.base, code)
         # otherwise the changes stand for the folder's code
         if options.changes is not None and (guidances.resolve(options.guidance).by_evidence or source.adapted is None):
-            subject = subject._replace(changes=changes.load(options.changes), changes_named=options.changes)
+            subject = subject._replace(changes=changes.load(options.changes), changes_reference=options.changes)
         with _person(options.judge_by) as prefer:
             outcome = options.run(subject._replace(prefer=prefer), watched_by(bars))
         outcome.write(place)
-    for line in outcome.found.words:
+    for line in outcome.result.words:
         out.print(line)
     measure = ["cuelearner", "evaluate", str(options.out), *_named_again(options, source.task, code)]
     out.print(f"wrote {options.out} (measure it with: {shlex.join(measure)})", soft_wrap=True)
-    if outcome.found.failed.any():
+    if outcome.result.failed.any():
         raise NotFinite("a fit is no longer finite, so its model is not used: lower --scalars.feedback-learning-rate")
 
 
@@ -73,7 +73,7 @@ def _person(judge_by: str) -> Any:
 def _named_again(options: Adapt, task: Task, code: str | None) -> list[str]:
     """Return the options that a command about the policy folder needs again: code that no file may have loaded."""
     again = {
-        "--env": task.origin or (task.named if (task.named or "").count(":") > 1 else None),
+        "--env": task.origin or (task.command_name if (task.command_name or "").count(":") > 1 else None),
         "--base": code,
         "--changes": options.changes,
         "--robot": options.robot,

@@ -15,8 +15,8 @@ from cuelearner_jax.cli.sources import source_and_options, source_in
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.measurements import Difference
-from cuelearner_jax.runs import trained
-from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.runs import policy_sources
+from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
@@ -93,11 +93,12 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
         raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
     assert path is not None
     kind = next(iter(options.guidance), None)
-    found = agreement(trained.one_policy(source, options.task, name, kind, None, None), path)
-    named = options.subject if name == "own" else f"{source.folder}, {name}"
-    title = f"{named}: agreement with {found.labels} labels of {path}"
+    (policy,), _ = policy_sources.several(source, options.task, name, kind)
+    result = agreement(policy, path)
+    subject = options.subject if name == "own" else f"{source.folder}, {name}"
+    title = f"{subject}: agreement with {result.labels} labels of {path}"
     table = Table("", "share of answers", "95% interval", title=title)
-    for row, share in found.rows():
+    for row, share in result.rows():
         table.add_row(row, f"{share[0]:.3f}", "{1:.3f} to {2:.3f}".format(*share))
     out.print_table(table)
 
@@ -115,10 +116,8 @@ def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
     elif name in POLICIES:
         other, policy = source, name
     else:
-        known = ", ".join(POLICIES)
-        raise UserError(
-            f"--compare is {name!r}: give a run folder, a policy folder, a shipped agent, or one of {known}"
-        )
+        names = ", ".join(POLICIES)
+        raise UserError(f"--compare is {name!r}: give a run folder, a policy folder, a shipped agent or one of {names}")
     if policy == options.policy and other.folder.absolute() == source.folder.absolute():
         raise UserError(f"--compare is {name!r}, the policy that is evaluated: give another one")
     other.check(policy, options.task)
@@ -133,7 +132,7 @@ def _table(*columns: str, **about: Any) -> Table:
     return table
 
 
-def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
+def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
     """Return a table of means with intervals (single policies: over `episodes`), by guidance and budget."""
     columns = {
         "guidance": lambda row: row.guidance,
@@ -142,25 +141,25 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
         "seeds": lambda row: str(len(row.seeds)),
         "trained steps": lambda row: f"{row.step:,}",
     }
-    if all(row.guidance == "-" for row in found):  # of no folder
+    if all(row.guidance == "-" for row in rows):  # of no folder
         columns = {}
-    elif not any(row.step for row in found):
+    elif not any(row.step for row in rows):
         del columns["trained steps"]
-    if all(row.bound_deg is None for row in found):
+    if all(row.bound_deg is None for row in rows):
         columns.pop("within", None)
     over = {
         "episodes": f"one policy: mean and bootstrap over {episodes}",
         "seeds": f"several seeds: interquartile mean and bootstrap over seeds and {episodes}",
     }
-    caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, found))
+    caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, rows))
     table = _table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
-    for row in found:
-        own = [told(row) for told in columns.values()]
+    for row in rows:
+        own = [text(row) for text in columns.values()]
         for name, values in row.metrics.items():
             of = measurements.spread(row, name)
             if of is None:
-                told = f"of {len(values)}, {int(np.isfinite(values).sum())} have one"
-                table.add_row(*own, name, "none", told)
+                count = f"of {len(values)}, {int(np.isfinite(values).sum())} have one"
+                table.add_row(*own, name, "none", count)
             else:
                 ends = "" if np.isnan(of.lower) else f"{of.lower:.3f} to {of.upper:.3f}"
                 table.add_row(*own, name, f"{of.estimate:.3f}", ends)
@@ -173,9 +172,11 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
     """Return a table of two policies side by side, with their difference."""
     mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
     over = f"{episodes}, paired" if difference.over == "episodes" else f"seeds and {episodes} (interquartile means)"
-    named = " against ".join(name + (f" ({told})" if told else "") for name, told in ((title, mine), (other, its)))
+    heading = " against ".join(
+        name + (f" ({variant})" if variant else "") for name, variant in ((title, mine), (other, its))
+    )
     caption = f"mean [95% bootstrap interval]; of the difference over {over}"
-    table = _table("metric", "policy", "against", "difference", title=named, caption=caption, padding=0)
+    table = _table("metric", "policy", "against", "difference", title=heading, caption=caption, padding=0)
     for name, less in difference.metrics.items():
         both = (measurements.spread(row, name) for row in (difference.row, difference.other))
         table.add_row(name, *map(str, both), f"{less.estimate:+.3f} [{less.lower:+.3f}, {less.upper:+.3f}]")
@@ -186,5 +187,5 @@ def _verdict(difference: Difference) -> str:
     """Return a sentence on which metrics' differences exclude 0."""
     apart = [name for name, less in difference.metrics.items() if less.excludes_zero]
     alike = [name for name in difference.metrics if name not in apart]
-    told = [f"excludes 0 for {', '.join(apart)}"] * bool(apart) + [f"includes 0 for {', '.join(alike)}"] * bool(alike)
-    return f"The 95% interval of the difference {'; '.join(told)}."
+    parts = [f"excludes 0 for {', '.join(apart)}"] * bool(apart) + [f"includes 0 for {', '.join(alike)}"] * bool(alike)
+    return f"The 95% interval of the difference {'; '.join(parts)}."

@@ -12,9 +12,8 @@ from cuelearner_jax.config import digest, to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions, lerobot
 from cuelearner_jax.policies import uniform_in
-from cuelearner_jax.runs import trained
-from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.studies.lanes import LaneChoice
+from cuelearner_jax.runs import policy_sources
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +38,7 @@ def run(arguments: list[str]) -> None:
     if any(word.partition("=")[0] == "--check" for word in arguments):
         options = parse(Export, arguments, "export", Export())
         folder = options.check
-        difference = contract.replay_golden_cases(folder)
+        difference = contract.open_decision(folder)[1]
         out.print(f"{folder} is unchanged since its export; golden cases replayed, largest difference {difference:.1e}")
         return
     more = f"\n\nformats (--format):\n{rows({**contract.FORMATS, lerobot.NAME: lerobot.ABOUT})}"
@@ -47,7 +46,7 @@ def run(arguments: list[str]) -> None:
     if options.format == lerobot.NAME:
         return _into_checkpoint(source, options)
     name = options.name_in(source, options.task)
-    if trained.POLICIES[name].taught:
+    if policy_sources.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who needs the true state: choose another policy")
     contract.check_request(options.format, options.out)
     env = source.task.environment(options.task)
@@ -58,7 +57,7 @@ def run(arguments: list[str]) -> None:
     if options.only_correction:
         policy, view = correction.correction_of(policy, env)
         draw = lambda: correction.cases(env)  # noqa: E731
-    if trained.POLICIES[name].trained:
+    if policy_sources.POLICIES[name].from_run:
         words = ", ".join(f"{option} {value}" for option, value in lane.items())
         out.print(f"the run's lane of {words}; choose by --guidance, --labels and --seed")
     origin = {
@@ -80,9 +79,7 @@ def run(arguments: list[str]) -> None:
 def _into_checkpoint(source: PolicySource, options: Export) -> None:
     """Write a LeRobot checkpoint with a correction. Raises UserError for a policy or checkpoint that does not fit."""
     if source.adapted is None or options.policy in (None, source.default_policy):
-        raise UserError(
-            "--format lerobot is for a policy folder and a checkpoint: give both, the checkpoint by --policy"
-        )
+        raise UserError("--format lerobot is for a policy folder and a checkpoint: give both, the latter by --policy")
     env = source.task.environment(options.task)
     policy = replace(options, policy=None).policy_in(source, options.task, env)
     names = tuple(getattr(options.task, "cue_names", ()))

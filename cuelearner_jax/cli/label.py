@@ -19,17 +19,7 @@ import tyro
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import changes
-from cuelearner_jax.cli.options import (
-    Changed,
-    Flag,
-    Word,
-    about,
-    as_options,
-    check_numbers,
-    look_ahead_of,
-    out,
-    parse,
-)
+from cuelearner_jax.cli.options import Flag, NewWorld, Word, about, as_options, check_numbers, look_ahead_of, out, parse
 from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, source_in, with_cues
 from cuelearner_jax.cli.train import asking_kind
 from cuelearner_jax.config import GuideScalars, GuideSizes
@@ -43,11 +33,10 @@ from cuelearner_jax.policies import NearAims, policy_of, uniform_in
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.adapt import AdaptRequest
-from cuelearner_jax.studies.lanes import LaneChoice
 from cuelearner_jax.studies.train import preset_kinds
 from cuelearner_jax.task import PAPER, QUICKSTART, Preset, Task, shape_of
 from cuelearner_jax.tasks import shipped
@@ -60,7 +49,7 @@ UNDRAWN = "the page has nothing to show; give its Body `pictures` with a `sketch
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(Changed):
+class LabelOptions(NewWorld):
     """Label actions in a browser: uniform ones, a policy's, or recorded ones.
 
     Name a policy after the task: a run folder, a policy folder, or package.module:NAME of a function of observations.
@@ -299,7 +288,7 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
 
     `config`: the preset's configuration.
     """
-    name, out, policy = task.origin or task.named or task.name, str(options.out), options.policy
+    name, out, policy = task.origin or task.command_name or task.name, str(options.out), options.policy
     if options.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
     if policy is None and options.questions == PROPOSED and _has_proposals(task, options.task):

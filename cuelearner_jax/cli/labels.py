@@ -128,8 +128,8 @@ def _facts(file: LabelFile) -> dict[str, str]:
         names = {UNSAID: "not said"} if form.by_eps else {}
         values = form.values(file.space)
         facts["of each answer"] = ", ".join(f"{names.get(one, f'{one:g}')}: {counts.get(one, 0)}" for one in values)
-    if file.said:
-        facts |= {"not known": str(file.said.get(UNSURE, 0)), "taken back": str(file.said.get(UNDONE, 0))}
+    if file.counts:
+        facts |= {"not known": str(file.counts.get(UNSURE, 0)), "taken back": str(file.counts.get(UNDONE, 0))}
     if file.session:
         facts |= {
             "actions of": " ".join(

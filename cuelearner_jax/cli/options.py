@@ -22,7 +22,7 @@ from rich.table import Table
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs.trained import POLICIES
+from cuelearner_jax.runs.policy_sources import POLICIES
 from cuelearner_jax.task import PAPER, Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import PLAIN
@@ -87,7 +87,7 @@ class RunParts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Changed(Outside):
+class NewWorld(Outside):
     """The world that a finished policy meets."""
 
     task: Any = field(default_factory=Unnamed)
@@ -102,7 +102,7 @@ class Changed(Outside):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finished(Changed, RunParts):
+class Finished(NewWorld, RunParts):
     """A finished policy's code, which is never loaded because a file names it, and its world."""
 
     code: Annotated[str | None, tyro.conf.arg(name="base")] = None

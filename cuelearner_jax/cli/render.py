@@ -9,7 +9,7 @@ from pathlib import Path
 from cuelearner_jax.cli.options import Finished, Flag, check_numbers, out
 from cuelearner_jax.cli.sources import source_and_options
 from cuelearner_jax.runs import filming
-from cuelearner_jax.studies.lanes import LaneChoice
+from cuelearner_jax.runs.policy_sources import LaneChoice
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from cuelearner_jax.environment import actions_of, check_layout
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.policies import FILES, policy_of, teaching
 from cuelearner_jax.run_config import PARTS
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.policy_sources import PolicySource
 from cuelearner_jax.spaces import cues_from
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import PAPER, Preset, Task, shape_of
@@ -73,9 +73,6 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
     code its teacher. --agent and --arbiter name a run's outside parts; --base and --changes a policy's code. Code
     without a task acts in the situations of --labels-from; without code their proposed actions are the policy.
     `is_policy`: code without a task is a policy, not a task.
-
-    Raises:
-        UserError: the folder or task does not exist or is not available.
     """
     word, task, code = ahead.words[0] if ahead.words else None, _task_by_option(ahead), None
     if word is task is None and ahead.labels_from is not None:
@@ -111,18 +108,16 @@ def source_in(folder: Path, task: Task | None, code: Any, path: str | None) -> P
     """Return the policies of a run or policy folder, for a family of tasks in the environment named beside it.
 
     `code`, `path`: code of a policy folder (an object, and package.module:NAME).
-
-    Raises UserError for another kind of folder, another task than named, or other observations or actions.
     """
 
     def find(name: str) -> Task:
-        return task if task is not None and task.name == name and not task.named else registry.find(name)
+        return task if task is not None and task.name == name and not task.command_name else registry.find(name)
 
     source = PolicySource.of_folder(folder, find, code, None if path is None else changes.load(path))
     if task is not None and task.name != source.task.name:
         what = "a run" if source.grid else "a policy"
         raise UserError(f"{folder} is {what} of {source.task.name}, not of {task.name}: give one of {task.name}")
-    if task is None or not task.named:
+    if task is None or not task.command_name:
         return source
     before = shape_of(task, source.config.task)
     check_layout(f"{folder}", before.observation, actions_of(before), shape_of(task, task.plain()))
@@ -176,10 +171,7 @@ def _recording_task(subject: str, path: str | None) -> Task:
 
 
 def _with_teacher(task: Task, reference: str | None) -> Task:
-    """Return the task with the teacher that `package.module:NAME` leads to: a teacher, or a policy used as one.
-
-    Raises UserError if there is none.
-    """
+    """Return the task with the teacher that `package.module:NAME` leads to: a teacher, or a policy used as one."""
     if reference is None:
         return task
     code = plugins.load(reference, object, "a teacher")

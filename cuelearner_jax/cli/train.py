@@ -87,10 +87,7 @@ def run(arguments: list[str]) -> None:
 
 
 def suggested(arguments: list[str], command: str, kind: type[TrainingT]) -> tuple[Task, Grid, TrainingT]:
-    """Return the task of a training command, the grid of its preset, and the default options but for the grid's.
-
-    Raises UserError for choices that do not exist.
-    """
+    """Return the task of a training command, the grid of its preset, and the default options but for the grid's."""
     ahead = look_ahead_of(arguments, command, kind)
     task = task_of(ahead)
     name, preset = preset_of(task, ahead.preset, QUICKSTART)

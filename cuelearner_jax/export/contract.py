@@ -30,7 +30,7 @@ from cuelearner_jax.export.graph import Traced
 from cuelearner_jax.policies import Policy, describe
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
-from cuelearner_jax.storage.whole import is_used, place_of, replacing
+from cuelearner_jax.storage.whole import is_occupied, place_of, replacing
 
 BASE = (
     "a correction alone: the last slice of the observation is the action of a base that is elsewhere, given beside the "
@@ -49,32 +49,31 @@ def check_request(format: str, out: Path) -> None:
     """Raise UserError unless a decision in that format can be written to a folder."""
     if format not in FORMATS:
         raise UserError(f"unknown format {format!r}{suggestion(format, FORMATS)}")
-    if is_used(out):
+    if is_occupied(out):
         raise UserError(f"{out} is not empty: give another --out")
 
 
 def write(
     policy: Policy,
     env: Any,
-    drawn: Callable[[], Float[np.ndarray, "n obs"]],
+    draw: Callable[[], Float[np.ndarray, "n obs"]],
     format: str,
     out: Path,
     source: dict[str, Any],
 ) -> dict[str, Any]:
     """Write a policy's decision and replay its golden cases; the folder appears completely or not at all.
 
-    `drawn` returns observations of the environment, from which golden cases are chosen. `source` is copied to the
+    `draw` returns observations of the environment, from which golden cases are chosen. `source` is copied to the
     contract.
 
-    Returns the contract, with "difference": the largest difference among the golden cases in this replay. Raises
-    UserError for an unknown format, a folder in use, or a policy that cannot be exported.
+    Returns the contract, with "difference": the largest difference among the golden cases in this replay.
     """
     with place_of(out, partial(check_request, format)) as place:
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
         base = getattr(env, "base_size", 0)  # only for a correction alone
         traced = trace_policy(policy, env.obs_size)
         file, contents, about = _artefact(format, policy, traced, env.obs_size, actions_of(env).size, base)
-        golden, cases = golden_cases(policy, drawn(), traced), io.BytesIO()
+        golden, cases = golden_cases(policy, draw(), traced), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {file: contents, runner.GOLDEN: cases.getvalue(), "decide.py": inspect.getsource(runner).encode()}
         ends = list(itertools.accumulate(quantity.size for quantity in env.observation))
@@ -92,7 +91,7 @@ def write(
             "policy": describe(policy),
             "source": source,
             "golden": {"cases": len(golden.obs), "tolerance": TOLERANCE}
-            | {"drawn": golden.drawn, "steady": golden.steady, "extreme": golden.extreme},
+            | {"drawn": golden.candidates, "steady": golden.steady, "extreme": golden.extreme},
             "files": {name: hashlib.sha256(contents).hexdigest() for name, contents in files.items()},
             **provenance(),
         }
@@ -100,9 +99,9 @@ def write(
         sealed = json.dumps({**contract, runner.DIGEST: runner.digest(contract)}, indent=1) + "\n"
         with place.writing() as folder:
             for name, contents in {**files, runner.CONTRACT: sealed.encode()}.items():
-                with replacing(folder / name, "wb") as written:
-                    written.write(contents)
-            return {**contract, "difference": replay_golden_cases(folder)}
+                with replacing(folder / name, "wb") as stream:
+                    stream.write(contents)
+            return {**contract, "difference": open_decision(folder)[1]}
 
 
 def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
@@ -126,7 +125,7 @@ def _artefact(
         decide, (count,) = row_by_row(policy), jax.export.symbolic_shape("n")
         parts = [obs_size - base_size, base_size] if base_size else [obs_size]
         shapes = [jax.ShapeDtypeStruct((count, size), jnp.float32) for size in parts]
-        together = jax.jit(lambda *seen: decide(jnp.concatenate(seen, -1)))
+        together = jax.jit(lambda *parts: decide(jnp.concatenate(parts, -1)))
         exported = jax.export.export(together if base_size else jax.jit(decide), platforms=PLATFORMS)(*shapes)
         about = {"needs": "jax", "jax": jax.__version__, "platforms": list(PLATFORMS)}
         return "decision.stablehlo", bytes(exported.serialize()), about
@@ -145,12 +144,10 @@ def _artefact(
     return "decision.npz", stored.getvalue(), {"needs": "numpy"}
 
 
-def replay_golden_cases(folder: Path) -> float:
-    """Replay a folder's golden cases; return the largest difference.
-
-    Raises UserError for a folder that is damaged, cannot be run here, or gives other actions.
-    """
+def open_decision(folder: Path) -> tuple[runner.Decision, float]:
+    """Return a folder's decision, and the largest difference of its golden cases, which were replayed."""
     try:
-        return runner.Decision(folder).check()
+        decide = runner.Decision(folder)
+        return decide, decide.check()
     except runner.ContractError as error:
         raise UserError(str(error)) from error

@@ -22,7 +22,7 @@ from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import EnvState
 
 
-class Given(PolicyNode):
+class FixedActions(PolicyNode):
     """Policy with fixed actions, supplied from elsewhere."""
 
     actions: Float[Array, "n action"]
@@ -46,11 +46,11 @@ class CorrectionAlone(PolicyNode):
         """Return the corrected actions for rows of observation and base action, concatenated."""
         own, base = jnp.split(obs, [obs.shape[-1] - self.space.size], -1)
         base = self.space.retract(self.space.only_actions(base))
-        return _over(self.corrected, Given(base)).act(key, states, own)
+        return _over(self.corrected, FixedActions(base)).act(key, states, own)
 
     def describe(self) -> dict[str, Any]:
         """Describe the nested corrections of a supplied action."""
-        return describe(_over(self.corrected, Given(jnp.zeros((1, self.space.size)))))
+        return describe(_over(self.corrected, FixedActions(jnp.zeros((1, self.space.size)))))
 
 
 def _over(policy: Any, base: Any) -> Any:
@@ -60,10 +60,7 @@ def _over(policy: Any, base: Any) -> Any:
 
 
 def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Any]:
-    """Return a policy's correction alone, and what export needs to know of its input and output in place of a world.
-
-    Raises UserError for a policy without a correction, or one that changes its base's observations.
-    """
+    """Return a policy's correction alone, and what export needs to know of its input and output in place of a world."""
     if getattr(policy, "base", None) is None:
         raise UserError("this policy has no correction: give a corrected policy, or export the whole policy")
     layer = policy
@@ -75,10 +72,10 @@ def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Any]:
             )
         layer = below
     space, action = actions_of(env), action_of(env)
-    seen = Quantity(BASE, space.size, action.unit, "what the base, which is elsewhere, would do")
-    without = jax.tree.map(jnp.asarray, _over(policy, Given(jnp.zeros((1, space.size)))))
+    base = Quantity(BASE, space.size, action.unit, "what the base, which is elsewhere, would do")
+    without = jax.tree.map(jnp.asarray, _over(policy, FixedActions(jnp.zeros((1, space.size)))))
     size = env.obs_size + space.size
-    beside = SimpleNamespace(observation=(*env.observation, seen), obs_size=size, actions=space, action=action)
+    beside = SimpleNamespace(observation=(*env.observation, base), obs_size=size, actions=space, action=action)
     beside.base_size = space.size  # number of entries at the end of the input that are the base's action
     return CorrectionAlone(without, space), beside
 

@@ -31,10 +31,7 @@ CALLBACKS = {"pure_callback", "io_callback", "python_callback"}
 
 
 def decision_of(policy: Policy) -> Callable[[PRNGKeyArray, Array], Array]:
-    """Return a policy's decision as a function (key, observation (obs,)) -> action (action,).
-
-    Raises UserError for a policy that needs more than observations.
-    """
+    """Return a policy's decision as a function (key, observation (obs,)) -> action (action,)."""
     if any(layer.get("asks") for layer in layers(describe(policy))):
         raise UserError("this policy asks a teacher, who needs the true state: export a policy without a teacher")
     return lambda key, obs: policy.act(key, None, obs[None])[0]
@@ -51,8 +48,8 @@ def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS)
     def step(walk: tuple[Any, Array], key: PRNGKeyArray) -> tuple[tuple[Any, Array], Array]:
         state, obs = walk
         action = policy.act(key, state, obs)
-        state, found = jax.vmap(env.step)(jax.random.split(key, WALKERS), state, action)
-        return (state, found.obs), obs
+        state, after = jax.vmap(env.step)(jax.random.split(key, WALKERS), state, action)
+        return (state, after.obs), obs
 
     @jax.jit
     def walked(key: PRNGKeyArray) -> Array:
@@ -64,19 +61,16 @@ def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS)
 
 
 def trace_policy(policy: Policy, obs_size: int) -> Traced:
-    """Trace a policy's decision as a graph.
-
-    Raises UserError for a policy with random actions, or with code other than JAX's.
-    """
-    found = trace(decision_of(policy), obs_size)
-    if CALLBACKS & set(found.missing):
+    """Trace a policy's decision as a graph."""
+    traced = trace(decision_of(policy), obs_size)
+    if CALLBACKS & set(traced.missing):
         raise UserError(
             "this policy calls a Python function, which cannot be exported: export a policy of JAX "
             "functions, or the correction alone (--only-correction, cl.export_correction)"
         )
-    if found.random:
+    if traced.random:
         raise UserError("this policy acts at random, which cannot be exported: export a deterministic policy")
-    return found
+    return traced
 
 
 class Golden(NamedTuple):
@@ -84,14 +78,14 @@ class Golden(NamedTuple):
 
     obs: Float[np.ndarray, "cases obs"]
     actions: Float[np.ndarray, "cases action"]  # computed by JAX
-    drawn: int  # number of observations that they were chosen from
+    candidates: int  # number of observations that they were chosen from
     steady: int  # number of these observations whose decision is insensitive to rounding
     extreme: int  # number of golden cases, the last ones, that no episode led to
 
 
-def extreme_observations(drawn: Float[np.ndarray, "n obs"]) -> Float[np.ndarray, "extreme obs"]:
+def extreme_observations(obs: Float[np.ndarray, "n obs"]) -> Float[np.ndarray, "extreme obs"]:
     """Return observations at the bounds of those drawn and far outside: zero, tiny, large, negative, and mixed."""
-    low, high = drawn.min(0), drawn.max(0)
+    low, high = obs.min(0), obs.max(0)
     far = (np.full_like(low, number) for number in (1e10, -1e10, 0.0, 1e-30, -1e-30))
     rows = np.stack([*far, low, high, -low, -high, 100 * low, 100 * high])
     mixed = np.random.default_rng(1).integers(len(rows), size=(MIXED, len(low)))
@@ -117,21 +111,19 @@ def is_steady(traced: Traced, obs: Float[np.ndarray, " obs"]) -> bool:
     return bool(np.ptp(actions, axis=0).max() <= TOLERANCE)
 
 
-def golden_cases(policy: Policy, drawn: Float[np.ndarray, "n obs"], traced: Traced, most: int = CASES) -> Golden:
+def golden_cases(policy: Policy, candidates: Float[np.ndarray, "n obs"], traced: Traced, most: int = CASES) -> Golden:
     """Return the first observations whose decision does not change under perturbations as small as rounding.
 
     An argmax jumps where two values tie, and another machine may choose the other one, so such cases verify nothing.
     Up to a quarter of the cases are extreme observations, where a policy may give no action; none if its graph is
     incomplete.
-
-    Raises UserError if there is no insensitive case among the drawn observations.
     """
-    drawn = np.asarray(drawn, np.float32)
-    beyond = extreme_observations(drawn)[: 0 if traced.missing else most // 4]
-    obs = np.concatenate([drawn, beyond])
+    candidates = np.asarray(candidates, np.float32)
+    beyond = extreme_observations(candidates)[: 0 if traced.missing else most // 4]
+    obs = np.concatenate([candidates, beyond])
     decide = jax.jit(row_by_row(policy))
     actions = np.asarray(decide(jnp.asarray(obs)))
-    user_code.check_actions(actions[: len(drawn)], policy_name(policy))
+    user_code.check_actions(actions[: len(candidates)], policy_name(policy))
     random = np.random.default_rng(0)
     apart = np.zeros(len(obs))
     for _ in range(NUDGES):
@@ -140,14 +132,14 @@ def golden_cases(policy: Policy, drawn: Float[np.ndarray, "n obs"], traced: Trac
         apart = np.maximum(apart, np.abs(nudged - actions).max(-1))
     steady = apart <= TOLERANCE  # never where an action is not finite
     with np.errstate(all="ignore"):
-        for place in range(len(drawn), len(obs)):  # zero is no direction
+        for place in range(len(candidates), len(obs)):  # zero is no direction
             steady[place] &= actions[place].any() and is_steady(traced, obs[place])
-    count, extreme = int(steady[: len(drawn)].sum()), int(steady[len(drawn) :].sum())
+    count, extreme = int(steady[: len(candidates)].sum()), int(steady[len(candidates) :].sum())
     if not count:
         raise UserError(
-            f"all {len(drawn)} decisions change with the last digits of their observation, so none can serve as a "
+            f"all {len(candidates)} decisions change with the last digits of their observation, so none can serve as a "
             "golden case"
         )
     places = np.flatnonzero(steady)
     places = np.concatenate([places[:count][: most - extreme], places[count:]])
-    return Golden(obs[places], actions[places], len(drawn), count, extreme)
+    return Golden(obs[places], actions[places], len(candidates), count, extreme)

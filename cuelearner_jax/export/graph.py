@@ -35,7 +35,7 @@ class Value(NamedTuple):
     kind: str  # float32, int32 or bool; of a missing operation's output also another type
 
 
-Known = Value | np.ndarray | jax.Array  # a run-time value, or one that is known already
+Operand = Value | np.ndarray | jax.Array  # a run-time value, or a constant
 
 
 class Graph(NamedTuple):
@@ -56,7 +56,7 @@ class Traced(NamedTuple):
     kinds: dict[str, str]  # of values and constants, by name
 
 
-Rule = Callable[["Builder", Any, list[Any]], list[Known]]  # (builder, equation, its inputs) -> its outputs
+Rule = Callable[["Builder", Any, list[Any]], list[Operand]]  # (builder, equation, its inputs) -> its outputs
 RULES: dict[str, Rule] = {}
 
 
@@ -66,8 +66,8 @@ def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
     with written_out():
         closed = jax.make_jaxpr(function)(key, obs)
     builder = Builder()
-    drawn, given = Value("key", (), "key"), Value("obs", (obs_size,), "float32")
-    (result,) = builder.inlined(closed.jaxpr, closed.consts, [drawn, given])
+    random, observation = Value("key", (), "key"), Value("obs", (obs_size,), "float32")
+    (result,) = builder.inlined(closed.jaxpr, closed.consts, [random, observation])
     ops, needed = _needed(builder.ops, {builder.name(result)})
     constants = {name: array for name, array in builder.constants.items() if name in needed}
     missing = sorted({what for name, what in builder.missing.items() if name in needed})
@@ -77,18 +77,18 @@ def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
 
 def _needed(ops: list[list[Any]], wanted: set[str]) -> tuple[list[list[Any]], set[str]]:
     """Return the operations needed for `wanted`, and all names that they read."""
-    kept, wanted = [], set(wanted)
+    needed, wanted = [], set(wanted)
     for op in reversed(ops):
         name, inputs, outputs, attributes = op
         if not wanted & set(outputs):
             continue
-        kept.append(op)
+        needed.append(op)
         wanted |= set(inputs)
         for part in ("test", "body") if name == "while" else ():
             inner = attributes[part]
-            inner["ops"], found = _needed(inner["ops"], set(inner["outputs"]))
-            wanted |= found
-    return kept[::-1], wanted
+            inner["ops"], names = _needed(inner["ops"], set(inner["outputs"]))
+            wanted |= names
+    return needed[::-1], wanted
 
 
 class Builder:
@@ -100,47 +100,47 @@ class Builder:
         self.constants: dict[str, np.ndarray] = {}
         self.kinds: dict[str, str] = {}
         self.missing: dict[str, str] = {}  # what no rule supports, by the names of its outputs
-        self._done_before: dict[str, Value] = {}  # results by operation and inputs
-        self._named: dict[int, tuple[Any, str]] = {}  # by identity; keeping the array reserves its identity
+        self._earlier: dict[str, Value] = {}  # results by operation and inputs
+        self._constant_names: dict[int, tuple[Any, str]] = {}  # by identity; keeping the array reserves its identity
         self._numbers = itertools.count()
 
-    def inlined(self, jaxpr: Any, consts: Any, inputs: list[Known]) -> list[Known]:
+    def inlined(self, jaxpr: Any, consts: Any, inputs: list[Operand]) -> list[Operand]:
         """Add the operations of a jaxpr on its inputs; return its outputs."""
-        values: dict[Any, Known] = dict(zip(jaxpr.constvars, consts, strict=True))
+        values: dict[Any, Operand] = dict(zip(jaxpr.constvars, consts, strict=True))
         values.update(zip(jaxpr.invars, inputs, strict=True))
 
-        def read(atom: Any) -> Known:
+        def value_of(atom: Any) -> Operand:
             if isinstance(atom, core.Literal):
                 return np.asarray(atom.val, atom.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
             return values[atom]
 
         for equation in jaxpr.eqns:
-            given = [read(atom) for atom in equation.invars]
-            values.update(zip(equation.outvars, self._done(equation, given, jaxpr.debug_info), strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
+            inputs = [value_of(atom) for atom in equation.invars]
+            values.update(zip(equation.outvars, self._outputs(equation, inputs, jaxpr.debug_info), strict=True))
+        return [value_of(atom) for atom in jaxpr.outvars]
 
-    def _done(self, equation: Any, given: list[Known], origin: Any) -> list[Known]:
+    def _outputs(self, equation: Any, inputs: list[Operand], origin: Any) -> list[Operand]:
         name = equation.primitive.name
-        if not any(isinstance(value, Value) for value in given):
-            return _computed(equation, given, origin)
-        if (inner := _called(equation)) is not None:
-            return self.inlined(inner.jaxpr, inner.consts, given)
+        if not any(isinstance(value, Value) for value in inputs):
+            return _evaluate(equation, inputs, origin)
+        if (inner := _inner_jaxpr(equation)) is not None:
+            return self.inlined(inner.jaxpr, inner.consts, inputs)
         if name not in RULES:
-            return self._missing(name, equation, given)
+            return self._missing(name, equation, inputs)
         try:
-            for value in given:
+            for value in inputs:
                 if isinstance(value, Value):
                     kind_of(value.kind)
-            return RULES[name](self, equation, given)
+            return RULES[name](self, equation, inputs)
         except NotImplementedError as error:
-            return self._missing(str(error), equation, given)
+            return self._missing(str(error), equation, inputs)
 
-    def _missing(self, what: str, equation: Any, given: list[Known]) -> list[Known]:
+    def _missing(self, what: str, equation: Any, inputs: list[Operand]) -> list[Operand]:
         """Add a placeholder for what no rule supports, which may turn out not to be needed."""
         outputs = [self.new(var.aval.shape, str(var.aval.dtype)) for var in equation.outvars]
         names = [value.name for value in outputs]
         self.missing.update(dict.fromkeys(names, what))
-        self.ops.append(["missing", [value.name for value in given if isinstance(value, Value)], names, {}])
+        self.ops.append(["missing", [value.name for value in inputs if isinstance(value, Value)], names, {}])
         return list(outputs)
 
     def new(self, shape: tuple[int, ...], kind: str) -> Value:
@@ -149,26 +149,26 @@ class Builder:
         self.kinds[value.name] = kind
         return value
 
-    def add(self, op: str, inputs: list[Known], shape: tuple[int, ...], kind: str, /, **attributes: Any) -> Value:
+    def add(self, op: str, inputs: list[Operand], shape: tuple[int, ...], kind: str, /, **attributes: Any) -> Value:
         """Add an operation with one output, or reuse an equal earlier one."""
         names = [self.name(value) for value in inputs]
-        done = json.dumps([op, names, attributes])
-        if done not in self._done_before:
-            output = self._done_before[done] = self.new(shape, kind)
+        key = json.dumps([op, names, attributes])
+        if key not in self._earlier:
+            output = self._earlier[key] = self.new(shape, kind)
             self.ops.append([op, names, [output.name], attributes])
-        return self._done_before[done]
+        return self._earlier[key]
 
-    def name(self, value: Known) -> str:
+    def name(self, value: Operand) -> str:
         """Return the name of a value; a known value becomes a constant."""
         if isinstance(value, Value):
             return value.name
-        if id(value) not in self._named:
-            kind, name = kind_of(value.dtype), f"c{len(self._named)}"
+        if id(value) not in self._constant_names:
+            kind, name = kind_of(value.dtype), f"c{len(self._constant_names)}"
             self.constants[name], self.kinds[name] = np.asarray(value).astype(kind), kind
-            self._named[id(value)] = (value, name)
-        return self._named[id(value)][1]
+            self._constant_names[id(value)] = (value, name)
+        return self._constant_names[id(value)][1]
 
-    def reshaped(self, value: Known, shape: tuple[int, ...]) -> Known:
+    def reshaped(self, value: Operand, shape: tuple[int, ...]) -> Operand:
         """Reshape a value."""
         if tuple(value.shape) == tuple(shape):
             return value
@@ -176,7 +176,7 @@ class Builder:
             return jnp.reshape(value, shape)
         return self.add("reshape", [value], shape, value.kind, shape=list(map(int, shape)))
 
-    def transposed(self, value: Known, axes: tuple[int, ...]) -> Known:
+    def transposed(self, value: Operand, axes: tuple[int, ...]) -> Operand:
         """Permute a value's axes."""
         if tuple(axes) == tuple(range(len(axes))):
             return value
@@ -185,17 +185,17 @@ class Builder:
         turned, axes = tuple(value.shape[a] for a in axes), tuple(map(int, axes))
         return self.add("transpose", [value], turned, value.kind, axes=list(axes))
 
-    def branch(self, jaxpr: Any, consts: list[Known], carried: list[Value]) -> Graph:
+    def branch(self, jaxpr: Any, consts: list[Operand], carried: list[Value]) -> Graph:
         """Return a jaxpr of carried values as a graph of its own, which may read all outer values."""
         outer, self.ops = self.ops, []
-        before = dict(self._done_before)
+        before = dict(self._earlier)
         results = self.inlined(jaxpr.jaxpr, jaxpr.consts, [*consts, *carried])
-        made, self.ops = self.ops, outer
-        self._done_before = before  # operations inside are not available outside
+        operations, self.ops = self.ops, outer
+        self._earlier = before  # operations inside are not available outside
         names = [value.name for value in carried]
-        return Graph(names, [self.name(result) for result in results], self._kept_inside(made, set(names)))
+        return Graph(names, [self.name(result) for result in results], self._loop_operations(operations, set(names)))
 
-    def _kept_inside(self, ops: list[list[Any]], changing: set[str]) -> list[list[Any]]:
+    def _loop_operations(self, ops: list[list[Any]], changing: set[str]) -> list[list[Any]]:
         """Return the operations that every pass must repeat; loop-invariant ones are moved before the loop."""
         inside = []
         for op in ops:
@@ -208,21 +208,21 @@ class Builder:
         return inside
 
 
-def _computed(equation: Any, given: list[Any], origin: Any) -> list[Any]:
+def _evaluate(equation: Any, inputs: list[Any], origin: Any) -> list[Any]:
     """Evaluate one equation with known inputs; `origin` is JAX's debug information."""
-    known: dict[Any, Any] = {}
-    for atom, value in zip(equation.invars, given, strict=True):
+    values: dict[Any, Any] = {}
+    for atom, value in zip(equation.invars, inputs, strict=True):
         if not isinstance(atom, core.Literal):
-            known.setdefault(atom, value)
-    alone = core.Jaxpr((), [*known], equation.outvars, [equation], debug_info=origin)
-    return core.jaxpr_as_fun(core.ClosedJaxpr(alone, ()))(*known.values())
+            values.setdefault(atom, value)
+    alone = core.Jaxpr((), [*values], equation.outvars, [equation], debug_info=origin)
+    return core.jaxpr_as_fun(core.ClosedJaxpr(alone, ()))(*values.values())
 
 
-def _called(equation: Any) -> Any:
+def _inner_jaxpr(equation: Any) -> Any:
     """Return the jaxpr that an equation merely calls, or None."""
     if equation.primitive.name in ("while", "cond", "scan"):
         return None
     for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-        if (found := equation.params.get(name)) is not None:
-            return found if hasattr(found, "consts") else core.ClosedJaxpr(found, ())
+        if (inner := equation.params.get(name)) is not None:
+            return inner if hasattr(inner, "consts") else core.ClosedJaxpr(inner, ())
     return None

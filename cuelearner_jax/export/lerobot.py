@@ -20,11 +20,11 @@ import numpy as np
 from cuelearner_jax.environment import BASE, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Heuristic
-from cuelearner_jax.reading import Read
+from cuelearner_jax.reading import ReadingPolicy
 from cuelearner_jax.reading.families import ACTIONS_ALONE
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.storage.situations import PHASE
-from cuelearner_jax.storage.whole import is_used, place_of
+from cuelearner_jax.storage.whole import is_occupied, place_of
 
 NAME = "lerobot"
 ABOUT = "for LeRobot: the checkpoint of --policy with the correction in its processors"
@@ -78,7 +78,7 @@ def arrays_of(policy: Any, env: Any) -> Arrays:
     Raises UserError for a policy that is no correction of proposed actions, or that changes nothing.
     """
     space = actions_of(env)
-    sound = isinstance(policy, Read) and isinstance(policy.base, Heuristic) and policy.family == ACTIONS_ALONE
+    sound = isinstance(policy, ReadingPolicy) and isinstance(policy.base, Heuristic) and policy.family == ACTIONS_ALONE
     if not sound or not isinstance(space, Box) or [part.name for part in env.observation[-2:]] != [PHASE, BASE]:
         raise UserError(
             "this policy is no correction of proposed actions: label situations that the package "
@@ -131,7 +131,7 @@ def safetensors(arrays: Arrays) -> bytes:
 
 
 def _check_unused(out: Path) -> None:
-    if is_used(out):
+    if is_occupied(out):
         raise UserError(f"{out} is not empty: give another --out")
 
 

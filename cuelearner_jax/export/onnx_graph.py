@@ -24,8 +24,7 @@ BASE = "base_action"  # the second input of a correction alone
 def serialize(traced: Traced, obs_size: int, action_size: int, base_size: int = 0) -> bytes:
     """Return the bytes of a model with input `obs` (n, obs_size) and output `action` (n, action_size).
 
-    For a correction alone, the last `base_size` entries of the input are a second input, `base_action`. Raises
-    UserError if the package onnx is missing.
+    For a correction alone, the last `base_size` entries of the input are a second input, `base_action`.
     """
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
@@ -68,39 +67,39 @@ class _Writer:
         self.counter = types.INT64
         self.constants: dict[str, np.ndarray] = {}
         self.names: dict[str, str] = {}  # the graph's names of values -> this model's, where they differ
-        self._made: list[Any] = []
+        self._nodes: list[Any] = []
         self._numbers = itertools.count()
 
     def nodes(self, ops: list[list[Any]], names: dict[str, str], suffix: str) -> list[Any]:
         """Return the nodes of operations; `names` renames inputs, and `suffix` is appended to outputs."""
-        outer, self._made = self._made, []
+        outer, self._nodes = self._nodes, []
         self.names.update(names)
         for op, inputs, outputs, attributes in ops:
-            given: Any = [self.names.get(name, name) for name in inputs]
+            operands: Any = [self.names.get(name, name) for name in inputs]
             self.names.update({name: name + suffix for name in outputs})
             results = [self.names[name] for name in outputs]
             self.kind = self._kinds[inputs[0]]
             if op == "while":
-                self._loop(given, results, **attributes)
+                self._loop(operands, results, **attributes)
             else:
-                last = NODES[op](self, *given, **attributes)
-                self._named("Identity", [last], results[0])
-        made, self._made = self._made, outer
-        return made
+                last = NODES[op](self, *operands, **attributes)
+                self._append("Identity", [last], results[0])
+        nodes, self._nodes = self._nodes, outer
+        return nodes
 
     def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
         """Add a node; return the name of its output."""
         name = f"n{next(self._numbers)}"
-        self._named(kind, list(inputs), name, **attributes)
+        self._append(kind, list(inputs), name, **attributes)
         return name
 
-    def _named(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> None:
-        self._made.append(self.helper.make_node(kind, inputs, [output], **attributes))
+    def _append(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> None:
+        self._nodes.append(self.helper.make_node(kind, inputs, [output], **attributes))
 
     def constant(self, array: np.ndarray) -> str:
         """Return the name of a constant array."""
-        for name, known in self.constants.items():
-            if known.dtype == array.dtype and np.array_equal(known, array):
+        for name, other in self.constants.items():
+            if other.dtype == array.dtype and np.array_equal(other, array):
                 return name
         name = f"k{len(self.constants)}"
         self.constants[name] = array
@@ -118,10 +117,12 @@ class _Writer:
         """Cast a value to another type."""
         return self.node("Cast", value, to=self.kinds[kind])
 
-    def _loop(self, given: list[str], results: list[str], carried: list[str], kinds: Any, test: Any, body: Any) -> None:
+    def _loop(
+        self, operands: list[str], results: list[str], carried: list[str], kinds: Any, test: Any, body: Any
+    ) -> None:
         """Convert a loop: ONNX reads the condition at the end of a pass, this graph at its beginning."""
-        first = self.nodes(test["ops"], dict(zip(carried, given, strict=True)), f"_t{next(self._numbers)}")
-        self._made += first
+        first = self.nodes(test["ops"], dict(zip(carried, operands, strict=True)), f"_t{next(self._numbers)}")
+        self._nodes += first
         condition = self.names[test["outputs"][0]]
         mark = f"_b{next(self._numbers)}"
         inside = [name + mark for name in carried]
@@ -140,7 +141,7 @@ class _Writer:
         gives = [info(goes_on, self.kinds["bool"], [])]
         gives += [info(name, self.kinds[kind], shape) for name, (kind, shape) in zip(after, kinds, strict=True)]
         graph = self.helper.make_graph(nodes, f"body{mark}", takes, gives)
-        self._made.append(self.helper.make_node("Loop", ["", condition, *given], results, body=graph))
+        self._nodes.append(self.helper.make_node("Loop", ["", condition, *operands], results, body=graph))
 
 
 def _plain(kind: str, **fixed: Any) -> Callable[..., str]:
@@ -158,10 +159,10 @@ def _extreme(kind: str) -> Callable[..., str]:
     """Reduce to the largest or smallest entry, or to NaN if one is NaN, which ONNX leaves open."""
 
     def extreme(w: _Writer, x: str, axes: list[int]) -> str:
-        found = w.node(kind, x, w.whole(axes), keepdims=0)
+        extreme_value = w.node(kind, x, w.whole(axes), keepdims=0)
         if w.kind != "float32":
-            return found
-        return w.node("Where", _of_bools("ReduceMax")(w, w.node("IsNaN", x), axes), w.number(math.nan), found)
+            return extreme_value
+        return w.node("Where", _of_bools("ReduceMax")(w, w.node("IsNaN", x), axes), w.number(math.nan), extreme_value)
 
     return extreme
 
@@ -174,12 +175,12 @@ def _argument(kind: str) -> Callable[..., str]:
     """Find the place of the largest or smallest entry, or of the first NaN."""
 
     def argument(w: _Writer, x: str, axis: int) -> str:
-        found = w.node(kind, x, axis=axis, keepdims=0)
+        place = w.node(kind, x, axis=axis, keepdims=0)
         if w.kind == "float32":
             odd = w.node("IsNaN", x)
             first = w.node("ArgMax", w.cast(odd, "int32"), axis=axis, keepdims=0)
-            found = w.node("Where", _of_bools("ReduceMax")(w, odd, [axis]), first, found)
-        return w.cast(found, "int32")
+            place = w.node("Where", _of_bools("ReduceMax")(w, odd, [axis]), first, place)
+        return w.cast(place, "int32")
 
     return argument
 
@@ -198,34 +199,21 @@ def _expm1(w: _Writer, x: str) -> str:
     return w.node("Mul", half, w.node("Add", w.node("Exp", x), w.number(1.0)))
 
 
-def _logistic(w: _Writer, x: str) -> str:
-    """Compute 1 / (1 + exp(-x)): the Sigmoid of onnxruntime is 0 from -18 on."""
-    return w.node("Reciprocal", w.node("Add", w.node("Exp", w.node("Neg", x)), w.number(1.0)))
-
-
 def _atan2(w: _Writer, y: str, x: str) -> str:
     """Compute atan2 from atan, which ONNX has; exact to a few units in the last place."""
     zero = w.number(0.0)
     both = w.node("And", w.node("IsInf", x), w.node("IsInf", y))  # where only signs count
     x, y = (w.node("Where", both, w.node("Sign", one), one) for one in (x, y))
-    left, down = (  # the reciprocal tells -0 from 0
+    negative, down = (  # the reciprocal tells -0 from 0
         w.node("Or", w.node("Less", one, zero), w.node("Less", w.node("Reciprocal", one), zero)) for one in (x, y)
     )
     steep = w.node("Equal", x, zero)
     slope = w.node("Atan", w.node("Div", y, w.node("Where", steep, w.number(1.0), x)))
     half = w.node("Where", down, w.number(-math.pi), w.number(math.pi))
-    turned = w.node("Where", left, w.node("Add", slope, half), slope)
-    level = w.node("Where", left, half, y)
+    turned = w.node("Where", negative, w.node("Add", slope, half), slope)
+    level = w.node("Where", negative, half, y)
     straight = w.node("Where", w.node("Equal", y, zero), level, w.node("Mul", w.node("Sign", y), w.number(math.pi / 2)))
     return w.node("Where", steep, straight, turned)
-
-
-def _finite(w: _Writer, x: str) -> str:
-    return w.node("Not", w.node("Or", w.node("IsInf", x), w.node("IsNaN", x)))
-
-
-def _padded(w: _Writer, x: str, value: str, low: list[int], high: list[int]) -> str:
-    return w.node("Pad", x, w.whole([*low, *high]), value)
 
 
 def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[int]) -> str:
@@ -241,8 +229,9 @@ NODES: dict[str, Callable[..., str]] = {
     "expm1": _expm1,
     "rsqrt": lambda w, x: w.node("Reciprocal", w.node("Sqrt", x)),
     "square": lambda w, x: w.node("Mul", x, x),
-    "logistic": _logistic,
-    "is_finite": _finite,
+    # the Sigmoid of onnxruntime is 0 from -18 on
+    "logistic": lambda w, x: w.node("Reciprocal", w.node("Add", w.node("Exp", w.node("Neg", x)), w.number(1.0))),
+    "is_finite": lambda w, x: w.node("Not", w.node("Or", w.node("IsInf", x), w.node("IsNaN", x))),
     "rem": _plain("Mod", fmod=1),
     "atan2": _atan2,
     "eq": _plain("Equal"),
@@ -258,7 +247,7 @@ NODES: dict[str, Callable[..., str]] = {
     "broadcast": lambda w, x, shape: w.node("Expand", x, w.whole(shape)),
     "concatenate": lambda w, *parts, axis: w.node("Concat", *parts, axis=axis),
     "slice": _sliced,
-    "pad": _padded,
+    "pad": lambda w, x, value, low, high: w.node("Pad", x, w.whole([*low, *high]), value),
     "take": lambda w, x, places: w.node("Gather", x, places, axis=0),
     "matmul": _plain("MatMul"),
     "sum": _sum,

@@ -54,20 +54,20 @@ class Decision:
         observation of another size or not finite in single precision, and for a decision that gives no valid action.
         """
         if (base_action is None) == bool(self._base):
-            told = "a correction alone: give the base's action, decide(obs, base_action)"
+            content = "a correction alone: give the base's action, decide(obs, base_action)"
             raise ContractError(
-                f"{self.folder} holds {told if self._base else 'a whole policy: leave out base_action'}"
+                f"{self.folder} holds {content if self._base else 'a whole policy: leave out base_action'}"
             )
         sizes = self.contract["observation"]["size"] - self._base, self._base
-        given = [_numbers(obs), *([_numbers(base_action)] if self._base else [])]
-        rows = given[0].shape[:-1]
-        for part, size in zip(given, sizes, strict=False):
+        parts = [_numbers(obs), *([_numbers(base_action)] if self._base else [])]
+        rows = parts[0].shape[:-1]
+        for part, size in zip(parts, sizes, strict=False):
             if len(rows) > 1 or part.shape != (*rows, size):
                 raise ContractError(
                     f"observations or base actions have shape {part.shape}: the contract says ({size},), or equally "
                     f"many rows (n, {size})"
                 )
-        batch = [np.ascontiguousarray(part if rows else part[None]) for part in given]
+        batch = [np.ascontiguousarray(part if rows else part[None]) for part in parts]
         if not all(np.isfinite(part).all() for part in batch):
             raise ContractError("an observation holds numbers that are not finite, or beyond single precision")
         if not len(batch[0]):
@@ -95,8 +95,8 @@ class Decision:
         with np.load(self.folder / GOLDEN, allow_pickle=False) as golden:
             obs, actions = golden["obs"], golden["actions"]
         own = obs.shape[1] - self._base
-        found = self(obs[:, :own], obs[:, own:]) if self._base else self(obs)
-        difference, allowed = float(np.abs(found - actions).max()), self.contract["golden"]["tolerance"]
+        result = self(obs[:, :own], obs[:, own:]) if self._base else self(obs)
+        difference, allowed = float(np.abs(result - actions).max()), self.contract["golden"]["tolerance"]
         if not difference <= allowed:
             raise ContractError(
                 f"{self.folder} gives other actions here than where it was exported: golden cases differ by "
@@ -128,17 +128,17 @@ def read_contract(folder: Path) -> dict[str, Any]:
     try:
         contract = json.loads(path.read_text(encoding="utf-8"))
         sound = contract.pop(DIGEST) == digest(contract)
-        found = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in contract["files"]}
+        digests = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in contract["files"]}
     except OSError as error:
         raise ContractError(f"{error.filename} cannot be read ({error.strerror}): export the policy anew") from None
     except (ValueError, KeyError, AttributeError, TypeError):
-        sound, contract, found = False, {}, {}
+        sound, contract, digests = False, {}, {}
     if not sound:
         raise ContractError(f"{path} is damaged or was changed: export the policy anew")
     if contract["version"] > VERSION:
         raise ContractError(f"{path} was written by a newer cuelearner: use the decide.py beside it, or update")
     for name, recorded in contract["files"].items():
-        if found[name] != recorded:
+        if digests[name] != recorded:
             raise ContractError(f"{folder / name} is not the file that was exported: export the policy anew")
     return contract
 
@@ -150,7 +150,7 @@ def _of_numpy(path: Path, contract: dict[str, Any]) -> Batch:
     with np.load(path, allow_pickle=False) as stored:
         graph = json.loads(stored["graph"].tobytes())
         constants = {name: stored[name] for name in stored.files if name != "graph"}
-    (given,), (result,) = graph["inputs"], graph["outputs"]
+    (source,), (result,) = graph["inputs"], graph["outputs"]
     run = compile_ops(graph["ops"])
 
     def decide(*batch: np.ndarray) -> np.ndarray:
@@ -158,7 +158,7 @@ def _of_numpy(path: Path, contract: dict[str, Any]) -> Batch:
         actions = np.empty((len(rows), contract["action"]["size"]), np.float32)
         with np.errstate(all="ignore"):  # JAX does not warn of floating-point errors either
             for number, row in enumerate(rows):
-                values = {**constants, given: row}
+                values = {**constants, source: row}
                 run(values)
                 actions[number] = values[result]
         return actions
@@ -194,10 +194,10 @@ def _of_stablehlo(path: Path, contract: dict[str, Any]) -> Batch:
     except ContractError:
         raise
     except Exception:
-        made = contract["artefact"]["jax"]
+        version = contract["artefact"]["jax"]
         raise ContractError(
-            f"this decision was exported with JAX {made}, and JAX {jax.__version__} on {jax.default_backend()} cannot "
-            f"call it: use JAX {made}, or export the policy anew with this one"
+            f"this decision was exported with JAX {version}, and JAX {jax.__version__} on {jax.default_backend()} "
+            f"cannot call it: use JAX {version}, or export the policy anew with this one"
         ) from None
     return lambda *batch: np.asarray(call(*batch))
 
@@ -255,10 +255,6 @@ def _reduction(function: np.ufunc) -> Callable[..., Any]:
     return lambda axes: lambda x, axis=tuple(axes): function.reduce(x, axis, x.dtype)
 
 
-def _slices(start: list[int], stop: list[int], step: list[int]) -> Callable[..., Any]:
-    return operator.itemgetter(tuple(slice(*each) for each in zip(start, stop, step, strict=True)))
-
-
 def _quotient(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Divide; integers round toward zero."""
     return np.asarray(np.trunc(np.true_divide(x, y)), x.dtype) if x.dtype.kind in "iu" else np.divide(x, y)
@@ -287,7 +283,7 @@ SETTLED: dict[str, Callable[..., Callable[..., Any]]] = {
     "transpose": lambda axes: operator.methodcaller("transpose", tuple(axes)),
     "broadcast": lambda shape: lambda x: np.broadcast_to(x, shape),
     "concatenate": lambda axis: lambda *parts: np.concatenate(parts, axis),
-    "slice": _slices,
+    "slice": lambda start, stop, step: operator.itemgetter(tuple(map(slice, start, stop, step))),
     "pad": lambda low, high: lambda x, value: np.pad(x, list(zip(low, high, strict=True)), constant_values=value),
     **{"sum": _reduction(np.add), "largest": _reduction(np.maximum)},
     **{"smallest": _reduction(np.minimum), "all": _reduction(np.logical_and), "any": _reduction(np.logical_or)},

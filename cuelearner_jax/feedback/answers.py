@@ -185,8 +185,8 @@ def scalar_answer(
     wanted = add_bias(space, wanted, space.from_unit(scalars.teacher_bias_deg))
     within = jnp.maximum(space.from_unit(scalars.scalar_within_deg), space.from_unit(scalars.indifference_deg))
     good = space.distance(action, wanted) <= within
-    said = jnp.where(jnp.isfinite(wanted).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
-    return said[None], answered
+    label = jnp.where(jnp.isfinite(wanted).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
+    return label[None], answered
 
 
 def _slips(

@@ -14,17 +14,17 @@ from cuelearner_jax.types import Label
 ACTION_ERROR = 1e-3  # largest error of an entry of an action
 
 
-def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, named: str) -> None:
-    """Check that a file's labels, called `named` in messages, fit an environment and a form of answers, as `check`.
+def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, source: str) -> None:
+    """Check that a file's labels, called `source` in messages, fit an environment and a form of answers, as `check`.
 
     `spaces`: None for observations of any size and the file's own space of actions.
     """
     if form is not None and form.by_eps and file.eps is None:
-        raise UserError(f"{named} does not name the strength (eps) of its {form.name} answers: write the file again")
-    check(file.labels, spaces or Spaces(file.labels.obs.shape[1], file.space), form, named)
+        raise UserError(f"{source} does not name the strength (eps) of its {form.name} answers: write the file again")
+    check(file.labels, spaces or Spaces(file.labels.obs.shape[1], file.space), form, source)
 
 
-def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "the labels") -> None:
+def check(labels: Label, spaces: Spaces, form: AnswerForm | None, source: str = "the labels") -> None:
     """Raise UserError unless labels (labels, ...) fit an environment's spaces and a form of answers.
 
     `form`: None if it is unknown; answers are then only checked to be finite.
@@ -34,18 +34,18 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
     widths = {"observations": spaces.obs_size, "actions": spaces.actions.size, "answers": width}
     for name, values in rows.items():
         if values.ndim != 2 or values.shape[1] != widths[name]:
-            raise UserError(f"{named}: {name} have the shape {values.shape}: give (labels, {widths[name]})")
-        _refuse(~np.isfinite(values), f"{named}: {name} hold numbers that are not finite", "leave these labels out")
+            raise UserError(f"{source}: {name} have the shape {values.shape}: give (labels, {widths[name]})")
+        _refuse(~np.isfinite(values), f"{source}: {name} hold numbers that are not finite", "leave these labels out")
     for name in ("actions", "answers") if form is not None and form.is_action else ("actions",):
         action = np.asarray(rows[name])
         off = np.abs(np.asarray(spaces.actions.retract(jnp.asarray(action))) - action) > ACTION_ERROR
         space = spaces.actions
-        _refuse(off, f"{named}: {name} are no {space.about}", f"the space {space.name} gives the nearest by `retract`")
+        _refuse(off, f"{source}: {name} are no {space.about}", f"the space {space.name} gives the nearest by `retract`")
     if form is not None and form.values is not None:
         values = form.values(spaces.actions)
         names = ", ".join(f"{value:g}" for value in values)
         wrong = ~np.isin(labels.answer, values)
-        _refuse(wrong, f"{named}: an answer is none of {names}", f"each means {form.meaning(spaces.actions)}")
+        _refuse(wrong, f"{source}: an answer is none of {names}", f"each means {form.meaning(spaces.actions)}")
 
 
 def _refuse(wrong: np.ndarray, reason: str, remedy: str) -> None:

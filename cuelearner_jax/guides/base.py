@@ -164,8 +164,8 @@ class Guide:
     ) -> Refinement:
         """Return `act`, limited to within `bound` of the given actions for every kind."""
         space = self.spaces.actions
-        moved = self.act(model, env, obs, actions, active, bound_scalars(space, scalars, bound))
-        return moved._replace(actions=space.clip(moved.actions, actions, bound))
+        refinement = self.act(model, env, obs, actions, active, bound_scalars(space, scalars, bound))
+        return refinement._replace(actions=space.clip(refinement.actions, actions, bound))
 
     def refined(
         self,
@@ -182,9 +182,9 @@ class Guide:
         return refine(residual, actions, active, space=space, **limits, k_max=most)
 
 
-def replaced(chosen: Actions, actions: Actions, rows: Rows) -> Refinement:
+def replaced(others: Actions, actions: Actions, rows: Rows) -> Refinement:
     """Return the chosen actions in place of others in some rows, as one pass."""
-    return Refinement(jnp.where(rows[:, None], chosen, actions), rows.astype(jnp.int32))
+    return Refinement(jnp.where(rows[:, None], others, actions), rows.astype(jnp.int32))
 
 
 class NoGuide(Guide):

@@ -78,7 +78,7 @@ class BatchCoach(DeepCoach):
         eps, own = space.from_unit(scalars.eps_deg), space.retract(acted)
         toward = space.retract(own + eps * self.member.network.predict(env, human, rows.obs, own))
         target = jax.lax.stop_gradient(space.clip(toward, own, eps))
-        return rows.replace(target=target, said=None if rows.said is None else jnp.ones_like(rows.said))
+        return rows.replace(target=target, cues=None if rows.cues is None else jnp.ones_like(rows.cues))
 
     def correction(
         self, env: Any, labels: Label, rows: Example, order: Int[Array, " slots"], scalars: GuideScalars
@@ -98,14 +98,14 @@ class BatchCoach(DeepCoach):
 
         def move(key: PRNGKeyArray, coached: BatchCoached, batch: Example, own: Array) -> BatchCoached:
             """Return the policy after one step; `own`: rows that keep their label's target."""
-            shown = self.augmented(key, batch)
+            sample = self.augmented(key, batch)
 
             def loss(policy: Params) -> Array:
-                acted = self.member.predict(env, policy, shown.obs, shown.action)
-                targets = self.policy_targets(env, coached.human, shown, acted, scalars)
+                acted = self.member.predict(env, policy, sample.obs, sample.action)
+                targets = self.policy_targets(env, coached.human, sample, acted, scalars)
                 pick = lambda one, other: jnp.where(own[:, None], one, other)  # noqa: E731
-                said = None if shown.said is None else pick(shown.said, targets.said)
-                both = shown.replace(target=pick(shown.target, targets.target), said=said)
+                cues = None if sample.cues is None else pick(sample.cues, targets.cues)
+                both = sample.replace(target=pick(sample.target, targets.target), cues=cues)
                 return jnp.mean(squared_errors(both, acted))
 
             updates, state = adam.update(jax.grad(loss)(coached.policy), coached.optimizer, coached.policy)

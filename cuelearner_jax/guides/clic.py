@@ -127,8 +127,8 @@ def direction_at(key: PRNGKeyArray, h: Float[Array, " cues"], angle: Array | flo
     """
     spoken = is_answered(h)
     h = jnp.where(spoken, h, 0.0)
-    drawn = jnp.where(spoken, jax.random.normal(key, h.shape), 0.0)
-    across = drawn - jnp.sum(drawn * h) / jnp.maximum(jnp.sum(h * h), 1.0) * h
+    noise = jnp.where(spoken, jax.random.normal(key, h.shape), 0.0)
+    across = noise - jnp.sum(noise * h) / jnp.maximum(jnp.sum(h * h), 1.0) * h
     size = _size(across)
     aside = jnp.cos(angle) * h + jnp.sin(angle) * _size(h) / size * across
     return jnp.where(size > 1e-3, aside, h)
@@ -223,12 +223,7 @@ class Clic(Guide):
         return fit_model(key, rows, scalars, init=self.network.init, losses=losses, sizes=sizes, augment=augment)
 
     def minimise_energy(
-        self,
-        env: Any,
-        params: Params,
-        obs: Float[Array, " obs"],
-        base: Float[Array, " action"],
-        scalars: GuideScalars,
+        self, env: Any, params: Params, obs: Float[Array, " obs"], base: Float[Array, " action"], scalars: GuideScalars
     ) -> Float[Array, " action"]:
         """Return the action of least energy within tau_max of `base`, by a deterministic search."""
         space, cues = self.spaces.actions, len(self.spaces.actions.cues)
@@ -258,11 +253,11 @@ class Clic(Guide):
         guided = active & model.fitted
 
         def choose(where: Array) -> Array:
-            seen, base = jnp.split(where, [obs.shape[1]])
-            return self.minimise_energy(env, model.params, seen, base, scalars)
+            own_obs, base = jnp.split(where, [obs.shape[1]])
+            return self.minimise_energy(env, model.params, own_obs, base, scalars)
 
-        chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
-        return replaced(chosen, actions, guided)
+        best = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
+        return replaced(best, actions, guided)
 
 
 class ClicShown(Clic):

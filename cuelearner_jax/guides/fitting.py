@@ -106,7 +106,7 @@ class Example(struct.PyTreeNode):
     action: Float[Array, " action"]
     target: Float[Array, " outputs"]
     valid: Bool[Array, ""]
-    said: Bool[Array, " cues"] | None = None  # the cues along which errors count; None: errors count as a whole
+    cues: Bool[Array, " cues"] | None = None  # the cues along which errors count; None: errors count as a whole
     space: Space | None = struct.field(pytree_node=False, default=None)  # the space of these cues
 
 
@@ -122,8 +122,8 @@ def examples(
     rows = Example(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
     if space is None or len(space.cues) == 1:
         return rows
-    said = is_answered(labels.answer)
-    return rows.replace(valid=labels.valid & said.any(-1), said=said, space=space)
+    cues = is_answered(labels.answer)
+    return rows.replace(valid=labels.valid & cues.any(-1), cues=cues, space=space)
 
 
 def squared_errors(rows: Example, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
@@ -133,11 +133,11 @@ def squared_errors(rows: Example, predicted: Float[Array, "n outputs"]) -> Float
     error along that cue in the space's unit. A cue of which nothing was said adds nothing, whatever is predicted.
     """
     off = predicted - rows.target
-    if rows.said is None:
+    if rows.cues is None:
         return jnp.sum(jnp.square(off), -1)
     assert rows.space is not None  # `examples` gives it with `said`
     along = jax.vmap(rows.space.along)(rows.action[..., : rows.space.size], off)
-    return jnp.sum(jnp.square(along), -1, where=rows.said)
+    return jnp.sum(jnp.square(along), -1, where=rows.cues)
 
 
 def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:

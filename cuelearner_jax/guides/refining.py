@@ -73,8 +73,8 @@ def refine(
         proposal = space.retract(current + residual(current))
         proposal = space.clip(proposal, first, tau_max)
         settled = space.distance(current, proposal) < tau
-        moved = jnp.where(done[:, None], current, proposal)
-        return moved, done | settled, passes + ~done, k + 1
+        following = jnp.where(done[:, None], current, proposal)
+        return following, done | settled, passes + ~done, k + 1
 
     at_once = portions().passes
     body = (

@@ -74,8 +74,6 @@ def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
     """Return a kind's guide for an environment, of which only the spaces are used (shapes in place of arrays will do).
 
     `options`: the kind's own, a `Guide.config` (None: its defaults).
-
-    Raises UserError for no such kind, or if the environment lacks what it needs.
     """
     kind = find(name)
     for need in kind.needs:

@@ -58,8 +58,8 @@ class Scalar(Guide):
         """Return the best of all actions in active rows of a fitted model."""
         guided = active & model.fitted
         value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
-        chosen = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
-        return replaced(chosen, actions, guided)
+        best = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
+        return replaced(best, actions, guided)
 
     def question(
         self,

@@ -36,7 +36,7 @@ RECENT = 50  # number of answers from which the pace is computed
 class Response(NamedTuple):
     """The recorded response to an item."""
 
-    said: str  # one of `label_files.SAID`
+    said: str  # one of `label_files.RESPONSES`
     obs: np.ndarray
     action: np.ndarray
     answer: np.ndarray | None

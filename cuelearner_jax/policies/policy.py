@@ -66,9 +66,9 @@ def _lane(part: Any, axes: Any, index: int | ArrayLike) -> Any:
     """Return the entries of some lanes; `axes` as `PolicyNode.axes`."""
     if hasattr(part, "lane"):
         return part.lane(index)
-    taken = lambda leaf: jnp.asarray(leaf)[index]  # noqa: E731
-    chosen = lambda axis, own: own if axis is SHARED else jax.tree.map(taken, own)  # noqa: E731
-    return jax.tree.map(chosen, axes, part, is_leaf=lambda axis: axis is SHARED)
+    rows = lambda leaf: jnp.asarray(leaf)[index]  # noqa: E731
+    entries = lambda axis, own: own if axis is SHARED else jax.tree.map(rows, own)  # noqa: E731
+    return jax.tree.map(entries, axes, part, is_leaf=lambda axis: axis is SHARED)
 
 
 def lanes_in(policy: PolicyNode) -> int | None:
@@ -104,10 +104,10 @@ def call_policy(
     policy: Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
 ) -> Float[Array, "n action"]:
     """Return a policy's actions, NaN in place of each invalid one. Raises UserError for another shape."""
-    chosen, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
-    if chosen.shape != wanted:
-        raise UserError(f"{policy_name(policy)} returned actions of shape {chosen.shape}: return {wanted}")
-    return actions.only_actions(chosen)
+    result, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
+    if result.shape != wanted:
+        raise UserError(f"{policy_name(policy)} returned actions of shape {result.shape}: return {wanted}")
+    return actions.only_actions(result)
 
 
 def layers(described: dict[str, Any]) -> Iterator[dict[str, Any]]:

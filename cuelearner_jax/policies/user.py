@@ -82,14 +82,14 @@ class Opaque(PolicyNode):
         if user_code.is_waiting():
             return nothing
         try:
-            chosen = self._called(np.asarray(obs))
-            usable = self.actions.usable(chosen, np)
+            actions = self._called(np.asarray(obs))
+            usable = self.actions.usable(actions, np)
             if not usable.all():
                 count = f"{(~usable).sum()} of {usable.size}"
                 raise UserError(
                     f"{policy_name(self)} gave zero or not finite numbers in place of actions, in {count} situations"
                 )
-            return chosen
+            return actions
         except BaseException as error:  # one that left the compiled program would be an error of XLA's
             user_code.leave(error)
             return nothing
@@ -97,27 +97,25 @@ class Opaque(PolicyNode):
     def _called(self, rows: np.ndarray) -> np.ndarray:
         """Call the function with a batch of any leading axes. Raises UserError for any exception of the function."""
         flat = rows.reshape(-1, rows.shape[-1])
-        chosen = _call_user(self.function, self.function, flat)
-        return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
+        result = _call_user(self.function, self.function, flat)
+        return self._checked(result, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
 
-    def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
+    def _checked(self, result: Any, rows: int, as_array: Callable[..., Any]) -> Any:
         """Return the function's result as an array of real numbers.
 
         Of a pair of actions and None (models of Stable-Baselines3), or a dictionary (of brax), the actions are taken.
         Whole numbers in a space of choices are numbers of choices.
         """
         name, wanted = policy_name(self), (rows, self.actions.size)
-        if isinstance(chosen, tuple) and len(chosen) == 2 and (chosen[1] is None or np.ndim(chosen[0]) == 2):
-            if not isinstance(chosen[1], dict | None):
+        if isinstance(result, tuple) and len(result) == 2 and (result[1] is None or np.ndim(result[0]) == 2):
+            if not isinstance(result[1], dict | None):
                 raise UserError(f"{name} {MEMORY}")
-            chosen = chosen[0]
+            result = result[0]
         try:
-            actions = as_array(chosen)
+            actions = as_array(result)
         except Exception as error:  # PyTorch's own kinds too
             why = " ".join(str(error).split())[:200]
-            raise UserError(
-                f"{name} returned {format_value(chosen)} ({why}): return an array of shape {wanted}"
-            ) from error
+            raise UserError(f"{name} returned {format_value(result)} ({why}): return an array {wanted}") from error
         is_whole = jnp.issubdtype(actions.dtype, jnp.integer)
         if not is_whole and not jnp.issubdtype(actions.dtype, jnp.floating):
             raise UserError(f"{name} returned {actions.dtype} numbers: return real ones, of shape {wanted}")
@@ -152,8 +150,8 @@ def _try(policy: Opaque, size: int) -> None:
 
 
 @partial(jax.jit, static_argnums=0)
-def _valid(actions: Space, chosen: Array) -> Array:
-    return actions.retract(actions.only_actions(chosen))
+def _valid(actions: Space, vectors: Array) -> Array:
+    return actions.retract(actions.only_actions(vectors))
 
 
 def _call_user(code: Any, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -166,45 +164,41 @@ def _call_user(code: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         raise user_code_error(f"policy {code_name(code)}", error) from error
 
 
-def policy_of(given: Any, space: Space | None = None) -> Any:
+def policy_of(source: Any, space: Space | None = None) -> Any:
     """Return anything that acts as a policy.
 
     Args:
-        given: a policy; a class or function that gives one when it is called with nothing; a function of a batch of
+        source: a policy; a class or function that gives one when it is called with nothing; a function of a batch of
             observations: one that `jax.jit` made is compiled with what calls it, any other gets NumPy arrays; a
             `torch.nn.Module`; a model or policy of Stable-Baselines3, or its `predict`; or the path of a file in ONNX.
         space: the space of the actions of a function (None: not known yet).
-
-    Raises:
-        UserError: the object is none of these, a policy that is not a pytree, a file that cannot be run, or a model
-            that is known to give other actions than those of the space.
     """
-    function = _foreign(given)
-    if function is None and not _acts(given) and _required(given) == []:
-        given = _call_user(given, given)
-        function = _foreign(given)
-    policy = given if function is None else Opaque(function, on_host=True)
+    function = _foreign(source)
+    if function is None and not _acts(source) and _required(source) == []:
+        source = _call_user(source, source)
+        function = _foreign(source)
+    policy = source if function is None else Opaque(function, on_host=True)
     if _acts(policy):
         if any(leaf is policy for leaf in jax.tree.leaves(policy)):
             kind = type(policy).__name__
             raise UserError(
-                f"a {kind} has `act` but is not a pytree: make it a flax.struct.PyTreeNode, or give a function"
+                f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function"
             )
-    elif callable(given) and not isinstance(given, type):
-        if len(more := _required(given) or ()) > 1:
+    elif callable(source) and not isinstance(source, type):
+        if len(more := _required(source) or ()) > 1:
             raise UserError(
-                f"policy {code_name(given)} takes {', '.join(more)}: give a function of observations alone, for "
+                f"policy {code_name(source)} takes {', '.join(more)}: give a function of observations alone, for "
                 f"instance jax.jit(lambda obs: policy(obs, {', '.join(more[1:])})[0])"
             )
-        policy = Opaque(given, on_host=not isinstance(given, jax.stages.Wrapped))
+        policy = Opaque(source, on_host=not isinstance(source, jax.stages.Wrapped))
     else:
         raise UserError(
-            f"{format_value(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
+            f"{format_value(source)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
             "model of Stable-Baselines3 or a file in ONNX, or load one"
         )
     if space is None or not isinstance(policy, Opaque):
         return policy
-    model = getattr(policy.function, "given", None)
+    model = getattr(policy.function, "model", None)
     own, wanted = action_words(getattr(model, "action_space", None)), action_words(space)
     if own and wanted and own != wanted:
         raise UserError(
@@ -218,10 +212,10 @@ def _acts(code: Any) -> bool:
     return hasattr(code, "act") and not isinstance(code, type)
 
 
-def _required(given: Any) -> list[str] | None:
+def _required(function: Any) -> list[str] | None:
     """Return the names of the arguments that an object cannot be called without; None: not known, or any number."""
     try:
-        parameters = inspect.signature(given).parameters.values()
+        parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # not callable, or compiled code
         return None
     if any(one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters):
@@ -240,11 +234,11 @@ class Teaching(struct.PyTreeNode):
         return self.policy.act(jax.random.key(0), states, obs[None])[0]
 
 
-def teaching(given: Any, space: Space) -> Teacher:
+def teaching(source: Any, space: Space) -> Teacher:
     """Return a teacher as given, or the teacher that shows what a given policy does (`policy_of`)."""
-    if callable(getattr(given, "best_action", None)) and not isinstance(given, type | Teaching):
-        return given
-    return Teaching(policy_of(given.policy if isinstance(given, Teaching) else given, space))
+    if callable(getattr(source, "best_action", None)) and not isinstance(source, type | Teaching):
+        return source
+    return Teaching(policy_of(source.policy if isinstance(source, Teaching) else source, space))
 
 
 # --- policies of other libraries -------------------------------------------------------------------------------------
@@ -256,13 +250,13 @@ class Foreign:
     Two functions of one object, or of one file, are equal: programs that call them are compiled once.
     """
 
-    def __init__(self, given: Any, act: Callable[[Any, Any], Any], path: Path | None = None) -> None:
-        self.given, self.act, self.key = given, act, (act if path is None else path, id(given) if path is None else 0)
-        self.__qualname__ = str(path or type(given).__qualname__)
+    def __init__(self, model: Any, act: Callable[[Any, Any], Any], path: Path | None = None) -> None:
+        self.model, self.act, self.key = model, act, (act if path is None else path, id(model) if path is None else 0)
+        self.__qualname__ = str(path or type(model).__qualname__)
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
         """Return actions for observations."""
-        return self.act(self.given, obs)
+        return self.act(self.model, obs)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Foreign) and self.key == other.key
@@ -271,24 +265,24 @@ class Foreign:
         return hash(self.key)
 
 
-def _foreign(given: Any) -> Foreign | None:
+def _foreign(source: Any) -> Foreign | None:
     """Return another library's policy as a function; None if the object is none of these."""
-    if isinstance(given, str | os.PathLike):
-        path = Path(given)
+    if isinstance(source, str | os.PathLike):
+        path = Path(source)
         if path.suffix != ONNX and path.suffix in FILES:
             raise UserError(
-                f"reading {given} may run code in it: write a module that loads it, as POLICY = PPO.load(...) or "
+                f"reading {source} may run code in it: write a module that loads it, as POLICY = PPO.load(...) or "
                 "torch.jit.load(...), and give my_policy:POLICY (module:NAME; in Python, the loaded policy)"
             )
         return _onnx(path) if path.suffix == ONNX else None
     predicts = lambda one: callable(getattr(one, "predict", None)) and hasattr(one, "observation_space")  # noqa: E731
-    owner = getattr(given, "__self__", None)
-    given = owner if predicts(owner) and getattr(given, "__name__", "") == "predict" else given
-    if predicts(given) and not isinstance(given, type):
-        return Foreign(given, _predicted)
+    owner = getattr(source, "__self__", None)
+    source = owner if predicts(owner) and getattr(source, "__name__", "") == "predict" else source
+    if predicts(source) and not isinstance(source, type):
+        return Foreign(source, _predicted)
     torch = sys.modules.get("torch")
-    is_module = torch is not None and hasattr(torch, "nn") and isinstance(given, torch.nn.Module)
-    return Foreign(given, _forwarded) if is_module else None
+    is_module = torch is not None and hasattr(torch, "nn") and isinstance(source, torch.nn.Module)
+    return Foreign(source, _forwarded) if is_module else None
 
 
 _alone = threading.Lock()  # evaluation mode is a state of a module, so calls must not overlap
@@ -365,13 +359,13 @@ def _onnx(path: Path) -> Foreign:
     if len(inputs) != 1 or inputs[0].type not in REAL or len(inputs[0].shape) != 2:
         shapes = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs)
         raise UserError(f"{path} has the inputs {shapes}: give a policy with one input of real numbers, (n, obs)")
-    chosen = [name for name in outputs if name in ("action", "actions")] or outputs
-    if len(chosen) != 1:
+    names = [name for name in outputs if name in ("action", "actions")] or outputs
+    if len(names) != 1:
         raise UserError(f"{path} has the outputs {', '.join(outputs)}: give a policy with one, or one named action")
 
     def act(session: Any, obs: np.ndarray) -> np.ndarray:
         rows = np.ascontiguousarray(obs).astype(REAL[inputs[0].type])
         parts = np.split(rows, len(rows)) if inputs[0].shape[0] == 1 else [rows]
-        return np.concatenate([session.run(chosen, {inputs[0].name: part})[0] for part in parts])
+        return np.concatenate([session.run(names, {inputs[0].name: part})[0] for part in parts])
 
     return Foreign(session, act, path.resolve())

@@ -1,7 +1,7 @@
 """Read relative answers as intervals: what changed between a policy and its world, and the corrected policy."""
 
 from cuelearner_jax.reading.families import Distortion, Unknown, declared_distortions
-from cuelearner_jax.reading.policy import Read
+from cuelearner_jax.reading.policy import ReadingPolicy
 from cuelearner_jax.reading.result import Estimate, Result
 from cuelearner_jax.reading.session import Reading
 from cuelearner_jax.reading.simulator import simulator_distortion
@@ -10,8 +10,8 @@ from cuelearner_jax.reading.walk import Walk
 __all__ = [
     "Distortion",
     "Estimate",
-    "Read",
     "Reading",
+    "ReadingPolicy",
     "Result",
     "Unknown",
     "Walk",

@@ -104,8 +104,8 @@ def check_family(family: Sequence[Distortion]) -> Family:
             raise UserError(f"distortion {distortion.name!r} has no unknowns: give at least one")
         if distortion.sees is None and distortion.plans is None and distortion.acts is None:
             raise UserError(f"distortion {distortion.name!r} changes nothing: give `sees`, `acts` or `plans`")
-    for taken in (names, [distortion.name for distortion in family]):
-        if twice := sorted({name for name in taken if taken.count(name) > 1}):
+    for names_of_kind in (names, [distortion.name for distortion in family]):
+        if twice := sorted({name for name in names_of_kind if names_of_kind.count(name) > 1}):
             raise UserError(f"{twice[0]!r} is the name of two distortions or unknowns: give each name once")
     return tuple(family)
 
@@ -238,13 +238,13 @@ def _turned_about(
     `followers`: first entries of differences, each with the first entry of the place that it is displaced with.
     """
     pairs = [(start, start) for _, start in slices] + followers
-    moved, by = (jnp.array(column) for column in zip(*pairs, strict=True))
+    entries, by = (jnp.array(column) for column in zip(*pairs, strict=True))
 
     def sees(theta: Array, obs: Array) -> Array:
         cos, sin = jnp.cos(jnp.deg2rad(theta[0])), jnp.sin(jnp.deg2rad(theta[0]))
         x, y = obs[by] - origin[0], obs[by + 1] - origin[1]
         change_x, change_y = cos * x + sin * y - x, cos * y - sin * x - y
-        return obs + jnp.zeros(len(obs)).at[moved].set(change_x).at[moved + 1].set(change_y)
+        return obs + jnp.zeros(len(obs)).at[entries].set(change_x).at[entries + 1].set(change_y)
 
     name = f"{_called(slices)}: turn"
     return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)

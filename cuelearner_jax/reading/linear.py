@@ -146,8 +146,8 @@ def probes(
     """
     steps, theta = jnp.diag(frame.step), change.theta[None]
     sides = jnp.concatenate([theta, theta - steps, theta + steps])
-    moved = jax.vmap(lambda theta: undone(family, change.replace(theta=theta), obs))(sides)
-    return jnp.concatenate([obs[None], moved])
+    shifted = jax.vmap(lambda theta: undone(family, change.replace(theta=theta), obs))(sides)
+    return jnp.concatenate([obs[None], shifted])
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -187,8 +187,8 @@ def influence(
     """Return the entries on which the policy's actions depend most, from its answers to `probes`."""
     size = len(frame.step)
     slope = space.log(actions[2 : 2 + size], actions[2 + size :])
-    moved = jnp.einsum("n,unc->u", labels.valid * 1.0, slope**2)
-    return jax.lax.top_k(moved, min(MIXED, size))[1]
+    effect = jnp.einsum("n,unc->u", labels.valid * 1.0, slope**2)
+    return jax.lax.top_k(effect, min(MIXED, size))[1]
 
 
 def data(

@@ -1,4 +1,4 @@
-"""A policy corrected by what answers said about its world."""
+"""A policy corrected by an estimated change, and by a process for what depends on the situation."""
 
 from __future__ import annotations
 
@@ -12,17 +12,69 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, describe
-from cuelearner_jax.reading import linear
-from cuelearner_jax.reading.correction import Correction, corrected
+from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.families import Family, unknowns_of
-from cuelearner_jax.reading.linear import ObservationFrame
+from cuelearner_jax.reading.linear import SCALE, Change, ObservationFrame
+from cuelearner_jax.reading.posterior import Posterior, Priors
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import EnvState
 
 KIND = "reading"
 
 
-class Read(PolicyNode):
+class Correction(struct.PyTreeNode):
+    """The estimate of a change, and the process with which other errors are corrected."""
+
+    change: Change
+    frame: ObservationFrame
+    known: Float[Array, "n z"]  # situations that the process was fitted in
+    alpha: Float[Array, "n cues"]  # times its variance: weights of the situations
+    length: Float[Array, " z"]  # length scale of each input of the process
+    scale: Float[Array, ""]  # unit of changes, in the unit of `space.log`
+
+    def more(self, space: Space, obs: Float[Array, "n obs"], action: Float[Array, "n a"]) -> Float[Array, "n cues"]:
+        """Return the mean of the process, in units of `scale`; `action`: the base's."""
+        inputs = linear.inputs(space, self.frame, obs, action)
+        return posterior.correlation(self.length, inputs, self.known) @ self.alpha
+
+
+def correction_of(
+    fitted: Posterior,
+    change: Change,
+    frame: ObservationFrame,
+    situations: Float[Array, "n z"],
+    eps: Any,
+    priors: Priors,
+) -> Correction:
+    """Return what is needed to act by a posterior."""
+    alpha = posterior.amplitudes(fitted.hyper, priors)[None] ** 2 * fitted.alpha
+    return Correction(
+        change, frame, situations, alpha, posterior.lengths(fitted.hyper, priors), jnp.float32(SCALE * eps)
+    )
+
+
+def corrected(
+    space: Space,
+    family: Family,
+    correction: Correction,
+    obs: Float[Array, "n obs"],
+    before: Float[Array, "n obs"],
+    first: Float[Array, "n action"],
+    action: Float[Array, "n action"],
+) -> Float[Array, "n action"]:
+    """Return corrected actions.
+
+    Args:
+        space, family, correction: the correction.
+        obs, before: observations as they are, and as they would be without the change (`linear.undone`).
+        first, action: what the policy does about the two.
+    """
+    base = linear.meant(family, correction.change.theta, before, action)
+    more = correction.more(space, obs, first)
+    return space.exp(base, correction.scale * (linear.basis(space, base) @ correction.change.action.T + more))
+
+
+class ReadingPolicy(PolicyNode):
     """Another policy, corrected; without a change it acts as its base."""
 
     base: Any  # a policy
@@ -30,7 +82,7 @@ class Read(PolicyNode):
     bound: Float[Array, ""]  # largest change along a cue, in the unit of `space.log`; infinite: none
     space: Space = struct.field(pytree_node=False)
     family: Family = struct.field(pytree_node=False)  # empty: shifts and mixings of entries
-    named: str = struct.field(pytree_node=False, default="")  # reference of the family's code; empty: declared
+    reference: str = struct.field(pytree_node=False, default="")  # reference of the family's code; empty: declared
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the base's actions, corrected."""
@@ -46,7 +98,7 @@ class Read(PolicyNode):
         return bool(np.any(np.asarray(change.theta)) or np.any(np.asarray(change.mix)))
 
     @property
-    def axes(self) -> Read:
+    def axes(self) -> ReadingPolicy:
         """Lane axes: each lane has its own base, and its own correction where there is more than one."""
         lanes = SHARED if jnp.ndim(self.correction.scale) == 0 else BY_LANE
         return self.replace(base=self.base.axes, correction=lanes, bound=lanes)
@@ -60,7 +112,7 @@ class Read(PolicyNode):
             "guidance": KIND,
             "changes": [{"name": one.name, "unit": one.unit, "value": value} for one, value in values],
             "distortions": [one.name for one in self.family],
-            "code": self.named,
+            "code": self.reference,
             "labels": int(own.known.shape[-2]),
             "mixed": int(own.frame.mixed.shape[-1]),
             "base": describe(self.base),
@@ -77,8 +129,8 @@ def _bounded(
 
 
 def unread(
-    base: Any, space: Space, family: Family, obs_size: int, labels: int = 0, mixed: int = 0, named: str = ""
-) -> Read:
+    base: Any, space: Space, family: Family, obs_size: int, labels: int = 0, mixed: int = 0, reference: str = ""
+) -> ReadingPolicy:
     """Return a policy without a correction, with arrays of the shapes that `describe` tells."""
     change, zeros = linear.no_change(space, family, obs_size), jnp.zeros
     z = obs_size + space.size
@@ -89,4 +141,4 @@ def unread(
     correction = Correction(
         change, frame, zeros((labels, z)), zeros((labels, len(space.cues))), jnp.ones(z), jnp.float32(0)
     )
-    return Read(base, correction, jnp.float32(jnp.inf), space, family, named)
+    return ReadingPolicy(base, correction, jnp.float32(jnp.inf), space, family, reference)

@@ -170,12 +170,12 @@ def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target
     solve = partial(jax.scipy.linalg.solve_triangular, inner, lower=True)
     vector = solve(jnp.einsum("cnp,cn->p", hx, hr))
     weights = jax.scipy.linalg.solve_triangular(inner.T, vector, lower=False)  # in units of size
-    left = hr - hx @ weights  # (cues, n)
+    rest = hr - hx @ weights  # (cues, n)
     mean, away = data.offset + x @ weights, jnp.moveaxis(x, 1, 0)
     variance, alpha = (prior**2)[:, None], jnp.zeros_like(residual)
     if hk is not None and back is not None:
-        alpha = jnp.einsum("cnm,cm->nc", back, left)
-        mean = mean + jnp.einsum("cnm,cn->mc", hk, left)
+        alpha = jnp.einsum("cnm,cm->nc", back, rest)
+        mean = mean + jnp.einsum("cnm,cn->mc", hk, rest)
         away = away - jnp.einsum("cnm,cnp->cmp", hk, hx)  # (cues, n, p)
         variance = variance - (hk**2).sum(1)
     spread = (solve(away.reshape(-1, len(size)).T) ** 2).sum(0).reshape(away.shape[:2])
@@ -234,9 +234,9 @@ def infer(
 
     def bound(hyper: Hyper, precision: Array, target: Array) -> tuple[Array, _Solved]:
         solved = _solve(hyper, parts, data, precision, target, priors)
-        said = expected_log_likelihood(solved.mean, solved.variance, answers, habits(hyper, eps, priors)).sum()
+        likelihood = expected_log_likelihood(solved.mean, solved.variance, answers, habits(hyper, eps, priors)).sum()
         fit = 0.5 * (precision * ((target - solved.mean) ** 2 + solved.variance)).sum()
-        return said + fit + solved.log_z + _log_prior(hyper, parts, priors), solved
+        return likelihood + fit + solved.log_z + _log_prior(hyper, parts, priors), solved
 
     def update(carry: tuple, _: None) -> tuple[tuple, None]:
         hyper, state, precision, target = carry

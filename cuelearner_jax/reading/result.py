@@ -74,7 +74,7 @@ class Result(NamedTuple):
 
 
 def describe_fit(
-    fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity], met: Float[Floats, "m z"]
+    fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity], walk: Float[Floats, "m z"]
 ) -> tuple[tuple[Estimate, ...], float, float | None, float]:
     """Return the entries of `Result` from `estimates` to `wrong`.
 
@@ -82,7 +82,7 @@ def describe_fit(
         fitted: one hypothesis.
         space, family, eps: as for `Reading`; eps in the unit of `space.log`.
         observation: slices of the observation; empty: entries have numbers alone.
-        met: situations that the policy met, as `linear.inputs` has them.
+        walk: situations that the policy met, as `linear.inputs` has them.
     """
     weights = np.asarray(linear.weights_of(fitted.frame, fitted.hypothesis.change), np.float64)
     root = np.asarray(fitted.posterior.root, np.float64) * np.asarray(fitted.hypothesis.parts.weights)[:, None]
@@ -92,7 +92,7 @@ def describe_fit(
     unknowns = len(fitted.hypothesis.change.theta)
     names = _names(family, unknowns, observation)
     step = np.asarray(fitted.frame.step, np.float64)
-    estimates = _seen(weights[:unknowns], root[:unknowns], effect[:, :unknowns], names, family, step)
+    estimates = _changes_of_observation(weights[:unknowns], root[:unknowns], effect[:, :unknowns], names, family, step)
     own = slice(len(weights) - linear.terms(*fitted.hypothesis.change.action.shape).shape[1], None)
     estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
     hyper, inputs, priors = fitted.posterior.hyper, fitted.data.inputs, posterior.PRIORS
@@ -100,8 +100,8 @@ def describe_fit(
     depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
     depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
     near = None
-    if len(met):
-        alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(met), inputs[valid])
+    if len(walk):
+        alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(walk), inputs[valid])
         near = float((alike.max(1) >= ALIKE_SITUATION).mean())
     wrong = float(posterior.habits(hyper, 1 / SCALE, priors).lapse)
     return tuple(estimates), depends, near, wrong
@@ -119,7 +119,7 @@ def _names(family: Family, count: int, observation: Sequence[Quantity]) -> list[
     return names
 
 
-def _seen(
+def _changes_of_observation(
     mean: Float[Floats, " u"],
     root: Float[Floats, "u p"],
     effect: Float[Floats, "n u"],
@@ -129,12 +129,14 @@ def _seen(
 ) -> list[Estimate]:
     """Return changes of what is seen; unknowns of proportional effects are one."""
     length = np.linalg.norm(effect, axis=0)
-    left = [k for k in np.argsort(-np.abs(mean) * length) if length[k] > 1e-6 and root[k].any()]
+    open_unknowns = [k for k in np.argsort(-np.abs(mean) * length) if length[k] > 1e-6 and root[k].any()]
     estimates = []
-    while left:
-        largest = left[0]
-        alike = [k for k in left if abs(effect[:, largest] @ effect[:, k]) >= ALIKE * length[largest] * length[k]]
-        left = [k for k in left if k not in alike]
+    while open_unknowns:
+        largest = open_unknowns[0]
+        alike = [
+            k for k in open_unknowns if abs(effect[:, largest] @ effect[:, k]) >= ALIKE * length[largest] * length[k]
+        ]
+        open_unknowns = [k for k in open_unknowns if k not in alike]
         first, members = min(alike), np.sort(alike)
         share = effect[:, first] @ effect[:, members] / (length[first] ** 2)
         value, deviation = share @ mean[members], float(np.linalg.norm(share @ root[members]))

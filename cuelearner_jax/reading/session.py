@@ -28,18 +28,17 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_name, policy_of
 from cuelearner_jax.reading import fitting, linear
 from cuelearner_jax.reading.families import Family
-from cuelearner_jax.reading.fitting import Fit, Reader
+from cuelearner_jax.reading.fitting import Fit, Reader, steps_of
 from cuelearner_jax.reading.linear import RelativeLabels
-from cuelearner_jax.reading.policy import Read, unread
+from cuelearner_jax.reading.policy import ReadingPolicy, unread
 from cuelearner_jax.reading.result import Result, describe_fit
-from cuelearner_jax.reading.steps import steps_of
 from cuelearner_jax.spaces import Space
 
 BATCHES = 5  # in which a budget of labels is asked or read
 LEAST_BATCH = 10
-USED = math.log(20)  # log of the test martingale from which a correction is used
+LEAST_EVIDENCE = math.log(20)  # log of the test martingale from which a correction is used
 MOST_WRONG = 0.4  # share of answers about something else from which none is believed
-MET = 200  # situations met that are kept
+MOST_SITUATIONS = 200  # situations met that are kept
 FIRST = 3.0  # spread of the first questions about the policy's actions, in eps
 
 
@@ -53,9 +52,6 @@ class Reading:
         eps_deg: strength of an answer, in the space's unit.
         labels: expected number of labels, for which programs are compiled.
         observation: slices of the observation, for words.
-
-    Raises:
-        UserError: the space has no cues.
     """
 
     def __init__(
@@ -76,12 +72,12 @@ class Reading:
         self.fits: Fit | None = None  # all hypotheses
         self.fit: Fit | None = None  # the best of them
         self.evidence = 0.0  # log of the test martingale [nats]
-        self.met = np.zeros((0, 0), np.float32)  # situations that the policy met last
+        self.situations = np.zeros((0, 0), np.float32)  # situations that the policy met last
         self._acts = acts_of(self.base)
         self._reader: Reader | None = None
 
     @property
-    def asked(self) -> int:
+    def count(self) -> int:
         """Number of answers so far."""
         return 0 if self.rows is None else len(self.rows.obs)
 
@@ -99,15 +95,15 @@ class Reading:
             Numbers of the situations (count,), and actions (count, action).
         """
         k_where, k_action = jax.random.split(key)
-        self.met = np.concatenate([self.met.reshape(-1, obs.shape[1]), obs])[-MET:]
+        self.situations = np.concatenate([self.situations.reshape(-1, obs.shape[1]), obs])[-MOST_SITUATIONS:]
         index = np.asarray(jax.random.choice(k_where, len(obs), (count,), replace=len(obs) < count))
         rows = jnp.asarray(np.asarray(obs)[index], jnp.float32)
         if self.fit is None or self._reader is None:
             base, spread = self._acts(rows), jnp.full((count, len(self.space.cues)), FIRST * self.eps)
         else:
             base, spread = self._reader.act(self.fit, rows), self._reader.spread(self.fit, rows)
-        asked = jnp.array([cue.is_asked for cue in self.space.cues])
-        return index, np.asarray(_near(self.space, k_action, base, asked[None] * jnp.maximum(spread, self.eps / 2)))
+        asks = jnp.array([cue.is_asked for cue in self.space.cues])
+        return index, np.asarray(_near(self.space, k_action, base, asks[None] * jnp.maximum(spread, self.eps / 2)))
 
     def learn(
         self,
@@ -139,25 +135,29 @@ class Reading:
             part = slice(start, start + size)
             self.learn(obs[part], action[part], answer[part])
 
-    def policy(self) -> Read:
+    def policy(self) -> ReadingPolicy:
         """Return the policy as corrected so far."""
         size = sum(part.size for part in self.observation)
         if self.fit is None:
             return unread(self.base, self.space, self.family, size)
         correction = fitting.correction(self.fit, self.eps)
-        return Read(self.base, correction, jnp.float32(jnp.inf), self.space, self.family)
+        return ReadingPolicy(self.base, correction, jnp.float32(jnp.inf), self.space, self.family)
 
     def result(self) -> Result:
         """Return the verdict."""
         if self.fits is None or self.fit is None:
             return Result(False, False, 0.0, (), 0.0, None, 0.0, self.policy())
         number = int(fitting.best_of(self.fits))
-        met = jnp.asarray(self.met)
-        inputs = linear.inputs(self.space, self.fit.frame, met, self._acts(met)) if len(met) else met
+        situations = jnp.asarray(self.situations)
+        inputs = (
+            linear.inputs(self.space, self.fit.frame, situations, self._acts(situations))
+            if len(situations)
+            else situations
+        )
         rest = (self.space, self.family, self.eps, self.observation, np.asarray(inputs))
         described = describe_fit(self.fit, *rest)
-        used = number > 0 and self.evidence >= USED and described[-1] < MOST_WRONG
-        return Result(used, number > 0, self.evidence, *described, self.policy())
+        in_use = number > 0 and self.evidence >= LEAST_EVIDENCE and described[-1] < MOST_WRONG
+        return Result(in_use, number > 0, self.evidence, *described, self.policy())
 
     def act(self, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return actions of the policy as corrected so far."""

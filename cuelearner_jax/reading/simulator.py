@@ -45,9 +45,6 @@ def simulator_distortion(
         tried: actions within the reach of another one; odd.
         aim: an action changes as much as the best one within the reach does, for a player who errs by this standard
             deviation, in the space's unit. None: rewards are matched.
-
-    Raises:
-        UserError: actions with several cues, or a number of tries that has no middle.
     """
     if len(space.cues) != 1:
         raise UserError(f"{name!r} is simulated for actions with one cue, not {len(space.cues)}: give `acts` instead")

@@ -41,15 +41,15 @@ class Walk:
         keys = jax.random.split(key, 1 + total)
         if self.states is None or len(self.obs) != envs:
             self.states, self.obs = _start(self.env, jax.random.split(keys[0], envs))
-        act, met = run_of(policy), []
-        for left in reversed(range(total)):
-            k_act, k_env = jax.random.split(keys[total - left])
+        act, situations = run_of(policy), []
+        for rest in reversed(range(total)):
+            k_act, k_env = jax.random.split(keys[total - rest])
             action = act(k_act, self.states, self.obs)
             self.states, self.obs = _step(self.env, jax.random.split(k_env, envs), self.states, action)
-            if left % APART == 0 and left < steps:
-                met.append((self.states, self.obs))
+            if rest % APART == 0 and rest < steps:
+                situations.append((self.states, self.obs))
         # Situations of one environment are adjacent, so that one question is chosen from few environments.
-        return _adjacent(count, met)
+        return _adjacent(count, situations)
 
     def answers(
         self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
@@ -60,8 +60,8 @@ class Walk:
 
 
 @partial(jax.jit, static_argnums=0)
-def _adjacent(count: int, met: Any) -> Any:
-    return jax.tree.map(lambda *rows: jnp.stack(rows, 1).reshape(-1, *rows[0].shape[1:])[:count], *met)
+def _adjacent(count: int, situations: Any) -> Any:
+    return jax.tree.map(lambda *rows: jnp.stack(rows, 1).reshape(-1, *rows[0].shape[1:])[:count], *situations)
 
 
 @jax.jit
@@ -78,8 +78,8 @@ def _step(env: Any, keys: Any, states: Any, actions: Any) -> Any:
 @jax.jit
 def _answers(env: Any, teacher: Any, scalars: Any, keys: Any, states: Any, obs: Any, actions: Any) -> Any:
     def one(row: Any) -> Any:
-        key, state, seen, action = row
-        answer, answered = relative_answer(key, env, teacher, state, seen, action, scalars)
+        key, state, own_obs, action = row
+        answer, answered = relative_answer(key, env, teacher, state, own_obs, action, scalars)
         return jnp.where(answered, answer, jnp.nan)
 
     return jax.lax.map(one, (keys, states, obs, actions), batch_size=min(len(obs), portions().states))

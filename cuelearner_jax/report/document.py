@@ -62,17 +62,12 @@ def report(
         lower_is_better: smaller values of the metric are better, for the best value and for reaching a value.
         by_run: reports each folder separately, under its name, as needed where the runs' configurations differ.
         study: called with the variants; returns additions to the report.
-        overwrite: replaces an existing report.
         command: command line that makes this report, recorded in it.
-
-    Raises UserError if `out` exists, or if the results cannot be reported (`read_groups`, `variants_of`).
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
     if in_use(out) and not overwrite:
-        raise UserError(
-            f"{out} exists already: choose another folder (--out), or allow it to be overwritten (--overwrite)"
-        )
+        raise UserError(f"{out} exists already: give another --out, or --overwrite to replace it")
     groups = read_groups(folders, metric, split, by_run)
     variants = variants_of(groups, metric)
     rows = tables.summary(variants, lower_is_better)
@@ -85,7 +80,7 @@ def report(
         figures["label_efficiency"] = draw_label_efficiency(variants, title, metric)
     added = study(variants) if study else Study((), {})
     every = pa.concat_tables([group.all_rows for group in groups], **PERMISSIVE)
-    missing = extent.missing(folders, every) + extent.shown(groups, variants, metric, split)
+    missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
     lines = [f"# {markdown(title)}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
     lines += [*tables.summary_lines(rows), "", NOTE, *added.lines]
     lines += ["", "## Missing", "", *(f"- {markdown(line)}" for line in missing or ["nothing: all runs are complete"])]
@@ -110,8 +105,8 @@ def _range(name: str, counts: Sequence[int]) -> str:
 
 def _origins(table: pa.Table, command: str) -> list[str]:
     """Return lines about where the numbers come from."""
-    found = [("report made by", command)] if command else []
+    origins = [("report made by", command)] if command else []
     for column, name in ORIGINS.items():
         values = set(table[column].to_pylist()) if column in table.column_names else set()
-        found += [(name, value) for value in sorted(filter(None, values))] or [(name, "not recorded")]
-    return [f"- {name}: {code(value)}" for name, value in found]
+        origins += [(name, value) for value in sorted(filter(None, values))] or [(name, "not recorded")]
+    return [f"- {name}: {code(value)}" for name, value in origins]

@@ -69,26 +69,26 @@ def _absent(run: Path, grid: dict[str, Any], table: pa.Table) -> list[str]:
     return lines
 
 
-def shown(groups: Sequence[Group], variants: Sequence[Variant], metric: str, split: str) -> list[str]:
+def gaps(groups: Sequence[Group], variants: Sequence[Variant], metric: str, split: str) -> list[str]:
     """Return one line for everything in the results that the figures do not show."""
     lines: list[str] = []
-    gaps: list[str] = []
+    omissions: list[str] = []
     for group in groups:
         own = [variant for variant in variants if variant.run == group.name]
-        left = {(variant.guidance, variant.labels): len(variant.seeds) for variant in own}
+        counts = {(variant.guidance, variant.labels): len(variant.seeds) for variant in own}
         for key, seeds in failures.describe_failed(group.failed).items():
-            rest = f"curve and means are over the other {left[key]}" if key in left else "no lane is left"
+            rest = f"curve and means are over the other {counts[key]}" if key in counts else "no lane is left"
             lines.append(f"{failures.variant_name(*key)}: {seeds} failed, no longer finite: {rest}")
-        gaps += _short(group.all_rows, own)
+        omissions += _short(group.all_rows, own)
         if group.invalid:
-            gaps.append(f"{group.invalid:,} {split} rows have no finite {metric}; their steps are left out")
+            omissions.append(f"{group.invalid:,} {split} rows have no finite {metric}; their steps are left out")
     ends = {int(variant.curve.steps[-1]) for variant in variants}
     if len(ends) > 1:
-        gaps.append(
+        omissions.append(
             "curves end at different steps, so their final values cannot be compared; "
             f"means over the curve are taken to step {min(ends):,}, shared by all"
         )
-    return lines + gaps
+    return lines + omissions
 
 
 def _short(table: pa.Table, variants: Sequence[Variant]) -> list[str]:

@@ -78,10 +78,10 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
     return figure
 
 
-def _at(known: Curve, step: int) -> Interval:
+def _at(curve: Curve, step: int) -> Interval:
     """Return the last evaluation up to a step, so that no curve is compared beyond its end."""
-    place = max(0, int(np.searchsorted(known.steps, step, side="right")) - 1)
-    return Interval(*(values[place] for values in known[1:]))
+    place = max(0, int(np.searchsorted(curve.steps, step, side="right")) - 1)
+    return Interval(*(values[place] for values in curve[1:]))
 
 
 def draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[Interval], panel: str) -> None:

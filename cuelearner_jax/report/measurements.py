@@ -15,7 +15,7 @@ from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import group_means, mean_interval
 from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
-from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.studies.evaluate import Measured
@@ -67,22 +67,18 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
 
     Two single policies are paired by episode, and rows of equal seeds by seed. A single policy is subtracted from each
     seed of several. Of rows with different seeds these are resampled independently, the episodes alike.
-
-    Raises UserError for a row without a counterpart.
     """
-    found = []
+    result = []
     for row in rows:
         alike = others if len(others) == 1 else [other for other in others if variant(other) == variant(row)]
         if len(alike) != 1:
-            known, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
-            raise UserError(
-                f"--compare has {len(others)} variants ({known}), but not {wanted}: give a policy of one variant"
-            )
+            variants, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
+            raise UserError(f"--compare has {len(others)} variants ({variants}), not {wanted}: give one variant")
         both = row, alike[0]
         shared = [name for name in row.metrics if name in both[1].metrics]
         finite = [name for name in shared if all(np.isfinite(one.metrics[name]).all() for one in both)]
-        found.append(Difference(*both, over(*both), {name: _less(*both, name) for name in finite}))
-    return found
+        result.append(Difference(*both, over(*both), {name: _less(*both, name) for name in finite}))
+    return result
 
 
 def _less(row: Measured, other: Measured, name: str) -> Interval:
@@ -93,8 +89,8 @@ def _less(row: Measured, other: Measured, name: str) -> Interval:
     groups = [group_means(one.each[name][rows]) for one, rows in zip((row, other), both, strict=True)]
     if is_single(row) or is_single(other) or np.array_equal(row.seeds, other.seeds):
         return interval(mine - its, groups[0] - groups[1])
-    drawn = resampled(groups[0], seed=0) - resampled(groups[1], seed=1)
-    return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(drawn, [0.025, 0.975]))
+    draws = resampled(groups[0], seed=0) - resampled(groups[1], seed=1)
+    return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(draws, [0.025, 0.975]))
 
 
 def _plain(values: Sequence[Any] | np.ndarray | None) -> list[float | None] | None:

@@ -79,8 +79,8 @@ def interval(
     estimate = interquartile_mean(data)
     if len(data) == 1:
         return Interval(estimate, np.full_like(estimate, np.nan), np.full_like(estimate, np.nan))
-    drawn = resampled(data[:, None] if each is None else each, resamples)
-    return Interval(estimate, *np.quantile(drawn, [0.025, 0.975], axis=0))
+    means = resampled(data[:, None] if each is None else each, resamples)
+    return Interval(estimate, *np.quantile(means, [0.025, 0.975], axis=0))
 
 
 def curve(steps: Int[np.ndarray, "steps"], values: np.ndarray, each: np.ndarray | None = None) -> Curve:
@@ -130,16 +130,16 @@ def step_at_level(
 
 def steps_to_level(steps: np.ndarray, curves: np.ndarray, level: float) -> Float[np.ndarray, "*samples 2"]:
     """Return bounds of `step_at_level`, equal where it is known: a curve that ends below needs more than all steps."""
-    found = step_at_level(steps, curves, level)
-    return np.stack([np.minimum(found, float(steps[-1])), found], axis=-1)
+    crossing = step_at_level(steps, curves, level)
+    return np.stack([np.minimum(crossing, float(steps[-1])), crossing], axis=-1)
 
 
-def censored_interval(drawn: Float[np.ndarray, "resamples 2"]) -> tuple[float, float]:
+def censored_interval(draws: Float[np.ndarray, "resamples 2"]) -> tuple[float, float]:
     """Return the ends of a 95% interval of draws between bounds, so wide that it holds all they allow.
 
     The ends are values of draws, never between two, so that infinity ("never") keeps its meaning.
     """
-    lower, upper = np.sort(drawn, axis=0).T
+    lower, upper = np.sort(draws, axis=0).T
     last = len(lower) - 1
     return float(lower[int(0.025 * last)]), float(upper[int(np.ceil(0.975 * last))])
 
@@ -165,6 +165,6 @@ def resampled(
     for at in range(0, resamples, batch):
         rows = slice(at, at + batch)
         curves = np.tensordot(weights[rows], each, axes=(1, 1)) if each.shape[1] > 1 else each[None, :, 0]
-        drawn = curves[np.arange(len(curves))[:, None], seeds[rows]]
-        parts.append(interquartile_mean(of(drawn), axis=1))
+        sample = curves[np.arange(len(curves))[:, None], seeds[rows]]
+        parts.append(interquartile_mean(of(sample), axis=1))
     return np.concatenate(parts)

@@ -50,7 +50,7 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
         steps, estimate, lower, upper = variant.curve
         goodness = sign * estimate
         best = int(goodness.argmax())
-        row: Row = {**named(variant), "seeds": len(variant.seeds), "failed": len(variant.failed)}
+        row: Row = {**identity(variant), "seeds": len(variant.seeds), "failed": len(variant.failed)}
         row |= {"episodes": variant.episodes or "not known"}
         row |= {"last_step": steps[-1], "final": estimate[-1], "final_lower": lower[-1], "final_upper": upper[-1]}
         row |= dict(zip(("mean", "mean_lower", "mean_upper"), map(float, variant.mean), strict=True))
@@ -69,8 +69,8 @@ def _steps_to(variant: Variant, sign: float, level: float) -> Row:
     """Return the columns of the step from which a variant's seeds stay at a level; an interval for several seeds."""
     bounds = lambda curves: steps_to_level(variant.curve.steps, sign * curves, level)  # noqa: E731
     ends = censored_interval(resampled(variant.groups, of=bounds)) if len(variant.seeds) > 1 else ()
-    found = (interquartile_mean(bounds(variant.values))[1], *ends)
-    return dict(zip(REACHES, (round(float(step)) if np.isfinite(step) else "never" for step in found), strict=False))
+    numbers = (interquartile_mean(bounds(variant.values))[1], *ends)
+    return dict(zip(REACHES, (round(float(step)) if np.isfinite(step) else "never" for step in numbers), strict=False))
 
 
 def unguided_of(variant: Variant, variants: Sequence[Variant]) -> Variant | None:
@@ -79,7 +79,7 @@ def unguided_of(variant: Variant, variants: Sequence[Variant]) -> Variant | None
     return next((other for other in unguided if other.run == variant.run), unguided[0] if unguided else None)
 
 
-def named(variant: Variant) -> Row:
+def identity(variant: Variant) -> Row:
     """Return the columns that identify a variant; `run` is among them where runs are reported separately."""
     row: Row = {"run": variant.run} if variant.run else {}
     return row | {"guidance": variant.guidance, "labels": variant.labels}
@@ -88,7 +88,7 @@ def named(variant: Variant) -> Row:
 def curve_rows(variants: Sequence[Variant]) -> list[Row]:
     """Return one row for each variant and evaluation: the values of the curves."""
     return [
-        {**named(variant), "seeds": len(variant.seeds), "step": int(step)}
+        {**identity(variant), "seeds": len(variant.seeds), "step": int(step)}
         | {"iqm": float(estimate), "lower": float(lower), "upper": float(upper)}
         for variant in variants
         for step, estimate, lower, upper in zip(*variant.curve, strict=True)

@@ -73,16 +73,12 @@ class Group(NamedTuple):
 
 
 def read_groups(folders: Sequence[PathLike], metric: str, split: str, by_run: bool) -> list[Group]:
-    """Read the results of folders, together or (`by_run`) each folder by itself under its name.
-
-    Raises UserError if results are missing, damaged, of several tasks, without the metric or the split, or have failed
-    lanes only; or if two folders that are to be reported separately have one name.
-    """
-    named = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
-    if by_run and len(named) < len(folders):
+    """Read the results of folders, together or (`by_run`) each folder by itself under its name."""
+    folders_of = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
+    if by_run and len(folders_of) < len(folders):
         raise UserError("--by-run: several folders have the same name: give them different names")
     groups = []
-    for name, own in named.items():
+    for name, own in folders_of.items():
         guides = results.read_guides(own)
         guides = None if guides is None else guides.filter(pc.field("split") == split)
         groups.append(Group(name, *_select(results.read(own), metric, split), guides))
@@ -112,11 +108,8 @@ def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Tabl
 
 
 def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
-    """Return the variants in the legend's order: for each group unguided first, then by guidance and label budget.
-
-    Raises UserError if a seed occurs twice, or the seeds of a variant have no step in common.
-    """
-    found = []
+    """Return the variants in the legend's order: for each group unguided first, then by guidance and label budget."""
+    entries = []
     for group in groups:
         failed = results.failures(group.failed)
         keys = group.table.group_by(["guidance", "labels"]).aggregate([]).to_pylist()
@@ -128,14 +121,14 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
             guide = _guides(rows, metric, None if group.guides is None else group.guides.filter(of_variant))
             episodes = min(rows["episodes"].to_pylist()) if each.shape[1] > 1 else 0
             others = (lost, group.name, guide if len(guide) else None, episodes)
-            found.append((kind, labels, seeds, steps, values, each, *others))
-    shared = min(steps[-1] for _, _, _, steps, *_ in found)
+            entries.append((kind, labels, seeds, steps, values, each, *others))
+    shared = min(steps[-1] for _, _, _, steps, *_ in entries)
     variants = []
-    for kind, labels, seeds, steps, values, each, *others in found:
+    for kind, labels, seeds, steps, values, each, *others in entries:
         until = max(1, int(np.searchsorted(steps, shared, side="right")))
         areas, parts = (mean_over_curve(steps[:until], of[..., :until]) for of in (values, each))
-        known = curve(steps, values, each)
-        variants.append(Variant(kind, labels, seeds, values, known, interval(areas, parts), *others, each=each))
+        mean_curve = curve(steps, values, each)
+        variants.append(Variant(kind, labels, seeds, values, mean_curve, interval(areas, parts), *others, each=each))
     return variants
 
 

@@ -23,6 +23,7 @@ from cuelearner_jax.runs.grid import world_of
 from cuelearner_jax.storage import formats, label_files, policy_folders
 from cuelearner_jax.storage.checkpoint import Checkpoints, digest
 from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.storage.table import plain
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.types import Label
@@ -42,7 +43,7 @@ class AdaptedLanes:
     folder: Path
     values: dict[str, Any]  # the contents of policy.json
     lanes: Lanes
-    used: np.ndarray  # (lanes,) bool
+    in_use: np.ndarray  # (lanes,) bool
     rows: int | None  # number of base policies, one per lane; None: the lanes share one
     code: Any  # the policy that the folder names as code; None: not given
     changes: Any = None  # the user's own distortions, as `changes.family_of` takes them; None: not given
@@ -89,20 +90,14 @@ def open_folder(
 ) -> tuple[Task, Any, AdaptedLanes]:
     """Open a policy folder; return its task, world (a configuration) and lanes.
 
-    Args:
-        folder: the folder.
-        find: see `grid.load`.
-        code: the policy that the folder names as code; None: not given.
-        changes: the user's own distortions in it, as `changes.family_of` takes them; None: not given.
-
-    Raises:
-        UserError: the folder cannot be read, is damaged, or belongs to an unknown task.
+    `find`: see `grid.load`. `code`, `changes`: what the folder names as code, and the user's own distortions in it, as
+    `changes.family_of` takes them; None: not given.
     """
     path = folder / policy_folders.POLICY
     values = formats.read("policy", path)
     task, world = world_of(values["task"], find, path)
-    *columns, is_used = (np.array(values["lanes"][name]) for name in COLUMNS)
-    return task, world, AdaptedLanes(folder, values, Lanes(*columns), is_used, values["rows"], code, changes)
+    *columns, in_use = (np.array(values["lanes"][name]) for name in COLUMNS)
+    return task, world, AdaptedLanes(folder, values, Lanes(*columns), in_use, values["rows"], code, changes)
 
 
 def write(
@@ -111,21 +106,14 @@ def write(
     task: Task,
     world: Any,
     origin: dict[str, Any],
-    used: dict[str, str | None] | None = None,
+    inputs: dict[str, str | None] | None = None,
 ) -> None:
-    """Write a policy folder.
+    """Write a policy folder of lanes that were adapted in a task's world.
 
-    Args:
-        place: the target; the folder appears once it is complete.
-        result: the lanes.
-        task, world: in which the lanes were adapted.
-        origin: the base policies in plain values: "folder" and which lanes of it, or "code".
-        used: further inputs by name: the label file, another robot.
-
-    Raises:
-        UserError: something appeared at the place meanwhile, or the policy cannot be written.
+    `origin`: the base policies in plain values: "folder" and which lanes of it, or "code". `inputs`: further inputs by
+    name: the label file, another robot.
     """
-    lanes, judgement, env = result.lanes, result.judged, shape_of(task, world)
+    lanes, judgement, env = result.lanes, result.judgement, shape_of(task, world)
     block = replace(result.policy(env), base=result.of.bases)
     values, arrays = serialization.to_json(block, origin.get("code")), serialization.arrays_of(block)
     contents = {
@@ -139,19 +127,19 @@ def write(
             "seeds": lanes.seed.tolist(),
             "labels": lanes.budget.tolist(),
             "bounds_deg": [float(f"{bound:g}") for bound in lanes.bound_deg],
-            "used": judgement.used.tolist(),
+            "used": judgement.in_use.tolist(),
         },
         "judged": {
             "by": judgement.by,
             "split": SPLIT,
-            "before": _plain(judgement.before),
-            "after": _plain(judgement.after),
+            "before": plain(judgement.before.tolist()),
+            "after": plain(judgement.after.tolist()),
             "within_deg": [float(f"{bound:g}") for bound in judgement.within_deg],
-            "difference": [_plain(ends) for ends in judgement.difference],
+            "difference": plain(judgement.difference.tolist()),
             "rewarded_steps": judgement.rewarded_steps.tolist(),
         },
         **({"reading": [one.to_json() for one in result.results]} if result.results else {}),
-        **{name: value for name, value in (used or {}).items() if value},
+        **{name: value for name, value in (inputs or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,
         **provenance(),
@@ -161,10 +149,6 @@ def write(
             store.save(0, {"policy": arrays})
         formats.write("policy", folder / policy_folders.POLICY, {**contents, "arrays": digest(arrays)})
         _write_labels(folder, result, task, world)
-
-
-def _plain(values: np.ndarray) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _write_labels(folder: Path, result: AdaptationResult, task: Task, world: Any) -> None:

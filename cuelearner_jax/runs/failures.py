@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pyarrow as pa
 
-from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import results
 from cuelearner_jax.terminal import console
 
@@ -39,10 +38,7 @@ def summary(table: pa.Table) -> str:
 
 
 def without_failed(groups: Sequence[Any]) -> list[Any]:
-    """Drop the failed lanes of trained lanes (`run_folders.RunLanes`) and name them on the console.
-
-    Raises UserError if no lane is left.
-    """
+    """Drop the failed lanes of trained lanes (`run_folders.RunLanes`) and name them on the console."""
     rest = []
     for lanes in groups:
         mask = np.asarray(lanes.policies["failed"])
@@ -66,11 +62,3 @@ def name_lanes(seeds: np.ndarray, budgets: np.ndarray) -> str:
 def _format_seeds(seeds: Sequence[str]) -> str:
     more = [f"{len(seeds) - LISTED} more"] if len(seeds) > LISTED else []
     return ("seed " if len(seeds) == 1 else "seeds ") + ", ".join([*seeds[:LISTED], *more])
-
-
-def check(out: Path, folders: Iterable[Path]) -> None:
-    """Raise NotFinite if the results in these folders of a run at `out` contain failed lanes."""
-    if words := summary(results.read(list(folders))):
-        raise NotFinite(
-            f"{words}: their rows in {out} are marked and excluded from reports; everything else is finished"
-        )

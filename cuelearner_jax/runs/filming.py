@@ -40,21 +40,9 @@ def check_free(*wanted: Path, overwrite: bool) -> None:
 
 
 def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, steps: int, to: Files) -> list[float]:
-    """Write a film and a still of some steps of a policy, over as many episodes as needed.
+    """Write a film and a still of a policy's steps from a validation episode on; return the reward of each step.
 
-    Args:
-        pictures: drawing functions of the environment.
-        env: the world.
-        policy: the acting policy.
-        episode: number of the first validation episode.
-        steps: number of steps.
-        to: the target paths; folders are made.
-
-    Returns:
-        The reward of each step.
-
-    Raises:
-        UserError: the policy's first action is not finite; nothing has been written.
+    As many episodes are played as needed. Raises UserError, and writes nothing, if the first action is not finite.
     """
     _first(env, policy, episode)
     frames, rewards = pictures.record(env, policy, _start(episode), steps)

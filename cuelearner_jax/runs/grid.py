@@ -56,12 +56,12 @@ def check_grid(grid: Grid, adapts: bool = False) -> None:
     for kind in kinds:
         if kind.adapts_only and not adapts:
             raise UserError(f"guidance {kind.name!r} corrects a finished policy: use it with `cuelearner adapt` only")
-    if not _is_set(grid.guidance):
+    if not _all_differ(grid.guidance):
         raise UserError("--guidance: give each kind once, and at least one")
-    if not _is_set(grid.seeds) or not all(0 <= seed < LARGEST_SEED for seed in grid.seeds):
+    if not _all_differ(grid.seeds) or not all(0 <= seed < LARGEST_SEED for seed in grid.seeds):
         raise UserError(f"seeds must be different numbers from 0 to {LARGEST_SEED - 1}, at least one")
     if any(kind.asks for kind in kinds):
-        if not _is_set(grid.labels):
+        if not _all_differ(grid.labels):
             raise UserError("--labels: give each budget once, and at least one")
         if min(grid.labels) < 1:
             raise UserError(
@@ -72,7 +72,7 @@ def check_grid(grid: Grid, adapts: bool = False) -> None:
             raise UserError(f"a label budget of {max(grid.labels)} cannot be counted: give less than {LARGEST_BUDGET}")
 
 
-def _is_set(values: tuple[Any, ...]) -> bool:
+def _all_differ(values: tuple[Any, ...]) -> bool:
     return 0 < len(values) == len(set(values))
 
 
@@ -124,10 +124,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
 
 
 def world_of(values: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:
-    """Return the task and the world (a configuration) that a folder's file describes.
-
-    Raises UserError if the task is unknown; the message says how to name a task from outside the package.
-    """
+    """Return the task and the world (a configuration) that a folder's file describes."""
     origin = values.get("from")
     try:
         task = find(values["name"])

@@ -10,23 +10,16 @@ import jax
 from jax.sharding import Mesh
 from jaxtyping import Array, PRNGKeyArray
 
+from cuelearner_jax import devices
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.devices import (
-    BY_LANE,
-    SHARED,
-    compiler_options,
-    each_lane,
-    each_lane_in_place,
-    lane_mesh,
-    over_lanes,
-)
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, each_lane_in_place, lane_mesh, over_lanes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Clock, Parts, TrainState, lane_of, parts_of
 from cuelearner_jax.run_config import RunConfig, Settings
 from cuelearner_jax.types import Label, Teacher
 
-PROGRAMS_KEPT = 8  # compiled programs that a process keeps for its next runs
+MOST_PROGRAMS = 8  # compiled programs that a process keeps for its next runs
 
 
 class Program(NamedTuple):
@@ -46,23 +39,13 @@ class Program(NamedTuple):
 
 
 def make_program(
-    config: RunConfig,
-    guidance: Guide,
-    env: Environment,
-    largest_budget: int,
-    mesh: Mesh | None = None,
-    lanes: int = 1,
+    config: RunConfig, guidance: Guide, env: Environment, largest_budget: int, mesh: Mesh | None = None, lanes: int = 1
 ) -> Program:
-    """Compile (on first use) the loop for one kind of guidance.
+    """Compile (on first use) the loop for one kind of guidance; only the shapes of `env` count.
 
     Another run of the same sizes, guidance and shapes in this process is given the same program, compiled already.
-
-    Args:
-        config: the configuration that shapes the program; its `settings` are passed at each call.
-        env: gives shapes; any environment of the same structure may be passed at the calls.
-        largest_budget: labels that the largest lane may use.
-        mesh: devices that share the lanes, whose number they must divide into (default: the first device alone).
-        lanes: expected number of lanes on each device; only speed depends on it.
+    `mesh`: devices that share the lanes, whose number they must divide into (default: the first device alone). `lanes`:
+    expected number of lanes on each device; only speed depends on it.
     """
     leaves, structure = jax.tree.flatten(jax.eval_shape(lambda env: env, env))
     return _program_of(
@@ -77,7 +60,7 @@ def make_program(
     )
 
 
-@lru_cache(maxsize=PROGRAMS_KEPT)
+@lru_cache(maxsize=MOST_PROGRAMS)
 def _program_of(
     sizes: Sizes,
     parts: Parts,
@@ -126,11 +109,10 @@ def _program_of(
     init = over_lanes(mesh, init, (SHARED, BY_LANE, BY_LANE, SHARED), BY_LANE)
     label_round = over_lanes(mesh, label_round, (*(SHARED,) * 4, BY_LANE), (SHARED, BY_LANE))
     take_labels = over_lanes(mesh, take_labels, (SHARED, SHARED, BY_LANE, BY_LANE), BY_LANE)
+    options = devices.compiler_options(lanes)
     return Program(
         init=jax.jit(init),
         label_round=jax.jit(label_round, donate_argnums=4),
         take_labels=jax.jit(take_labels, donate_argnums=3),
-        train=jax.jit(
-            stretch, donate_argnames="state", static_argnames="iterations", compiler_options=compiler_options(lanes)
-        ),
+        train=jax.jit(stretch, donate_argnames="state", static_argnames="iterations", compiler_options=options),
     )

@@ -47,8 +47,6 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
     """Open the run in a folder, or the sweep whose shards lie below it (`--shard`).
 
     Returns the task, the configuration, the grid of all shards, and the folders. `find`: see `grid.load`.
-
-    Raises UserError for a folder without runs, an unknown task, or shards of different sweeps.
     """
     whole = (folder / CONFIG).exists()
     folders = [] if whole else sorted(file.parent for file in folder.glob(f"shard-*-of-*/{CONFIG}"))
@@ -73,8 +71,6 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
 
     A failed lane is restored at its last finite state. Missing or unfinished shards are named on the console, one line
     each. `sweep`: whether these are a sweep's shards, some of which may not have begun.
-
-    Raises UserError if there is no checkpoint, or one is damaged.
     """
     env = shape_of(task, config.task)
     guidance = config.guide_in(env, kind)

@@ -101,7 +101,7 @@ class Runner:
         now = self.training
         store.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
 
-    def _stop_if_asked(self, store: Checkpoints) -> None:
+    def _stop_on_signal(self, store: Checkpoints) -> None:
         if self.stopping.is_set():
             self._save(store)
             step = self.training.step
@@ -118,11 +118,7 @@ class Runner:
         self.failed = self.training.failed
 
     def _label(
-        self,
-        store: Checkpoints,
-        guides: TableWriter,
-        teacher: Teacher | None,
-        labels: label_files.LabelFile | None,
+        self, store: Checkpoints, guides: TableWriter, teacher: Teacher | None, labels: label_files.LabelFile | None
     ) -> None:
         """Take the labels of a file, or ask the teacher for missing ones; write the label file.
 
@@ -145,7 +141,7 @@ class Runner:
                         guides.append(**row)
                     if number % ROUNDS_A_CHUNK == 0:
                         self._save(store)
-                    self._stop_if_asked(store)
+                    self._stop_on_signal(store)
         self._write_labels()
         if asks:
             self._save(store)
@@ -173,4 +169,4 @@ class Runner:
             self.bars.update(self._bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(store)
-            self._stop_if_asked(store)
+            self._stop_on_signal(store)

@@ -36,10 +36,7 @@ class Shard(NamedTuple):
         return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
 
     def check_sweep(self, out: Path, contents: dict[str, Any]) -> None:
-        """Check that the shard, with `contents` as its config.json, belongs to the sweep in the folder `out`.
-
-        Raises UserError if the folder holds a whole run, shards of another number, or of a sweep with other settings.
-        """
+        """Check that the shard, with `contents` as its config.json, belongs to the sweep in the folder `out`."""
         if out.exists() and not out.is_dir():
             raise UserError(f"{out} is not a folder: give another --out")
         if (out / CONFIG).exists():
@@ -59,10 +56,7 @@ class Shard(NamedTuple):
                 )
 
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the shard's share of a sweep's seeds; shares differ by at most one seed.
-
-        Raises UserError if some shard would have none.
-        """
+        """Return the shard's share of a sweep's seeds; shares differ by at most one seed."""
         if self.count > len(seeds):
             raise UserError(
                 f"--shard: {len(seeds)} seeds cannot be divided into {self.count} shards: give at most {len(seeds)}"

@@ -53,12 +53,7 @@ class Training:
     """
 
     def __init__(self, group: LaneGroup, eval_env: Environment, split: str) -> None:
-        """Start at the beginning.
-
-        Args:
-            group: the lanes.
-            eval_env, split: environment and episodes of evaluations, see `evaluate.SPLITS`.
-        """
+        """Start at the beginning. `eval_env`, `split`: world and episodes of evaluations, see `evaluate.SPLITS`."""
         self.group, self.split = group, split
         self.eval_env = place(group.mesh, eval_env, SHARED)
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)

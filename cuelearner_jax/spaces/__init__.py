@@ -9,7 +9,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.box import Box, cues_from
 from cuelearner_jax.spaces.choices import Choices
 from cuelearner_jax.spaces.directions import DIRECTIONS, check_directions
-from cuelearner_jax.spaces.space import KNOWN, UNSAID, Cue, Space, is_answered, says_something
+from cuelearner_jax.spaces.space import SPACES, UNSAID, Cue, Space, is_answered, says_something
 
 
 def from_json(about: Any) -> Space:
@@ -19,7 +19,7 @@ def from_json(about: Any) -> Space:
     """
     try:
         cues = tuple(Cue(cue["name"], tuple(cue["words"]), tuple(cue["keys"]), cue["unit"]) for cue in about["cues"])
-        space = KNOWN[about["name"]].of_json(about, cues)
+        space = SPACES[about["name"]].of_json(about, cues)
     except (KeyError, TypeError, AttributeError, UserError) as error:
         raise ValueError("the description of its space of actions makes no sense, or is of unknown code") from error
     if space.to_json() != about:

@@ -166,23 +166,21 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
     if not any(map(any, pairs)) or not all(
         is_sound or pair == UNASKED for is_sound, pair in zip(sound, pairs, strict=True)
     ):
-        raise UserError(
-            f'cues is {format_value(words)}: give two words for each entry of an action, as "left,right;up,down"'
-        )
+        raise UserError(f'cues is {format_value(words)}: give two words an entry of an action, as "left,right;up,down"')
     if names and len(names) != len(pairs):
         raise UserError(
             f"cues are {len(pairs)} pairs of words for {len(names)} entries of an action: give one an entry"
         )
-    taken = {HELD[word] for pair in pairs for word in pair if word in HELD}
+    keys_in_use = {HELD[word] for pair in pairs for word in pair if word in HELD}
     cues = []
     for number, pair in enumerate(pairs):
         keys = []
         for word, spare in zip(pair, KEYS[number % len(KEYS)], strict=True) if any(pair) else ():
             key = ARROWS.get(word.lower())
-            if key is None or key in taken:
+            if key is None or key in keys_in_use:
                 letters = (letter for letter in word.lower() if letter.isascii() and letter.isalpha())
-                key = next((one for one in (*letters, spare, *"".join(KEYS), *"ws") if one not in taken), "")
-            taken.add(key)
+                key = next((one for one in (*letters, spare, *"".join(KEYS), *"ws") if one not in keys_in_use), "")
+            keys_in_use.add(key)
             keys.append(key)
         name = names[number] if names else " or ".join(pair)
         cues.append(Cue(name, (pair[0], pair[1]), tuple(keys) if all(keys) else (), unit))
@@ -192,8 +190,8 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
 def _by_name(pairs: list[tuple[str, ...]], names: Sequence[str]) -> list[tuple[str, ...]]:
     """Return a pair of words for each of `names`; `pairs` start with "NAME=". Raises UserError for unknown names."""
     parts = [(first.partition("="), *rest) for first, *rest in pairs]
-    known = {name.strip(): (word.strip(), *rest) for (name, _, word), *rest in parts}
-    if not known.keys() <= {*names} or len(known) < len(pairs):
+    by_name = {name.strip(): (word.strip(), *rest) for (name, _, word), *rest in parts}
+    if not by_name.keys() <= {*names} or len(by_name) < len(pairs):
         there = ", ".join(names) or "no names"
-        raise UserError(f"cues name {', '.join(known)}, but the entries of an action are {there}: name each once")
-    return [known.get(name, UNASKED) for name in names]
+        raise UserError(f"cues name {', '.join(by_name)}, but the entries of an action are {there}: name each once")
+    return [by_name.get(name, UNASKED) for name in names]

@@ -69,8 +69,8 @@ class Choices(Space):
 
     def retract(self, vector: Vectors) -> Float[Array, "... action"]:
         """Return the choice with the largest entry; NaN where an entry is not finite."""
-        chosen = jax.nn.one_hot(jnp.argmax(jnp.asarray(vector), -1), self.count)
-        return jnp.where(jnp.isfinite(vector).all(-1, keepdims=True), chosen, jnp.nan)
+        one_hot = jax.nn.one_hot(jnp.argmax(jnp.asarray(vector), -1), self.count)
+        return jnp.where(jnp.isfinite(vector).all(-1, keepdims=True), one_hot, jnp.nan)
 
     def spread(self, count: int) -> Float[Array, "count action"]:
         """Return all choices, whatever the number asked for."""

@@ -36,7 +36,7 @@ class Cue:
         return bool(self.words[0])
 
 
-KNOWN: dict[str, type[Space]] = {}  # registered spaces by their names in files
+SPACES: dict[str, type[Space]] = {}  # registered spaces by their names in files
 
 
 class Space:
@@ -55,7 +55,7 @@ class Space:
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         if "name" in vars(cls):
-            KNOWN[cls.name] = cls
+            SPACES[cls.name] = cls
 
     def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Float[Array, "*shape action"]:
         """Draw actions uniformly."""

@@ -25,7 +25,7 @@ from jax.tree_util import keystr, tree_leaves_with_path, tree_map_with_path
 
 from cuelearner_jax.errors import UserError, first_line
 
-KEPT = 2  # number of checkpoints of a run that stay on disk
+MOST_CHECKPOINTS = 2  # number of checkpoints of a run that stay on disk
 DIGESTS = "digests"
 # Remedy in the message about a checkpoint that cannot be read.
 REMEDY = (
@@ -78,16 +78,13 @@ class Checkpoints(AbstractContextManager):
     def __init__(self, folder: Path, read_only: bool = False, remedy: str = REMEDY, run: str = "") -> None:
         """Open a folder of checkpoints.
 
-        Args:
-            folder: the folder of the checkpoints.
-            read_only: change nothing on disk.
-            remedy: the remedy in the message about a checkpoint that cannot be read.
-            run: the key of the run that the checkpoints belong to (`grid.run_key`); empty: of none.
+        `read_only`: change nothing on disk. `remedy`: of a checkpoint that cannot be read. `run`: the key of the run
+        that the checkpoints belong to (`grid.run_key`); empty: of none.
         """
         self._remedy, self._run, self._folder = remedy, run, folder.resolve()
         for name in ("absl", "asyncio"):  # what Orbax's threads log is raised anyway
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        writing = {} if read_only else {"max_to_keep": KEPT, "enable_async_checkpointing": False}
+        writing = {} if read_only else {"max_to_keep": MOST_CHECKPOINTS, "enable_async_checkpointing": False}
         options = ocp.CheckpointManagerOptions(read_only=read_only, **writing)
         self._manager = ocp.CheckpointManager(self._folder, options=options)
 
@@ -105,10 +102,7 @@ class Checkpoints(AbstractContextManager):
         self._manager.wait_until_finished()
 
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
-        """Return the newest checkpoint's items named in `like` (trees of arrays or shapes), on the default device.
-
-        Raises UserError if there is no checkpoint, it cannot be read, it is another run's, or its shapes differ.
-        """
+        """Return the newest checkpoint's items named in `like` (trees of arrays or shapes), on the default device."""
         number = self.latest()
         if number is None:
             raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first checkpoint")

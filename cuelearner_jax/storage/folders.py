@@ -66,8 +66,6 @@ def claimed(out: Path) -> Iterator[None]:
     """Make a run's folder and claim it for this process; the claim ends however the process ends.
 
     The folder may have changed before it was claimed, so check it again afterwards.
-
-    Raises UserError if another process has claimed the folder.
     """
     out.mkdir(parents=True, exist_ok=True)
     with hold(out / LOCK, out):

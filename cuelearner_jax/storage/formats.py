@@ -41,10 +41,7 @@ def damage_error(kind: str, path: Path, reason: object = "") -> UserError:
 
 
 def read(kind: str, path: Path) -> Values:
-    """Read a JSON file in the current format of its kind; return its values without the digest.
-
-    Raises UserError if the file is damaged, was changed since it was written, or has another format.
-    """
+    """Read a JSON file in the current format of its kind; return its values without the digest."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:

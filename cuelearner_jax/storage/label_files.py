@@ -11,7 +11,7 @@ every kind of guidance with this form of answers. A file holds one set of labels
 | action  | list of floats | the action asked about                                                               |
 | answer  | list of floats | what the teacher said; the file names the form of it; absent where nothing was said  |
 | item    | int            | people: number of the question, from 0                                               |
-| said    | string         | people: one of `SAID`; the last row of an item counts                            |
+| said    | string         | people: one of `RESPONSES`; the last row of an item counts                            |
 | seconds | float          | people: from the question on the screen to the answer [s]                            |
 | who     | string         | people: a name                                                                       |
 | when    | string         | people: time of the answer, ISO 8601 in UTC                                          |
@@ -40,7 +40,7 @@ from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.folders import differences
 from cuelearner_jax.types import Label
 
-ANSWERED, UNSURE, UNDONE = SAID = ("answer", "unsure", "undone")  # an answer, "don't know", an answer taken back
+ANSWERED, UNSURE, UNDONE = RESPONSES = ("answer", "unsure", "undone")  # an answer, "don't know", an answer taken back
 ROW = ("obs", "action", "answer")  # columns that hold lists
 PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of a person's rows
 SCHEMA = tables.Schema(
@@ -81,7 +81,7 @@ class LabelFile(NamedTuple):
     labels: Label  # rows (labels, ...) that still count, in the order they were given
     people: People | None = None  # None: the labels of a simulated teacher, or a merge that includes such labels
     session: dict[str, Any] | None = None  # settings of the page that asked, see `labelling.session`
-    said: dict[str, int] | None = None  # number of rows of each kind in `SAID`, all rows counted
+    counts: dict[str, int] | None = None  # number of rows of each kind in `RESPONSES`, all rows counted
 
     @property
     def budget(self) -> int:
@@ -103,16 +103,10 @@ class LabelWriter(tables.TableWriter):
         session: dict[str, Any] | None = None,
         **more: Any,
     ) -> None:
-        """Open the file, creating it and the folder where needed.
+        """Open the file, creating it and the folder where needed; labels of another kind there are refused unchanged.
 
-        Args:
-            folder: the file's folder.
-            task, answers, space, eps, session: see `LabelFile`.
-            meaning: meaning of an answer's numbers, written into the file.
-            more: further entries of a new file's head, such as the versions that wrote it.
-
-        Raises:
-            UserError: the folder holds labels of another kind, or unreadable ones; nothing has been changed.
+        `task`, `answers`, `space`, `eps`, `session`: see `LabelFile`. `meaning`: of an answer's numbers, for the file.
+        `more`: further entries of a new file's head, such as the versions that wrote it.
         """
         about = _about(task, answers, space, eps, meaning, session)
         if (there := found_in(folder)) and (before := _table_and_head(there)[1]):
@@ -195,15 +189,12 @@ def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = Tru
 
 
 def read(path: Path) -> LabelFile:
-    """Read the labels that still count from a Parquet or JSONL file, or from the folder of one.
-
-    Raises UserError if the file is missing, damaged, of another format, or holds no labels.
-    """
+    """Read the labels that still count from a Parquet or JSONL file, or from the folder of one."""
     file = found_in(path)
     if file is None or not file.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
     table, head = _table_and_head(file)
-    said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
+    counts = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
     table = _standing(table)
     if head is None or not table.num_rows:
         raise UserError(f"{file} holds no labels: collect some first")
@@ -217,7 +208,7 @@ def read(path: Path) -> LabelFile:
     people = None
     if "item" in columns and not (columns["item"] < 0).any():
         people = People(*(columns[name] for name in People._fields))
-    rest = {"people": people, "session": head.get("session"), "said": said}
+    rest = {"people": people, "session": head.get("session"), "counts": counts}
     return LabelFile(**about, eps=eps, seeds=columns["seed"], labels=labels, **rest)
 
 
@@ -228,8 +219,10 @@ def _standing(table: pa.Table) -> pa.Table:
     last: dict[Any, int] = {}
     for row, (seed, item) in enumerate(zip(*(table[name].to_pylist() for name in ("seed", "item")), strict=True)):
         last[seed, row if item is None else item, item is None] = row
-    said = table["said"].to_pylist()
-    rows = [row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if said[row] in (None, ANSWERED)]
+    responses = table["said"].to_pylist()
+    rows = [
+        row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if responses[row] in (None, ANSWERED)
+    ]
     return table.take(pa.array(rows, pa.int64()))
 
 
@@ -241,8 +234,7 @@ def digest(path: Path) -> str:
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:
     """Return the lanes' label sets, padded: rows (lanes, slots, ...).
 
-    A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget. Raises
-    UserError for a seed without labels, or with fewer than a lane's budget.
+    A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget.
     """
     own_seeds = np.unique(file.seeds)
     sets = []
@@ -259,8 +251,8 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
                 f"the label file has {len(rows)} labels for seed {seed}, the budget is {budget}: "
                 "lower --labels or collect more"
             )
-        rows = rows[:budget]
-        sets.append(jax.tree.map(lambda leaf, rows=rows: _pad(leaf[rows], slots), file.labels))
+        pad = lambda leaf, own=rows[:budget]: np.pad(leaf[own], [(0, slots - len(own)), *[(0, 0)] * (leaf.ndim - 1)])  # noqa: E731
+        sets.append(jax.tree.map(pad, file.labels))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
 
 
@@ -295,7 +287,3 @@ def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
     if name in SCHEMA.integers:
         return np.array([-1 if value is None else value for value in column.to_pylist()], np.int64)
     return np.array(column.to_pylist(), np.float32)
-
-
-def _pad(rows: np.ndarray, slots: int) -> np.ndarray:
-    return np.concatenate([rows, np.zeros((slots - len(rows), *rows.shape[1:]), rows.dtype)])

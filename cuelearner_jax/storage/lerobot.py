@@ -46,8 +46,6 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str
     without entries where the dataset has pictures alone, and actions (n, action); and the names of the entries of each,
     empty where the dataset names none. Last comes a function from a row to the first camera's picture, None without a
     camera.
-
-    Raises UserError if the dataset has another version of the format, is damaged, or lacks vectors of either.
     """
     features = _features(path)
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
@@ -75,11 +73,9 @@ def _damage_error(path: Path, why: object) -> UserError:
 
 
 def _parts(path: Path, features: dict[str, Any], name: str, cameras: list[str]) -> list[str]:
-    """Return the features of numbers called `name` or `name.PART`; none for observations by `cameras` alone.
-
-    Raises UserError if there are none.
-    """
-    vectors = [key for key, feature in features.items() if _is_vector(feature)]
+    """Return the features of numbers called `name` or `name.PART`; none for observations by `cameras` alone."""
+    kinds = ("float", "int", "uint", "bool")
+    vectors = [key for key, one in features.items() if one["dtype"].startswith(kinds) and len(one["shape"]) == 1]
     parts = [name] if name in vectors else [key for key in vectors if key.startswith(f"{name}.")]
     others = {key for key in features if key.startswith(name)} - {*cameras}
     if not parts and (name != OBSERVATION or others or not cameras):
@@ -103,11 +99,6 @@ def _features(path: Path) -> dict[str, Any]:
             "LeRobot's own script first"
         )
     return features
-
-
-def _is_vector(feature: dict[str, Any]) -> bool:
-    """Return whether a feature is a row of numbers."""
-    return feature["dtype"].startswith(("float", "int", "uint", "bool")) and len(feature["shape"]) == 1
 
 
 def _parquet(file: Path, columns: list[str]) -> pa.Table:

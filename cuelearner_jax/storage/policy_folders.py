@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import whole
-from cuelearner_jax.storage.whole import Place, is_used
+from cuelearner_jax.storage.whole import Place, is_occupied
 
 POLICY, ARRAYS = "policy.json", "arrays"
 
@@ -26,7 +26,7 @@ def is_one(folder: Path) -> bool:
 
 def check_free(folder: Path, overwrite: bool) -> None:
     """Raise UserError unless `folder` is free, or is a policy folder and `overwrite` is given."""
-    if not is_used(folder):
+    if not is_occupied(folder):
         return
     if not overwrite:
         raise UserError(f"{folder} is not empty: give --overwrite to delete it, or another --out")

@@ -107,15 +107,8 @@ def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
 def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> pa.Table:
     """Read the results of any number of runs of one task, finished or not, into one table.
 
-    Args:
-        paths: results files, run folders, or folders at any height above them.
-        schema: that of the wanted tables.
-
-    Returns:
-        A table with the columns listed at the top of this module and `folder`, the folder of the row's run. A column
-        that a run lacks is null for that run.
-
-    Raises UserError if a path is missing, holds no rows or is damaged, or the runs are of several tasks.
+    `paths`: results files, run folders, or folders at any height above them. The table has the columns listed at the
+    top of this module and `folder`, the folder of the row's run. A column that a run lacks is null for that run.
     """
     files = find(paths, schema)
     parts = []

@@ -46,7 +46,7 @@ from cuelearner_jax.storage.picture_files import Picture, read_picture
 STEM = "situations"
 SUFFIXES = (".parquet", ".csv", ".npz")
 OBSERVATION, ACTION, PICTURE, TEXT, PHASE, HAND = "observation", "action", "picture", "text", "phase", "hand"
-MOST_NAMED = 64  # largest number of observation entries that each get a slice of their own
+MOST_SLICES = 64  # largest number of observation entries that each get a slice of their own
 
 
 class Situations(NamedTuple):
@@ -66,11 +66,7 @@ class Situations(NamedTuple):
 
 
 def read(path: Path) -> Situations:
-    """Read a folder of situations, its table alone, or a LeRobot dataset folder.
-
-    Raises:
-        UserError: nothing to read, missing columns, sizes that do not fit, or a number that is not finite.
-    """
+    """Read a folder of situations, its table alone, or a LeRobot dataset folder."""
     if lerobot.is_dataset(path):
         return _situations_of(path, *lerobot.read(path))
     table = _table_in(path)
@@ -116,10 +112,10 @@ def _situations_of(
             raise UserError(f"{path} holds no {name}s: record some situations first")
         if len(wrong := np.flatnonzero(~np.isfinite(rows).all(-1))):
             raise UserError(
-                f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave these rows out"
+                f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave them out"
             )
     slices = (Quantity(OBSERVATION, own, "1", "as recorded"),)
-    if len(names) == own <= MOST_NAMED:
+    if len(names) == own <= MOST_SLICES:
         slices = tuple(Quantity(name, 1, "1", "as recorded") for name in names)
     if is_proposed:
         places = () if phase is None else (Quantity(PHASE, 1, "1", "place in the chunk"),)
@@ -172,9 +168,7 @@ def _columns(table: Path) -> dict[str, Any]:
         rows: pa.Table = csv.read_csv(table) if table.suffix == ".csv" else pq.ParquetFile(table).read()
     except (pa.ArrowException, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         why = " ".join(str(error).split())[:120]
-        raise UserError(
-            f"{table} cannot be read ({why}): write the table anew, without Python objects in it"
-        ) from error
+        raise UserError(f"{table} cannot be read ({why}): write it anew, without Python objects in it") from error
     columns: dict[str, Any] = {
         name.strip(): column.to_pylist() for name, column in zip(rows.column_names, rows.columns, strict=True)
     }
@@ -186,10 +180,7 @@ def _columns(table: Path) -> dict[str, Any]:
 
 
 def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.ndarray, "n size"], tuple[str, ...]]:
-    """Return the numbers (n, size) of a column of lists, or of one column per entry, and the names of the entries.
-
-    Raises UserError for a missing column, or sizes that do not fit.
-    """
+    """Return the numbers (n, size) of a column of lists, or of one column per entry, and the names of the entries."""
     entries = tuple(column.partition(".")[2] for column in columns if column.startswith(f"{name}."))
     if (name in columns) == bool(entries):
         raise UserError(

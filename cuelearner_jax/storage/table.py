@@ -91,10 +91,8 @@ class TableWriter(contextlib.AbstractContextManager):
     ) -> None:
         """Open the table in `folder`, creating both where needed.
 
-        Args:
-            folder, schema: the table's folder and kind.
-            constants: columns with one value for all rows to come; None: no such columns.
-            about: the description written at the head of a new table; an existing table keeps its own.
+        `constants`: columns with one value for all rows to come. `about`: the description written at the head of a new
+        table; an existing table keeps its own.
         """
         self.path, self._schema = Path(folder) / schema.jsonl, schema
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,7 +117,7 @@ class TableWriter(contextlib.AbstractContextManager):
         many = {name for name, array in arrays.items() if array.ndim > self._schema.is_list(name)}
         (count,) = {len(arrays[name]) for name in many} or {1}
         # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
-        values = {name: _plain(array.tolist()) for name, array in arrays.items()}
+        values = {name: plain(array.tolist()) for name, array in arrays.items()}
         self._put(
             {name: value[row] if name in many else value for name, value in values.items()} for row in range(count)
         )
@@ -152,10 +150,7 @@ def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> N
 
 
 def finish(folder: PathLike, schema: Schema) -> Path:
-    """Convert a folder's JSONL table to Parquet, unless it is finished already; return the Parquet file.
-
-    Raises UserError if there is no table, or it has no rows or cannot be read.
-    """
+    """Convert a folder's JSONL table to Parquet, unless it is finished already; return the Parquet file."""
     path, target = (Path(folder) / name for name in (schema.jsonl, schema.parquet))
     if path.exists():
         table = read(path, schema)
@@ -195,10 +190,7 @@ def digest(table: pa.Table) -> str:
 
 
 def read(path: Path, schema: Schema) -> pa.Table:
-    """Read one file of a table with its column types; a table that has just begun has no rows and no columns.
-
-    Raises UserError if the file is damaged or is not a table of this schema.
-    """
+    """Read one file of a table with its column types; a table that has just begun has no rows and no columns."""
     try:
         if path.suffix == ".jsonl":
             table = _growing(path, schema)
@@ -230,10 +222,10 @@ def _metadata(about: Row | None) -> dict[bytes, bytes]:
     return {} if about is None else {META: json.dumps(about).encode()}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
     if isinstance(value, list):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     value = float(value) if isinstance(value, bool) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 

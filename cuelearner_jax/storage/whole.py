@@ -22,10 +22,7 @@ from cuelearner_jax.errors import UserError
 
 @contextmanager
 def hold(lock: Path, what: Path) -> Iterator[None]:
-    """Hold a lock file that claims the folder `what`; the lock ends however the process ends.
-
-    Raises UserError if another process holds the lock.
-    """
+    """Hold a lock file that claims the folder `what`; the lock ends however the process ends."""
     file_lock = FileLock(lock, blocking=False)
     try:
         file_lock.acquire()
@@ -42,10 +39,7 @@ def hold(lock: Path, what: Path) -> Iterator[None]:
 def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[Any]]:
     """Open a file that replaces `path` atomically once complete and on disk; text is UTF-8.
 
-    Args:
-        path: the file.
-        mode: "w" or "wb".
-        fresh: make folders as needed, and raise UserError if the file exists.
+    `mode`: "w" or "wb". `fresh`: make folders as needed, and raise UserError if the file exists.
     """
     if fresh and os.path.lexists(path):
         raise UserError(f"{path} exists: give another --out")
@@ -62,7 +56,7 @@ def replacing(path: Path, mode: str = "w", fresh: bool = False) -> Iterator[IO[A
         temporary.unlink(missing_ok=True)
 
 
-def is_used(folder: Path) -> bool:
+def is_occupied(folder: Path) -> bool:
     """Whether a path holds anything but an empty folder."""
     return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
@@ -80,14 +74,8 @@ class Place(NamedTuple):
 def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = False) -> Iterator[Place]:
     """Claim the place of a folder for this process while its new contents are prepared (`Place.writing`).
 
-    Args:
-        folder: the target; links are followed.
-        check: raises UserError for an existing folder that may not be replaced; called now, and again before the
-            replacement.
-        overwrite: whether an existing folder may be replaced at all.
-
-    Raises:
-        UserError: as `check`, or another process has claimed the place.
+    `folder`: links are followed. `check`: raises UserError for an existing folder that may not be replaced; called now,
+    and again before the replacement. `overwrite`: whether an existing folder may be replaced at all.
     """
     check(folder)
     target = folder.resolve()
@@ -96,7 +84,7 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
 
     def tidy() -> None:
         shutil.rmtree(new, ignore_errors=True)
-        if old.exists() and is_used(target):
+        if old.exists() and is_occupied(target):
             shutil.rmtree(old)
         elif old.exists():
             os.rename(old, target)
@@ -107,7 +95,7 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
         try:
             yield new
             check(folder)
-            if overwrite and is_used(target):
+            if overwrite and is_occupied(target):
                 os.rename(target, old)
             os.rename(new, target)
         finally:

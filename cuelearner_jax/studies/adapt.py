@@ -19,9 +19,8 @@ import numpy as np
 from cuelearner_jax.adaptation import by_model, by_reading, changes, judging, serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.by_reading import ReadingAdaptation
-from cuelearner_jax.adaptation.judging import Judging
+from cuelearner_jax.adaptation.judging import Judging, Person, Prefer
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, product, side_by_side
-from cuelearner_jax.adaptation.person import Person, Prefer
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.devices import release_programs
@@ -35,13 +34,12 @@ from cuelearner_jax.guides.base import Guide, ReadingGuide
 from cuelearner_jax.policies import Common, lanes_in, policy_of
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs import adapted, trained
+from cuelearner_jax.runs import adapted, policy_sources
 from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
 from cuelearner_jax.runs.order import read_labels
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.policy_sources import BaseLanes, PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
-from cuelearner_jax.studies.lanes import BaseLanes
 from cuelearner_jax.task import Scenario, Task
 from cuelearner_jax.types import Label, Teacher
 
@@ -63,32 +61,35 @@ class Subject(NamedTuple):
     teacher: Teacher | None = None  # None: the task's teacher
     rows: Label | None = None  # labels (labels, ...) in place of questions; None: ask
     changes: Any = None  # what may have changed, as `changes.family_of` takes it; None: what the world declares
-    changes_named: str = "code"  # package.module:NAME of `changes`
+    changes_reference: str = "code"  # package.module:NAME of `changes`
     prefer: Prefer | None = None  # who judges, where a person does
 
 
-def subject_of(source: PolicySource, world: Any, base: BaseLanes, named: str | None = None) -> Subject:
+def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str | None = None) -> Subject:
     """Return the source's policies, or its code, in a world of its task.
 
-    `named`: package.module:NAME of code that acts or is in the folder. Raises UserError if the policies cannot act
-    there.
+    `reference`: package.module:NAME of code that acts or is in the folder.
     """
     env = source.task.environment(world)
     if source.code is not None:
         if base != BaseLanes():
-            raise UserError(f"--base.… chooses among the lanes of a folder, but {named} is not a folder: leave it out")
+            raise UserError(
+                f"--base.… chooses among the lanes of a folder, but {reference} is not a folder: leave it out"
+            )
         policy = policy_of(source.code, actions_of(env))
-        return Subject(env, Common(policy), origin={"code": named}, task=source.task)
+        return Subject(env, Common(policy), origin={"code": reference}, task=source.task)
     name = base.name_in(source, world)
-    if trained.POLICIES[name].taught:
+    if policy_sources.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
     if len(set(base.seeds)) < len(base.seeds):
         raise UserError("--base.seeds: give each seed once")
-    policies, lanes = trained.several(source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env)
+    policies, lanes = policy_sources.several(
+        source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env
+    )
     seeds = tuple(lane["seed"] for lane in lanes)
-    chosen = {option: value for option, value in dataclasses.asdict(base).items() if value not in (None, ())}
-    origin = {"folder": source.folder.name, **chosen, "policy": name, "seeds": list(seeds)}
-    origin |= {"code": named} if named else {}
+    choices = {option: value for option, value in dataclasses.asdict(base).items() if value not in (None, ())}
+    origin = {"folder": source.folder.name, **choices, "policy": name, "seeds": list(seeds)}
+    origin |= {"code": reference} if reference else {}
     bases = Common(policies[0]) if len(policies) == 1 else side_by_side(policies)
     return Subject(env, bases, seeds, origin, source.task)
 
@@ -237,7 +238,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             return ReadingAdaptation(*shared, declared_distortions(env))
         family = changes.family_of(subject.changes, env)
         changes.check_acts(family, env)
-        return ReadingAdaptation(*shared, family, subject.changes_named)
+        return ReadingAdaptation(*shared, family, subject.changes_reference)
 
     def _labels(self, subject: Subject, guidance: Guide, grid: Grid) -> label_files.LabelFile | None:
         """Return the labels in place of questions; None: there are none. Raises UserError if they do not fit."""
@@ -277,14 +278,14 @@ class AdaptRequest(Generic[TaskT, KindsT]):
         if not 1 <= self.judge_episodes <= MOST_ENVS:
             raise UserError(f"judge_episodes is {self.judge_episodes}: give a number from 1 to {MOST_ENVS:,}")
         if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
-            given = " ".join(f"{share:g}" for share in shares)
-            raise UserError(f"judge_bounds is {given}: give shares of the bound above 0 and below 1, each once")
+            text = " ".join(f"{share:g}" for share in shares)
+            raise UserError(f"judge_bounds is {text}: give shares of the bound above 0 and below 1, each once")
         if shares and by in (judging.LABELS, judging.PERSON):
             raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
-        known = [*judging.metrics_of(subject.env), judging.LABELS, judging.PERSON]
-        if by not in known:
+        names = [*judging.metrics_of(subject.env), judging.LABELS, judging.PERSON]
+        if by not in names:
             name = task.name if task else "this environment"
-            raise UserError(f"judge_by is {by!r}, which is not a metric of {name}{suggestion(by, known)}")
+            raise UserError(f"judge_by is {by!r}, which is not a metric of {name}{suggestion(by, names)}")
         steps, tuned, person = judging.STEPS, None, None
         if task and task.longest:
             steps = task.longest(self.task)
@@ -303,7 +304,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
 class AdaptedStudy(NamedTuple):
     """The result of an adaptation, with its subject and its request."""
 
-    found: AdaptationResult
+    result: AdaptationResult
     subject: Subject
     request: AdaptRequest
 
@@ -311,5 +312,8 @@ class AdaptedStudy(NamedTuple):
         """Write the policy folder. Raises UserError if the policy cannot be kept."""
         path, task = self.request.labels_from, self.subject.task
         assert task is not None  # a folder names it
-        used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": task.robot or None}
-        adapted.write(place, self.found, task, self.request.task, self.subject.origin, used)
+        inputs = {
+            "labels_from": f"{path.name} {label_files.digest(path)}" if path else None,
+            "robot": task.robot or None,
+        }
+        adapted.write(place, self.result, task, self.request.task, self.subject.origin, inputs)

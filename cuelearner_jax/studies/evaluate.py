@@ -23,7 +23,7 @@ from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, mean_interv
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
-from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource
+from cuelearner_jax.runs.policy_sources import POLICIES, Block, PolicySource
 from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Label
@@ -75,51 +75,43 @@ class Measured(NamedTuple):
         return "" if self.bound_deg is None else f"{self.bound_deg:g} {self.unit}"
 
 
-def amount(task: Task, asked: EvaluateRequest[Any]) -> tuple[int, int]:
-    """Return the number of environments and the number of steps that they share.
-
-    Raises UserError for invalid numbers, or steps that cut episodes short.
-    """
-    longest = None if task.longest is None else task.longest(asked.task)
-    if asked.episodes is not None:
-        if asked.steps is not None or asked.envs is not None:
+def amount(task: Task, request: EvaluateRequest[Any]) -> tuple[int, int]:
+    """Return the number of environments and the number of steps that they share."""
+    longest = None if task.longest is None else task.longest(request.task)
+    if request.episodes is not None:
+        if request.steps is not None or request.envs is not None:
             raise UserError("episodes determines environments and steps: leave out steps and envs")
         if longest is None:
             raise UserError(f"{task.name} counts steps, not episodes: give steps in place of episodes")
-    name = "envs" if asked.episodes is None else "episodes"
-    envs = next((number for number in (asked.episodes, asked.envs) if number is not None), 100)
+    name = "envs" if request.episodes is None else "episodes"
+    envs = next((number for number in (request.episodes, request.envs) if number is not None), 100)
     if not 1 <= envs <= MOST_ENVS:
         raise UserError(f"{name} is {envs}: give a number from 1 to {MOST_ENVS:,}")
-    steps = asked.steps
+    steps = request.steps
     if steps is None:
         steps = 10_000 if longest is None else envs * longest
     if steps < 1 or steps % envs or steps // envs > MOST_STEPS:
         raise UserError(f"steps is {steps}: give a positive multiple of envs ({envs}), at most {MOST_STEPS:,} for each")
-    task.check_whole(asked.task, envs, steps, "envs", "steps")
+    task.check_whole(request.task, envs, steps, "envs", "steps")
     return envs, steps
 
 
 def run(
-    source: PolicySource,
-    asked: EvaluateRequest[Any],
-    watch: Callable[[str], Tell] = lambda kind: ignore_progress,
+    source: PolicySource, request: EvaluateRequest[Any], watch: Callable[[str], Tell] = lambda kind: ignore_progress
 ) -> list[Measured]:
-    """Return metrics of a policy on validation episodes of a world, for each guidance and budget.
+    """Return metrics of a policy on validation episodes of the request's world, for each guidance and budget.
 
-    Args:
-        source: the policy's origin.
-        asked: the request, whose `task` is the world (a configuration).
-        watch: given a kind of guidance, returns the function that reports the progress of its lanes.
+    `watch`: given a kind of guidance, returns the function that reports the progress of its lanes.
     """
     release_programs()
-    task, world, name = source.task, asked.task, asked.policy
-    num_envs, steps = amount(task, asked)
-    engine, key = task.engine(asked.engine), episodes()
+    task, world, name = source.task, request.task, request.policy
+    num_envs, steps = amount(task, request)
+    engine, key = task.engine(request.engine), episodes()
     env = task.environment(world, "validation")
-    named, unit = POLICIES[name], actions_of(env).unit.replace("degrees", "deg")
-    teacher = task.make_teacher(world, env) if named.taught else None
-    if named.kept:
-        blocks = source.blocks(name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
+    entry, unit = POLICIES[name], actions_of(env).unit.replace("degrees", "deg")
+    teacher = task.make_teacher(world, env) if entry.taught else None
+    if entry.from_folder:
+        blocks = source.blocks(name, view_of(env), teacher, tuple(map(guidances.kind_name, request.guidance)))
     else:
         policy = source.alone(name, view_of(env), teacher)
         none = np.zeros(1, int)
@@ -155,13 +147,13 @@ class Agreement(NamedTuple):
 
     def rows(self) -> list[tuple[str, Share]]:
         """Return each share with its name."""
-        named = (
+        shares = (
             ("the policy", self.policy),
             ("the policy as it was", self.base),
             ("always already right", self.right),
             ("difference from the policy as it was", self.difference),
         )
-        return [(name, share) for name, share in named if share is not None]
+        return [(name, share) for name, share in shares if share is not None]
 
     def words(self) -> list[str]:
         """Return the agreement in words, line by line."""
@@ -170,23 +162,19 @@ class Agreement(NamedTuple):
 
 
 def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = None) -> Agreement:
-    """Return the share of answers that a policy agrees with. Labels that say nothing of any cue do not count.
+    """Return the share of relative answers that a policy agrees with, called with observations only.
 
-    Args:
-        policy: the acting policy, see `types.Policy`, called with observations only.
-        rows: relative labels (labels, ...) as arrays.
-        space: the actions' space.
-        eps: strength of an answer, in the space's unit.
-        base: the policy before its correction; None: unknown.
+    Labels that say nothing of any cue do not count. `eps`: strength of an answer, in the space's unit. `base`: the
+    policy before its correction; None: unknown.
     """
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(says_something(rows.answer))], rows)
     if not len(rows.obs):
         raise UserError("labels say nothing of any cue: give labels with answers")
     answers = np.asarray(rows.answer)
-    told = np.asarray(is_answered(answers)) if len(space.cues) > 1 else np.ones(answers.shape, bool)
+    counts = np.asarray(is_answered(answers)) if len(space.cues) > 1 else np.ones(answers.shape, bool)
 
     def agreed(own: Any) -> Float[np.ndarray, " labels"]:
-        return ((own == answers) & told).sum(-1) / told.sum(-1)
+        return ((own == answers) & counts).sum(-1) / counts.sum(-1)
 
     def interval(values: Float[np.ndarray, " labels"]) -> Share:
         estimate, low, high = (float(value) for value in mean_interval(values))
@@ -206,8 +194,8 @@ def _says(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarra
     def answered(policy: Any, obs: Any, action: Any) -> Any:
         own = space.only_actions(policy.act(jax.random.key(0), None, obs))
         strength = space.from_unit(eps)
-        return own, jax.vmap(lambda asked, own: relative_feedback(space, asked, own, strength))(action, own)
+        return own, jax.vmap(lambda row, own: relative_feedback(space, row, own, strength))(action, own)
 
-    own, found = answered(policy, jnp.asarray(rows.obs), jnp.asarray(rows.action))
+    own, result = answered(policy, jnp.asarray(rows.obs), jnp.asarray(rows.action))
     user_code.check_actions(own, policy_name(policy))
-    return np.asarray(found)
+    return np.asarray(result)

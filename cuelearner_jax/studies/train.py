@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place, release_programs
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
@@ -26,7 +26,7 @@ from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order, TrainRequest, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
-from cuelearner_jax.storage import formats
+from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, prepare_folder
 from cuelearner_jax.task import Preset, Task, shape_of
 from cuelearner_jax.terminal import interruptible, progress_bars
@@ -89,19 +89,14 @@ def run(order: Order) -> None:
             bars.remove_task(waiting)
             for group in groups:
                 Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels)
-    failures.check(order.out, [order.out / group.guidance.name for group in groups])
+    if words := failures.summary(results.read([order.out / group.guidance.name for group in groups])):
+        raise NotFinite(f"{words}: their rows in {order.out} are marked and left out of reports; all else is finished")
 
 
 def in_memory(
     request: TrainRequest, env: Environment, examined: Environment, teacher: Teacher | None, progress: bool = True
 ) -> tuple[pa.Table, dict[str, Training]]:
-    """Train every lane of the grid; write nothing.
-
-    Args:
-        request: what to train.
-        env, examined: environments of the request's world, for learning and for evaluations.
-        teacher: who answers; None where no kind asks.
-        progress: show progress bars on standard error.
+    """Train every lane of the grid; write nothing. `env`, `examined`: environments for learning and for evaluations.
 
     Returns:
         A row per lane and evaluation (guidance, labels, seed, step, wall_s, failed and metrics); and the trainings by
@@ -113,7 +108,7 @@ def in_memory(
     groups = _groups(request, place(lane_mesh(), env, SHARED))
     teacher = _teacher(request, groups, labels, lambda: teacher)
     rows, trainings = [], {}
-    with progress_bars(shown=progress) as bars:
+    with progress_bars(visible=progress) as bars:
         for group in groups:
             name, training = group.guidance.name, Training(group, examined, request.split)
             training.begin()
@@ -122,9 +117,9 @@ def in_memory(
             bar = bars.add_task(name, total=request.config.schedule.total_steps, note="")
             if not training.labelled:
                 assert teacher is not None  # checked above
-                asked = bars.add_task(f"{name}: labels", total=group.rounds, note="")
-                for done in training.label_rounds(teacher):
-                    bars.update(asked, completed=done)
+                label_bar = bars.add_task(f"{name}: labels", total=group.rounds, note="")
+                for count in training.label_rounds(teacher):
+                    bars.update(label_bar, completed=count)
             for row in training.stretches():
                 rows.append(_table(group, row))
                 bars.update(bar, completed=training.step, note=f"reward {mean_of_finite(row['reward'])}")
@@ -136,8 +131,8 @@ def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
     """Return the columns of one evaluation as a table with a row per lane."""
     count = len(group.seeds)
     columns = {name: value if np.ndim(value) else np.full(count, value) for name, value in row.items()}
-    told = {
+    arrays = {
         name: pa.array(values if values.ndim == 1 else list(values), from_pandas=True)
         for name, values in columns.items()
     }
-    return pa.table({"guidance": pa.array([group.guidance.name] * len(group.seeds)), **told})
+    return pa.table({"guidance": pa.array([group.guidance.name] * len(group.seeds)), **arrays})

@@ -26,10 +26,10 @@ def observation_of(skill: str) -> tuple[Quantity, ...]:
     """Return the slices of a skill's observation: Fetch's, with the centre of the camera's rotation."""
     layout = fetch_layout.layout_of(FETCH[skill])
     assert layout is not None
-    return tuple(_seen(quantity) for quantity in layout)
+    return tuple(_declared(quantity) for quantity in layout)
 
 
-def _seen(quantity: Quantity) -> Quantity:
+def _declared(quantity: Quantity) -> Quantity:
     if quantity.name in PLACES and quantity.kind != OWN:
         return quantity._replace(origin=BASE)
     return quantity._replace(follows="object position") if quantity.name == RELATIVE else quantity
@@ -41,10 +41,7 @@ def make_environment(config: ArmConfig, split: str = "training") -> Environment:
 
 
 def make_fetch(config: ArmConfig, split: str = "training") -> Environment:
-    """Return the world of a configuration in Fetch, run by the Gymnasium bridge in separate processes.
-
-    Raises UserError for a change that Fetch does not support, or where Gymnasium-Robotics is not installed.
-    """
+    """Return the world of a configuration in Fetch, run by the Gymnasium bridge in separate processes."""
     from cuelearner_envs.arm import fetch
     from cuelearner_jax.bridges.gymnasium.environment import GymnasiumTask
     from cuelearner_jax.bridges.gymnasium.source import Source
@@ -71,7 +68,7 @@ def _wants(config: ArmConfig) -> str:
     }[config.skill]
 
 
-def _judged(*arguments: Any) -> dict[str, Any]:
+def _rollout(*arguments: Any) -> dict[str, Any]:
     from cuelearner_envs.arm.judged import rollout
 
     return rollout(*arguments)
@@ -96,7 +93,7 @@ GRIPPER = Body(
     name="gripper",
     about="three slides and two fingers with contacts, simulated by MJX",
     environment=make_environment,
-    engines={"mujoco": _judged},
+    engines={"mujoco": _rollout},
     pictures=_pictures,
 )
 

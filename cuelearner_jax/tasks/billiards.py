@@ -38,10 +38,7 @@ def teacher_folder(config: BilliardsConfig) -> Path | None:
 
 
 def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
-    """Return the teacher of a configuration.
-
-    Raises UserError if there is none, or if it cannot account for a change in this world.
-    """
+    """Return the teacher of a configuration."""
     aim_error = jnp.deg2rad(jnp.array(config.aim_error_deg, jnp.float32))
     habit = jnp.array(config.habit, jnp.float32)
     folder = teacher_folder(config)

@@ -50,10 +50,10 @@ def layout_of(environment: str) -> tuple[Quantity, ...] | None:
 
 def picture_arguments(environment: str, arguments: str) -> str:
     """Return an environment's arguments (JSON) for pictures: with this camera, where Fetch is given none."""
-    named: dict[str, Any] = json.loads(arguments)
-    if not environment.startswith(FETCH) or "default_camera_config" in named:
+    options: dict[str, Any] = json.loads(arguments)
+    if not environment.startswith(FETCH) or "default_camera_config" in options:
         return arguments
-    return json.dumps({**named, "default_camera_config": CAMERA})
+    return json.dumps({**options, "default_camera_config": CAMERA})
 
 
 def points_of(environment: str, arguments: str) -> tuple[tuple[float, float] | None, ...]:

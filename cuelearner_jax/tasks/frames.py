@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
-from cuelearner_envs.playing import played
+from cuelearner_envs.playing import record_steps
 from cuelearner_jax import pictures, user_code
 from cuelearner_jax.bridges.brax import JaxEnvironment, SimulatorState, model_of
 from cuelearner_jax.errors import UserError
@@ -28,7 +28,7 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 def pictures_of(
     draw: Callable[[Any, Any, Any], list[Frame]],
-    drawn: Callable[[Any], Any],
+    drawable: Callable[[Any], Any],
     film: Callable[[Any, Any, Any], list[Frame]],
     points: Callable[[Any], tuple[tuple[float, float] | None, ...]] = lambda env: (),
     check: Callable[[Any], Any] | None = None,
@@ -37,7 +37,7 @@ def pictures_of(
 
     Args:
         draw: (environment, state, actions (n, action)) -> a frame of the state and one after each of the actions.
-        drawn: the part of a state that a film needs.
+        drawable: the part of a state that a film needs.
         film: (environment, these parts (steps, ...), actions (steps, action)) -> frames of a roll-out.
         points: see `Sketch.points`.
         check: see `Pictures.check`.
@@ -59,8 +59,8 @@ def pictures_of(
         pictures.still([frames[0], frames[-1]], file)
 
     def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
-        see = lambda env, state, action, step: (drawn(state), action, step.reward)  # noqa: E731
-        states, actions, rewards = played(env, policy, key, steps, see)
+        see = lambda env, state, action, step: (drawable(state), action, step.reward)  # noqa: E731
+        states, actions, rewards = record_steps(env, policy, key, steps, see)
         user_code.tell()
         return film(env, states, actions), rewards.tolist()
 
@@ -86,7 +86,7 @@ def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Frame]:
     if source.factory is None:
         source = dataclasses.replace(source, arguments=fetch_layout.picture_arguments(source.name, source.arguments))
     rows = np.asarray(actions, np.float32).reshape(-1, env.actions.size)
-    return pool_of(dataclasses.replace(source, drawn=True)).film(int(seed), rows, first)
+    return pool_of(dataclasses.replace(source, draws=True)).film(int(seed), rows, first)
 
 
 def _drawn_instance(env: Any, state: Any, actions: Any) -> list[Frame]:

@@ -171,7 +171,7 @@ def task_of(name: str) -> Task:
 
 
 def task_from(
-    given: Any,
+    source: Any,
     arguments: Mapping[str, Any] | None = None,
     *,
     called: str | None = None,
@@ -184,27 +184,20 @@ def task_from(
 ) -> Task:
     """Return an environment as a task. One instance is made and plays an episode, to find out its layout.
 
-    Args:
-        given: an id of Gymnasium's registry, or a class or function that returns an environment.
-        arguments: arguments of the environment, by name.
-        called: name of code in messages and files (default: its module:NAME).
-        num_envs, max_steps, processes, cues, observation, units: see `cl.from_gymnasium`.
-
-    Raises:
-        UserError: the environment cannot be made, or its spaces are not supported.
+    `called`: name of code in messages and files (default: its module:NAME). For the others see `cl.from_gymnasium`.
     """
     check_installed()
     if max_steps is not None:
         check_number("max_steps", max_steps, 1, MOST_STEPS, whole=True)
-    factory, name, fetch = None, given, None
-    if isinstance(given, str):
-        fetch, max_steps = fetch_layout.layout_of(given), max_steps or registry_spec(given).max_episode_steps
-    elif callable(given):
-        factory, code = given, getattr(given, "func", given)
+    factory, name, fetch = None, source, None
+    if isinstance(source, str):
+        fetch, max_steps = fetch_layout.layout_of(source), max_steps or registry_spec(source).max_episode_steps
+    elif callable(source):
+        factory, code = source, getattr(source, "func", source)
         name = called or f"{getattr(code, '__module__', '')}:{getattr(code, '__qualname__', type(code).__name__)}"
     else:
         raise UserError(
-            f"env is {format_value(given)}: give an id of Gymnasium's registry, or a class or function that "
+            f"env is {format_value(source)}: give an id of Gymnasium's registry, or a class or function that "
             "gives environments"
         )
     try:
@@ -220,7 +213,7 @@ def task_from(
             f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,} (give "
             "--task.max-steps, or max_steps in Python, for another limit)"
         )
-    slices = _named(name, slices, observation or fetch, units or {})
+    slices = _with_names(name, slices, observation or fetch, units or {})
     pairs = cues.split(";") if isinstance(cues, str) else cues
     words = tuple(pair if isinstance(pair, str) else ",".join(pair) for pair in pairs if pair)
     is_fetch = not words and fetch is not None and len(actions.low) == len(fetch_layout.CUES)
@@ -280,7 +273,7 @@ def _limit(env: Any) -> int:
     return int(limit or 0)
 
 
-def _named(
+def _with_names(
     name: str, slices: Sequence[Quantity], names: Sequence[Any] | None, units: Mapping[str, str]
 ) -> tuple[Quantity, ...]:
     """Return the slices with names and units that the caller, or this package, knows."""
@@ -296,7 +289,9 @@ def _named(
         ) from error
     if total != wanted:
         raise UserError(f"observation names {total} entries, and {name} has {wanted}: name each entry once")
-    known = {quantity.name for quantity in own}
-    if unknown := sorted(set(units) - known):
-        raise UserError(f"units names {unknown[0]!r}, and the slices are {', '.join(sorted(known))}: name one of them")
+    names_there = {quantity.name for quantity in own}
+    if unknown := sorted(set(units) - names_there):
+        raise UserError(
+            f"units names {unknown[0]!r}, the slices are {', '.join(sorted(names_there))}: name one of them"
+        )
     return tuple(quantity._replace(unit=units.get(quantity.name, quantity.unit)) for quantity in own)

@@ -107,7 +107,7 @@ class SituationState(struct.PyTreeNode):
     """Position in a walk over the situations."""
 
     row: Int[Array, ""]  # of the situation
-    met: Int[Array, ""]  # number of situations before it in this episode
+    count: Int[Array, ""]  # number of situations before it in this episode
 
 
 class Logs(WholeObservations, struct.PyTreeNode):
@@ -154,10 +154,10 @@ class Logs(WholeObservations, struct.PyTreeNode):
         self, key: PRNGKeyArray, state: SituationState, action: Float[Array, " action"]
     ) -> tuple[SituationState, Step]:
         """Return the next situation, whatever the action; after all of them a random one."""
-        following = SituationState((state.row + 1) % len(self.rows), state.met + 1)
+        following = SituationState((state.row + 1) % len(self.rows), state.count + 1)
         final_obs, (anew, first) = self.rows[following.row], self.reset(key)
         change = self.actions.to_unit(self.actions.distance(self.recorded[state.row], action))
-        ended = following.met >= len(self.rows)
+        ended = following.count >= len(self.rows)
         state, obs = jax.tree.map(partial(jnp.where, ended), (anew, first), (following, final_obs))
         reward = jnp.zeros(())
         return state, Step(obs, final_obs, final_obs, reward, jnp.array(False), ended, {"change": change}, {})
@@ -194,11 +194,8 @@ def task_of(
         low, high: bounds of the actions, one per entry (default: the recorded actions' range, reported by `note`).
         actions: kind of action space, "box", "directions" or "choices".
         note: called with one line about each value that had to be chosen.
-
-    Raises:
-        UserError: the situations cannot be read, or bounds or cues do not fit their actions.
     """
-    recording = _read(Path(folder))
+    recording = _recording(Path(folder))
     if actions not in get_args(Actions):
         raise UserError(f"actions is {actions!r}{suggestion(actions, get_args(Actions))}")
     size, names = recording.actions.shape[1], ()
@@ -266,10 +263,7 @@ def bounds_of(
     entries: Sequence[str] = (),
     note: Callable[[str], None] = console.print,
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the bounds of a box of actions: the given ones, or the range of the actions, reported by `note`.
-
-    Raises UserError for one bound without the other, or an entry that never changes.
-    """
+    """Return the bounds of a box of actions: the given ones, or the range of the actions, reported by `note`."""
     if low is not None and high is not None:
         return low, high
     if low is not None or high is not None:
@@ -284,21 +278,18 @@ def bounds_of(
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path) -> Situations:
+def _recording(path: Path) -> Situations:
     """Read situations once."""
     return situations.read(path)
 
 
 def filled(config: LogsConfig, observations: Any = None, actions: Any = None) -> Logs:
-    """Return the environment of situations (n, obs) and (n, action) in their order; zeros where none are given.
-
-    Raises UserError for an invalid configuration.
-    """
+    """Return the environment of situations (n, obs) and (n, action) in their order; zeros where none are given."""
     space, size = space_of(config), sum(config.entries)
     sound = len(config.names) == len(config.entries) and min((*config.entries, config.rows, *config.spread)) > 0
     if not sound or not all(len(part) in (0, size) for part in (config.centre, config.spread)):
         raise UserError(
-            "task.names, entries, rows, centre or spread do not describe situations: give the folder by logs:FOLDER"
+            "task.names, entries, rows, centre or spread are of no situations: give the folder by logs:FOLDER"
         )
     slices = [Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True)]
     if slices[-1].name == BASE and slices[-1].size == space.size:
@@ -312,13 +303,10 @@ def filled(config: LogsConfig, observations: Any = None, actions: Any = None) ->
 
 
 def _environment(config: LogsConfig, split: str) -> Logs:
-    """Return the situations of a configuration, which are equal in every split.
-
-    Raises UserError where they are missing, or differ from the configuration's digest.
-    """
+    """Return the situations of a configuration, which are equal in every split."""
     if not config.path:
         raise UserError("no situations are given: name their folder, as logs:FOLDER or by --task.path")
-    recording, layout = _read(Path(config.path)), filled(config)
+    recording, layout = _recording(Path(config.path)), filled(config)
     if config.digest not in ("", recording.digest):
         raise UserError(f"{config.path} holds other situations than before: restore the folder, or collect new labels")
     sizes = (recording.observations.shape[1], recording.actions.shape[1])
@@ -332,14 +320,11 @@ def _environment(config: LogsConfig, split: str) -> Logs:
 
 
 def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
-    """Return the frames of a row's picture or clip, and the row's place in the recording.
-
-    Raises UserError if there is none, or if it cannot be read.
-    """
+    """Return the frames of a row's picture or clip, and the row's place in the recording."""
     if not env.path:
         raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
     place = int(env.places[row])
-    picture = _read(Path(env.path)).picture(place)
+    picture = _recording(Path(env.path)).picture(place)
     if picture is None:
         raise UserError(f"{env.path} has no picture of row {place}: add a column `picture` with the name of its file")
     if picture.kind.startswith("image/") and picture.kind != "image/gif":
@@ -349,13 +334,13 @@ def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
         film = imageio.mimread(io.BytesIO(picture.data), format=suffix, memtest=False)  # pyright: ignore
     except Exception as error:  # film readers raise many exception types
         raise UserError(f"a clip cannot be read ({' '.join(str(error).split())[:80]}): give GIF or MP4") from error
-    chosen = np.unique(np.linspace(0, len(film) - 1, min(len(film), CLIP_FRAMES)).round().astype(int))
-    return [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in chosen], place
+    numbers = np.unique(np.linspace(0, len(film) - 1, min(len(film), CLIP_FRAMES)).round().astype(int))
+    return [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in numbers], place
 
 
 def _sketch(env: Logs, state: SituationState) -> Sketch:
     frames, place = _frames(env, state.row)
-    text = _read(Path(env.path)).text(place)
+    text = _recording(Path(env.path)).text(place)
     drawn = pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
     for _, (hand, *steps) in _seen(env, state, drawn, lambda hand: hand + STEP * np.eye(3))[:1]:
         ways = np.stack(steps) - hand
@@ -372,7 +357,7 @@ def _seen(
 
     `places` is a function of the hand's position (3,) that returns others (n, 3).
     """
-    recording, seen = _read(Path(env.path)), []
+    recording, seen = _recording(Path(env.path)), []
     if recording.hands is None or not recording.about:
         return []
     hand = recording.hands[int(env.places[state.row])]

@@ -58,7 +58,7 @@ def _legged(config: NavigationConfig, split: str, folder: Path | None = None) ->
     return make_environment(config, split, policy.load(folder) if folder else policy.load())
 
 
-def _judged(*arguments: Any) -> dict[str, Any]:
+def _rollout(*arguments: Any) -> dict[str, Any]:
     from cuelearner_envs.anymal.judged import rollout
 
     return rollout(*arguments)
@@ -87,7 +87,7 @@ def _anymal(folder: Path | None = None) -> Body:
         digest = hashlib.sha256((folder / policy.WEIGHTS).read_bytes()).hexdigest()[:12]
     about = "a quadruped with full physics; anymal:FOLDER walks by a policy that experiments/train_walking.py made"
     environment = partial(_legged, folder=folder)
-    return Body("anymal", about, environment, {"mujoco": _judged}, _legged_pictures, _anymal, digest)
+    return Body("anymal", about, environment, {"mujoco": _rollout}, _legged_pictures, _anymal, digest)
 
 
 ANYMAL = _anymal()

@@ -21,12 +21,9 @@ GROUPS = [field.name for field in dataclasses.fields(RunConfig)]
 
 
 def read(name: str, config: Any, space: Space = DIRECTIONS) -> dict[str, Any]:
-    """Return `presets` and `scenarios` of a task: fields of `task.Task`.
+    """Return `presets` and `scenarios` of a task from the file of a name: fields of `task.Task`.
 
-    Args:
-        name: of the file.
-        config: the task's default configuration.
-        space: of the actions, in whose unit scalars are.
+    `config`: the task's default configuration. `space`: of the actions, in whose unit scalars are.
     """
     tables = tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
     presets, scenarios = {}, {}
@@ -34,19 +31,19 @@ def read(name: str, config: Any, space: Space = DIRECTIONS) -> dict[str, Any]:
         start = Preset("", RunConfig(config, scalars=plain_scalars(space)))
         start = presets.get(own.pop("like", None), start)
         groups = {group: _group(start.config, group, own.pop(group)) for group in GROUPS if group in own}
-        presets[key] = _changed(start, own | {"config": dataclasses.replace(start.config, **groups)})
+        presets[key] = _replace(start, own | {"config": dataclasses.replace(start.config, **groups)})
     for key, own in tables.get("scenarios", {}).items():
-        scenarios[key] = _changed(scenarios.get(own.pop("like", None), Scenario("", {})), own)
+        scenarios[key] = _replace(scenarios.get(own.pop("like", None), Scenario("", {})), own)
     return {"presets": presets, "scenarios": scenarios}
 
 
 def _group(start: RunConfig, name: str, values: dict[str, Any]) -> Any:
     if name == "kinds":
         return {kind: kind_from_json(kind, own) for kind, own in values.items()}
-    return part_from_json(name, values) if "name" in values else _changed(getattr(start, name), values)
+    return part_from_json(name, values) if "name" in values else _replace(getattr(start, name), values)
 
 
-def _changed(start: Any, values: dict[str, Any]) -> Any:
+def _replace(start: Any, values: dict[str, Any]) -> Any:
     """Return a dataclass with fields changed; lists become tuples, also within a table."""
     tables = {
         key: {own: plain(part) for own, part in value.items()} for key, value in values.items() if type(value) is dict

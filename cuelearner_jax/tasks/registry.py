@@ -53,9 +53,7 @@ def find(name: str) -> Task:
     if name in _registered:
         return _registered[name]
     if (entry := _installed().get(name)) is None:
-        raise UserError(
-            f"unknown task {name!r}{suggestion(name, names())} (one of your own is named as package.module:NAME)"
-        )
+        raise UserError(f"unknown task {name!r}{suggestion(name, names())} (your own: package.module:NAME)")
     return dataclasses.replace(_loaded(entry.value), name=name)
 
 
@@ -72,15 +70,12 @@ def resolve(text: str) -> Task:
     """Return the task that the user names: by its name, as FAMILY:ENVIRONMENT (`FAMILIES`), or as package.module:name.
 
     A task from outside is registered. The current folder is searched for modules last.
-
-    Raises:
-        UserError: no such task, or its code cannot be loaded.
     """
     if ":" not in text:
         return find(text)
     family, _, environment = text.partition(":")
     if family in FAMILIES:
-        return dataclasses.replace(_built_in(FAMILIES[family])(environment), named=text)
+        return dataclasses.replace(_built_in(FAMILIES[family])(environment), command_name=text)
     task = dataclasses.replace(_loaded(text), origin=text)
     installed = _installed().get(task.name)
     return find(task.name) if installed and installed.value == text else register(task)

@@ -16,19 +16,19 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(f"{PREFIX}{folder.parent.name}" for folder in _place().glob("*/config.json")))
 
 
-def is_shipped(named: str | os.PathLike[str]) -> bool:
+def is_shipped(name: str | os.PathLike[str]) -> bool:
     """Return whether a word names a shipped agent, known or not."""
-    return isinstance(named, str) and named.startswith(PREFIX)
+    return isinstance(name, str) and name.startswith(PREFIX)
 
 
-def folder_of(named: str | os.PathLike[str]) -> Path:
+def folder_of(name: str | os.PathLike[str]) -> Path:
     """Return the folder that the user names, as `shipped:NAME` or as a path.
 
     Raises UserError for a shipped agent that does not exist. A path is not checked.
     """
-    if not is_shipped(named):
-        return Path(named)
-    text = os.fspath(named)
+    if not is_shipped(name):
+        return Path(name)
+    text = os.fspath(name)
     if text not in names():
         raise UserError(f"no shipped agent {text!r}: give one of {', '.join(names())}")
     return _place() / text.removeprefix(PREFIX)

@@ -95,9 +95,7 @@ def _from_playground(name: str) -> Any:
     try:
         from mujoco_playground import dm_control_suite, registry  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
-        raise UserError(
-            "tasks of playground need the extra `playground`: pip install 'cuelearner-jax[playground]'"
-        ) from None
+        raise UserError("tasks of playground need an extra: pip install 'cuelearner-jax[playground]'") from None
     if name not in dm_control_suite.ALL_ENVS:
         if name in registry.ALL_ENVS:
             raise UserError(
@@ -107,16 +105,11 @@ def _from_playground(name: str) -> Any:
     try:
         return dm_control_suite.load(name, config_overrides={"impl": "jax"})
     except AttributeError as error:  # MuJoCo's own interface has changed
-        raise UserError(
-            f"playground:{name} does not work with the installed MuJoCo ({error}): choose another task"
-        ) from error
+        raise UserError(f"playground:{name} fails with the installed MuJoCo ({error}): choose another task") from error
 
 
 def make_environment(family: str, config: Any, split: str = "training") -> JaxEnvironment:
-    """Return the environment of a configuration; the simulator is made at the first step or reset.
-
-    Raises UserError for a value that makes none.
-    """
+    """Return the environment of a configuration; the simulator is made at the first step or reset."""
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     if backend := getattr(config, "backend", ""):
         check_word("backend", backend, get_args(Backend))

@@ -11,7 +11,7 @@ import jax
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from cuelearner_envs.bounds import MOST_SEED, check_number, check_word
-from cuelearner_envs.zoo import ERRORS, STEPS, ZooWorld, changed, robots
+from cuelearner_envs.zoo import ERRORS, STEPS, ZooWorld, change, robots
 from cuelearner_envs.zoo.distil import SPLITS
 from cuelearner_envs.zoo.environment import ZooEnvironment, ZooTeacher
 from cuelearner_jax.adaptation.by_model import plain_scalars
@@ -56,14 +56,14 @@ def _world(config: ZooConfig) -> ZooWorld:
     """Return the world of a configuration, drawn once in a process."""
     error = ERRORS.index(config.error)
     with jax.ensure_compile_time_eval():
-        return _drawn(jax.random.key(config.seed), config.cues, config.split, config.number % 2, config.number, error)
+        return _draw(jax.random.key(config.seed), config.cues, config.split, config.number % 2, config.number, error)
 
 
 @partial(jax.jit, static_argnames=("cues", "split", "odd"))
-def _drawn(key: PRNGKeyArray, cues: int, split: str, odd: int, number: Index, error: Index) -> ZooWorld:
+def _draw(key: PRNGKeyArray, cues: int, split: str, odd: int, number: Index, error: Index) -> ZooWorld:
     pair = robots(key, cues, 1 + odd, split, number - odd)  # an odd robot behind its even neighbour
     robot = jax.tree.map(lambda leaf: leaf[odd], pair)
-    return changed(jax.random.fold_in(jax.random.fold_in(key, cues), number), robot, error)
+    return change(jax.random.fold_in(jax.random.fold_in(key, cues), number), robot, error)
 
 
 def make_environment(config: ZooConfig, split: str = "training") -> ZooEnvironment:

@@ -33,18 +33,18 @@ def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None
     _check_shapes(laws, env)
     key = jax.random.key(0) if key is None else key
     walk, traces = counted_jit(lambda env, key: _walk(env, key, steps))
-    met = jax.device_get(walk(env, key))
+    path = jax.device_get(walk(env, key))
     walk(change_floats(env), key)
     laws.hold(len(traces) == 1, "other values of its floats are traced anew: keep them out of static fields")
-    _check_steps(laws, env, met, steps)
+    _check_steps(laws, env, path, steps)
     if offers(env, "heuristic"):
-        laws.actions(actions_of(env), met["heuristic"], "what `heuristic` gives")
+        laws.actions(actions_of(env), path["heuristic"], "what `heuristic` gives")
     if offers(env, "features"):
-        _check_features(laws, *met["features"])
+        _check_features(laws, *path["features"])
     if offers(env, "aims"):
-        _check_aims(laws, env, met["aims"])
+        _check_aims(laws, env, path["aims"])
     if offers(env, "mirror"):
-        _check_mirrors(laws, met)
+        _check_mirrors(laws, path)
 
 
 def _check_shapes(laws: Laws, env: Environment) -> None:
@@ -69,8 +69,8 @@ def _check_shapes(laws: Laws, env: Environment) -> None:
         for name, value in values.items():
             fits = value.dtype == kind and value.shape == shape
             laws.hold(fits, f"{name} is {value.dtype} of shape {value.shape}: make it {kind} of shape {shape}")
-    taken = sorted({"reward", "finished"} & {*step.metrics, *step.outcome} | {*step.metrics} & {*step.outcome})
-    laws.hold(not taken, f"a metric or outcome is called {taken[:1]}, which results have already: give another name")
+    names = sorted({"reward", "finished"} & {*step.metrics, *step.outcome} | {*step.metrics} & {*step.outcome})
+    laws.hold(not names, f"a metric or outcome is called {names[:1]}, which results have already: give another name")
     one, other = (re.sub("0x[0-9a-f]+", "", str(program)) for program in programs)  # without memory addresses
     laws.hold(one == other, "two traces give two programs: draw all random numbers from the key alone")
 
@@ -89,28 +89,31 @@ def _walk(env: Any, key: PRNGKeyArray, steps: int) -> dict[str, Any]:
 
     _, (keys, states, obs, actions, recalled, afters, step) = jax.lax.scan(one, env.reset(k_reset), jnp.arange(steps))
     few = lambda tree: jax.tree.map(lambda leaf: leaf[:COMPARED], tree)  # noqa: E731
-    met: dict[str, Any] = {"obs": obs, "actions": actions, "recalled": recalled, "step": step}
-    met["batched"] = jax.vmap(env.step)(few(keys), few(states), few(actions)), few((afters, step))
+    path: dict[str, Any] = {"obs": obs, "actions": actions, "recalled": recalled, "step": step}
+    path["batched"] = jax.vmap(env.step)(few(keys), few(states), few(actions)), few((afters, step))
     if offers(env, "heuristic"):
-        met["heuristic"] = jax.vmap(env.heuristic)(obs)
+        path["heuristic"] = jax.vmap(env.heuristic)(obs)
     if offers(env, "features"):
         each = [tuple(env.features(obs[0], action)) for action in few(actions)]
-        met["features"] = tuple(env.features(obs[0], few(actions))), jax.tree.map(lambda *rows: jnp.stack(rows), *each)
+        path["features"] = tuple(env.features(obs[0], few(actions))), jax.tree.map(lambda *rows: jnp.stack(rows), *each)
     if offers(env, "aims"):
-        met["aims"] = jax.vmap(env.aims)(obs)
+        path["aims"] = jax.vmap(env.aims)(obs)
     if offers(env, "mirror"):
         which, other = jnp.arange(symmetries_of(env)), jnp.roll(actions, 1, 0)
         image = jax.vmap(jax.vmap(env.mirror, (None, 0, 0)), (0, None, None))  # (symmetries, steps, ...)
-        met["images"] = image(which, obs, actions)
-        met["sums"] = image(which, obs, 2.0 * actions + other)[1], 2.0 * met["images"][1] + image(which, obs, other)[1]
-        met["twice"] = jax.vmap(lambda both: image(which, *both))(met["images"])  # (first, second, steps, ...)
-    return met
+        path["images"] = image(which, obs, actions)
+        path["sums"] = (
+            image(which, obs, 2.0 * actions + other)[1],
+            2.0 * path["images"][1] + image(which, obs, other)[1],
+        )
+        path["twice"] = jax.vmap(lambda both: image(which, *both))(path["images"])  # (first, second, steps, ...)
+    return path
 
 
-def _check_steps(laws: Laws, env: Environment, met: dict[str, Any], steps: int) -> None:
+def _check_steps(laws: Laws, env: Environment, path: dict[str, Any], steps: int) -> None:
     """Check the laws of the steps."""
-    step = met["step"]
-    laws.actions(actions_of(env), met["actions"], "what its actions' `sample` draws")
+    step = path["step"]
+    laws.actions(actions_of(env), path["actions"], "what its actions' `sample` draws")
     values = {"obs": step.obs, "final_obs": step.final_obs, "reward": step.reward, **step.metrics, **step.outcome}
     for name, rows in values.items():
         wrong = np.flatnonzero(~np.isfinite(rows).reshape(steps, -1).all(-1))
@@ -126,16 +129,16 @@ def _check_steps(laws: Laws, env: Environment, met: dict[str, Any], steps: int) 
         laws.same(step.obs[~ended], step.final_obs[~ended]),
         "Step.obs is not Step.final_obs where an episode goes on: they differ only by the automatic reset",
     )
-    recalled, recalled_next = met["recalled"]
+    recalled, recalled_next = path["recalled"]
     laws.hold(
-        laws.same(recalled, met["obs"]),
+        laws.same(recalled, path["obs"]),
         "recall(remember(state, obs)) is not obs: keep all that it is computed from, or derive WholeObservations",
     )
     laws.hold(
         laws.same(recalled_next, step.final_obs),
         "recall_next(remember(state, obs), action, aftermath) is not Step.final_obs: it is before the automatic reset",
     )
-    laws.hold(laws.same(*met["batched"]), "steps under vmap differ from the same steps alone")
+    laws.hold(laws.same(*path["batched"]), "steps under vmap differ from the same steps alone")
 
 
 def _check_features(laws: Laws, together: Any, each: Any) -> None:
@@ -160,15 +163,17 @@ def _check_aims(laws: Laws, env: Environment, aims: Aims) -> None:
     laws.hold(np.any(aims.possible), "no aim was possible in any step: mark those that are")
 
 
-def _check_mirrors(laws: Laws, met: dict[str, Any]) -> None:
+def _check_mirrors(laws: Laws, path: dict[str, Any]) -> None:
     """Check that symmetries form a group of linear isometries with 0 as identity."""
-    (obs, vectors), plain, twice = met["images"], (met["obs"], met["actions"]), met["twice"]
+    (obs, vectors), plain, twice = path["images"], (path["obs"], path["actions"]), path["twice"]
     same = np.shape(obs)[1:] == np.shape(plain[0]) and np.shape(vectors)[1:] == np.shape(plain[1])
     laws.hold(same, "`mirror` changes a shape: an image is an observation and a vector of the same sizes")
     laws.hold(laws.same((obs[0], vectors[0]), plain), "`mirror` 0 is not the identity: make it the first")
     lengths = np.broadcast_to(np.linalg.norm(plain[1], axis=-1), vectors.shape[:2])
     laws.hold(laws.same(np.linalg.norm(vectors, axis=-1), lengths), "`mirror` changes a vector's length")
-    laws.hold(laws.same(*met["sums"]), "`mirror` of a sum of vectors is not the sum of their images: it must be linear")
+    laws.hold(
+        laws.same(*path["sums"]), "`mirror` of a sum of vectors is not the sum of their images: it must be linear"
+    )
     for number in range(len(obs)):
         undone = any(laws.same(back, plain) for back in zip(twice[0][number], twice[1][number], strict=True))
         laws.hold(undone, f"no symmetry undoes `mirror` {number}: add its inverse, or mend its observation")

@@ -50,9 +50,9 @@ def check_guidance(kind: type[Guide], env: Environment, sizes: GuideSizes = SMAL
     actions = actions_of(env).sample(key, (ROWS,))
     fitted = _fitted(laws, guide, env, model, _labels(laws, guide, env, states, obs, actions)) if guide.form else model
     _check_act(laws, guide, env, model, fitted, obs, actions)
-    asked = jax.jit(guide.question)(jax.random.key(3), fitted, env, obs[0], actions[0], SCALARS)
-    laws.hold(asked.shape == actions[0].shape, f"`question` returns shape {asked.shape}: ask about one action")
-    laws.actions(actions_of(env), asked, "what `question` asks about")
+    action = jax.jit(guide.question)(jax.random.key(3), fitted, env, obs[0], actions[0], SCALARS)
+    laws.hold(action.shape == actions[0].shape, f"`question` returns shape {action.shape}: ask about one action")
+    laws.actions(actions_of(env), action, "what `question` asks about")
     if guide.form is not None:
         members = kind(dataclasses.replace(sizes, ensemble=2), spaces_of(env))
         apart = jax.jit(members.disagreement)(members.init(jax.random.key(4)), env, obs, actions)
@@ -99,15 +99,15 @@ def _check_act(
 ) -> None:
     """Check the changes to a batch of actions."""
     active, (act, traces) = jnp.arange(ROWS) % 2 == 0, counted_jit(guide.act)
-    moved, passes = act(fitted, env, obs, actions, active, SCALARS)
+    refined, passes = act(fitted, env, obs, actions, active, SCALARS)
     act(fitted, env, obs, actions, active, change_floats(SCALARS))
     alone = act(unfitted, env, obs, actions, jnp.ones(ROWS, bool), SCALARS).actions
     laws.hold(len(traces) == 1, "`act` is traced anew for other scalars: no Python branch may look at them")
-    laws.hold(moved.shape == actions.shape, f"`act` returns actions of shape {moved.shape}")
-    laws.actions(actions_of(env), moved, "an action that `act` returns")
+    laws.hold(refined.shape == actions.shape, f"`act` returns actions of shape {refined.shape}")
+    laws.actions(actions_of(env), refined, "an action that `act` returns")
     counts = passes.shape == (ROWS,) and jnp.issubdtype(passes.dtype, jnp.integer)
     laws.hold(counts, "`act` returns passes that are no count for each row: how often was each moved?")
-    same = np.array_equal(moved[~active], actions[~active])
+    same = np.array_equal(refined[~active], actions[~active])
     laws.hold(same, "`act` changes rows that are not active: keep them by jnp.where(active[:, None], ...)")
     same = not guide.asks or np.array_equal(alone, actions)
     laws.hold(same, "`act` of an unfitted model changes actions: guide only active & model.fitted")

@@ -13,7 +13,7 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.policies import BY_LANE, SHARED
 from cuelearner_jax.spaces import Space, from_json
 
-DRAWN = 64  # actions of a check of a space
+SAMPLES = 64  # actions of a check of a space
 ROWS = 9  # situations of a check of a policy
 
 
@@ -77,16 +77,16 @@ def check_space(space: Space, tolerance: float = 1e-5) -> None:
     laws = Laws(space, tolerance)
     hash(space)
     laws.hold(from_json(space.to_json()) == space, "its description gives another space: see `to_json`, `of_json`")
-    one, other = (space.sample(jax.random.key(seed), (DRAWN,)) for seed in (0, 1))
+    one, other = (space.sample(jax.random.key(seed), (SAMPLES,)) for seed in (0, 1))
     change = jax.jit(space.log)(one, other)
-    moved, retracted = jax.jit(space.exp)(one, change), space.retract(one)
-    spread = space.spread(DRAWN)
-    laws.hold(change.shape == (DRAWN, len(space.cues)), f"`log` has shape {change.shape}: give one number a cue")
-    for function, actions in (("sample", one), ("exp", moved), ("spread", spread)):
+    reached, retracted = jax.jit(space.exp)(one, change), space.retract(one)
+    spread = space.spread(SAMPLES)
+    laws.hold(change.shape == (SAMPLES, len(space.cues)), f"`log` has shape {change.shape}: give one number a cue")
+    for function, actions in (("sample", one), ("exp", reached), ("spread", spread)):
         laws.actions(space, actions, f"what `{function}` gives")
     laws.hold(laws.same(retracted, one), "`retract` changes actions: it must leave them as they are")
     if space.cues:
-        laws.hold(laws.same(moved, other), "exp(a, log(a, b)) is not b: `exp` must go where `log` says")
+        laws.hold(laws.same(reached, other), "exp(a, log(a, b)) is not b: `exp` must go where `log` says")
         farthest = float(np.max(np.abs(space.to_unit(np.asarray(change), np))))
         laws.hold(farthest <= space.reach * (1 + tolerance), f"`log` goes as far as {farthest:g}: beyond `reach`")
     lost = space.retract(one.at[0].set(jnp.nan))
@@ -112,13 +112,13 @@ def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None
     broken = "`axes` holds something else than BY_LANE and SHARED: replace every field"
     laws.hold(all(axis is SHARED or axis == BY_LANE for axis in axes), broken)
     alone = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[:1], states), obs[:1])
-    for rows, found in ((ROWS, actions), (1, alone)):
-        shape = np.shape(found)
+    for rows, result in ((ROWS, actions), (1, alone)):
+        shape = np.shape(result)
         laws.hold(shape == (rows, space.size), f"`act` returns shape {shape} for {rows} observations")
-        laws.actions(space, found, "an action that `act` returns")
+        laws.actions(space, result, "an action that `act` returns")
     laws.hold(laws.same(actions, again), "the same key gives other actions: draw all random numbers from the key")
     if laws.same(actions, other):  # random actions differ where rows have another order
         order = jnp.roll(jnp.arange(ROWS), 4)
-        moved = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[order], states), obs[order])
-        apart = laws.same(moved, actions[order]) and laws.same(alone, actions[:1])
+        rolled = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[order], states), obs[order])
+        apart = laws.same(rolled, actions[order]) and laws.same(alone, actions[:1])
         laws.hold(apart, "the action in one situation depends on the others: rows must not look at each other")

@@ -90,10 +90,10 @@ def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
 
 def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
     """Check a film, a still and a question of a few random steps."""
-    drawn, env = task.pictures(), task.environment(config, "validation")
+    pictures, env = task.pictures(), task.environment(config, "validation")
     files = filming.files(folder, task.name, "gif")
-    rewards = filming.film(drawn, env, uniform_in(env), 0, FILMED, files)
-    filming.question(drawn, env, uniform_in(env), 0, files.question)
+    rewards = filming.film(pictures, env, uniform_in(env), 0, FILMED, files)
+    filming.question(pictures, env, uniform_in(env), 0, files.question)
     laws.hold(len(rewards) == FILMED, f"`record` returns {len(rewards)} rewards of {FILMED} steps: one a step")
     for file in files:
         laws.hold(file.is_file() and file.stat().st_size, f"{file.name} was not written: write the file that is named")

@@ -39,10 +39,10 @@ def check_number(
     raise UserError(f"task.{name} is {format_value(value)}: give {wanted}{f' ({unit})' if unit else ''}")
 
 
-def check_word(name: str, value: Any, known: Iterable[str]) -> None:
+def check_word(name: str, value: Any, words: Iterable[str]) -> None:
     """Raise UserError unless a field holds one of the words that it can."""
-    if not isinstance(value, str) or value not in tuple(known):
-        raise UserError(f"task.{name} is {format_value(value)}{suggestion(str(value), known)}")
+    if not isinstance(value, str) or value not in tuple(words):
+        raise UserError(f"task.{name} is {format_value(value)}{suggestion(str(value), words)}")
 
 
 def check_vector(name: str, value: Any, size: int, least: float, most: float, unit: str = "") -> None:

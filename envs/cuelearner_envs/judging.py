@@ -27,7 +27,7 @@ def rollout(
     key: PRNGKeyArray,
     num_envs: int,
     steps: int,
-    tell: Callable[[int, int], None] = lambda done, count: None,
+    tell: Callable[[int, int], None] = lambda count_so_far, count: None,
 ) -> dict[str, np.ndarray]:
     """Roll out first episodes alone; `tell` receives how many steps of how many each robot has made.
 

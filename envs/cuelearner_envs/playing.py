@@ -12,7 +12,7 @@ from jaxtyping import PRNGKeyArray
 from cuelearner_jax.types import Policy, Step
 
 
-def played(
+def record_steps(
     env: Any,
     policy: Policy,
     key: PRNGKeyArray,

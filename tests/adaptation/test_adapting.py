@@ -88,8 +88,8 @@ def test_a_constant_shift_is_recovered_to_within_eps():
     policy = found().policy(ENV)
     for lane in np.flatnonzero((LANES.budget == 80) & (LANES.bound_deg == 60)):
         assert errors(policy, lane).max() < SCALARS.eps_deg
-    judged = found().judged
-    np.testing.assert_array_equal(judged.used, judged.after > 0.2)  # a lane that may not go far enough is no better
+    judged = found().judgement
+    np.testing.assert_array_equal(judged.in_use, judged.after > 0.2)  # a lane that may not go far enough is no better
     np.testing.assert_array_equal(judged.before, 0.0)
     assert judged.after[(LANES.budget == 80) & (LANES.bound_deg == 60)].min() == 1.0
     np.testing.assert_allclose(judged.difference[:, 0], judged.after - judged.before, atol=1e-6)
@@ -149,7 +149,7 @@ def test_given_labels_lead_where_asking_for_them_did():
     labels = found().labels
     given = by_model.adapt(of(), LANES, JUDGING, labels=labels, mesh=MESH)
     chex.assert_trees_all_equal(given.block.guide.model, found().block.guide.model)
-    np.testing.assert_array_equal(given.judged.after, found().judged.after)
+    np.testing.assert_array_equal(given.judgement.after, found().judgement.after)
 
 
 def own_labels(shift, count, answer=1.0):
@@ -168,16 +168,16 @@ def test_without_a_simulator_held_out_answers_decide():
     chance = np.random.default_rng(1).choice([-1.0, 0.0, 0.0, 0.0, 1.0], (1, 40, 1)).astype(np.float32)
     noise = one.replace(answer=chance)
     both = jax.tree.map(lambda *leaves: np.concatenate(leaves), one, noise)
-    judged = by_model.adapt(of(base), lanes, how, labels=both, mesh=MESH).judged
+    judged = by_model.adapt(of(base), lanes, how, labels=both, mesh=MESH).judgement
     assert judged.by == "labels"
     assert judged.rewarded_steps.tolist() == [0, 0]
-    assert (judged.before[0], judged.after[0], judged.used[0]) == (0.0, 1.0, True)
+    assert (judged.before[0], judged.after[0], judged.in_use[0]) == (0.0, 1.0, True)
     held = chance[0, 3::5, 0]
     assert judged.before[1] == pytest.approx((held == 0).mean())
     assert judged.after[1] <= judged.before[1]
     few = begin(of(), product(1, (0,), (4,), (10.0,)))
     with pytest.raises(UserError, match="fewer than 5 labels"):
-        judging.judged_by_labels(of(), few)
+        judging.judge_by_labels(of(), few)
 
 
 @pytest.mark.long
@@ -189,12 +189,12 @@ def test_a_bound_is_narrowed_where_that_is_worth_more():
         by_model.adapt(of(base), lanes, dataclasses.replace(JUDGING, bounds=shares), labels=own_labels(-8.0, 40))
         for shares in ((), (0.5, 0.05))
     )
-    assert (wide.judged.before[0], wide.judged.after[0], wide.judged.used[0]) == (0.0, 0.0, False)
-    assert wide.judged.within_deg.tolist() == pytest.approx([60.0])
-    assert (narrow.judged.after[0], narrow.judged.used[0]) == (1.0, True)
-    assert narrow.judged.within_deg.tolist() == pytest.approx([3.0])
+    assert (wide.judgement.before[0], wide.judgement.after[0], wide.judgement.in_use[0]) == (0.0, 0.0, False)
+    assert wide.judgement.within_deg.tolist() == pytest.approx([60.0])
+    assert (narrow.judgement.after[0], narrow.judgement.in_use[0]) == (1.0, True)
+    assert narrow.judgement.within_deg.tolist() == pytest.approx([3.0])
     episodes = 3 * 20 + 2 * 10, 2 * 20  # the three bounds, then pairs until the test decides
-    spent = narrow.judged.rewarded_steps[0], wide.judged.rewarded_steps[0]
+    spent = narrow.judgement.rewarded_steps[0], wide.judgement.rewarded_steps[0]
     assert spent == tuple(count * JUDGING.steps for count in episodes)
     assert errors(narrow.policy(ENV), 0) == pytest.approx(5.0, abs=0.01)
 

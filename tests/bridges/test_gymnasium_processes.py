@@ -107,7 +107,7 @@ def test_pictures_are_of_the_state_that_is_shown(tmp_path):
     assert len(rewards) == 9
     pictures.question(env, states[2], None, jnp.float32([-0.5]), tmp_path / "question.png")
     assert Image.open(tmp_path / "question.png").size == (48, 16)
-    (drawn,) = pids(env.replace(source=dataclasses.replace(env.source, drawn=True)))
+    (drawn,) = pids(env.replace(source=dataclasses.replace(env.source, draws=True)))
     pool.close_all()
     assert not is_alive(drawn)
 

@@ -135,18 +135,18 @@ def test_a_folder_that_is_damaged_or_changed_is_refused(folder, tmp_path):
         before = (there / name).read_bytes()
         (there / name).write_bytes(before[:50] + bytes([before[50] ^ 1]) + before[51:])
         with pytest.raises(UserError, match=name):
-            contract.replay_golden_cases(there)
+            contract.open_decision(there)
         (there / name).write_bytes(before)
     text = (there / runner.CONTRACT).read_text()
     (there / runner.CONTRACT).write_text(text.replace('"unit": "1"', '"unit": "m"'))
     with pytest.raises(UserError, match="was changed"):
-        contract.replay_golden_cases(there)
+        contract.open_decision(there)
     (there / runner.CONTRACT).write_text(text)
     (there / "golden.npz").unlink()
     with pytest.raises(UserError, match=r"golden.npz cannot be read"):
-        contract.replay_golden_cases(there)
+        contract.open_decision(there)
     with pytest.raises(UserError, match="cannot be read"):
-        contract.replay_golden_cases(tmp_path / "nowhere")
+        contract.open_decision(tmp_path / "nowhere")
 
 
 def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_path):
@@ -159,7 +159,19 @@ def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_
     (there / "decision.stablehlo").write_bytes(changed.serialize())
     edit_contract(there)
     with pytest.raises(UserError, match="calls Python functions"):
-        contract.replay_golden_cases(there)
+        contract.open_decision(there)
+
+
+def test_what_this_program_cannot_run_is_told_in_one_line(folder, tmp_path):
+    there = copied(folder / "stablehlo", tmp_path)
+    (there / "decision.stablehlo").write_bytes((there / "decision.stablehlo").read_bytes()[:3000])
+    edit_contract(there, lambda told: told["artefact"].update(jax="0.99.1"))
+    with pytest.raises(UserError, match=r"exported with JAX 0\.99\.1, and JAX .* cannot call it") as refused:
+        contract.open_decision(there)
+    assert "\n" not in str(refused.value)
+    edit_contract(there, lambda told: told.update(version=runner.VERSION + 1))
+    with pytest.raises(UserError, match="newer cuelearner"):
+        contract.open_decision(there)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +204,7 @@ def test_golden_cases_are_those_that_rounding_does_not_turn():
     policy = Opaque(lambda obs: jnp.where(obs[:, 1:] > 0, 1.0, -1.0) * jnp.array([[0.6, 0.8]]))
     drawn = np.concatenate([np.stack([np.ones(20), np.linspace(-1e-8, 1e-8, 20)], -1), DRAWN[1:]]).astype(np.float32)
     golden = decisions.golden_cases(policy, drawn, decisions.trace_policy(policy, 2))
-    assert golden.drawn == len(drawn)
+    assert golden.candidates == len(drawn)
     assert len(DRAWN) - 1 <= golden.steady <= len(DRAWN) + 8  # of the twenty near the jump, chance may leave a few
     with pytest.raises(UserError, match="change with the last digits"):
         decisions.golden_cases(policy, drawn[9:11], decisions.trace_policy(policy, 2))

@@ -14,7 +14,7 @@ from cuelearner_jax.environment import BASE
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import lerobot
 from cuelearner_jax.policies import Heuristic
-from cuelearner_jax.reading import Read
+from cuelearner_jax.reading import ReadingPolicy
 from cuelearner_jax.reading.families import ACTIONS_ALONE
 from cuelearner_jax.reading.policy import unread
 from cuelearner_jax.tasks import logs
@@ -65,7 +65,7 @@ def env():
 
 
 @pytest.fixture(scope="module")
-def policy(env) -> Read:
+def policy(env) -> ReadingPolicy:
     """A correction with a shift, gains and a process of the state and the phase; one entry never changed."""
     read = unread(Heuristic(env.view()), env.actions, ACTIONS_ALONE, env.obs_size, labels=6)
     random = lambda number, *shape: jax.random.normal(jax.random.key(number), shape)  # noqa: E731

@@ -185,7 +185,7 @@ def test_the_human_model_leads_the_policy_by_eps_at_most_and_along_all_cues():
     targets = jax.jit(guide.policy_targets)
     still = targets(ENV, params, rows, acted, SCALARS)
     np.testing.assert_allclose(still.target, acted, atol=1e-6)  # it says "already right"
-    assert still.said.all()
+    assert still.cues.all()
     loud = jax.tree.map(lambda leaf: jnp.full_like(leaf, 9.0) if leaf.shape == (3,) else leaf, params)
     moved = targets(ENV, loud, rows, acted, SCALARS)
     np.testing.assert_allclose(log(acted, moved.target), SCALARS.eps_deg, rtol=1e-5)

@@ -11,7 +11,7 @@ import pytest
 import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.runs import lanes, trained
+from cuelearner_jax.runs import lanes, policy_sources
 from cuelearner_jax.runs.grid import Grid, load
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.storage import results
@@ -93,7 +93,7 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
     found = []
     for folder in (sick, healthy):
         _, config, grid = load(folder, {TASK.name: TASK}.__getitem__)
-        source = trained.PolicySource(TASK, config, grid, folder)
+        source = policy_sources.PolicySource(TASK, config, grid, folder)
         found += evaluate.run(source, evaluate.EvaluateRequest(task=config.task, envs=10, steps=10))
         policies = source.load()[0].policies
         np.testing.assert_array_equal(policies["failed"], [False, folder == sick, False])
@@ -101,9 +101,9 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
     assert [row.seeds.tolist() for row in found] == [[3, 8], [3, 5, 8]]
     np.testing.assert_array_equal(found[0].metrics["reward"], found[1].metrics["reward"][[0, 2]])
     assert "none: seed 5 failed, no longer finite: left out" in capsys.readouterr().err
-    source = trained.PolicySource(TASK, CONFIG, GRID, sick)
+    source = policy_sources.PolicySource(TASK, CONFIG, GRID, sick)
     for seed, says in ((3, ""), (5, "seed 5 failed, no longer finite: this is its last finite state\n")):
-        trained.one_policy(source, CONFIG.task, "agent", "none", None, seed)
+        policy_sources.several(source, CONFIG.task, "agent", "none", None, (seed,))
         assert capsys.readouterr().err == says
 
 
@@ -120,7 +120,7 @@ def test_diverging_from_the_command_line_and_from_python(tmp_path):
     with pytest.raises(NotFinite, match="3 of 3 lanes failed"):
         train.run(Order(TASK, wild, grid, tmp_path / "run"))
     _, config, grid = load(tmp_path / "run", {TASK.name: TASK}.__getitem__)
-    source = trained.PolicySource(TASK, config, grid, tmp_path / "run")
+    source = policy_sources.PolicySource(TASK, config, grid, tmp_path / "run")
     with pytest.raises(UserError, match="all of these lanes failed"):
         evaluate.run(source, evaluate.EvaluateRequest(task=config.task, envs=10, steps=10))
     with pytest.warns(UserWarning, match=r"3 of 3 lanes failed, no longer finite .*: leave out the rows"):

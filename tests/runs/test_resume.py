@@ -21,7 +21,7 @@ from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes, runner, training
 from cuelearner_jax.runs.grid import Grid, run_key
 from cuelearner_jax.runs.order import Order
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.policy_sources import PolicySource
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
@@ -171,13 +171,13 @@ def test_a_run_that_is_cut_short_again_and_again_while_it_asks_goes_on_as_one(wh
         run(out)
     assert newest(out, "relative")[1] == 3
     # Round 4 is saved, round 5 is asked, then the process dies.
-    with killed_at(2, "_stop_if_asked"), pytest.raises(Killed):
+    with killed_at(2, "_stop_on_signal"), pytest.raises(Killed):
         run(out, resume=True)
     assert newest(out, "relative")[1] == 4
     assert not (out / "relative" / "labels.parquet").exists()
     with killed_at(1, "_train"), pytest.raises(Killed):  # all labels are there, and no row
         run(out, resume=True)
-    with killed_at(1, "_stop_if_asked"), pytest.raises(Killed):
+    with killed_at(1, "_stop_on_signal"), pytest.raises(Killed):
         run(out, resume=True)
     assert {row["step"] for row in rows(out)} == {0, 16}
     run(out, resume=True)
@@ -191,7 +191,7 @@ def test_a_run_that_is_cut_short_again_and_again_while_it_trains_goes_on_as_one(
         table.write('{"step": 48, "se')
     (out / "relative" / label_files.PARQUET).write_bytes(b"PAR1")
     # The row of step 80 is on disk, its checkpoint (at 64) is not the newest state.
-    with killed_at(2, "_stop_if_asked"), pytest.raises(Killed):
+    with killed_at(2, "_stop_on_signal"), pytest.raises(Killed):
         run(out, resume=True)
     assert newest(out, "relative")[1] == 6 + 64
     assert max(row["step"] for row in rows(out)) == 80

@@ -10,7 +10,7 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import checkpoint
-from cuelearner_jax.storage.checkpoint import KEPT, Checkpoints
+from cuelearner_jax.storage.checkpoint import MOST_CHECKPOINTS, Checkpoints
 
 pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
 
@@ -66,7 +66,7 @@ def test_the_newest_comes_back_bit_by_bit(saved):
         state(12)["block"][1]["keys"][1]
     )
     assert sorted(path.name for path in saved.iterdir()) == ["12", "5"]
-    assert KEPT == 2
+    assert MOST_CHECKPOINTS == 2
 
 
 def test_a_part_can_be_read_without_the_rest_and_reading_changes_nothing(saved, tmp_path):

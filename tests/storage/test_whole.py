@@ -18,7 +18,7 @@ class Killed(BaseException):
 
 def check(folder):
     """Whatever holds a file `ours` may be replaced."""
-    if whole.is_used(folder) and not (folder / "ours").exists():
+    if whole.is_occupied(folder) and not (folder / "ours").exists():
         raise UserError(f"{folder} is not ours")
 
 

@@ -71,10 +71,7 @@ class Leaf(NamedTuple):
 
 
 def leaves_of(whose: str, space: Any, path: tuple[Any, ...] = ()) -> tuple[Leaf, ...]:
-    """Return the entries of a space of observations, in the order of the space.
-
-    Raises UserError for images and for spaces that have no vectors; `whose`: for the message.
-    """
+    """Return the entries of a space of observations, in the order of the space; `whose`: for the message."""
     kind = type(space).__name__
     if kind in ("Dict", "Tuple"):
         parts = space.spaces.items() if kind == "Dict" else enumerate(space.spaces)
@@ -180,7 +177,7 @@ class Running:
         self.leaves = leaves_of(self.whose, self.env.observation_space)
         self.to_action = action_maker(self.env.action_space)
         self.seed, self.steps, self.total, self.place = -1, 0, 0.0, b""
-        self.used = -RECENT  # number of the call that used it last
+        self.last_use = -RECENT  # number of the call that used it last
         self.filmed = np.zeros((0, 0), np.float32)  # actions so far, where it is filmed
         self.reports_success = False
 
@@ -222,9 +219,9 @@ class Running:
         step = f"step {self.steps} of the episode" if self.steps else "its reset"
         return f"{step} with seed {self.seed}"
 
-    def _called(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    def _called(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         try:
-            return function(*arguments, **named)
+            return function(*arguments, **options)
         except Exception as error:
             raise user_code_error(f"{self.whose}, in {self._when},", error) from error
 
@@ -289,11 +286,11 @@ class Instances:
         standing: dict[bytes, list[Running]] = defaultdict(list)
         for one in self.running:
             standing[one.place].append(one)
-        chosen = [standing[row.place].pop() if row.place and standing[row.place] else None for row in requests]
-        for one in filter(None, chosen):
-            one.used = self.calls
-        free = iter(sorted((one for one in self.running if one.used < self.calls), key=lambda one: one.used))
-        return [self._result(request, one, free) for request, one in zip(requests, chosen, strict=True)]
+        instances = [standing[row.place].pop() if row.place and standing[row.place] else None for row in requests]
+        for one in filter(None, instances):
+            one.last_use = self.calls
+        free = iter(sorted((one for one in self.running if one.last_use < self.calls), key=lambda one: one.last_use))
+        return [self._result(request, one, free) for request, one in zip(requests, instances, strict=True)]
 
     def _result(self, request: Request, one: Running | None, free: Iterator[Running]) -> Went | str | None:
         if one is None and request.place and request.history is None:
@@ -319,11 +316,11 @@ class Instances:
     def _vacated(self, free: Iterator[Running], replays: bool) -> Running:
         """Return the least recently used instance, or a new one where a state in use would be lost."""
         one = next(free, None)
-        wanted = one is not None and one.used > self.calls - RECENT
+        wanted = one is not None and one.last_use > self.calls - RECENT
         if one is None or (wanted and replays and len(self.running) < MOST_INSTANCES):
             one = self._new()
             self.running.append(one)
-        one.used = self.calls
+        one.last_use = self.calls
         return one
 
     def _new(self) -> Running:

@@ -58,7 +58,7 @@ class Process:
             str(os.getpid()),
         ]
         paths = os.pathsep.join([str(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])
-        environ = {**os.environ, "PYTHONPATH": paths, **(drawing_variables() if source.drawn else {})}
+        environ = {**os.environ, "PYTHONPATH": paths, **(drawing_variables() if source.draws else {})}
         # An environment's prints must not mix with our output.
         self.child = subprocess.Popen(
             command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2, env=environ
@@ -121,12 +121,10 @@ class Pool:
         self.hosts: dict[int, Process | Here] = {}
 
     def carry_out(self, requests: Mapping[int, Request], history: Callable[[int], np.ndarray] | None) -> list[Went]:
-        """Carry out the rows of a call. Raises UserError for the first that fails.
+        """Carry out the rows of a call, each by its number. Raises UserError for the first that fails.
 
-        Args:
-            requests: by the number of the row, which says what process plays the row.
-            history: number of a row -> its actions (steps, action) so far, asked for where no instance stands at its
-                place; None: all rows begin episodes.
+        `history`: number of a row -> its actions (steps, action) so far, asked for where no instance stands at its
+        place; None: all rows begin episodes.
         """
         with self.lock:
             results = self._results(requests)

@@ -34,30 +34,30 @@ class Source:
     processes: int  # 0: one for each processor; 1: this one
     size: int = 0  # entries of an observation
     factory: Callable[..., Any] | None = None  # None: by the id
-    drawn: bool = False  # True if its instances are drawn, which takes one process
+    draws: bool = False  # True if its instances are drawn, which takes one process
 
     @property
     def hosts(self) -> int:
         """Number of processes that play."""
-        return 1 if self.drawn else self.processes or cores()
+        return 1 if self.draws else self.processes or cores()
 
     @property
     def plays_here(self) -> bool:
         """Whether instances are played in this process. Drawn ones are not: OpenGL does not work across threads."""
-        return self.hosts == 1 and not self.drawn
+        return self.hosts == 1 and not self.draws
 
     @property
     def make(self) -> Callable[[], Any]:
         """A function without arguments that makes one instance."""
-        named = json.loads(self.arguments)
-        if self.drawn and (self.factory is None or _takes(self.factory, "render_mode")):
-            named["render_mode"] = "rgb_array"
+        arguments = json.loads(self.arguments)
+        if self.draws and (self.factory is None or _takes(self.factory, "render_mode")):
+            arguments["render_mode"] = "rgb_array"
         if self.factory is not None:
-            return partial(make_from_code, self.factory, named)
+            return partial(make_from_code, self.factory, arguments)
         import gymnasium
 
         spec = gymnasium.registry.get(self.name)  # of the caller's own registry, which another process lacks
-        return partial(make_registered, self.name, named, self.max_steps, spec)
+        return partial(make_registered, self.name, arguments, self.max_steps, spec)
 
 
 def _takes(factory: Callable[..., Any], name: str) -> bool:
@@ -81,10 +81,7 @@ def check_installed() -> None:
 
 
 def registry_spec(name: str) -> Any:
-    """Return the specification of an id in Gymnasium's registry, without importing the id's module.
-
-    Raises UserError for an id that is not there.
-    """
+    """Return the specification of an id in Gymnasium's registry, without importing the id's module."""
     check_installed()
     if ":" in name:
         raise UserError(

@@ -26,7 +26,7 @@ Scalar = float | Float[Array, ""]
 SENSOR_NOISE = 0.02  # standard deviation of a scanner's range error [m]
 CONTROL_STEPS = 10  # per step of navigation: 0.2 s at 50 Hz
 TURNING_TIME = 0.3  # time constant of the commanded turn toward the heading; the turn rate stays bounded [s]
-# The command changes by no more than this [m/s^2, rad/s^2]: of robots told other ways at once 11% fell within 10 s
+# The command changes by no more than this [m/s^2, rad/s^2]: of robots turned other ways at once 11% fell within 10 s
 # (docs/data/anymal_fit.json), with these bounds none.
 ACCELERATION, TURN_ACCELERATION = 8.0, 20.0
 
@@ -37,7 +37,7 @@ class LeggedWalker(struct.PyTreeNode):
     body: AnymalState
     last_action: Float[Array, "12"]  # of the walking policy
     # the walking policy's command: velocity forward and to the left [m/s], turning rate [rad/s]
-    told: Float[Array, "3"]
+    command: Float[Array, "3"]
     goal: Float[Array, "2"]  # [m]
     previous: Float[Array, "3 2"]  # actions, the latest first, as they were given; zeros before the first
     world: Int[Array, ""]
@@ -59,47 +59,47 @@ class LeggedNavigation(Navigation, kw_only=True):
     ground: AnymalGround = AnymalGround()
     control_steps: int = struct.field(pytree_node=False, default=CONTROL_STEPS)  # `period` is that many times 0.02 s
 
-    def moved(self, state: LeggedWalker, action: Float[Array, "2"]) -> LeggedWalker:
+    def move(self, state: LeggedWalker, action: Float[Array, "2"]) -> LeggedWalker:
         """Return the state after a step, without a reset."""
         heading = rotate(action, state.pose[2])
 
         def one(carry: tuple, _: None) -> tuple[tuple, None]:
-            body, last_action, told, fallen = carry
-            last_action, told = self.act(body, last_action, told, heading)
+            body, last_action, command, fallen = carry
+            last_action, command = self.act(body, last_action, command, heading)
             after, felt = control(body, last_action, self.ground)
             # a robot whose numbers diverged counts as fallen and stays where it was
             sound = jnp.isfinite(after.qvel).all()
             body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, body)
-            return (body, last_action, told, fallen | felt.fallen), None
+            return (body, last_action, command, fallen | felt.fallen), None
 
-        start = (state.body, state.last_action, state.told, state.fallen)
-        (body, last_action, told, fallen), _ = jax.lax.scan(one, start, length=self.control_steps)
+        start = (state.body, state.last_action, state.command, state.fallen)
+        (body, last_action, command, fallen), _ = jax.lax.scan(one, start, length=self.control_steps)
         return state.replace(
             body=body,
             last_action=last_action,
-            told=told,
+            command=command,
             previous=latest_first(action, state.previous),
             steps=state.steps + 1,
             fallen=fallen,
         )
 
     def act(
-        self, body: AnymalState, last_action: Float[Array, "12"], told: Float[Array, "3"], heading: Float[Array, "2"]
+        self, body: AnymalState, last_action: Float[Array, "12"], before: Float[Array, "3"], heading: Float[Array, "2"]
     ) -> tuple[Float[Array, "12"], Float[Array, "3"]]:
-        """Return the walking policy's action and its command, on the way from `told` to walking toward `heading`."""
-        told = self.command(body, told, heading)
-        return self.walking(observe(body.qpos, body.qvel, last_action, told)), told
+        """Return the walking policy's action and its command, on the way from `before` to walking toward `heading`."""
+        command = self.command(body, before, heading)
+        return self.walking(observe(body.qpos, body.qvel, last_action, command)), command
 
-    def command(self, body: AnymalState, told: Float[Array, "3"], heading: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Return the command that follows `told` on the way toward a heading, a unit vector in the world's frame."""
+    def command(self, body: AnymalState, before: Float[Array, "3"], heading: Float[Array, "2"]) -> Float[Array, "3"]:
+        """Return the command that follows `before` on the way toward a heading, a unit vector in the world's frame."""
         yaw = robot.planar_pose(body.qpos)[2]
         off = difference(from_angle(yaw), heading)
         turning = jnp.clip(off / TURNING_TIME, -self.robot.turn_rate, self.robot.turn_rate)
-        change = self.robot.speed * rotate(heading, -yaw) - told[:2]
+        change = self.robot.speed * rotate(heading, -yaw) - before[:2]
         most = ACCELERATION * robot.CONTROL_PERIOD
         change = change * (most / jnp.maximum(jnp.linalg.norm(change), most))
         most = TURN_ACCELERATION * robot.CONTROL_PERIOD
-        return told + jnp.append(change, jnp.clip(turning - told[2], -most, most))
+        return before + jnp.append(change, jnp.clip(turning - before[2], -most, most))
 
     def failures(self, state: LeggedWalker) -> dict[str, Bool[Array, ""]]:
         """Return the failures that end an episode, by name; at most one holds."""
@@ -136,7 +136,7 @@ class LeggedNavigation(Navigation, kw_only=True):
         return LeggedWalker(
             body=body.replace(qpos=body.qpos.at[:7].set(place)),
             last_action=jnp.zeros(robot.JOINTS),
-            told=jnp.zeros(3),
+            command=jnp.zeros(3),
             goal=goal,
             previous=previous,
             world=world,

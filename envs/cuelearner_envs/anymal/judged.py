@@ -119,15 +119,15 @@ class Course:
 
         `each` is called with the configurations after every control step.
         """
-        body, last, told = self.state.body, self.state.last_action, self.state.told
+        body, last, command = self.state.body, self.state.last_action, self.state.command
         headings = rotate(actions, jnp.asarray(_poses(body.qpos))[:, 2])
         for _ in range(self.env.control_steps):
-            last, told = _act(self.env, body, last, told, headings)
+            last, command = _act(self.env, body, last, command, headings)
             self.judge.control(np.asarray(last))
             body = body.replace(qpos=jnp.asarray(self.judge.qpos), qvel=jnp.asarray(self.judge.qvel))
             if each:
                 each(self.judge.qpos)
-        changes = {"body": body, "last_action": last, "told": told, "fallen": jnp.asarray(self.judge.fallen)}
+        changes = {"body": body, "last_action": last, "command": command, "fallen": jnp.asarray(self.judge.fallen)}
         self.state, self.obs, ends = _after(self.env, self.state, actions, changes)
         outcome, terminated, truncated = jax.device_get(ends)
         self.judge.retired |= terminated | truncated

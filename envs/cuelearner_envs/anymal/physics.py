@@ -82,9 +82,9 @@ def control(body: AnymalState, action: Float[Array, "12"], ground: AnymalGround)
     def one(carry: AnymalState, _: None) -> tuple[AnymalState, tuple[jax.Array, ...]]:
         begun = data.replace(qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart, ctrl=targets)
         with jax.default_matmul_precision("highest"):  # an accelerator would round the factors to three digits
-            done = mjx.step(model, begun)
-        heights = done.geom_xpos[feet, 2], done.xpos[places["shanks"], 2], done.actuator_force
-        return AnymalState(done.qpos, done.qvel, done.qacc_warmstart), heights
+            after = mjx.step(model, begun)
+        heights = after.geom_xpos[feet, 2], after.xpos[places["shanks"], 2], after.actuator_force
+        return AnymalState(after.qpos, after.qvel, after.qacc_warmstart), heights
 
     steps = round(robot.CONTROL_PERIOD / float(robot.load().opt.timestep))
     body, states = jax.lax.scan(one, body, length=steps)

@@ -38,7 +38,7 @@ class LeggedFrame(NamedTuple):
     goal: Float[np.ndarray, "2"]  # [m]
     goal_radius: float  # nearer than this, the goal is reached [m]
     ends: Float[np.ndarray, "271 3"]  # where the beams end that were perceived at the step's beginning [m]
-    met: Bool[np.ndarray, " 271"]  # which of them end at something
+    hits: Bool[np.ndarray, " 271"]  # which of them end at something
     qpos: Float[np.ndarray, "control 19"]  # after each step of control, see `model`
     outcome: str  # one of `ENDS` if the episode ended with this step, otherwise empty
     episode: int  # counted from 0
@@ -55,21 +55,21 @@ def record(
             episode += 1
             course = Course(env, jax.random.fold_in(key, episode)[None])
         state = jax.tree.map(lambda leaf: leaf[0], course.state)
-        ends, met, world = jax.device_get(see(env, state))
+        ends, hits, world = jax.device_get(see(env, state))
         configurations: list[np.ndarray] = []
         action = choose(jax.random.fold_in(key, number), course.state, course.obs)
-        outcome, ended = course.step(action, each=lambda qpos, kept=configurations: kept.append(qpos[0]))
-        named = [name for name in ENDS if outcome.get(name, np.zeros(1))[0]]
-        rewards.append(10.0 if "success" in named else 0.0 if named in ([], ["timeout"]) else -10.0)
+        outcome, ended = course.step(action, each=lambda qpos, rows=configurations: rows.append(qpos[0]))
+        names = [name for name in ENDS if outcome.get(name, np.zeros(1))[0]]
+        rewards.append(10.0 if "success" in names else 0.0 if names in ([], ["timeout"]) else -10.0)
         frames.append(
             LeggedFrame(
                 world=world,
                 goal=np.asarray(state.goal),
                 goal_radius=float(env.goal_radius),
                 ends=ends,
-                met=met,
+                hits=hits,
                 qpos=np.stack(configurations),
-                outcome="".join(named),
+                outcome="".join(names),
                 episode=episode,
             )
         )
@@ -84,7 +84,7 @@ def still(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
     with Studio(furnish(frame.world, frame.goal, frame.goal_radius), *STILL) as studio:
         studio.pose(frame.qpos[0])
         camera = unobstructed(studio.model, studio.data, distance=4.5)
-        imageio.imwrite(Path(file), studio.picture(camera, frame.ends, frame.met))
+        imageio.imwrite(Path(file), studio.picture(camera, frame.ends, frame.hits))
 
 
 def animate(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
@@ -102,8 +102,8 @@ def _perceived(env: LeggedNavigation, state: Any) -> tuple[jax.Array, jax.Array,
     ahead = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
     beams = ahead[:, :1] * turn[:, 0] + ahead[:, 1:] * turn[:, 1]
     ranges = env.ranges(state)
-    met = ranges < 0.999 * jnp.asarray(env.lidar.max_range)
-    return state.body.qpos[:3] + ranges[:, None] * beams, met, env.world(state.world)
+    hits = ranges < 0.999 * jnp.asarray(env.lidar.max_range)
+    return state.body.qpos[:3] + ranges[:, None] * beams, hits, env.world(state.world)
 
 
 def _pictures(frames: Sequence[LeggedFrame], fps: float) -> Iterator[Picture]:
@@ -119,7 +119,7 @@ def _pictures(frames: Sequence[LeggedFrame], fps: float) -> Iterator[Picture]:
                 studio.pose(qpos)
                 side = unobstructed(studio.model, studio.data, near)
                 near = side.azimuth  # it stays there until something comes in between
-                views = [studio.picture(camera, frame.ends, frame.met) for camera in (high, side)]
+                views = [studio.picture(camera, frame.ends, frame.hits) for camera in (high, side)]
                 picture = np.concatenate(views, axis=1)
                 yield picture
             if episode[-1].outcome and picture is not None:

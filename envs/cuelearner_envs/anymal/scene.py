@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.navigation.world import NavigationWorld, tallness, used
+from cuelearner_envs.navigation.world import NavigationWorld, solids_of, tallness
 from cuelearner_jax.errors import UserError
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -36,12 +36,12 @@ def furnish(world: NavigationWorld, goal: Float[np.ndarray, "2"], goal_radius: f
     """Return the robot's model with a world's solids and the goal, for drawing only."""
     spec = mujoco.MjSpec.from_file(str(robot.FILE))
     look: dict[str, Any] = {"contype": 0, "conaffinity": 0}
-    for (x, y, yaw, length, width), height in used(world.boxes, world.box_heights):
+    for (x, y, yaw, length, width), height in solids_of(world.boxes, world.box_heights):
         turn = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
         size, place = [length, width, height / 2], [x, y, height / 2]
         kind = mujoco.mjtGeom.mjGEOM_BOX
         spec.worldbody.add_geom(type=kind, pos=place, quat=turn, size=size, rgba=_shade(height), **look)
-    for (x, y, radius), height in used(world.circles, world.circle_heights):
+    for (x, y, radius), height in solids_of(world.circles, world.circle_heights):
         size, place = [radius, height / 2, 0], [x, y, height / 2]
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER
         spec.worldbody.add_geom(type=kind, pos=place, size=size, rgba=_shade(height), **look)
@@ -83,26 +83,26 @@ class Studio:
         self,
         camera: mujoco.MjvCamera,
         ends: Float[np.ndarray, "beams 3"] | None = None,
-        met: Bool[np.ndarray, " beams"] | None = None,
+        hits: Bool[np.ndarray, " beams"] | None = None,
     ) -> Picture:
         """Render a camera's view, with the lidar's beams up to their ends [m] and dots at their hits."""
         option, every = mujoco.MjvOption(), mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, self.data, option, None, camera, every, self._scene)
-        if ends is not None and met is not None:
-            self._draw(ends, met)
+        if ends is not None and hits is not None:
+            self._draw(ends, hits)
         rectangle = mujoco.MjrRect(0, 0, *self.size)
         mujoco.mjr_render(rectangle, self._scene, self._context)
         picture = np.empty((self.size[1], self.size[0], 3), np.uint8)
         mujoco.mjr_readPixels(picture, None, rectangle, self._context)
         return picture[::-1]
 
-    def _draw(self, ends: Float[np.ndarray, "beams 3"], met: Bool[np.ndarray, " beams"]) -> None:
+    def _draw(self, ends: Float[np.ndarray, "beams 3"], hits: Bool[np.ndarray, " beams"]) -> None:
         origin = np.asarray(self.data.site("lidar").xpos)
         line, ball = mujoco.mjtGeom.mjGEOM_LINE, mujoco.mjtGeom.mjGEOM_SPHERE
         for number, end in enumerate(np.asarray(ends, float)):
             if number % BEAMS_APART == 0:
                 mujoco.mjv_connector(self._added(line, BEAM), line, 1.0, origin, end)
-            if met[number]:
+            if hits[number]:
                 self._added(ball, HIT, end)
 
     def _added(self, kind: Any, colour: tuple, place: np.ndarray | None = None) -> Any:

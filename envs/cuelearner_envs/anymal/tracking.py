@@ -32,7 +32,7 @@ TRIALS = {
 }
 
 
-def _chosen(
+def _choose(
     policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, index: Array, qpos: Array, qvel: Array, last: Array
 ) -> tuple[Array, Array, PRNGKeyArray]:
     """Return a robot's action and command in a step, and the key of its pushes."""
@@ -51,7 +51,7 @@ def walk(
 
     def one(ground: AnymalGround, key: PRNGKeyArray, state: tuple, index: jax.Array) -> tuple[tuple, tuple]:
         body, last_action, down = state
-        action, command, k_push = _chosen(policy, trial, key, index, body.qpos, body.qvel, last_action)
+        action, command, k_push = _choose(policy, trial, key, index, body.qpos, body.qvel, last_action)
         after, felt = control(push_randomly(k_push, body, trial), action, ground)
         down = down | felt.fallen
         body = jax.tree.map(partial(jnp.where, down), body, after)  # a fallen robot stays where it is
@@ -82,7 +82,7 @@ def walk_in_mujoco(
         """Actions, commands and pushes of a step."""
 
         def one(key: PRNGKeyArray, qpos: jax.Array, qvel: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
-            action, command, k_push = _chosen(policy, trial, key, index, qpos, qvel, last)
+            action, command, k_push = _choose(policy, trial, key, index, qpos, qvel, last)
             after = push_randomly(k_push, AnymalState(qpos, qvel, qvel), trial).qvel
             return action, command, after[:2] - qvel[:2]
 

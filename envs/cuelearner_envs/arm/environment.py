@@ -54,7 +54,7 @@ class Camera(struct.PyTreeNode):
     turn: Scalar = 0.0  # about the vertical through the robot's base, counterclockwise [rad]
     offset: Float[Array, "3"] | tuple[float, ...] = (0.0, 0.0, 0.0)  # added afterwards [m]
 
-    def seen(self, place: Float[Array, "3"]) -> Float[Array, "3"]:
+    def view_of(self, place: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return the observed position of a point [m]."""
         cos, sin, base = jnp.cos(self.turn), jnp.sin(self.turn), jnp.asarray(BASE)
         x, y = place[:2] - base
@@ -160,11 +160,11 @@ class Arm(WholeObservations, struct.PyTreeNode):
         """Return what is seen, in the order of Fetch's flattened observations; `camera`: in place of the own one."""
         camera = self.camera if camera is None else camera
         place, velocity = self.gripper(state), state.body.qvel[physics.GRIPPER] * arm.CONTROL_PERIOD
-        goal = camera.seen(state.goal)
+        goal = camera.view_of(state.goal)
         if not self.has_object:
             return jnp.concatenate([place, goal, place, jnp.zeros(2), velocity, jnp.zeros(2)])
         body = state.body
-        cube = camera.seen(self.cube(state))
+        cube = camera.view_of(self.cube(state))
         turn = rotation(body.qpos[physics.CUBE][3:])
         moving = body.qvel[physics.CUBE_VELOCITY] * arm.CONTROL_PERIOD - velocity
         turning = jnp.sum(turn * body.qvel[physics.CUBE_TURNING][None], -1) * arm.CONTROL_PERIOD

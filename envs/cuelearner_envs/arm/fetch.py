@@ -21,7 +21,7 @@ CLEAR = 0.42  # of the gripper [m]: lower, Fetch's fingers touch the table
 ACHIEVED, RELATIVE = slice(0, 3), slice(12, 15)  # in an observation
 
 
-class Played(struct.PyTreeNode):
+class FetchState(struct.PyTreeNode):
     """State between steps."""
 
     episode: Any  # of what plays Fetch
@@ -41,21 +41,21 @@ class FetchArm(Arm, kw_only=True):
 
     plays: Environment  # Fetch, whose observations are those of an unchanged camera
 
-    def reset(self, key: PRNGKeyArray) -> tuple[Played, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[FetchState, Float[Array, " obs"]]:
         """Begin an episode, as Fetch draws it."""
-        state = Played(*self.plays.reset(key))
+        state = FetchState(*self.plays.reset(key))
         return state, self.observe(state)
 
-    def step(self, key: PRNGKeyArray, state: Played, action: Float[Array, "4"]) -> tuple[Played, Step]:
+    def step(self, key: PRNGKeyArray, state: FetchState, action: Float[Array, "4"]) -> tuple[FetchState, Step]:
         """Execute an action; a new episode follows the end of one.
 
         Its target keeps within the workspace, as in `physics.command`, and above the table. Fetch itself would press
         the fingers on it, where friction holds them.
         """
         lowest, highest = (jnp.asarray(WORKSPACE).at[0, 2].set(CLEAR) - state.true[None, GRIPPER]) / REACH
-        moved = jnp.clip(jnp.clip(action[:3], lowest, highest), -1.0, 1.0)
-        episode, step = self.plays.step(key, state.episode, action.at[:3].set(moved))
-        following, after = Played(episode, step.obs), Played(episode, step.final_obs)
+        change = jnp.clip(jnp.clip(action[:3], lowest, highest), -1.0, 1.0)
+        episode, step = self.plays.step(key, state.episode, action.at[:3].set(change))
+        following, after = FetchState(episode, step.obs), FetchState(episode, step.final_obs)
         final_obs, distance = self.observe(after), self.distance(after)
         success = (distance < self.within).astype(jnp.float32)
         return following, step.replace(
@@ -67,21 +67,21 @@ class FetchArm(Arm, kw_only=True):
             outcome={"success": success, "distance": distance},
         )
 
-    def gripper(self, state: Played) -> Float[Array, "3"]:
+    def gripper(self, state: FetchState) -> Float[Array, "3"]:
         """Return the gripper's place [m]."""
         return state.true[GRIPPER]
 
-    def cube(self, state: Played) -> Float[Array, "3"]:
+    def cube(self, state: FetchState) -> Float[Array, "3"]:
         """Return the place of the cube's middle [m]."""
         return state.true[OBJECT]
 
-    def observe(self, state: Played, camera: Camera | None = None) -> Float[Array, " obs"]:
+    def observe(self, state: FetchState, camera: Camera | None = None) -> Float[Array, " obs"]:
         """Return what the camera sees; `camera`: in place of the robot's own."""
         camera, true = self.camera if camera is None else camera, state.true
-        view = true.at[GOAL].set(camera.seen(state.goal))
+        view = true.at[GOAL].set(camera.view_of(state.goal))
         if not self.has_object:
             return view
-        cube = camera.seen(self.cube(state))
+        cube = camera.view_of(self.cube(state))
         return view.at[ACHIEVED].set(cube).at[OBJECT].set(cube).at[RELATIVE].set(cube - self.gripper(state))
 
 

@@ -115,8 +115,8 @@ def control(body: ArmState, targets: Command, ground: ArmGround) -> ArmState:
         begun = data.replace(qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart, ctrl=ctrl)
         # An accelerator would round the factors of products to three digits. MJX promotes ranks.
         with jax.default_matmul_precision("highest"), jax.numpy_rank_promotion("allow"):
-            done = mjx.step(model, begun)
-        return ArmState(done.qpos, done.qvel, done.qacc_warmstart), None
+            after = mjx.step(model, begun)
+        return ArmState(after.qpos, after.qvel, after.qacc_warmstart), None
 
     return jax.lax.scan(one, body, length=arm.SUBSTEPS)[0]
 

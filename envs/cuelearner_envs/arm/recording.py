@@ -15,7 +15,7 @@ from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
 from cuelearner_envs.arm.drawing import Picture, Scene, draw, points
 from cuelearner_envs.arm.environment import Arm, Situation
-from cuelearner_envs.playing import played
+from cuelearner_envs.playing import record_steps
 from cuelearner_jax import pictures
 from cuelearner_jax.types import Policy, Reel, Sketch
 
@@ -37,7 +37,7 @@ def scene_of(env: Arm, state: Situation, action: Any = None) -> Scene:
 def record(env: Arm, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Picture], list[float]]:
     """Return a picture and the reward of each of so many steps; a new episode follows the end of one."""
 
-    states, rewards = played(env, policy, key, steps, lambda env, state, action, step: (state, step.reward))
+    states, rewards = record_steps(env, policy, key, steps, lambda env, state, action, step: (state, step.reward))
     each = (jax.tree.map(lambda leaf, number=number: leaf[number], states) for number in range(steps))
     return [draw(scene_of(env, state)) for state in each], [float(reward) for reward in rewards]
 
@@ -49,8 +49,8 @@ def question(env: Arm, state: Situation, obs: Float[Array, " obs"], action: Floa
 
 def sketch(env: Arm, state: Situation) -> Sketch:
     """Return the situation for the labelling page."""
-    left = int(env.max_steps) - int(state.steps)
-    drawing = pictures.sketch(draw(scene_of(env, state)), f"{left} steps left; the ring is the goal")
+    rest = int(env.max_steps) - int(state.steps)
+    drawing = pictures.sketch(draw(scene_of(env, state)), f"{rest} steps left; the ring is the goal")
     return drawing._replace(points=points())
 
 

@@ -60,7 +60,7 @@ class ShotState(NamedTuple):
     warped: Float[Array, ""]  # warped time since the strike [s]
     kicks: Int[Array, ""]  # since the strike
     events: Int[Array, ""]
-    done: Bool[Array, ""]
+    is_over: Bool[Array, ""]
 
 
 class Contact(NamedTuple):
@@ -126,14 +126,14 @@ def time_to_stop(table: Table, motion: ShotState, unseen: Scalar) -> Float[Array
 
     Along its direction a ball obeys dv/dt = a - lambda v, `unseen` being the kick due since the last one applied.
     """
-    rate, left = drag(table), 1.0 - drag(table) * motion.warped
+    rate, rest = drag(table), 1.0 - drag(table) * motion.warped
     gx, gy = table.acceleration[0], table.acceleration[1]
-    vx, vy = (motion.ux + gx * unseen) * left, (motion.uy + gy * unseen) * left
+    vx, vy = (motion.ux + gx * unseen) * rest, (motion.uy + gy * unseen) * rest
     speed = jnp.sqrt(vx * vx + vy * vy)
     fast = ~motion.pocketed & (speed > table.stop_speed)
     along = (gx * vx + gy * vy) / jnp.where(fast, speed, 1.0)
     slows = rate * table.stop_speed > along  # else the tilt keeps it faster for ever
-    wait = left * (speed - table.stop_speed) / jnp.where(fast & slows, rate * speed - along, 1.0)
+    wait = rest * (speed - table.stop_speed) / jnp.where(fast & slows, rate * speed - along, 1.0)
     return jnp.max(jnp.where(fast, jnp.where(slows, wait, jnp.inf), 0.0))
 
 
@@ -172,7 +172,7 @@ def step(table: Table, motion: ShotState) -> ShotState:
     rate, slice_ = drag(table), slice_length(table)
     gx, gy = table.acceleration[0], table.acceleration[1]
     tilted = (gx != 0.0) | (gy != 0.0)
-    active = ~motion.done
+    active = ~motion.is_over
     middle = warp(rate, (motion.kicks + 0.5) * slice_)  # where u is the true velocity
 
     contact = next_contact(table, motion)
@@ -186,10 +186,10 @@ def step(table: Table, motion: ShotState) -> ShotState:
     touches = active & ~stops & ~kicks & (contact.wait < jnp.inf)
 
     now = motion.warped + wait
-    moved = motion._replace(x=motion.x + motion.ux * wait, y=motion.y + motion.uy * wait, warped=now)
+    after = motion._replace(x=motion.x + motion.ux * wait, y=motion.y + motion.uy * wait, warped=now)
     falling = contact.a & touches & contact.falls
     contact = contact._replace(a=contact.a & touches & ~contact.falls, b=contact.b & touches)
-    hit = impact(table, moved, contact, kick(rate, middle, now))
+    hit = impact(table, after, contact, kick(rate, middle, now))
 
     gain = jnp.where(kicks, kick(rate, middle, warp(rate, (motion.kicks + 1.5) * slice_)), 0.0)
     pocketed = motion.pocketed | falling
@@ -205,7 +205,7 @@ def step(table: Table, motion: ShotState) -> ShotState:
         warped=now,
         kicks=motion.kicks + kicks,
         events=motion.events + active,
-        done=motion.done | stops,
+        is_over=motion.is_over | stops,
     )
 
 
@@ -232,7 +232,7 @@ def strike(
         warped=zero,
         kicks=count,
         events=count,
-        done=jnp.zeros((), bool),
+        is_over=jnp.zeros((), bool),
     )
 
 
@@ -249,7 +249,7 @@ def simulate(
     positions = jnp.asarray(positions)
     table = as_arrays(table, positions.dtype)
     motion = jax.lax.while_loop(
-        lambda motion: ~motion.done & (motion.events < table.max_events),
+        lambda motion: ~motion.is_over & (motion.events < table.max_events),
         lambda motion: step(table, motion),
         strike(table, positions, jnp.asarray(pocketed, bool), jnp.asarray(angle, positions.dtype)),
     )
@@ -258,7 +258,7 @@ def simulate(
         pocketed=motion.pocketed,
         duration=unwarp(drag(table), motion.warped),
         events=motion.events,
-        exhausted=~motion.done,
+        exhausted=~motion.is_over,
     )
 
 

@@ -16,7 +16,7 @@ from cuelearner_envs import svg
 from cuelearner_envs.billiards.environment import Balls, Billiards
 from cuelearner_envs.billiards.physics import Trajectory, positions_at
 from cuelearner_envs.billiards.table import Table, corner_gap, cushions, parking, pockets
-from cuelearner_envs.playing import played
+from cuelearner_envs.playing import record_steps
 from cuelearner_jax.types import Policy, Reel, Sketch
 
 CLOTH, CUSHION, RAIL, HOLE, CUE = "#2f7f5f", "#1d5741", "#6d4a32", "#15110e", "#fdfbf5"
@@ -25,8 +25,8 @@ FRAMES = 90  # of a film
 LONGEST = 3.0  # a film [s]: longer shots are shown faster
 TRAIL = 181  # moments of a trail
 BEND = 0.03  # sine of the least angle of a trail's bend
-TOLD = 3.0  # so much of a shot a trail tells at most [s]
-MOVED = 1e-4  # what a ball moves by that was hit, at least [m]
+TRAIL_SECONDS = 3.0  # so much of a shot a trail tells at most [s]
+LEAST_MOVE = 1e-4  # what a ball moves by that was hit, at least [m]
 
 
 def rail_width(table: Table) -> float:
@@ -61,7 +61,7 @@ def solids(table: Table) -> Iterator[tuple[np.ndarray, np.ndarray, float, str]]:
 def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tuple[list[Trajectory], list[float]]:
     """Return paths and rewards of `shots` shots of a policy; a new rack follows the end of an episode."""
     see = lambda env, state, action, step: (env.path(state, action), step.reward)  # noqa: E731
-    paths, rewards = played(env, policy, key, shots, see)
+    paths, rewards = record_steps(env, policy, key, shots, see)
     each = (jax.tree.map(lambda leaf, shot=shot: leaf[shot], paths) for shot in range(shots))
     return list(each), [float(reward) for reward in rewards]
 
@@ -103,7 +103,7 @@ def _places(positions: np.ndarray, gone: np.ndarray) -> dict[str, Any]:
 
 
 @jax.jit
-def _played(env: Billiards, state: Balls, action: jax.Array) -> tuple[Array, Array, Array, Array]:
+def _play(env: Billiards, state: Balls, action: jax.Array) -> tuple[Array, Array, Array, Array]:
     path = env.path(state, action)
     times = jnp.linspace(0.0, 1.0, FRAMES) * path.times[-1]
     return *positions_at(env.table, path, times), path.times[-1], path.pocketed[-1]
@@ -111,7 +111,7 @@ def _played(env: Billiards, state: Balls, action: jax.Array) -> tuple[Array, Arr
 
 def reel(env: Billiards, state: Balls, action: Float[Array, "2"]) -> Reel:
     """The shot, in `FRAMES` pictures; a ball that falls is not seen from then on."""
-    positions, pocketed, seconds, end = jax.device_get(_played(env, state, jnp.asarray(action)))
+    positions, pocketed, seconds, end = jax.device_get(_play(env, state, jnp.asarray(action)))
     frames = [_places(positions[number], fallen) for number, fallen in enumerate(pocketed)]
     scored = int((end & ~np.asarray(state.pocketed))[1:].sum())
     words = "foul: the cue ball is pocketed" if end[0] else f"{scored} pocketed" if scored else "nothing pocketed"
@@ -120,12 +120,12 @@ def reel(env: Billiards, state: Balls, action: Float[Array, "2"]) -> Reel:
 
 @jax.jit
 def _rolled(env: Billiards, state: Balls, actions: jax.Array) -> tuple[Array, Array]:
-    times = jnp.linspace(0.0, TOLD, TRAIL)
+    times = jnp.linspace(0.0, TRAIL_SECONDS, TRAIL)
     return jax.vmap(lambda action: positions_at(env.table, env.path(state, action), times))(actions)
 
 
 def trails(env: Billiards, state: Balls, actions: Float[Array, "n 2"]) -> list[str]:
-    """Return for each action the paths of the cue ball and of the first ball it hits, for `TOLD` seconds.
+    """Return for each action the paths of the cue ball and of the first ball it hits, for `TRAIL_SECONDS` seconds.
 
     The cue ball's is a line, the other's is dashed; a ring is where a ball is then, a disc a target that fell, a cross
     the cue ball that did.
@@ -135,11 +135,11 @@ def trails(env: Billiards, state: Balls, actions: Float[Array, "n 2"]) -> list[s
 
 
 def _trail(radius: float, positions: np.ndarray, pocketed: np.ndarray) -> str:
-    moved = np.linalg.norm(positions - positions[:1], axis=-1) > MOVED
-    moved[:, 0] = False
-    hit = int(moved.any(axis=1).argmax())  # the first moment at which a target has moved
-    shown = [0, int(moved[hit].argmax())] if moved.any() else [0]
-    return "".join(_way(radius, number, positions[:, number], pocketed[:, number]) for number in shown)
+    moves = np.linalg.norm(positions - positions[:1], axis=-1) > LEAST_MOVE
+    moves[:, 0] = False
+    hit = int(moves.any(axis=1).argmax())  # the first moment at which a target has moved
+    numbers = [0, int(moves[hit].argmax())] if moves.any() else [0]
+    return "".join(_way(radius, number, positions[:, number], pocketed[:, number]) for number in numbers)
 
 
 def _way(radius: float, number: int, places: np.ndarray, gone: np.ndarray) -> str:
@@ -168,7 +168,7 @@ def _corners(rows: np.ndarray) -> np.ndarray:
     for place, following in pairwise(rows[1:]):
         way, onward = place - corners[-1], following - place
         bent = abs(way[0] * onward[1] - way[1] * onward[0]) > BEND * np.hypot(*way) * np.hypot(*onward)
-        if np.hypot(*way) > MOVED and (bent or way @ onward < 0):
+        if np.hypot(*way) > LEAST_MOVE and (bent or way @ onward < 0):
             corners.append(place)
     return np.array([*corners, rows[-1]])
 

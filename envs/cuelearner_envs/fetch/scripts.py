@@ -53,15 +53,15 @@ def push(obs: Observations, gains: Gains = USUAL) -> Float[Array, "n 4"]:
     obs = jnp.asarray(obs)
     goal, gripper, thing = obs[:, GOAL], obs[:, GRIPPER], obs[:, OBJECT]
     way = goal[:, :2] - thing[:, :2]
-    left = jnp.linalg.norm(way, axis=-1, keepdims=True)
-    ahead = way / jnp.maximum(left, 1e-6)
+    distance = jnp.linalg.norm(way, axis=-1, keepdims=True)
+    ahead = way / jnp.maximum(distance, 1e-6)
     off = gripper[:, :2] - thing[:, :2]
     along = jnp.sum(off * ahead, -1, keepdims=True)
     side = off - along * ahead
     behind = thing[:, :2] - gains.back * ahead - gripper[:, :2]
     over = gripper[:, 2:] - thing[:, 2:]
 
-    pushing = gains.along * ahead * jnp.minimum(left + gains.lead, gains.fastest) - gains.side * side
+    pushing = gains.along * ahead * jnp.minimum(distance + gains.lead, gains.fastest) - gains.side * side
     travelling = GAIN * behind
     down, up, level = -GAIN * over, jnp.ones_like(over), GAIN * (HIGH - over)
     away = jnp.linalg.norm(off, axis=-1, keepdims=True)
@@ -73,7 +73,7 @@ def push(obs: Observations, gains: Gains = USUAL) -> Float[Array, "n 4"]:
     rising = jnp.where(free, travelling, 0.0)
     across = jnp.where(in_place, pushing, jnp.where(arrived | ~rises, travelling, rising))
     height = jnp.where(in_place | arrived, down, jnp.where(rises, up, level))
-    return jnp.where(left < gains.pushed, 0.0, _action(jnp.concatenate([across, height], -1)))
+    return jnp.where(distance < gains.pushed, 0.0, _action(jnp.concatenate([across, height], -1)))
 
 
 def _action(move: Float[Array, "n 3"]) -> Float[Array, "n 4"]:

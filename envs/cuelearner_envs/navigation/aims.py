@@ -63,8 +63,8 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
     rows = [*_lengths(ways, free[1], goal, away), *_seen_from(ways, goal[None]), *_seen_from(ways, previous)]
     rows += [jnp.full(WAYS, away / SCALE), ways[:, 0], ways[:, 1], visible.astype(jnp.float32)]
     if ahead:
-        left, detour, leg = look_ahead(points_of(obs)[::EVERY], ways, free[2], away * goal, RADII[2])
-        rows += [left / SCALE, jnp.clip(detour / SCALE, 0.0, 3.0), leg / SCALE]
+        rest, detour, leg = look_ahead(points_of(obs)[::EVERY], ways, free[2], away * goal, RADII[2])
+        rows += [rest / SCALE, jnp.clip(detour / SCALE, 0.0, 3.0), leg / SCALE]
     features = jnp.concatenate([row.reshape(-1, WAYS) for row in [*beside, *rows]]).T
     room = (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & visible
     return Aims(ways, features, jnp.ones(WAYS, bool), room)
@@ -92,11 +92,11 @@ def _lengths(
     end = jnp.minimum(free, away)
     corners = [jnp.minimum(jnp.minimum(jnp.roll(free, side), jnp.roll(free, 2 * side)), end) for side in (-1, 1)]
 
-    def left(length: Float[Array, " ways"]) -> Float[Array, " ways"]:
+    def rest(length: Float[Array, " ways"]) -> Float[Array, " ways"]:
         return jnp.linalg.norm(length[:, None] * ways - (away * goal)[None], axis=-1)
 
-    detours = [jnp.clip((length + left(length) - away) / SCALE, 0.0, 3.0) for length in (end, *corners)]
-    return [*detours, left(end) / SCALE, jnp.clip(free - away, -1.0, 1.0), free / SCALE]
+    detours = [jnp.clip((length + rest(length) - away) / SCALE, 0.0, 3.0) for length in (end, *corners)]
+    return [*detours, rest(end) / SCALE, jnp.clip(free - away, -1.0, 1.0), free / SCALE]
 
 
 def _seen_from(ways: Float[Array, "ways 2"], vectors: Float[Array, "n 2"]) -> list[Float[Array, "n ways"]]:
@@ -126,15 +126,15 @@ def look_ahead(
     second_legs = lambda leg: _second_legs(points, ways, leg, goal, radius)  # noqa: E731
     # Reductions take one station after the other: side by side they need three times the memory, and no less time.
     plans = jax.vmap(second_legs)(legs) if goes_through() else jax.lax.map(second_legs, legs)
-    cost, left, walked, leg = (values.reshape(-1, ways.shape[0]) for values in plans)
-    chosen = cost <= cost.min(0, keepdims=True)  # more than one only where they are worth the same
+    cost, rest, walked, leg = (values.reshape(-1, ways.shape[0]) for values in plans)
+    is_least = cost <= cost.min(0, keepdims=True)  # more than one only where they are worth the same
 
-    def of_chosen(values: Float[Array, "plans ways"]) -> Float[Array, " ways"]:
-        return jnp.where(chosen, values, jnp.inf).min(0)
+    def of_least(values: Float[Array, "plans ways"]) -> Float[Array, " ways"]:
+        return jnp.where(is_least, values, jnp.inf).min(0)
 
     away, room = jnp.linalg.norm(goal), free > STEP
-    detour = jnp.where(room, of_chosen(walked + left) - away, jnp.inf)
-    return jnp.where(room, of_chosen(left), away), detour, jnp.where(room, of_chosen(leg), 0.0)
+    detour = jnp.where(room, of_least(walked + rest) - away, jnp.inf)
+    return jnp.where(room, of_least(rest), away), detour, jnp.where(room, of_least(leg), 0.0)
 
 
 def _stations(
@@ -163,13 +163,13 @@ def _second_legs(
     offset = goal[None] - places
     away = jnp.sqrt(jnp.maximum(jnp.sum(jnp.square(offset), -1), 1e-12))
     ahead = offset / away[:, None]
-    found, turns = [], [math.radians(turn) for turn in TURNS_DEG]
+    features, turns = [], [math.radians(turn) for turn in TURNS_DEG]
     turned = jnp.stack([rotate(ahead, turn) for turn in turns])
     free = free_paths(turned, jnp.broadcast_to(places, turned.shape), points, radius, MAX_RANGE)
     for turn, length in zip(turns, free, strict=True):
         cos, sin = math.cos(turn), math.sin(turn)
         second = jnp.minimum(length, cos * away)
-        left = jnp.sqrt(jnp.square(away - second * cos) + jnp.square(second * sin))
+        rest = jnp.sqrt(jnp.square(away - second * cos) + jnp.square(second * sin))
         walked = leg + second
-        found.append((left + SHORTER * walked, left, walked, leg))
-    return tuple(jnp.stack(column) for column in zip(*found, strict=True))
+        features.append((rest + SHORTER * walked, rest, walked, leg))
+    return tuple(jnp.stack(column) for column in zip(*features, strict=True))

@@ -26,7 +26,7 @@ from cuelearner_envs import canvas
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import RecordedStep
 from cuelearner_envs.navigation.robot import Robot, hull
-from cuelearner_envs.navigation.world import tallness, used
+from cuelearner_envs.navigation.world import solids_of, tallness
 from cuelearner_jax import pictures
 
 # Okabe and Ito's palette, as in the figures of results: told apart with any colour vision.
@@ -39,8 +39,8 @@ WORDS = {
     "fall": "fell after",
     "timeout": "out of time after",
 }
-CHOSEN, ASKED = "direction chosen", "direction in question"  # what an arrow means
-COURSE = ("start", "goal", "lidar", CHOSEN)
+CHOICE, QUESTION = "direction chosen", "direction in question"  # what an arrow means
+COURSE = ("start", "goal", "lidar", CHOICE)
 FLOOR, LOW, TALL = "#fbfaf7", "#c9ccd1", "#5d636b"
 WIDTH_INCHES, STRIP_INCHES, MARGIN = 7.0, 0.4, 0.35  # the strip below the floor is for words; margin in [m]
 ARROW_REACH = (0.55, 1.6)  # beginning and end of an arrow, from the middle of the body [m]
@@ -72,7 +72,7 @@ def still(robot: Robot, frames: Sequence[RecordedStep], file: str | os.PathLike[
 
 def question(robot: Robot, frame: RecordedStep, file: str | os.PathLike[str], dpi: int = 160) -> None:
     """Write a picture of one situation and of the direction in question as an arrow, for somebody to judge it."""
-    figure, axes, strip = _figure(frame, np.asarray(frame.world.extent), dpi, ("goal", "lidar", ASKED))
+    figure, axes, strip = _figure(frame, np.asarray(frame.world.extent), dpi, ("goal", "lidar", QUESTION))
     _lidar(axes, frame)
     _body(axes, robot, frame.pose)
     _arrow(axes, frame)
@@ -115,8 +115,8 @@ def _film(
     def trail(steps: int) -> list[Line2D]:
         return axes.plot(*way[: steps + 1, :2].T, color=BODY, linewidth=1.6)
 
-    for taken, frame in enumerate(episode):
-        moving = [*_lidar(axes, frame), *trail(taken), *_body(axes, robot, frame.pose), _arrow(axes, frame)]
+    for number, frame in enumerate(episode):
+        moving = [*_lidar(axes, frame), *trail(number), *_body(axes, robot, frame.pose), _arrow(axes, frame)]
         yield over.picture(*moving, _caption(strip, f"episode {frame.episode + 1}: {seconds:.1f} s"))
         seconds = frame.seconds
     if last.outcome:
@@ -138,7 +138,7 @@ def _way(episode: Sequence[RecordedStep]) -> Float[np.ndarray, "poses 3"]:
 
 
 def _figure(
-    first: RecordedStep, extent: Float[np.ndarray, "2"], dpi: float, shown: Sequence[str]
+    first: RecordedStep, extent: Float[np.ndarray, "2"], dpi: float, parts: Sequence[str]
 ) -> tuple[Figure, Axes, Axes]:
     """A figure of axes for a floor and of a strip for words below, as many metres long; its sides are even dots.
 
@@ -156,8 +156,10 @@ def _figure(
     axes.set(xlim=(-half[0] - MARGIN, half[0] + MARGIN), ylim=(-half[1] - MARGIN, half[1] + MARGIN), aspect="equal")
     axes.add_patch(Rectangle((-half[0], -half[1]), *(2 * half), facecolor=FLOOR, edgecolor="none", zorder=0))
     square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-    solids = [(h, Polygon(_to_world(row[:3], square * row[3:]))) for row, h in used(world.boxes, world.box_heights)]
-    solids += [(height, Circle((row[0], row[1]), row[2])) for row, height in used(world.circles, world.circle_heights)]
+    solids = [
+        (h, Polygon(_to_world(row[:3], square * row[3:]))) for row, h in solids_of(world.boxes, world.box_heights)
+    ]
+    solids += [(h, Circle((row[0], row[1]), row[2])) for row, h in solids_of(world.circles, world.circle_heights)]
     for height, patch in sorted(solids, key=lambda solid: solid[0]):  # from above, the tall covers the low
         patch.set(facecolor=shade(height), edgecolor="none", zorder=1)
         axes.add_patch(patch)
@@ -165,16 +167,16 @@ def _figure(
     ring = {"facecolor": GOAL + "33", "edgecolor": GOAL, "linewidth": 1.2, "zorder": 2}
     axes.add_patch(Circle((x, y), float(first.goal_radius), **ring))
     axes.plot(x, y, marker="*", markersize=11, color=GOAL, markeredgewidth=0, zorder=3)
-    if "start" in shown:
+    if "start" in parts:
         axes.plot(*first.pose[:2], marker="o", markersize=6, color="white", markeredgecolor=START, zorder=3)
     strip.set(xlim=(-length / 2, length / 2), ylim=(0, 1))
-    _draw_strip(strip, 2 * float(half[0]), shown)
+    _draw_strip(strip, 2 * float(half[0]), parts)
     for one in (axes, strip):
         one.axis("off")
     return figure, axes, strip
 
 
-def _draw_strip(strip: Axes, extent: float, shown: Sequence[str]) -> None:
+def _draw_strip(strip: Axes, extent: float, parts: Sequence[str]) -> None:
     """The key to the signs that are shown, and a scale."""
     length, right = 2.0 if extent > 12.0 else 1.0, extent / 2
     strip.plot([right - length, right], [0.3, 0.3], color=INK, linewidth=2, solid_capstyle="butt")
@@ -185,7 +187,7 @@ def _draw_strip(strip: Axes, extent: float, shown: Sequence[str]) -> None:
         "goal": {"marker": "*", "color": GOAL, "markeredgewidth": 0, "markersize": 11},
         "lidar": {"marker": "o", "color": HITS, "markersize": 3},
     }
-    handles = [Line2D([], [], linestyle="none", label=name, **signs.get(name, arrow)) for name in shown]
+    handles = [Line2D([], [], linestyle="none", label=name, **signs.get(name, arrow)) for name in parts]
     place = 0.98 - (length + MARGIN) / (extent + 2 * MARGIN), 0.5
     look: dict[str, Any] = {"frameon": False, "borderpad": 0, "handletextpad": 0.1, "columnspacing": 0.9}
     strip.legend(handles=handles, loc="center right", bbox_to_anchor=place, ncols=len(handles), fontsize=7.5, **look)
@@ -208,9 +210,9 @@ def _lidar(axes: Axes, frame: RecordedStep) -> list[Artist]:
     angles = np.asarray(BEAM_ANGLES, float)
     beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     ends = _to_world(frame.pose, np.asarray(frame.ranges)[:, None] * beams)
-    met = np.asarray(frame.ranges) < 0.999 * frame.max_range
+    hits = np.asarray(frame.ranges) < 0.999 * frame.max_range
     free = Polygon(np.concatenate([[frame.pose[:2]], ends]), facecolor=BEAMS, alpha=0.22, edgecolor="none", zorder=2)
-    dots = axes.plot(*ends[met].T, linestyle="none", marker="o", markersize=1.8, color=HITS, zorder=4)
+    dots = axes.plot(*ends[hits].T, linestyle="none", marker="o", markersize=1.8, color=HITS, zorder=4)
     return [axes.add_patch(free), *dots]
 
 

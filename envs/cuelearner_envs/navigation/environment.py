@@ -92,7 +92,7 @@ class Navigation(Described, struct.PyTreeNode):
 
     def step(self, key: PRNGKeyArray, state: AnyWalker, action: Float[Array, "2"]) -> tuple[AnyWalker, Step]:
         """Walk for one period in the direction; a new episode follows an end."""
-        after = self.counted(state, self.moved(state, action))
+        after = self.counted(state, self.move(state, action))
         outcome, terminated, truncated = self.ends(after)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), self._start(key), after)
         step = Step(
@@ -118,8 +118,8 @@ class Navigation(Described, struct.PyTreeNode):
         success = self.arrived(after) & ~failed
         terminated = success | failed
         truncated = (after.steps >= self.max_steps) & ~terminated
-        named = {"success": success, **failures, "timeout": truncated, **self.sides_taken(after)}
-        outcome = {name: value.astype(jnp.float32) for name, value in named.items()}
+        outcomes = {"success": success, **failures, "timeout": truncated, **self.sides_of(after)}
+        outcome = {name: value.astype(jnp.float32) for name, value in outcomes.items()}
         return {**outcome, "duration": after.steps * jnp.asarray(self.period)}, terminated, truncated
 
     def counted(self, before: AnyWalker, after: AnyWalker) -> AnyWalker:
@@ -129,7 +129,7 @@ class Navigation(Described, struct.PyTreeNode):
         world, ahead = self.world(before.world), heading(self.worlds.starts[before.world, before.route], before.goal)
         return after.replace(passed=before.passed + count_passed(world, ahead, before.pose[:2], after.pose[:2]))
 
-    def sides_taken(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
+    def sides_of(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
         """Whether all obstacles passed so far were passed on one side, or some on either; none holds before the first.
 
         Nothing where sides do not count.
@@ -139,7 +139,7 @@ class Navigation(Described, struct.PyTreeNode):
         left, right = state.passed > 0
         return {"passed_left": left & ~right, "passed_right": right & ~left, "passed_both": left & right}
 
-    def moved(self, state: AnyWalker, action: Float[Array, "2"]) -> AnyWalker:
+    def move(self, state: AnyWalker, action: Float[Array, "2"]) -> AnyWalker:
         """The state after a step, without a reset."""
         motion = walk(self.robot, Motion(state.pose, state.velocity), action, self.period)
         return state.replace(

@@ -32,11 +32,11 @@ def clutter(key: PRNGKeyArray) -> Layout:
     extent = jnp.array([20.0, 20.0])
     k_count, k_place, k_turn, k_size, k_round, k_radius, k_tall = jax.random.split(key, 7)
     k_boxes, k_circles = jax.random.split(k_count)
-    used = jnp.arange(16) < jax.random.randint(k_boxes, (), 8, 17)
-    boxes = _drawn(16, (k_place, 2, -9.5, 9.5), (k_turn, 1, 0.0, math.pi), (k_size, 2, 0.2, 0.9))
-    drawn = jnp.arange(12) < jax.random.randint(k_circles, (), 6, 13)
-    circles = _drawn(12, (k_round, 2, -9.5, 9.5), (k_radius, 1, 0.15, 0.6))
-    return _layout(k_tall, extent, _only(used, boxes), _only(drawn, circles))
+    exists = jnp.arange(16) < jax.random.randint(k_boxes, (), 8, 17)
+    boxes = _draw(16, (k_place, 2, -9.5, 9.5), (k_turn, 1, 0.0, math.pi), (k_size, 2, 0.2, 0.9))
+    exists_round = jnp.arange(12) < jax.random.randint(k_circles, (), 6, 13)
+    circles = _draw(12, (k_round, 2, -9.5, 9.5), (k_radius, 1, 0.15, 0.6))
+    return _layout(k_tall, extent, _only(exists, boxes), _only(exists_round, circles))
 
 
 def rooms(key: PRNGKeyArray) -> Layout:
@@ -62,9 +62,9 @@ def rooms(key: PRNGKeyArray) -> Layout:
     k_place, k_turn, k_length, k_width = jax.random.split(k_thin, 4)
     inside = -extent / 2 + 0.8, extent / 2 - 0.8
     shape = (k_turn, 1, 0.0, math.pi), (k_length, 1, 0.3, 0.8), (k_width, 1, 0.02, 0.05)
-    thin = _drawn(6, (k_place, 2, *inside), *shape)
+    thin = _draw(6, (k_place, 2, *inside), *shape)
     k_where, k_radius = jax.random.split(k_poles)
-    poles = _drawn(8, (k_where, 2, *inside), (k_radius, 1, 0.05, 0.12))
+    poles = _draw(8, (k_where, 2, *inside), (k_radius, 1, 0.05, 0.12))
     return _layout(k_tall, extent, jnp.concatenate([walls, thin]), poles)
 
 
@@ -104,15 +104,15 @@ def _wall_with_door(key: PRNGKeyArray, ends: Float[Array, "4"]) -> Float[Array, 
     return _only(pieces > 0.2, walls)
 
 
-def _drawn(count: int, *columns: tuple[PRNGKeyArray, int, Any, Any]) -> Float[Array, "count width"]:
+def _draw(count: int, *columns: tuple[PRNGKeyArray, int, Any, Any]) -> Float[Array, "count width"]:
     """Rows of uniform numbers: of each group of columns the key, their number, and both bounds."""
     groups = [jax.random.uniform(key, (count, width), minval=low, maxval=high) for key, width, low, high in columns]
     return jnp.concatenate(groups, axis=-1)
 
 
-def _only(used: Bool[Array, " rows"], rows: Float[Array, "rows width"]) -> Float[Array, "rows width"]:
+def _only(exists: Bool[Array, " rows"], rows: Float[Array, "rows width"]) -> Float[Array, "rows width"]:
     """The rows in use; the others far away and tiny."""
-    return jnp.where(used[:, None], rows, _unused(*rows.shape))
+    return jnp.where(exists[:, None], rows, _unused(*rows.shape))
 
 
 def _unused(count: int, width: int) -> Float[Array, "count width"]:

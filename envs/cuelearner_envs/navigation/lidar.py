@@ -47,7 +47,7 @@ class Lidar(struct.PyTreeNode):
     def faulty(self, ranges: Float[Array, "271"], pose: Float[Array, " n"]) -> Float[Array, "271"]:
         """True distances with the sensor's noise and drop-outs, which the numbers of a pose decide [m]."""
 
-        def drawn() -> jax.Array:
+        def with_faults() -> jax.Array:
             key = jax.random.key(0)
             for bits in jax.lax.bitcast_convert_type(pose, jnp.uint32):
                 key = jax.random.fold_in(key, bits)
@@ -56,7 +56,7 @@ class Lidar(struct.PyTreeNode):
             return jnp.where(jax.random.bernoulli(k_drop, self.dropout, ranges.shape), self.max_range, noisy)
 
         has_faults = (jnp.asarray(self.noise) > 0) | (jnp.asarray(self.dropout) > 0)
-        return jax.lax.cond(has_faults, drawn, lambda: ranges)
+        return jax.lax.cond(has_faults, with_faults, lambda: ranges)
 
 
 def scan(world: NavigationWorld, pose: Float[ArrayLike, "3"], max_range: Scalar = MAX_RANGE) -> Float[Array, "271"]:
@@ -86,12 +86,12 @@ def scan_tilted(
     level = jnp.sqrt(jnp.sum(jnp.square(beams[:, :2]), -1))  # cosine of each beam's slope
     flat, rise = beams[:, :2] / level[:, None], beams[:, 2] / level
 
-    def met(inverse: Float[Array, "solids beams"], heights: Float[Array, " solids"]) -> Float[Array, " beams"]:
+    def nearest_of(inverse: Float[Array, "solids beams"], heights: Float[Array, " solids"]) -> Float[Array, " beams"]:
         """The nearest solid's that is high enough where the beam is: height + rise / inverse <= top."""
         return jnp.where(rise[None] <= (heights[:, None] - origin[2]) * inverse, inverse, 0.0).max(0)
 
-    boxes = met(_boxes(world.boxes, origin[:2], flat), world.box_heights)
-    circles = met(_circles(world.circles, origin[:2], flat), world.circle_heights)
+    boxes = nearest_of(_boxes(world.boxes, origin[:2], flat), world.box_heights)
+    circles = nearest_of(_circles(world.circles, origin[:2], flat), world.circle_heights)
     floor = -rise / origin[2]
     nearest = jnp.maximum(jnp.maximum(boxes, circles), floor) * level
     return 1.0 / jnp.maximum(nearest, 1.0 / max_range)
@@ -123,12 +123,12 @@ def _boxes(
 
     in_x, in_y = products(enter)
     entered = jnp.minimum(in_x + unbounded[:, 0, None], in_y + unbounded[:, 1, None])
-    left = jnp.maximum(
+    leaving = jnp.maximum(
         jnp.maximum(*products(leave_behind)),
         jnp.maximum(*products(leave_ahead)),
     )
-    inverse = jnp.where(within[:, None], left, entered)
-    return jnp.where(entered >= left, inverse, 0.0)
+    inverse = jnp.where(within[:, None], leaving, entered)
+    return jnp.where(entered >= leaving, inverse, 0.0)
 
 
 def _circles(

@@ -11,7 +11,7 @@ from jaxtyping import ArrayLike, Float, PRNGKeyArray
 
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.world import NavigationWorld
-from cuelearner_envs.playing import played
+from cuelearner_envs.playing import record_steps
 from cuelearner_jax.types import Policy, Step
 
 ENDS = ("success", "collision", "fall", "timeout")
@@ -34,7 +34,7 @@ class RecordedStep(NamedTuple):
 
 
 @jax.jit
-def _seen(env: Navigation, state: Any, after: Any) -> dict[str, Any]:
+def _view(env: Navigation, state: Any, after: Any) -> dict[str, Any]:
     world, radius, most = env.world(state.world), jnp.asarray(env.goal_radius), jnp.asarray(env.lidar.max_range)
     view = {"world": world, "goal": state.goal, "goal_radius": radius, "pose": state.pose, "ranges": env.ranges(state)}
     seconds = after.steps * jnp.asarray(env.period)
@@ -43,7 +43,7 @@ def _seen(env: Navigation, state: Any, after: Any) -> dict[str, Any]:
 
 def situation(env: Navigation, state: Any, action: Float[ArrayLike, "2"]) -> RecordedStep:
     """Return a state's frame for a picture, with the asked action."""
-    return RecordedStep(**jax.device_get(_seen(env, state, state)), action=np.asarray(action))
+    return RecordedStep(**jax.device_get(_view(env, state, state)), action=np.asarray(action))
 
 
 def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[RecordedStep], list[float]]:
@@ -51,9 +51,9 @@ def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tu
 
     def see(env: Navigation, state: Any, action: jax.Array, step: Step) -> tuple[Any, ...]:
         ends = jnp.stack([step.outcome.get(name, jnp.zeros(())) for name in ENDS])  # only legged robots fall
-        return {**_seen(env, state, env.moved(state, action)), "action": action}, ends, step.reward
+        return {**_view(env, state, env.move(state, action)), "action": action}, ends, step.reward
 
-    views, ends, rewards = played(env, policy, key, steps, see)
+    views, ends, rewards = record_steps(env, policy, key, steps, see)
     finished = np.cumsum(ends.any(-1)) - ends.any(-1)  # episodes before each step
     frames = []
     for number in range(steps):

@@ -17,7 +17,7 @@ from cuelearner_envs import svg
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.robot import Robot, hull
-from cuelearner_envs.navigation.world import used
+from cuelearner_envs.navigation.world import solids_of
 from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Reel, Sketch
 
@@ -31,15 +31,15 @@ WORDS = {"success": "the goal is reached", "collision": "collision", "fall": "it
 
 def sketch(env: Navigation, state: Any) -> Sketch:
     """Return the robot's surroundings as a sketch, from above."""
-    world, goal, pose, ranges = jax.device_get(_seen(env, state))
+    world, goal, pose, ranges = jax.device_get(_view(env, state))
     parts = [svg.rectangle(-AROUND, -AROUND, 2 * AROUND, 2 * AROUND, "fill:var(--floor)")]
-    solids = [(height, _box(row, height, pose)) for row, height in used(world.boxes, world.box_heights)]
-    solids += [(height, _disc(row, height, pose)) for row, height in used(world.circles, world.circle_heights)]
+    solids = [(height, _box(row, height, pose)) for row, height in solids_of(world.boxes, world.box_heights)]
+    solids += [(height, _disc(row, height, pose)) for row, height in solids_of(world.circles, world.circle_heights)]
     parts += [shape for _, shape in sorted(solids)]  # from above, the tall covers the low
     ends = _up(ranges[:, None] * np.stack([np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES)], axis=-1))
     parts.append(svg.polygon([(0.0, 0.0), *ends], "fill:var(--free);fill-opacity:0.25"))
-    met = ends[ranges < 0.999 * float(env.lidar.max_range)]
-    dots = "".join(f"M{svg.number(x)} {svg.number(y)}h0" for x, y in met)
+    hits = ends[ranges < 0.999 * float(env.lidar.max_range)]
+    dots = "".join(f"M{svg.number(x)} {svg.number(y)}h0" for x, y in hits)
     line = f"fill:none;stroke:var(--hit);stroke-width:{2 * DOT};stroke-linecap:round"
     parts.append(svg.element("path", d=dots, style=line))
     at, away = _placed(goal[None], pose)[0], float(np.linalg.norm(goal - pose[:2]))
@@ -58,7 +58,7 @@ def sketch(env: Navigation, state: Any) -> Sketch:
 
 
 @jax.jit
-def _seen(env: Navigation, state: Any) -> Any:
+def _view(env: Navigation, state: Any) -> Any:
     return env.world(state.world), state.goal, state.pose, env.ranges(state)
 
 
@@ -67,7 +67,7 @@ def _walked(env: Navigation, state: Any, action: jax.Array) -> tuple[Array, dict
     heading = rotate(action, state.pose[2])
 
     def one(state: Any, _: None) -> tuple[Any, tuple[Array, dict[str, Array]]]:
-        after = env.moved(state, rotate(heading, -state.pose[2]))
+        after = env.move(state, rotate(heading, -state.pose[2]))
         return after, (after.pose, env.ends(after)[0])
 
     return jax.lax.scan(one, state, None, length=STEPS)[1]
@@ -108,8 +108,8 @@ def _fill(height: float) -> str:
 def _box(row: np.ndarray, height: float, pose: np.ndarray) -> str:
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * row[3:]
     cos, sin = math.cos(row[2]), math.sin(row[2])
-    found = _placed(corners @ np.array([[cos, sin], [-sin, cos]]) + row[:2], pose)
-    return svg.polygon(found, _fill(height))
+    corner_points = _placed(corners @ np.array([[cos, sin], [-sin, cos]]) + row[:2], pose)
+    return svg.polygon(corner_points, _fill(height))
 
 
 def _disc(row: np.ndarray, height: float, pose: np.ndarray) -> str:

@@ -33,7 +33,7 @@ class NavigationWorld(struct.PyTreeNode):
     goals: Float[Array, "routes 2"]  # [m], 5 to 15 m from the start as the crow flies
 
 
-def used(rows: ArrayLike, heights: ArrayLike) -> list[tuple[np.ndarray, float]]:
+def solids_of(rows: ArrayLike, heights: ArrayLike) -> list[tuple[np.ndarray, float]]:
     """Return boxes or circles with their heights, without those that only fill the arrays."""
     pairs = zip(np.asarray(rows, float), np.asarray(heights, float).tolist(), strict=True)
     return [(row, height) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]

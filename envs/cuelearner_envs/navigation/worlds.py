@@ -87,8 +87,8 @@ def any_of(key: PRNGKeyArray, usable: Bool[Array, " all"]) -> Int[Array, ""]:
     The draw of `jax.random.categorical` with equal weights, without its two logarithms a cell, which do not change the
     order of what they are taken of.
     """
-    drawn = jax.random.uniform(key, usable.shape, minval=jnp.finfo(jnp.float32).tiny)
-    return jnp.argmax(jnp.where(usable, drawn, -1.0))
+    draws = jax.random.uniform(key, usable.shape, minval=jnp.finfo(jnp.float32).tiny)
+    return jnp.argmax(jnp.where(usable, draws, -1.0))
 
 
 def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[NavigationWorld, Bool[Array, ""]]:
@@ -105,8 +105,8 @@ def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[Naviga
     usable = (roomy & reached).ravel()
     # A world whose seed cell is cut off from the rest is rejected.
     connected = (passable & reached).sum() >= 0.8 * passable.sum()
-    starts, goals, found = jax.vmap(partial(_route, usable))(jax.random.split(k_routes, routes))
-    return world.replace(starts=starts, goals=goals), connected & found.all()
+    starts, goals, exists = jax.vmap(partial(_route, usable))(jax.random.split(k_routes, routes))
+    return world.replace(starts=starts, goals=goals), connected & exists.all()
 
 
 def _route(usable: Bool[Array, " all"], key: PRNGKeyArray) -> tuple[jax.Array, jax.Array, Bool[Array, ""]]:

@@ -1,6 +1,6 @@
 """A zoo: small robots drawn by chance, in changed worlds, on which methods that correct policies are judged.
 
-`robots` draws a group; `changed` the world of an error; `rollout` plays an episode; `answer` is the teacher's. All are
+`robots` draws a group; `change` the world of an error; `rollout` plays an episode; `answer` is the teacher's. All are
 pure JAX. `robots` and `measure` take many robots, the others one world, to be mapped by `jax.vmap`.
 """
 
@@ -13,7 +13,7 @@ from cuelearner_envs.zoo.worlds import (
     State,
     ZooWorld,
     answer,
-    changed,
+    change,
     observe,
     reset,
     right,
@@ -32,7 +32,7 @@ __all__ = [
     "ZooRobot",
     "ZooWorld",
     "answer",
-    "changed",
+    "change",
     "measure",
     "observe",
     "policy",

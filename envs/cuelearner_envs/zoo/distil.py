@@ -87,5 +87,5 @@ def distil(key: PRNGKeyArray, robot: ZooRobot) -> ZooRobot:
 def _play(key: PRNGKeyArray, robot: ZooRobot, episodes: int) -> tuple[Float[Array, "episodes steps obs"], Array]:
     """Return the observations and successes of a robot's policy where nothing is wrong."""
     act = lambda obs: policy(robot, obs)  # noqa: E731
-    obs, _, _, done = jax.vmap(lambda key: rollout(key, unchanged(robot), act))(jax.random.split(key, episodes))
-    return obs, done
+    obs, _, _, success = jax.vmap(lambda key: rollout(key, unchanged(robot), act))(jax.random.split(key, episodes))
+    return obs, success

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_envs.zoo.robots import ZooRobot, policy
-from cuelearner_envs.zoo.worlds import ERRORS, changed, right, rollout, unchanged
+from cuelearner_envs.zoo.worlds import ERRORS, change, right, rollout, unchanged
 
 
 class Scores(NamedTuple):
@@ -26,7 +26,7 @@ def measure(key: PRNGKeyArray, robots: ZooRobot, episodes: int = 20) -> tuple[Sc
     """Return successes and returns of robots (leading axis) in the world of every error."""
 
     def one(robot: ZooRobot, key: PRNGKeyArray, error: Array) -> tuple[Array, Array]:
-        world, keys = changed(key, robot, error), jax.random.split(key, episodes)
+        world, keys = change(key, robot, error), jax.random.split(key, episodes)
         act = lambda obs: policy(robot, obs)  # noqa: E731
         ways = (
             lambda key: rollout(key, unchanged(robot), act)[2:],
@@ -34,10 +34,10 @@ def measure(key: PRNGKeyArray, robots: ZooRobot, episodes: int = 20) -> tuple[Sc
             lambda key: rollout(key, world, lambda state: right(world, state), knows=True)[2:],
         )
         means = [jax.tree.map(jnp.mean, jax.vmap(way)(keys)) for way in ways]
-        return jnp.stack([done for _, done in means]), jnp.stack([total for total, _ in means])
+        return jnp.stack([successes for _, successes in means]), jnp.stack([total for total, _ in means])
 
     count = robots.task.shape[0]
     keys = jax.random.split(key, (count, len(ERRORS)))
     each = jax.vmap(jax.vmap(one, (None, 0, 0)), (0, 0, None))
-    done, total = each(robots, keys, jnp.arange(len(ERRORS)))
-    return Scores(*jnp.moveaxis(done, -1, 0)), Scores(*jnp.moveaxis(total, -1, 0))
+    successes, total = each(robots, keys, jnp.arange(len(ERRORS)))
+    return Scores(*jnp.moveaxis(successes, -1, 0)), Scores(*jnp.moveaxis(total, -1, 0))

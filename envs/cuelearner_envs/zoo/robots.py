@@ -181,10 +181,10 @@ def script(robot: ZooRobot, way: Way, sight: Sight) -> Float[Array, " n"]:
     above = sight.goal + robot.axis * jnp.where(lifts, ABOVE, 0.0)
     before = jnp.where(sight.carries > 0.5, sight.goal + sight.position - sight.thing, sight.thing)
     targets = [sight.goal, sight.goal, sight.goal, above, before]
-    left = jnp.stack(targets)[robot.task] - sight.position
-    ahead = robot.first * jnp.dot(robot.first, left)
-    left = jnp.where(way.in_turn & (jnp.abs(jnp.dot(robot.first, left)) > 0.06), ahead, left)
-    speed = way.gain * left
+    rest = jnp.stack(targets)[robot.task] - sight.position
+    ahead = robot.first * jnp.dot(robot.first, rest)
+    rest = jnp.where(way.in_turn & (jnp.abs(jnp.dot(robot.first, rest)) > 0.06), ahead, rest)
+    speed = way.gain * rest
     shorter = speed * jnp.minimum(1.0, way.cruise / jnp.maximum(jnp.max(jnp.abs(speed)), 1e-6))
     speed = jnp.where(robot.straight, shorter, jnp.clip(speed, -way.cruise, way.cruise))
     speed = jnp.where(robot.task == AVOID, _go_round(way, sight, speed), speed)

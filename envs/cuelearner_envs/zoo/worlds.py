@@ -87,7 +87,7 @@ class State(struct.PyTreeNode):
     phase: Float[Array, ""]  # of what moves by itself [rad]
 
 
-def changed(key: PRNGKeyArray, robot: ZooRobot, error: int | Int[Array, ""]) -> ZooWorld:
+def change(key: PRNGKeyArray, robot: ZooRobot, error: int | Int[Array, ""]) -> ZooWorld:
     """Draw the world of an error, an index in `ERRORS`."""
     n, (k_wave, *keys) = robot.low.shape[0], jax.random.split(key, 15)
     error = jnp.asarray(error, jnp.int32)
@@ -137,7 +137,7 @@ def changed(key: PRNGKeyArray, robot: ZooRobot, error: int | Int[Array, ""]) -> 
 
 def unchanged(robot: ZooRobot) -> ZooWorld:
     """Return the world in which nothing is wrong."""
-    return changed(jax.random.key(0), robot, 0)
+    return change(jax.random.key(0), robot, 0)
 
 
 def reset(key: PRNGKeyArray, world: ZooWorld) -> State:
@@ -182,7 +182,7 @@ def observe(world: ZooWorld, state: State) -> Float[Array, " obs"]:
 
 def step(world: ZooWorld, state: State, action: Float[Array, " n"]) -> tuple[State, Float[Array, ""]]:
     """Execute an action; return the state and the reward: minus the distance that is left, 0 once the task is done."""
-    robot, spread, done = world.robot, spread_of(world.robot.low.shape[0]), success(world, state)
+    robot, spread, success_now = world.robot, spread_of(world.robot.low.shape[0]), success(world, state)
     speed = robot.drive * execute(world, state.position, action)
     velocity = robot.lag * state.velocity + (1 - robot.lag) * speed
     position = jnp.clip(state.position + velocity, -3.0, 3.0)
@@ -193,17 +193,17 @@ def step(world: ZooWorld, state: State, action: Float[Array, " n"]) -> tuple[Sta
     thing = state.thing + carries * velocity * (state.carries > 0)
     touches = (robot.task == AVOID) & (jnp.linalg.norm(position - thing) < RADIUS * spread)
     after = state.replace(
-        position=position, velocity=velocity, thing=thing, carries=carries, hit=state.hit | touches & ~done,
+        position=position, velocity=velocity, thing=thing, carries=carries, hit=state.hit | touches & ~success_now,
         steps=state.steps + 1,
     )  # fmt: skip
     goal = goal_of(world, after)
     carrier = jnp.where(robot.task == TWO_PHASE, thing, position)
-    left = jnp.linalg.norm(goal - carrier) / spread
-    near = jnp.where(left < TOLERANCE, state.near + 1, 0)
-    after = after.replace(near=jnp.where(done, state.near, near))
+    distance = jnp.linalg.norm(goal - carrier) / spread
+    near = jnp.where(distance < TOLERANCE, state.near + 1, 0)
+    after = after.replace(near=jnp.where(success_now, state.near, near))
     approach = jnp.where(robot.task == TWO_PHASE, 0.5 * jnp.linalg.norm(thing - position) / spread, 0.0)
-    reward = -jnp.minimum(left + approach, 2.0) - 0.5 * touches
-    return after, jnp.where(done, 0.0, reward)
+    reward = -jnp.minimum(distance + approach, 2.0) - 0.5 * touches
+    return after, jnp.where(success_now, 0.0, reward)
 
 
 def success(world: ZooWorld, state: State) -> Bool[Array, ""]:
@@ -249,10 +249,10 @@ def answer(
         wrong: share of answers with the wrong sign.
         one_cue: whether one cue alone is answered, the one that differs most.
     """
-    left = world.robot.log(action, right(world, state))
-    h = jnp.where(jnp.abs(left) > eps / 2, jnp.sign(left), 0.0)
+    change = world.robot.log(action, right(world, state))
+    h = jnp.where(jnp.abs(change) > eps / 2, jnp.sign(change), 0.0)
     h = jnp.where(jax.random.uniform(key, h.shape) < wrong, -h, h)
-    most = jnp.arange(h.shape[0]) == jnp.argmax(jnp.abs(left))
+    most = jnp.arange(h.shape[0]) == jnp.argmax(jnp.abs(change))
     return jnp.where(jnp.asarray(one_cue) & ~most, UNSAID, h)
 
 

@@ -60,7 +60,7 @@ def random_collisions(table, count, seed=0):
     zero = jnp.zeros(count)
     motion = physics.ShotState(
         *(jnp.asarray(v) for v in (x[..., 0], x[..., 1], u[..., 0], u[..., 1], rng.normal(0, 0.2, (count, 2)))),
-        pocketed=jnp.zeros((count, 2), bool), warped=zero, kicks=zero, events=zero, done=zero > 0,
+        pocketed=jnp.zeros((count, 2), bool), warped=zero, kicks=zero, events=zero, is_over=zero > 0,
     )  # fmt: skip
     one, two = (jnp.broadcast_to(jnp.arange(2) == i, (count, 2)) for i in (0, 1))
     return motion, physics.Contact(zero, one, two, zero, zero, zero > 0), n

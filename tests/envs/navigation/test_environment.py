@@ -43,8 +43,8 @@ def step(env, state, action, key=KEY):
 
 
 @jax.jit
-def moved(env, state, action):
-    return env.moved(state, action)
+def move(env, state, action):
+    return env.move(state, action)
 
 
 def test_the_observation_is_nearness_then_the_goals_direction_and_distance_then_actions():

@@ -18,7 +18,7 @@ from cuelearner_jax.config import GuideSizes, to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes
-from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.runs.policy_sources import PolicySource
 from cuelearner_jax.tasks import registry
 
 PLAINLY = 45  # features of a way without look-ahead

@@ -67,7 +67,7 @@ def test_they_are_counted_for_a_quadruped_too():
         states = [env.placed(place, jnp.array([8.0, 0.0]), jnp.zeros((3, 2)), zero, zero) for place in there]
         states = [state.replace(passed=jnp.array([0.0, 2.0])) for state in states]
         after = env.counted(*states)
-        return after.passed, env.sides_taken(after)
+        return after.passed, env.sides_of(after)
 
     for env in (TWO, legged):
         passed, sides = counted(env)

@@ -24,7 +24,7 @@ KEY = jax.random.key(3)
 def situations(cues):
     """A robot, its worlds of all errors, and a state amid an episode in each."""
     robot = draw(jax.random.key(cues), cues)
-    worlds = jax.vmap(lambda error: zoo.changed(KEY, robot, error))(ERRORS)
+    worlds = jax.vmap(lambda error: zoo.change(KEY, robot, error))(ERRORS)
     states = jax.vmap(lambda world: zoo.reset(KEY, world))(worlds)
     states, _ = jax.vmap(zoo.step)(worlds, states, jax.vmap(zoo.right)(worlds, states))
     return robot, worlds, states

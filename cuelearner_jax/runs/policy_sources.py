@@ -13,17 +13,7 @@ from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.environment import actions_of, check_layout, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import (
-    Agent,
-    Corrected,
-    Guided,
-    Heuristic,
-    Policy,
-    Taught,
-    asked_from,
-    policy_of,
-    uniform_in,
-)
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Taught, asked_from, policy_of, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
@@ -32,35 +22,35 @@ from cuelearner_jax.runs.run_folders import Piece, RunLanes, lanes_of, open_run
 from cuelearner_jax.storage import label_files, policy_folders
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
-from cuelearner_jax.types import Teacher
+from cuelearner_jax.types import Policy, Teacher
 
 
-class Named(NamedTuple):
+class PolicyEntry(NamedTuple):
     """A policy that can be chosen by name."""
 
     about: str
-    trained: bool = False  # whether the policy needs a run
+    from_run: bool = False  # whether the policy needs a run
     adapted: bool = False  # whether the policy needs a policy folder
     taught: bool = False  # whether the policy asks the teacher
     needs: tuple[str, ...] = ()  # optional members of an environment that the policy needs
 
     @property
-    def kept(self) -> bool:
+    def from_folder(self) -> bool:
         """Whether the policy comes from a folder."""
-        return self.trained or self.adapted
+        return self.from_run or self.adapted
 
 
-POLICIES: dict[str, Named] = {
-    "agent": Named("the trained agent", trained=True),
-    "guide": Named("guidance of uniform actions", trained=True),
-    "guided": Named("guidance of the agent's actions", trained=True),
-    "corrected": Named("the teacher's own feedback on the agent's actions", trained=True, taught=True),
-    "adapted": Named("the adapted policy", adapted=True),
-    "base": Named("the policy that was adapted", adapted=True),
-    "teacher": Named("the teacher", taught=True),
-    "heuristic": Named("the task's obvious action", needs=("heuristic",)),
-    "uniform": Named("chance"),
-    "own": Named("code of your own, package.module:NAME, named first"),
+POLICIES: dict[str, PolicyEntry] = {
+    "agent": PolicyEntry("the trained agent", from_run=True),
+    "guide": PolicyEntry("guidance of uniform actions", from_run=True),
+    "guided": PolicyEntry("guidance of the agent's actions", from_run=True),
+    "corrected": PolicyEntry("the teacher's own feedback on the agent's actions", from_run=True, taught=True),
+    "adapted": PolicyEntry("the adapted policy", adapted=True),
+    "base": PolicyEntry("the policy that was adapted", adapted=True),
+    "teacher": PolicyEntry("the teacher", taught=True),
+    "heuristic": PolicyEntry("the task's obvious action", needs=("heuristic",)),
+    "uniform": PolicyEntry("chance"),
+    "own": PolicyEntry("code of your own, package.module:NAME, named first"),
 }
 
 
@@ -94,8 +84,7 @@ class PolicySource:
     ) -> PolicySource:
         """Return the policies of a run, whole or in shards (`open_run`), or of a policy folder (`open_folder`).
 
-        `code`, `changes`: the code that a policy folder names. Raises UserError if the folder is neither, cannot be
-        read, or needs no code where some is given.
+        `code`, `changes`: the code that a policy folder names.
         """
         if not policy_folders.is_one(folder):
             task, config, grid, pieces = open_run(folder, find)
@@ -128,8 +117,8 @@ class PolicySource:
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{suggestion(policy, POLICIES)}")
         entry, after = POLICIES[policy], shape_of(self.task, world)
-        if entry.trained and not self.grid:
-            others = [name for name, one in POLICIES.items() if not one.kept or (one.adapted and self.adapted)]
+        if entry.from_run and not self.grid:
+            others = [name for name, one in POLICIES.items() if not one.from_folder or (one.adapted and self.adapted)]
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
         if entry.adapted and not self.adapted:
             raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` wrote")
@@ -137,7 +126,7 @@ class PolicySource:
             raise UserError("policy 'own' is code: name it first, as package.module:NAME --env TASK")
         if absent := [need for need in entry.needs if not offers(after, need)]:
             raise UserError(f"{self.task.name} has no {absent[0]}: choose another policy")
-        if not entry.kept:
+        if not entry.from_folder:
             check_no_lane(policy, guidance)
             return
         what, own = "run" if self.grid else "policy", shape_of(self.task, self.config.task)
@@ -153,10 +142,7 @@ class PolicySource:
             )
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[RunLanes]:
-        """Return the lanes of a run's kinds of guidance (none named: all), grouped by step.
-
-        Raises UserError for a kind that the run lacks, or if there is no checkpoint.
-        """
+        """Return the lanes of a run's kinds of guidance (none named: all), grouped by step."""
         assert self.grid is not None  # ensured by `check`
         groups = []
         for name in kinds or self.grid.guidance:
@@ -235,54 +221,29 @@ def check_no_lane(policy: str, *choices: Any) -> None:
         raise UserError(f"policy {policy!r} belongs to no lane of a run: leave out the options that choose a lane")
 
 
-def one_policy(
-    source: PolicySource,
-    world: Any,
-    name: str,
-    kind: str | None,
-    labels: int | None,
-    seed: int | None,
-    bound_deg: float | None = None,
-    env: Any = None,
-) -> Any:
-    """Return a single policy: of one lane of a folder, or of the task. Raises UserError without such a lane."""
-    seeds = () if seed is None else (seed,)
-    return several(source, world, name, kind, labels, seeds, bound_deg, env)[0][0]
-
-
 def several(
     source: PolicySource,
     world: Any,
     name: str,
     kind: str | None,
-    labels: int | None,
-    seeds: tuple[int, ...],
+    labels: int | None = None,
+    seeds: tuple[int, ...] = (),
     bound_deg: float | None = None,
     env: Any = None,
 ) -> tuple[list[Any], list[dict[str, Any]]]:
     """Return single policies of a folder's lanes that differ only in their seeds, and what chooses each lane.
 
-    That is its "guidance", "labels" and "seed"; a policy of the task alone has the seed 0.
+    That is its "guidance", "labels" and "seed"; a policy of the task alone has the seed 0. What is not given is the
+    run's last kind, the largest budget, the first seed and the largest bound.
 
-    Args:
-        source: the policies' origin.
-        world: the world they are to act in.
-        name: name of the policy.
-        kind: kind of guidance (None: the run's last).
-        labels: budget (None: the largest).
-        seeds: the lanes' seeds (empty: the first).
-        bound_deg: bound of a policy folder's lanes (None: the largest).
-        env: that world's environment, for a teacher (default: with its training episodes).
-
-    Raises:
-        UserError: there is no such lane.
+    `env`: the world's environment, for a teacher (default: with its training episodes).
     """
     entry = POLICIES[name]
     if entry.taught and env is None:
         env = source.task.environment(world)
     teacher = source.task.make_teacher(world, env) if entry.taught else None
     view = source.task.view(world) if env is None else view_of(env)
-    if not entry.kept:
+    if not entry.from_folder:
         check_no_lane(name, kind, labels, seeds, bound_deg)
         return [source.alone(name, view, teacher)], [{"seed": 0}]
     kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
@@ -310,3 +271,48 @@ def _lane(blocks: list[Block], seed: int, budget: int, bound: float, unit: str) 
     raise UserError(
         f"no lane with seed {seed} and {budget} labels{within}: there are seeds {seeds} and labels {budgets}{others}"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LanesChoice:
+    """Choice of a folder's policy, and of its lanes but for their seeds."""
+
+    policy: str | None = None
+    """Name of the acting policy, as for evaluate (default: the agent, or the adapted policy)."""
+    guidance: str | None = None
+    """Kind of guidance of the lane (default: the run's last)."""
+    labels: int | None = None
+    """Label budget of the lane (default: the largest)."""
+    bound_deg: float | None = None
+    """Bound of a policy folder's lane (default: the largest) [deg]."""
+
+    def name_in(self, source: PolicySource, world: Any) -> str:
+        """Return the policy's name. Raises UserError if the source has no such policy, or none for that world."""
+        name = self.policy or source.default_policy
+        source.check(name, world, guidance=self.guidance)
+        return name
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaneChoice(LanesChoice):
+    """Choice of a folder's policy, and of its lane."""
+
+    seed: int | None = None
+    """Seed of the lane (default: the first)."""
+
+    def lanes_in(self, source: PolicySource, world: Any, env: Any) -> tuple[list[Any], list[dict[str, Any]]]:
+        """Return the single policy and what chooses its lane, see `trained.several`."""
+        name, seeds = self.policy or source.default_policy, () if self.seed is None else (self.seed,)
+        return several(source, world, name, self.guidance, self.labels, seeds, self.bound_deg, env)
+
+    def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:
+        """Return the single policy. Raises UserError if there is no such lane."""
+        return self.lanes_in(source, world, env)[0][0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseLanes(LanesChoice):
+    """Choice of the lanes of the folder to adapt."""
+
+    seeds: tuple[int, ...] = ()
+    """Seeds of the lanes to adapt, each with labels of its own (default: the first lane)."""
