@@ -145,20 +145,20 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
     parser.add_argument("--resume", action="store_true", help="go on with pieces that were begun, leave finished ones")
     parser.add_argument("--list", action="store_true", help="list the pieces and stop")
     parser.add_argument("--report", action="store_true", help="report on what there is, and run nothing")
-    asked = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        pieces = pieces_below(experiment.pieces, asked.pieces)
+        pieces = pieces_below(experiment.pieces, options.pieces)
     except ValueError as error:
         parser.error(str(error))
-    if asked.list:
+    if options.list:
         print("\n".join(f"{piece.path}: {piece.seeds} seeds, labels {piece.labels or 'none'}" for piece in pieces))
         return 0
-    out = asked.out if asked.scale == "paper" else asked.out / asked.scale
-    left = [scaled(piece, experiment.scales[asked.scale]) for piece in pieces if not asked.report]
-    for piece in filter(None, left):
-        for command in experiment.commands(experiment.task, piece, out, asked.resume):
+    out = options.out if options.scale == "paper" else options.out / options.scale
+    own = [scaled(piece, experiment.scales[options.scale]) for piece in pieces if not options.report]
+    for piece in filter(None, own):
+        for command in experiment.commands(experiment.task, piece, out, options.resume):
             if status := cuelearner(command):
                 return status
     worlds = dict.fromkeys(piece.world for piece in pieces if experiment.report is not None)
-    reports = [report_command(experiment, world, out, asked.scale) for world in worlds]
+    reports = [report_command(experiment, world, out, options.scale) for world in worlds]
     return next((status for command in reports if command and (status := label_efficiency.main(command))), 0)

@@ -10,6 +10,7 @@ the base agents. Pieces without labels measure the base agents, or the teacher. 
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +30,7 @@ NEAREST: Options = {
 }
 LIDAR: Options = {"sizes.frame": "action", "bound-deg": 60.0, "judge-by": "success"}
 WIDE: Options = {"sizes.frame": "action", "scalars.eps-deg": 20.0}  # in rooms small turns lead nowhere
-PLAYED: dict[str, Options] = {  # how policies are measured
+MANY: dict[str, Options] = {  # how policies are result
     "billiards": {"envs": 200, "steps": 10_000},
     "navigation": {"episodes": 2_000},
 }
@@ -37,10 +38,10 @@ FEW: dict[str, Options] = {"billiards": {"envs": 4, "steps": 12}, "navigation": 
 TRAINING = {"billiards": billiards_bootstrapping, "navigation": navigation_bootstrapping}
 
 
-def pieces(task: str, world: str, *asked: tuple[str, str, tuple[int, ...], Options]) -> list[Piece]:
+def pieces(task: str, world: str, *rows: tuple[str, str, tuple[int, ...], Options]) -> list[Piece]:
     """Return the pieces of a world: its base agents, its teacher, and (name, guidance, budgets, options) of others."""
-    known = [("none", "agent", (), {}), ("teacher", "teacher", (), {})]
-    return [Piece(task, world, name, (kind,), labels, 1, options) for name, kind, labels, options in [*known, *asked]]
+    plain = [("none", "agent", (), {}), ("teacher", "teacher", (), {})]
+    return [Piece(task, world, name, (kind,), labels, 1, options) for name, kind, labels, options in [*plain, *rows]]
 
 
 def billiards(world: str, more: Options) -> list[Piece]:
@@ -65,7 +66,7 @@ def lidar(world: str) -> list[Piece]:
     )
 
 
-def ways(world: str, *asked: tuple[str, str, tuple[int, ...], Options]) -> list[Piece]:
+def ways(world: str, *rows: tuple[str, str, tuple[int, ...], Options]) -> list[Piece]:
     """Return the pieces of a world where a way has to be chosen."""
     return pieces(
         "navigation",
@@ -73,7 +74,7 @@ def ways(world: str, *asked: tuple[str, str, tuple[int, ...], Options]) -> list[
         ("relative", "relative", (250, 1_000), WIDE),
         ("intent", "intent", (100, 250, 1_000), {}),
         ("intent-shuffled", "intent", (250, 1_000), SHUFFLED),
-        *asked,
+        *rows,
     )
 
 
@@ -125,16 +126,17 @@ def commands(_: str, piece: Piece, out: Path, resume: bool) -> list[list[str]]:
     if piece.run == BASES:
         own = {"preset": own["preset"], **(TRAINING[task].SCALES["smoke"].options if is_smoke else {})}
         return [sweep_command(task, piece._replace(options=own), out, resume)]
-    agents, measured = str(out / task / BASES / "none"), folder.with_suffix(".json")
-    if resume and measured.exists():
+    agents, result = out / task / BASES / "none", folder.with_suffix(".json")
+    if resume and result.exists():
         return []
     world = [] if piece.run == UNCHANGED else ["--scenario", piece.run]
     robot = words_of({"robot": own.pop("robot")} if "robot" in own else {})
-    measure = [*words_of(FEW[task] if is_smoke else PLAYED[task]), "--out", str(measured)]
+    measure = [*words_of(FEW[task] if is_smoke else MANY[task]), "--out", str(result)]
     if not piece.labels:
-        return [["evaluate", agents, "--policy", *piece.kinds, *world, *robot, *measure]]
-    ask = words_of({"guidance": piece.kinds, "labels": piece.labels, **own})
-    adapt = ["adapt", agents, *ask, *world, *robot, "--out", str(folder), *(["--overwrite"] if resume else [])]
+        return [["evaluate", str(agents), "--policy", *piece.kinds, *world, *robot, *measure]]
+    seeds = tuple(json.loads((agents / "config.json").read_text())["grid"]["seeds"])
+    ask = words_of({"base.seeds": seeds, "guidance": piece.kinds, "labels": piece.labels, **own})
+    adapt = ["adapt", str(agents), *ask, *world, *robot, "--out", str(folder), *(["--overwrite"] if resume else [])]
     return [adapt, ["evaluate", str(folder), "--compare", "base", *robot, *measure]]
 
 

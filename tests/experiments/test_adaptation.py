@@ -22,13 +22,21 @@ def study():
     sys.path.remove(str(FOLDER))
 
 
-def corrections(study, scale):
+def bases(folder, task):
+    """Write the seeds of a task's base agents."""
+    (folder / task / "bases/none").mkdir(parents=True)
+    (folder / task / "bases/none/config.json").write_text('{"grid": {"seeds": [5000, 5001]}}')
+
+
+def corrections(study, scale, folder):
     """Every piece that asks, with its command line, of agents that are at hand."""
+    for task in AGENTS:
+        bases(folder, task)
     for piece in study.PIECES:
-        left = scaled(piece, study.SCALES[scale])
-        if left is not None and left.labels:
-            command = study.commands("", left, Path("nowhere"), False)[0]
-            yield left, [AGENTS[piece.world] if word.endswith("/bases/none") else word for word in command]
+        own = scaled(piece, study.SCALES[scale])
+        if own is not None and own.labels:
+            command = study.commands("", own, folder, False)[0]
+            yield own, [AGENTS[piece.world] if word.endswith("/bases/none") else word for word in command]
 
 
 def test_every_piece_acts_in_a_world_of_its_task(study):
@@ -37,34 +45,35 @@ def test_every_piece_acts_in_a_world_of_its_task(study):
         assert piece.run in (*registry.find(piece.world).scenarios, study.BASES, study.UNCHANGED)
 
 
-@pytest.mark.parametrize("scale", ["smoke", "paper"])
+@pytest.mark.parametrize("scale", ["smoke", pytest.param("paper", marks=pytest.mark.long)])
 def test_every_correction_has_options_that_exist(study, scale, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    asked = []
+    worlds = []
 
     def subject_of(source, world, *_):
-        asked.append(world)
+        worlds.append(world)
         raise UserError("all options are read")
 
     monkeypatch.setattr(adapt, "subject_of", subject_of)
-    commands = [command for _, command in corrections(study, scale)][:: 3 if scale == "smoke" else 1]
+    commands = [command for _, command in corrections(study, scale, tmp_path)][:: 3 if scale == "smoke" else 1]
     for command in commands:
         main(command)
-    assert len(asked) == len(commands)
+    assert len(worlds) == len(commands)
 
 
 def test_a_piece_that_was_measured_is_not_run_again(study, monkeypatch, tmp_path):
     known = importlib.import_module("_pieces")
     lines = []
+    bases(tmp_path, "navigation")
     monkeypatch.setattr(known, "cuelearner", lambda command: lines.append(command) or 0)
-    asked = ["--out", str(tmp_path), "--pieces", "navigation/rooms/intent", "navigation/rooms/none"]
-    assert study.main(asked) == 0
+    arguments = ["--out", str(tmp_path), "--pieces", "navigation/rooms/intent", "navigation/rooms/none"]
+    assert study.main(arguments) == 0
     assert [line[0] for line in lines] == ["evaluate", "adapt", "evaluate"]
     assert lines[1][1:] == [
-        str(tmp_path / "navigation/bases/none"), "--guidance", "intent", "--labels", "100", "250", "1000",
-        "--scenario", "rooms", "--out", str(tmp_path / "navigation/rooms/intent"),
+        str(tmp_path / "navigation/bases/none"), "--base.seeds", "5000", "5001", "--guidance", "intent",
+        "--labels", "100", "250", "1000", "--scenario", "rooms", "--out", str(tmp_path / "navigation/rooms/intent"),
     ]  # fmt: skip
-    (tmp_path / "navigation/rooms").mkdir(parents=True)
+    (tmp_path / "navigation/rooms").mkdir()
     (tmp_path / "navigation/rooms/none.json").touch()
-    assert study.main([*asked, "--resume"]) == 0
+    assert study.main([*arguments, "--resume"]) == 0
     assert [line[0] for line in lines[3:]] == ["adapt", "evaluate"]
