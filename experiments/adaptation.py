@@ -30,7 +30,7 @@ NEAREST: Options = {
 }
 LIDAR: Options = {"sizes.frame": "action", "bound-deg": 60.0, "judge-by": "success"}
 WIDE: Options = {"sizes.frame": "action", "scalars.eps-deg": 20.0}  # in rooms small turns lead nowhere
-MANY: dict[str, Options] = {  # how policies are result
+MANY: dict[str, Options] = {  # episodes, or steps, of a measurement
     "billiards": {"envs": 200, "steps": 10_000},
     "navigation": {"episodes": 2_000},
 }
