@@ -86,7 +86,8 @@ class Experiment(NamedTuple):
     task: str
     pieces: tuple[Piece, ...]
     scales: Mapping[str, Scale]
-    report: Mapping[str, Sequence[str]] | None = None  # options of label_efficiency.py at the scale `paper`, by world
+    # Options of label_efficiency.py at the scale `paper`, by world; None: there is no report.
+    report: Mapping[str, Sequence[str]] | None = None
     metric: Sequence[str] = ()  # options of it at every scale
     # (task, piece, folder of all pieces, go on?) -> command lines of the piece
     commands: Callable[[str, Piece, Path, bool], list[list[str]]] = lambda *piece: [sweep_command(*piece)]

@@ -102,7 +102,7 @@ SCALES = {
     "smoke": Scale(
         "seconds a piece on a CPU, to see that everything runs",
         seeds=2,
-        labels={50: 5, 250: 10},
+        labels={50: 20, 250: 25},  # a reading asks for at least 20
         options={
             "sizes.feedback-layers": 16,
             "sizes.labels-per-round": 5,

@@ -84,9 +84,7 @@ SCALES = {
         instead={"agent.critics": 3},
     ),
 }
-EXPERIMENT = Experiment(
-    "arm", PIECES, SCALES, report=dict.fromkeys(WORLDS, ("--level", "0.8")), metric=("--metric", "success")
-)
+EXPERIMENT = Experiment("arm", PIECES, SCALES, report={}, metric=("--metric", "success", "--level", "0.8"))
 main = partial(run, EXPERIMENT, __doc__ or "")
 
 
