@@ -58,8 +58,8 @@ gallery: $(VENV)/.tested
 smoke: $(VENV)/.installed
 	$(BIN)/python experiments/billiards_bootstrapping.py --scale smoke --pieces easy/frame --resume
 	$(BIN)/python experiments/navigation_bootstrapping.py --scale smoke --pieces clutter/frame --resume
-	$(BIN)/python experiments/adaptation_billiards.py --scale smoke --pieces unchanged/none tilted_table --resume
-	$(BIN)/python experiments/adaptation_navigation.py --scale smoke --pieces unchanged/none turned_lidar corridor_left --resume
+	$(BIN)/python experiments/adaptation.py --scale smoke --resume --pieces billiards/bases billiards/tilted_table \
+		navigation/bases navigation/turned_lidar navigation/corridor_left
 
 test: $(VENV)/.tested
 	$(PYTEST) -m "not long"

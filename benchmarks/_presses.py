@@ -8,15 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from _photos import ENTRIES, HIGH, best
-from _way import Scene
 
 from cuelearner_jax.spaces import UNSAID
 
-KEYS = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0, "ArrowDown": None}  # of a page about directions
-UNSURE, MISTAKES = 0.1, 0.1  # shares of a script's keys, and of its answers
-RIGHT_DEG = 10.0  # half of navigation's eps: an arrow this near the way is left as it is
-RIGHT_SHARE = 0.05  # of a range: an entry this near is left as it is
-DRAWN = "document.querySelector('svg.scene').outerHTML"
+TURNS = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0}  # of a page about directions
+UNSURE = 0.1  # share of a script's keys
+RIGHT_SHARE = 0.05  # of a range: the script does not correct an entry this near
 SEEN = "() => [document.querySelector('.side').innerText, [...document.querySelectorAll('.note')].at(-1).innerText]"
 
 
@@ -27,13 +24,13 @@ class Presses(NamedTuple):
     answer: tuple[float, ...] | None
 
 
-def chosen(page: Any, task: str, rng: random.Random, seen: np.ndarray | None = None) -> Presses:
-    """Return the script's key; `seen` (situations, 4): contents of a folder's pictures."""
+def presses_of(page: Any, rng: random.Random, seen: np.ndarray | None = None) -> Presses:
+    """Return the script's keys; `seen` (situations, 4): contents of a folder's pictures; otherwise at random."""
     named = page.evaluate("cue.keys")
     cues = sorted({int(name.split("-")[1]) for name in named.values() if name.startswith(("pick-", "only-"))})
     if not cues:
-        key = _turned(page, task, rng)
-        return Presses((key,), None if (said := KEYS[key]) is None else (said,))
+        key = "ArrowDown" if rng.random() < UNSURE else rng.choice([*TURNS])
+        return Presses((key,), (TURNS[key],) if key in TURNS else None)
     keys = {}
     for key, name in named.items():
         keys.setdefault(name, key)
@@ -49,19 +46,6 @@ def chosen(page: Any, task: str, rng: random.Random, seen: np.ndarray | None = N
         return Presses((keys[f"only-{cue}-{'more' if said[cue] > 0 else 'less'}"],), alone)
     picks = [keys[f"pick-{cue}-{'more' if said[cue] > 0 else 'less'}"] for cue in cues if said[cue]]
     return Presses((*picks, keys["rest"]), tuple(said))
-
-
-def _turned(page: Any, task: str, rng: random.Random) -> str:
-    """A key of a page about directions."""
-    if rng.random() < UNSURE:
-        return "ArrowDown"
-    if task != "navigation":
-        return rng.choice(["ArrowLeft", "ArrowUp", "ArrowRight"])
-    scene = Scene(page.evaluate(DRAWN))
-    apart = (scene.to_goal() - scene.asked + 180) % 360 - 180
-    right = "ArrowUp" if abs(apart) <= RIGHT_DEG else "ArrowLeft" if apart > 0 else "ArrowRight"
-    wrong = [key for key, said in KEYS.items() if said is not None and key != right]
-    return rng.choice(wrong) if rng.random() < MISTAKES else right
 
 
 def _wanted(page: Any, seen: np.ndarray) -> list[float]:

@@ -20,10 +20,9 @@
 The task `pictures` is a folder of plain pictures, written anew; a script that knows what they show answers about three
 cues.
 
-`paced`: a script that sees only the page turns navigation's arrow onto the shortest way past what is drawn, but 10% of
-its keys are "don't know" and 10% of the others one of the two wrong ones; in billiards it presses at random. Measured
-are a key's press to the next question painted, while a model is being fitted and otherwise, and whether every press is
-in the file once. Needs playwright and a Chromium (`--browser`).
+`paced`: a script presses keys at random, or as the pictures say; 10% are "don't know". Measured are a key's press to
+the next question painted, while a model is being fitted and otherwise, and whether every press is in the file once.
+Needs playwright and a Chromium (`--browser`).
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ from typing import Any
 import _photos
 import numpy as np
 from _photos import CUES
-from _presses import Presses, chosen
+from _presses import Presses, presses_of
 from playwright.sync_api import Browser, Page, sync_playwright  # pyright: ignore[reportMissingImports]
 
 from cuelearner_jax.storage import label_files
@@ -142,7 +141,7 @@ def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
     """Labels at a pace: every press in the file once, and how long each took."""
     rng, pressed, answered = random.Random(0), {}, 0
     (task,) = asked.task
-    folder = asked.keep or work / "labels"
+    folder = work / "labels"
     began = time.time()
     with served(asked, task, folder, "--labels", str(asked.labels)) as (process, address):
         opened, page = time.time() - began, entered(browser, address)
@@ -152,7 +151,7 @@ def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
             if item is None:
                 break
             time.sleep(max(0.0, start + number / asked.rate - time.perf_counter()))
-            presses = pressed[item] = chosen(page, task, rng, asked.seen)
+            presses = pressed[item] = presses_of(page, rng, asked.seen)
             press(page, presses)
             answered += presses.answer is not None
             moved(page, item)
@@ -194,7 +193,7 @@ def kills(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
                     item = page.evaluate(ITEM)
                     told = re.search(r"(\d+) answers saved", page.locator(".side").inner_text())
                     saved = max(saved, int(told[1]) if told else 0)
-                    pressed[item] = chosen(page, task, rng, asked.seen)
+                    pressed[item] = presses_of(page, rng, asked.seen)
                     press(page, pressed[item])
                     if time.perf_counter() > end:
                         time.sleep(rng.uniform(0, 0.03))
@@ -235,7 +234,7 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
                 rng, wanted = random.Random(2), 0 if kind else 12
                 while int(re.match(r"\d+", page.locator(".side").inner_text())[0]) < wanted:  # pyright: ignore[reportOptionalSubscript]
                     item = page.evaluate(ITEM)
-                    press(page, chosen(page, task, rng, asked.seen))
+                    press(page, presses_of(page, rng, asked.seen))
                     moved(page, item)
                 if wanted:
                     page.wait_for_function("() => document.body.innerText.includes('model 1')", timeout=300_000)
@@ -260,7 +259,6 @@ def main() -> None:
     parser.add_argument("--labels", type=int, default=500)
     parser.add_argument("--rate", type=float, default=5.0, help="presses a second")
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--keep", type=Path, help="paced: folder for the labels (default: one that is removed)")
     parser.add_argument("--to", type=Path, default=Path("docs/figures"), help="folder for pictures")
     parser.add_argument("--called", default="", help="pictures: a word for their names, of a page with further options")
     parser.add_argument("--browser", default=shutil.which("chromium"), help="a Chromium")

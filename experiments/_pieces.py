@@ -1,25 +1,38 @@
-"""Sweeps cut into pieces: which pieces, at which scale, resumed, and reported together."""
+"""The runner of studies: pieces are data, commands run them at a scale, and one report reads their runs."""
 
 from __future__ import annotations
 
 import argparse
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import label_efficiency
-import numpy as np
 
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.evaluate import mean_interval
 
 FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
-Options = Mapping[str, object]  # of `cuelearner sweep`: a value, several in a tuple, or whether a flag is on
+Options = Mapping[str, object]  # of a command: a value, several in a tuple, or whether a flag is on
+SMOKE: Options = {  # of every sweep at the scale `smoke`
+    "agent.replay-capacity": 200,
+    "sizes.feedback-layers": 16,
+    "sizes.labels-per-round": 5,
+    "sizes.fit-steps": 20,
+    "sizes.fit-batch-size": 10,
+    "sizes.lanes-per-block": 1,
+    "schedule.total-steps": 200,
+    "schedule.random-steps": 50,
+    "schedule.learn-after": 50,
+    "schedule.guidance-until": 200,
+    "schedule.eval-every": 100,
+    "schedule.eval-envs": 5,
+    "schedule.eval-steps": 100,
+    "schedule.checkpoint-every": 200,
+}
 
 
 class Piece(NamedTuple):
-    """One sweep. Its folder is world/run/name."""
+    """One sweep, or one policy in a changed world. Its folder is world/run/name."""
 
     world: str  # that it is played in: what one report is of
     run: str  # what is compared as one: kinds and budgets under one configuration
@@ -45,28 +58,6 @@ class Scale(NamedTuple):
     instead: Mapping[str, object] = {}  # of options that a piece has
 
 
-class Experiment(NamedTuple):
-    """The sweeps of one task."""
-
-    task: str
-    pieces: tuple[Piece, ...]
-    scales: Mapping[str, Scale]
-    report: Mapping[str, Sequence[str]]  # options of label_efficiency.py at the scale `paper`, by world
-    metric: Sequence[str] = ()  # options of it at every scale
-
-
-def scaled(piece: Piece, scale: Scale) -> Piece | None:
-    """Return a piece at a scale, or None where nothing of it is left."""
-    seeds = min(piece.seeds, scale.seeds or piece.seeds)
-    labels = piece.labels
-    if scale.labels is not None and labels:
-        labels = tuple(scale.labels[budget] for budget in labels if budget in scale.labels)
-        if not labels:
-            return None
-    instead = {name: value for name, value in scale.instead.items() if name in piece.options}
-    return piece._replace(seeds=seeds, labels=labels, options={**piece.options, **scale.options, **instead})
-
-
 def option(name: str, value: object) -> list[str]:
     """Return an option as it is typed: `--no-…` for a flag that is off."""
     if isinstance(value, bool):
@@ -81,17 +72,37 @@ def words_of(options: Options) -> list[str]:
 
 
 def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]:
-    """Return the command line of a piece."""
-    own: dict[str, object] = {**piece.options, "guidance": piece.kinds, "seeds": piece.seeds}
-    own |= {"first-seed": FIRST_SEED, **({"labels": piece.labels} if piece.labels else {})}
+    """Return the command line of a piece that is a sweep."""
+    own: dict[str, object] = {"first-seed": FIRST_SEED, **piece.options, "guidance": piece.kinds, "seeds": piece.seeds}
+    own |= {"labels": piece.labels} if piece.labels else {}
     folder = out / piece.path
     going_on = ["--resume"] if resume and (folder / "config.json").exists() else []
     return ["sweep", task, *words_of(own), "--out", str(folder), *going_on]
 
 
-def folder_at(out: Path, scale: str) -> Path:
-    """Return the folder of a scale's worlds: the folder itself for `paper`, one below for others."""
-    return out if scale == "paper" else out / scale
+class Experiment(NamedTuple):
+    """The pieces of one study."""
+
+    task: str
+    pieces: tuple[Piece, ...]
+    scales: Mapping[str, Scale]
+    # Options of label_efficiency.py at the scale `paper`, by world; None: there is no report.
+    report: Mapping[str, Sequence[str]] | None = None
+    metric: Sequence[str] = ()  # options of it at every scale
+    # (task, piece, folder of all pieces, go on?) -> command lines of the piece
+    commands: Callable[[str, Piece, Path, bool], list[list[str]]] = lambda *piece: [sweep_command(*piece)]
+
+
+def scaled(piece: Piece, scale: Scale) -> Piece | None:
+    """Return a piece at a scale, or None where nothing of it is left."""
+    seeds = min(piece.seeds, scale.seeds or piece.seeds)
+    labels = piece.labels
+    if scale.labels is not None and labels:
+        labels = tuple(scale.labels[budget] for budget in labels if budget in scale.labels)
+        if not labels:
+            return None
+    instead = {name: value for name, value in scale.instead.items() if name in piece.options}
+    return piece._replace(seeds=seeds, labels=labels, options={**piece.options, **scale.options, **instead})
 
 
 def report_command(experiment: Experiment, world: str, out: Path, scale: str) -> list[str] | None:
@@ -101,20 +112,20 @@ def report_command(experiment: Experiment, world: str, out: Path, scale: str) ->
     kinds = {kind for piece in begun for kind in piece.kinds}
     if "none" not in kinds:
         return None
-    more = list(experiment.report.get(world, ())) if scale == "paper" else []
+    more = list((experiment.report or {}).get(world, ())) if scale == "paper" else []
     if "--reference" in more and more[(at := more.index("--reference")) + 1] not in kinds:
         del more[at : at + 2]
     folders = dict.fromkeys(str(out / world / piece.run) for piece in begun)
     return [*folders, "--by-run", *experiment.metric, *more, "--out", str(out / world / "report"), "--overwrite"]
 
 
-def pieces_below(pieces: Sequence[Any], names: Sequence[str]) -> list[Any]:
+def pieces_below(pieces: Sequence[Piece], names: Sequence[str]) -> list[Piece]:
     """Return the pieces of these names, or below these folders, in the order of the data; all for no name.
 
     Raises ValueError for a name that none has.
     """
 
-    def below(piece: Any, name: str) -> bool:
+    def below(piece: Piece, name: str) -> bool:
         return f"{piece.path}/".startswith(f"{name.rstrip('/')}/")
 
     for name in names:
@@ -123,63 +134,32 @@ def pieces_below(pieces: Sequence[Any], names: Sequence[str]) -> list[Any]:
     return [piece for piece in pieces if not names or any(below(piece, name) for name in names)]
 
 
-def asked_of(
-    about: str, pieces: Sequence[Piece], scales: Mapping[str, Scale], out: Path, arguments: Sequence[str] | None
-) -> tuple[argparse.Namespace, list[Piece]]:
-    """Return the arguments of a study's command, and the pieces that are meant; print them and exit for --list."""
+def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = None) -> int:
+    """Run pieces and reports on their worlds; stop at the first command that fails and return its status."""
     parser = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    known = "; ".join(f"{name}: {scale.about}" for name, scale in scales.items())
-    parser.add_argument("--scale", choices=list(scales), default="paper", help=known)
+    scales = "; ".join(f"{name}: {scale.about}" for name, scale in experiment.scales.items())
+    parser.add_argument("--scale", choices=list(experiment.scales), default="paper", help=scales)
     parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
-    parser.add_argument("--out", type=Path, default=out, help="folder")
+    parser.add_argument("--out", type=Path, default=Path("runs/studies") / experiment.task, help="folder")
     parser.add_argument("--resume", action="store_true", help="go on with pieces that were begun, leave finished ones")
     parser.add_argument("--list", action="store_true", help="list the pieces and stop")
     parser.add_argument("--report", action="store_true", help="report on what there is, and run nothing")
-    asked = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        meant = pieces_below(pieces, asked.pieces)
+        pieces = pieces_below(experiment.pieces, options.pieces)
     except ValueError as error:
         parser.error(str(error))
-    if asked.list:
-        print("\n".join(f"{piece.path}: {piece.seeds} seeds, labels {piece.labels or 'none'}" for piece in meant))
-        raise SystemExit(0)
-    return asked, meant
-
-
-def run_pieces(task: str, pieces: Sequence[Piece], scale: Scale, out: Path, resume: bool) -> int:
-    """Run pieces at a scale; stop at the first command that fails and return its status."""
-    for piece in pieces:
-        at_scale = scaled(piece, scale)
-        if at_scale and (status := cuelearner(sweep_command(task, at_scale, out, resume))):
-            return status
-    return 0
-
-
-def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = None) -> int:
-    """Run pieces and reports on their worlds; stop at the first command that fails and return its status."""
-    folder = Path("runs") / f"{experiment.task}_bootstrapping"
-    asked, pieces = asked_of(about, experiment.pieces, experiment.scales, folder, arguments)
-    out = folder_at(asked.out, asked.scale)
-    if not asked.report:
-        scale = experiment.scales[asked.scale]
-        if status := run_pieces(experiment.task, pieces, scale, out, asked.resume):
-            return status
-    worlds = dict.fromkeys(piece.world for piece in pieces)
-    commands = [report_command(experiment, world, out, asked.scale) for world in worlds]
-    return next((status for command in commands if command and (status := label_efficiency.main(command))), 0)
-
-
-def grouped(rows: Sequence[dict[str, Any]], *names: str) -> list[tuple[Any, list[dict[str, Any]]]]:
-    """Return rows that are alike in some columns, by these."""
-    groups = defaultdict(list)
-    for row in rows:
-        groups[tuple(row[name] for name in names)].append(row)
-    return sorted(groups.items())
-
-
-def spread(values: Sequence[float]) -> dict[str, Any]:
-    """Return the mean of as many seeds with its 95% bootstrap interval."""
-    mean, low, high = mean_interval(np.array(values, float)).tolist()
-    return {"seeds": len(values), "mean": mean, "low": low, "high": high}
+    if options.list:
+        print("\n".join(f"{piece.path}: {piece.seeds} seeds, labels {piece.labels or 'none'}" for piece in pieces))
+        return 0
+    out = options.out if options.scale == "paper" else options.out / options.scale
+    own = [scaled(piece, experiment.scales[options.scale]) for piece in pieces if not options.report]
+    for piece in filter(None, own):
+        for command in experiment.commands(experiment.task, piece, out, options.resume):
+            if status := cuelearner(command):
+                return status
+    worlds = dict.fromkeys(piece.world for piece in pieces if experiment.report is not None)
+    reports = [report_command(experiment, world, out, options.scale) for world in worlds]
+    return next((status for command in reports if command and (status := label_efficiency.main(command))), 0)

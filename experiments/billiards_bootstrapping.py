@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from _pieces import Experiment, Options, Piece, Scale, run
+from _pieces import SMOKE, Experiment, Options, Piece, Scale, run
 
 BUDGETS = (25, 50, 100, 350, 500, 1_000)
 ASKING = ("relative", "intent", "demonstration", "scalar", "dcoach")
@@ -77,24 +77,12 @@ SCALES = {
         seeds=2,
         labels={25: 5, 500: 10, 1_000: 15},
         options={
+            **SMOKE,
             "agent.q-layers": 16,
-            "sizes.feedback-layers": 16,
             "agent.directions": 36,
             "agent.coarse-directions": 0,
             "sizes.num-envs": 10,
-            "agent.replay-capacity": 200,
-            "sizes.labels-per-round": 5,
-            "sizes.fit-steps": 20,
-            "sizes.fit-batch-size": 10,
-            "sizes.lanes-per-block": 1,
-            "schedule.total-steps": 200,
-            "schedule.random-steps": 50,
-            "schedule.learn-after": 50,
-            "schedule.guidance-until": 200,
-            "schedule.eval-every": 100,
-            "schedule.eval-steps": 100,
             "schedule.eval-envs": 10,
-            "schedule.checkpoint-every": 200,
         },
     ),
     "paper": Scale("half an hour a piece on an accelerator"),

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
@@ -41,6 +42,18 @@ def read(file: Path) -> list[Row]:
     """Return the rows of a figure, numbers as numbers."""
     with file.open(newline="", encoding="utf-8") as lines:
         return [{name: _number(cell) for name, cell in row.items()} for row in csv.DictReader(lines)]
+
+
+def write(name: str, samples: Iterable[tuple[str, str, str, Sequence[float]]]) -> None:
+    """Write the file of a figure: the mean of each (panel, series, x, sample) with its 95% bootstrap interval."""
+    random = np.random.default_rng(0)
+    with (DOCS / "data" / "results" / f"{name}.csv").open("w", newline="", encoding="utf-8") as lines:
+        out = csv.writer(lines)
+        out.writerow(("panel", "series", "x", "value", "lower", "upper"))
+        for panel, series, x, sample in samples:
+            values = np.array(sample)
+            drawn = values[random.integers(len(values), size=(2000, len(values)))].mean(1)
+            out.writerow((panel, series, x, *np.round((values.mean(), *np.quantile(drawn, (0.025, 0.975))), 4)))
 
 
 def _number(cell: str) -> Any:

@@ -14,7 +14,6 @@ cell; what is there is kept.
 from __future__ import annotations
 
 import argparse
-import csv
 import importlib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -26,13 +25,13 @@ import gymnasium
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import results_figures
 
 import cuelearner_jax as cl
 from cuelearner_envs.fetch import scripts
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import fetch_layout
 
-DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 REPORTED = 50  # episodes of each measurement
 EPS = 0.05  # strength of an answer, as a share of the range
 WORSE = 0.15  # difference of success that is more than the noise of `REPORTED` episodes
@@ -291,25 +290,17 @@ def lost(row: dict[str, Any]) -> float:
     return (row["after"] - row["before"]) / loss if loss > WORSE else np.nan
 
 
-def record(rows: list[dict[str, Any]]) -> None:
-    """Write the success of each change, with its interval over robots and seeds, into docs/data/results."""
-    random = np.random.default_rng(0)
-    with (DATA / "results" / "scripted_arms.csv").open("w", newline="", encoding="utf-8") as lines:
-        out = csv.writer(lines)
-        out.writerow(("panel", "series", "x", "value", "lower", "upper"))
-        for panel, of in (("Fetch", "Fetch"), ("Meta-World", "")):
-            group = [row for row in rows if row["robot"].startswith("Fetch") == bool(of)]
-            for change in dict.fromkeys(row["change"] for row in group):
-                own = [row for row in group if row["change"] == change and row["labels"] == "labels"]
-                control = [row for row in group if row["change"] == change and row["labels"] != "labels"]
-                series = (("as it was", own, "before"), ("corrected", own, "after"), ("unchanged", own, "unchanged"))
-                for name, cells, end in (*series, ("random answers", control, "after")):
-                    if not cells:
-                        continue
-                    values = np.array([row[end] for row in cells])
-                    drawn = values[random.integers(len(values), size=(2000, len(values)))].mean(1)
-                    ends = np.quantile(drawn, (0.025, 0.975))
-                    out.writerow((panel, name, change, *np.round((values.mean(), *ends), 4)))
+def success_of(rows: list[dict[str, Any]]) -> Iterator[tuple[str, str, str, list[float]]]:
+    """Yield the success of the cells of each change, as the figure takes it."""
+    for panel in ("Fetch", "Meta-World"):
+        group = [row for row in rows if row["robot"].startswith("Fetch") == (panel == "Fetch")]
+        for change in dict.fromkeys(row["change"] for row in group):
+            own = [row for row in group if row["change"] == change and row["labels"] == "labels"]
+            control = [row for row in group if row["change"] == change and row["labels"] != "labels"]
+            series = (("as it was", own, "before"), ("corrected", own, "after"), ("unchanged", own, "unchanged"))
+            for name, cells, end in (*series, ("random answers", control, "after")):
+                if cells:
+                    yield panel, name, change, [row[end] for row in cells]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -329,7 +320,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows = pq.read_table(options.table).to_pylist()
         table(rows)
         if options.record:
-            record(rows)
+            results_figures.write("scripted_arms", success_of(rows))
         return
     warnings.simplefilter("ignore")  # that a correction is not used is a row
     seeds = range(options.first_seed, options.first_seed + options.seeds)

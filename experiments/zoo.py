@@ -12,7 +12,7 @@ chosen on held-out robots. An accelerator reads all cells of a group side by sid
 from __future__ import annotations
 
 import argparse
-import csv
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import results_figures
 
 from cuelearner_envs import zoo
 from cuelearner_jax.adaptation.judging import PairedTest, differences
@@ -320,22 +321,15 @@ def table(rows: list[dict[str, Any]]) -> None:
         print(f"judged by {name}: {lost} of {len(gained)} gains are not used")
 
 
-def record(rows: list[dict[str, Any]]) -> None:
-    """Write the success of each error, with its interval over robots, into docs/data/results."""
-    random = np.random.default_rng(0)
-    with (DATA / "results" / "zoo.csv").open("w", newline="", encoding="utf-8") as lines:
-        out = csv.writer(lines)
-        out.writerow(("panel", "series", "x", "value", "lower", "upper"))
-        for error, fault in dict.fromkeys((row["error"], row["fault"]) for row in rows):
-            own = [row for row in rows if (row["error"], row["fault"]) == (error, fault)]
-            robots = sorted({(row["cues"], row["robot"]) for row in own})
-            for series, name in (("as it was", "before"), ("corrected", "after"), ("unchanged world", "unchanged")):
-                each = [[row[f"{name} success"] for row in own if (row["cues"], row["robot"]) == r] for r in robots]
-                means = np.array([np.mean(values) for values in each])
-                drawn = means[random.integers(len(means), size=(2000, len(means)))].mean(1)
-                ends = np.quantile(drawn, (0.025, 0.975))
-                label = ", ".join(filter(None, (error, fault))).replace("_", " ")
-                out.writerow((f"{len(robots)} robots", series, label, *np.round((means.mean(), *ends), 4)))
+def success_of(rows: list[dict[str, Any]]) -> Iterator[tuple[str, str, str, list[float]]]:
+    """Yield the success of each robot under each error, as the figure takes it."""
+    for error, fault in dict.fromkeys((row["error"], row["fault"]) for row in rows):
+        own = [row for row in rows if (row["error"], row["fault"]) == (error, fault)]
+        robots = sorted({(row["cues"], row["robot"]) for row in own})
+        label = ", ".join(filter(None, (error, fault))).replace("_", " ")
+        for series, name in (("as it was", "before"), ("corrected", "after"), ("unchanged world", "unchanged")):
+            each = [[row[f"{name} success"] for row in own if (row["cues"], row["robot"]) == r] for r in robots]
+            yield f"{len(robots)} robots", series, label, [float(np.mean(values)) for values in each]
 
 
 def group(cues: int, count: int, split: str) -> Any:
@@ -376,7 +370,7 @@ def main() -> None:
         rows = [row for row in pq.read_table(options.table).to_pylist() if row["seed"] < options.seeds]
         table(rows)
         if options.record:
-            record(rows)
+            results_figures.write("zoo", success_of(rows))
         return
     robots = group(options.cues, options.robots, options.split)
     cells, file = cells_of(options.robots, options.seeds), options.out / f"{options.split}_{options.cues}.parquet"

@@ -1,0 +1,269 @@
+"""Meta-World with pictures in changed worlds, in processes of its own, and as an environment of LeRobot.
+
+    lerobot-eval --env.discover_packages_path=_metaworld_pictures --env.type=metaworld_pictures --env.task=reach-v3 ...
+
+Needs lerobot 0.6.1 and `pip install --no-deps metaworld`. What is seen is one picture of the camera `corner2`, and the
+hand's place and opening. Its reset of the gripper's weld writes 11 numbers where MuJoCo 3.17 has 12 columns: the first
+11 are filled.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple
+
+import gymnasium
+import metaworld
+import mujoco
+import numpy as np
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.envs import metaworld as of_lerobot
+from lerobot.envs.configs import EnvConfig
+from metaworld.sawyer_xyz_env import SawyerMocapBase
+
+TASKS = ("reach-v3", "button-press-v3", "drawer-open-v3", "door-open-v3")
+SIZE = 128  # of a picture [pixels]
+STEPS = 200  # of an episode at most
+CAMERA, PLACE = 2, (0.75, 0.075, 0.7)  # `corner2`, where LeRobot has it [m]
+DISTURBED = 0.3  # spread of the disturbance of a demonstration's motion, so that recoveries are seen
+
+
+class Change(NamedTuple):
+    """What is wrong in a world."""
+
+    aside: float = 0.0  # of the camera, along the picture's horizontal [m]
+    pan: float = 0.0  # of the camera, about the vertical [deg]
+    gain: float = 1.0  # of the executed motion
+    turn: float = 0.0  # of the executed motion, about the vertical [deg]
+
+
+CHANGES = {
+    "nothing": Change(),
+    "camera 5 cm aside": Change(aside=0.05),
+    "camera 10 cm aside": Change(aside=0.1),
+    "camera turned by 5 degrees": Change(pan=5.0),
+    "gain 0.8": Change(gain=0.8),
+    "motion turned by 20 degrees": Change(turn=20.0),
+}
+
+
+def motion(change: Change, action: np.ndarray, back: bool = False) -> np.ndarray:
+    """Return the action (4,) as it is executed; `back`: the one that is executed as the given one."""
+    angle = np.deg2rad(-change.turn if back else change.turn)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved = np.array(action, float)
+    moved[:2] = turn @ moved[:2]
+    moved[:3] *= 1 / change.gain if back else change.gain
+    return np.clip(moved, -1, 1).astype(np.float32)
+
+
+class ChangedMetaworld(of_lerobot.MetaworldEnv):
+    """LeRobot's environment of a task, with smaller pictures and a change."""
+
+    def __init__(self, task: str, change: str = "nothing") -> None:
+        size = {"observation_width": SIZE, "observation_height": SIZE}
+        super().__init__(task, obs_type="pixels_agent_pos", **size)
+        self.change, self._max_episode_steps = CHANGES[change], STEPS
+
+    def _ensure_env(self) -> None:
+        if self._env is not None:
+            return
+        SawyerMocapBase.reset_mocap_welds = _reset_welds
+        one = metaworld.MT1(self._env_name, seed=42)
+        size = {"camera_name": self.camera_name, "width": SIZE, "height": SIZE}
+        env: Any = one.train_classes[self._env_name](render_mode="rgb_array", **size)
+        env.set_task(one.train_tasks[0])
+        env.reset()
+        env._freeze_rand_vec, env.seeded_rand_vec = False, True
+        env.model.vis.quality.shadowsize = 0  # pictures without shadows, which take long without a GPU
+        self._turned = env.model.cam_quat[CAMERA].copy()
+        self._env = env
+        self.move_camera()
+
+    def move_camera(self) -> None:
+        """Put the camera where the change has it."""
+        self._ensure_env()
+        model, axes, turned = self._env.model, np.zeros(9), np.zeros(4)
+        mujoco.mju_quat2Mat(axes, self._turned)
+        half = np.deg2rad(self.change.pan) / 2
+        mujoco.mju_mulQuat(turned, np.array([np.cos(half), 0, 0, np.sin(half)]), self._turned)
+        model.cam_pos[CAMERA] = PLACE + self.change.aside * axes.reshape(3, 3)[:, 0]
+        model.cam_quat[CAMERA] = turned
+
+    def start(self, change: str, seed: int) -> np.ndarray:
+        """Begin an episode and return all that the simulator tells (39,)."""
+        self.change = CHANGES[change]
+        self.move_camera()
+        self._env.seed(seed)
+        return self._env.reset(seed=seed)[0]
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Execute the changed action."""
+        return super().step(motion(self.change, action))
+
+    def intended(self, told: np.ndarray) -> np.ndarray:
+        """Return the script's action, for the world as it is."""
+        return motion(self.change, np.clip(self.expert_policy.get_action(told), -1, 1), back=True)
+
+
+def _reset_welds(env: Any) -> None:
+    for number in np.flatnonzero(env.model.eq_type == mujoco.mjtEq.mjEQ_WELD):
+        env.model.eq_data[number][:11] = [0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5]
+
+
+@EnvConfig.register_subclass("metaworld_pictures")
+@dataclass
+class PicturesConfig(EnvConfig):
+    """Options of the environment in LeRobot's commands: `--env.task`, `--env.change`."""
+
+    task: str = TASKS[0]
+    change: str = "nothing"
+    fps: int = 80
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {
+            "action": PolicyFeature(type=FeatureType.ACTION, shape=(4,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(4,)),
+            "pixels": PolicyFeature(type=FeatureType.VISUAL, shape=(SIZE, SIZE, 3)),
+        }
+    )
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {"action": "action", "agent_pos": "observation.state", "pixels": "observation.image"}
+    )
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """What an environment is made with."""
+        return {"change": self.change}
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> Any:
+        """Return the environments of the only task."""
+        kind = gymnasium.vector.AsyncVectorEnv if use_async_envs and n_envs > 1 else gymnasium.vector.SyncVectorEnv
+        make = partial(ChangedMetaworld, self.task, self.change)
+        return {self.task: {0: kind([make] * n_envs)}}
+
+
+Plan = Callable[[np.ndarray, np.ndarray], np.ndarray]  # pictures (n, h, w, 3), states (n, 4) -> chunks (n, T, 4)
+Correct = Callable[[np.ndarray], np.ndarray]  # what is seen (n, 9) -> actions (n, 4)
+
+
+class Demonstration(NamedTuple):
+    """An episode of the script until its first success."""
+
+    pictures: np.ndarray  # (steps, height, width, 3)
+    states: np.ndarray  # (steps, 4)
+    actions: np.ndarray  # (steps, 4): the script's, without the disturbance of the motion
+
+
+class Episode(NamedTuple):
+    """An episode of a policy."""
+
+    success: bool
+    seen: np.ndarray  # (steps, 9): state, proposed action, phase in the chunk
+    intended: np.ndarray  # (steps, 4): the script's actions in these situations
+
+
+class Robots:
+    """Worlds of one task in processes of their own."""
+
+    def __init__(self, task: str, processes: int) -> None:
+        """Start before a GPU or JAX is in use: the processes are forks."""
+        context = multiprocessing.get_context("fork")
+        self.pipes = []
+        for _ in range(processes):
+            here, there = context.Pipe()
+            context.Process(target=_serve, args=(task, there), daemon=True).start()
+            self.pipes.append(here)
+
+    def call(self, requests: dict[int, tuple[Any, ...]]) -> dict[int, Any]:
+        """Send requests to processes by their number, and return the answers."""
+        for number, request in requests.items():
+            self.pipes[number].send(request)
+        return {number: self.pipes[number].recv() for number in requests}
+
+    def demonstrations(self, change: str, first_seed: int, count: int) -> list[Demonstration]:
+        """Return episodes of the script that succeed."""
+        episodes: list[Demonstration] = []
+        while len(episodes) < count:
+            seeds = range(first_seed, first_seed + len(self.pipes))
+            made = self.call({number: ("record", change, seed) for number, seed in enumerate(seeds)})
+            episodes += [one for one in made.values() if one is not None]
+            first_seed += len(self.pipes)
+        return episodes[:count]
+
+    def play(self, change: str, seeds: Sequence[int], plan: Plan, correct: Correct | None, every: int) -> list[Episode]:
+        """Return an episode a seed; `plan` gives a chunk every `every` steps, `correct` the action of what is seen."""
+        episodes: list[Episode] = []
+        for start in range(0, len(seeds), len(self.pipes)):
+            episodes += self._wave(change, seeds[start : start + len(self.pipes)], plan, correct, every)
+        return episodes
+
+    def _wave(
+        self, change: str, seeds: Sequence[int], plan: Plan, correct: Correct | None, every: int
+    ) -> list[Episode]:
+        told = self.call({number: ("start", change, seed) for number, seed in enumerate(seeds)})
+        seen: list[list[np.ndarray]] = [[] for _ in seeds]
+        intended: list[list[np.ndarray]] = [[] for _ in seeds]
+        success, chunks = np.zeros(len(seeds), bool), np.zeros((len(seeds), every, 4), np.float32)
+        for step in range(STEPS):
+            active, phase = list(told), step % every
+            if phase == 0:
+                pictures, states = (
+                    np.stack([told[number][name] for number in active]) for name in ("picture", "state")
+                )
+                chunks[active] = plan(pictures, states)[:, :every]
+            proposed = np.clip(chunks[active, phase], -1, 1)
+            states = np.stack([told[number]["state"] for number in active])
+            rows = np.concatenate([states, proposed, np.full((len(active), 1), phase / every)], 1).astype(np.float32)
+            actions = proposed if correct is None else correct(rows)
+            for number, row in zip(active, rows, strict=True):
+                seen[number].append(row)
+                intended[number].append(told[number]["intended"])
+            looks = phase == every - 1
+            told = self.call({n: ("step", action, looks) for n, action in zip(active, actions, strict=True)})
+            success[[number for number, one in told.items() if one["success"]]] = True
+            told = {number: one for number, one in told.items() if not one["success"]}
+            if not told:
+                break
+        return [Episode(bool(success[n]), np.stack(seen[n]), np.stack(intended[n])) for n in range(len(seeds))]
+
+
+def _serve(task: str, pipe: Any) -> None:
+    """Answer requests until the other end closes."""
+    world = ChangedMetaworld(task)
+    while True:
+        try:
+            what, *rest = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(_record(world, *rest) if what == "record" else _played(world, what, *rest))
+
+
+def _played(world: ChangedMetaworld, what: str, first: Any, second: Any) -> dict[str, Any]:
+    success = False
+    if what == "start":
+        told, looks = world.start(first, second), True
+    else:
+        told, _, _, _, info = world._env.step(motion(world.change, first))
+        success, looks = bool(info["success"]), second
+    picture = world.render() if looks and not success else None
+    state = told[:4].astype(np.float32)
+    return {"state": state, "picture": picture, "intended": world.intended(told), "success": success}
+
+
+def _record(world: ChangedMetaworld, change: str, seed: int) -> Demonstration | None:
+    """Return an episode of the script, or None if it fails."""
+    told, random, rows = world.start(change, seed), np.random.default_rng(seed), []
+    for _ in range(STEPS):
+        action = world.intended(told)
+        rows.append((np.ascontiguousarray(world.render()), told[:4].astype(np.float32), action))
+        disturbed = action + DISTURBED * random.normal(size=4) * (1, 1, 1, 0)
+        told, _, _, _, info = world._env.step(motion(world.change, np.clip(disturbed, -1, 1)))
+        if info["success"]:
+            return Demonstration(*(np.stack(column) for column in zip(*rows, strict=True)))
+    return None
+
+
+__path__: list[str] = []  # LeRobot looks for more modules of a plugin here

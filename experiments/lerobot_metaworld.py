@@ -1,0 +1,319 @@
+"""A picture policy of LeRobot (ACT) in changed worlds of Meta-World, corrected by 100 labels.
+
+    python experiments/lerobot_metaworld.py collect --task reach-v3 --out runs/lerobot_metaworld
+    python experiments/lerobot_metaworld.py train --task reach-v3 --minutes 4.5     # runs `lerobot-train`
+    python experiments/lerobot_metaworld.py evaluate --task reach-v3                # before, labels, after
+    python experiments/lerobot_metaworld.py table
+
+`all` does the first three. 50 episodes of the script with pictures become a LeRobot dataset (v3.0), which
+`lerobot-train` reads. The camera is moved, or the motion is changed. 100 situations, of failed episodes where there are
+any, are labelled in four rounds by a program that knows the script, with a person's slips. The correction acts beside
+the policy, on the hand's state, the proposed action and the phase in the chunk. Labels alone decide whether it is used.
+A control has answers drawn by chance about the same actions. Each task has a file, which grows with each cell.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the GPU is the policy's
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from _metaworld_pictures import CHANGES, SIZE, TASKS, Episode, Robots
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+DEMONSTRATIONS, REPORTED = 50, 50  # episodes
+CHUNK, EXECUTED = 20, 10  # steps that ACT proposes at once, and those that are executed
+LABELS, ROUNDS, SITUATIONS = 100, 4, 6  # situations met for each question
+EPS = 0.05  # strength of an answer, as a share of the range
+MISTAKEN, SILENT = 0.05, 0.1  # shares of the answers about a cue
+TRAIN_SEED, LABEL_SEED, REPORT_SEED = 0, 100_000, 200_000  # of episodes
+CUES = "right,left;forward,back;up,down;close,open"
+ACT = {
+    "type": "act", "push_to_hub": "false", "pretrained_backbone_weights": "null", "chunk_size": CHUNK,
+    "n_action_steps": EXECUTED, "dim_model": 256, "dim_feedforward": 1024, "optimizer_lr": 1e-4,
+    "optimizer_lr_backbone": 1e-4, "n_encoder_layers": 4, "kl_weight": 10,
+}  # fmt: skip
+
+
+def collect(robots: Robots, folder: Path, change: str, first_seed: int, count: int) -> None:
+    """Write demonstrations as a LeRobot dataset."""
+    features = {
+        "observation.image": {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]},
+        "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "opening"]},
+        "action": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "grip"]},
+    }
+    dataset = LeRobotDataset.create("local/metaworld", fps=80, features=features, root=folder, use_videos=False)
+    for episode in robots.demonstrations(change, first_seed, count):
+        for picture, state, action in zip(*episode, strict=True):
+            row = {"observation.image": picture, "observation.state": state, "action": action, "task": folder.name}
+            dataset.add_frame(row)
+        dataset.save_episode()
+    dataset.finalize()
+
+
+def train(dataset: Path, out: Path, seconds: float, sizes: dict[str, Any], base: Path | None = None) -> None:
+    """Run `lerobot-train` for a wall time, and keep its last checkpoint."""
+    shutil.rmtree(out, ignore_errors=True)
+    policy = {"path": base, "push_to_hub": "false"} if base else ACT | {"device": sizes["device"]}
+    words = {f"policy.{name}": value for name, value in policy.items()}
+    words |= {"dataset.repo_id": "local/metaworld", "dataset.root": dataset, "output_dir": out, "steps": 10**6}
+    words |= {"batch_size": sizes["batch"], "save_freq": sizes["save"], "num_workers": sizes["workers"]}
+    words |= {"env_eval_freq": 0, "log_freq": sizes["save"], "dataloader_multiprocessing_context": "fork"}
+    command = [sys.executable, "-m", "lerobot.scripts.lerobot_train", *(f"--{n}={v}" for n, v in words.items())]
+    with (out.parent / f"{out.name}.log").open("w") as log:
+        work = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+        try:
+            work.wait(seconds)
+        except subprocess.TimeoutExpired:
+            os.killpg(work.pid, signal.SIGKILL)
+            work.wait()
+    checkpoint(out)
+
+
+def checkpoint(out: Path) -> Path:
+    """Return the last checkpoint of a training that is whole. Raises FileNotFoundError where there is none."""
+    last = out / "checkpoints" / "last"
+    if not last.exists():
+        raise FileNotFoundError(f"{out} has no checkpoint: read {out}.log")
+    return last / "pretrained_model"
+
+
+def planner(place: Path, device: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return a checkpoint's chunks, by LeRobot's own processors."""
+    import torch
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
+    policy = ACTPolicy.from_pretrained(place).to(device).eval()
+    where = {"device_processor": {"device": device}}
+    before, after = make_pre_post_processors(policy.config, str(place), preprocessor_overrides=where)
+
+    def plan(pictures: np.ndarray, states: np.ndarray) -> np.ndarray:
+        image = torch.from_numpy(np.ascontiguousarray(pictures)).permute(0, 3, 1, 2).float() / 255
+        with torch.inference_mode():
+            rows = before({"observation.image": image, "observation.state": torch.from_numpy(states)})
+            return after(policy.predict_action_chunk(rows)).float().cpu().numpy()
+
+    return plan
+
+
+class Labeller:
+    """Labels about a policy in a changed world, and the correction that they give."""
+
+    def __init__(self, seed: int) -> None:
+        import jax
+
+        import cuelearner_jax as cl  # noqa: F401
+        from cuelearner_jax.reading import Reading
+        from cuelearner_jax.reading.families import ACTIONS_ALONE
+        from cuelearner_jax.spaces import Box, cues_from
+
+        space = Box((-1.0,) * 4, (1.0,) * 4, cues_from(CUES, ("x", "y", "z", "grip"), "shares"))
+        proposed = jax.jit(lambda obs: obs[:, 4:8])
+        self.space, self.random, self.key = space, np.random.default_rng(seed), jax.random.key(seed)
+        self.make = lambda: Reading(proposed, ACTIONS_ALONE, space, EPS, LABELS)
+        self.reading = self.make()
+
+    def correct(self, seen: np.ndarray) -> np.ndarray:
+        """Return corrected actions; rows are filled up, so that one program serves."""
+        rows = np.concatenate([seen, np.repeat(seen[-1:], -len(seen) % 32, 0)])
+        return np.asarray(self.reading.act(rows))[: len(seen)]
+
+    def ask(self, episodes: Sequence[Episode], count: int) -> None:
+        """Ask about situations of failed episodes, or of all where none failed."""
+        import jax
+
+        failed = [one for one in episodes if not one.success] or list(episodes)
+        seen, intended = (
+            np.concatenate(part) for part in zip(*((one.seen, one.intended) for one in failed), strict=True)
+        )
+        some = self.random.choice(len(seen), min(SITUATIONS * count, len(seen)), replace=False)
+        self.key, key = jax.random.split(self.key)
+        index, action = self.reading.questions(seen[some], count, key)
+        self.reading.learn(seen[some][index], action, self.answers(action, intended[some][index]))
+
+    def answers(self, action: np.ndarray, intended: np.ndarray) -> np.ndarray:
+        """Return a person's answers about each cue: some are mistaken, and of some nothing is said."""
+        from cuelearner_jax.spaces import UNSAID
+
+        off = np.asarray(self.space.log(action, intended))
+        answer = np.where(np.abs(off) <= EPS / 2, 0.0, np.sign(off))
+        chance = self.random.random(off.shape)
+        answer = np.where(chance < MISTAKEN, self.random.integers(-1, 2, off.shape), answer)
+        return np.where(chance > 1 - SILENT, UNSAID, answer).astype(np.float32)
+
+    def shuffled(self) -> Labeller:
+        """Return what answers drawn by chance about the same actions give."""
+        rows, self.reading = self.reading.rows, self.make()
+        assert rows is not None
+        answer = self.random.integers(-1, 2, np.shape(rows.answer)).astype(np.float32)
+        self.reading.read_in_batches(np.asarray(rows.obs), np.asarray(rows.action), answer)
+        return self
+
+
+class Cells:
+    """The measurements of a task; those that its file has are not repeated."""
+
+    def __init__(self, task: str, robots: Robots, plan: Any, folder: Path, episodes: int) -> None:
+        self.task, self.robots, self.plan, self.episodes = task, robots, plan, episodes
+        self.file = folder / "cells.parquet"
+        self.rows: list[dict[str, Any]] = pq.read_table(self.file).to_pylist() if self.file.exists() else []
+
+    def played(self, change: str, correct: Any = None, first: int = REPORT_SEED, count: int = 0) -> list[Episode]:
+        """Return episodes by the policy, or by the corrected policy."""
+        seeds = range(first, first + (count or self.episodes))
+        return self.robots.play(change, seeds, self.plan, correct, EXECUTED)
+
+    def measure(self, seeds: int, until: float) -> None:
+        """Measure all cells, those of one seed of labels after those of another, while there is time."""
+        bases: dict[str, np.ndarray] = {}
+        for seed in range(seeds):
+            for change in CHANGES:
+                if any((row["change"], row["seed"]) == (change, seed) for row in self.rows) or time.time() > until:
+                    continue
+                for name in {"nothing": 0, change: 0}:
+                    bases.setdefault(name, np.array([one.success for one in self.played(name)], float))
+                for row in self.cell(change, seed, bases[change]):
+                    self.rows.append({"task": self.task, "unchanged": bases["nothing"].mean(), **row})
+                    print({**self.rows[-1], "words": "; ".join(row["words"])[:300]}, flush=True)
+                pq.write_table(pa.Table.from_pylist(self.rows), self.file, compression="zstd")
+
+    def cell(self, change: str, seed: int, before: np.ndarray) -> Iterator[dict[str, Any]]:
+        """Yield the row of a change, and of its control."""
+        began, labeller, count = time.time(), Labeller(seed), LABELS // ROUNDS
+        for round_ in range(ROUNDS):
+            first = LABEL_SEED + 1000 * seed + 100 * round_
+            correct = labeller.correct if round_ else None
+            labeller.ask(self.played(change, correct, first, len(self.robots.pipes)), count)
+        yield self.row(change, seed, "labels", before, labeller, began)
+        if seed == 0:
+            yield self.row(change, seed, "random", before, labeller.shuffled(), time.time())
+
+    def row(
+        self, change: str, seed: int, kind: str, before: np.ndarray, labeller: Labeller, began: float
+    ) -> dict[str, Any]:
+        """Return how the corrected policy does, whether labels use it, and what paired episodes say."""
+        from cuelearner_jax.adaptation.judging import PairedTest
+
+        result, seconds = labeller.reading.result(), time.time() - began
+        after = np.array([one.success for one in self.played(change, labeller.correct)], float)
+        test = PairedTest(1)
+        test.add((after - before)[None])
+        verdict = "better" if test.better[0] else "worse" if test.worse[0] else "open"
+        row = {"change": change, "seed": seed, "labels": kind, "before": before.mean(), "corrected": after.mean()}
+        row |= {"used": bool(result.used), "after": (after if result.used else before).mean(), "paired": verdict}
+        return row | {"evidence": float(result.evidence), "seconds": seconds, "words": list(result.words())}
+
+
+def fine_tune(cells: Cells, folder: Path, options: argparse.Namespace, sizes: dict[str, Any]) -> None:
+    """Measure fine-tuning by five new demonstrations in each changed world of the camera, for a wall time."""
+    for change in [name for name in CHANGES if name.startswith("camera")]:
+        if any(row["change"] == change and row["labels"] == "demonstrations" for row in cells.rows):
+            continue
+        if time.time() + options.tune + 30 > options.until:
+            return
+        place = folder / change.replace(" ", "_")
+        collect(cells.robots, emptied(place / "dataset"), change, 500_000, 5)
+        train(place / "dataset", place / "act", options.tune, sizes | {"save": 50}, checkpoint(folder / "act"))
+        cells.plan = planner(checkpoint(place / "act"), options.device)
+        after = float(np.mean([one.success for one in cells.played(change)]))
+        like = next(row for row in cells.rows if row["change"] == change)
+        row = {"corrected": after, "after": after, "labels": "demonstrations", "used": True, "paired": "open"}
+        cells.rows.append(like | row | {"evidence": 0.0, "seconds": options.tune, "words": []})
+        print(cells.rows[-1], flush=True)
+        pq.write_table(pa.Table.from_pylist(cells.rows), cells.file, compression="zstd")
+
+
+def emptied(folder: Path) -> Path:
+    """Return a folder's path with nothing there."""
+    shutil.rmtree(folder, ignore_errors=True)
+    return folder
+
+
+def table(out: Path) -> None:
+    """Print, for each task and change, success before and after."""
+    rows = [row for file in sorted(out.glob("*/cells.parquet")) for row in pq.read_table(file).to_pylist()]
+    print(f"{'task':<17}{'change':<28}{'by':<15}cells unchanged before corrected after used better worse seconds")
+    for key in dict.fromkeys((row["task"], row["change"], row["labels"]) for row in rows):
+        own = [row for row in rows if (row["task"], row["change"], row["labels"]) == key]
+        ends = [float(np.mean([row[name] for row in own])) for name in ("unchanged", "before", "corrected", "after")]
+        counts = [
+            sum(row["used"] for row in own),
+            *(sum(row["paired"] == it for row in own) for it in ("better", "worse")),
+        ]
+        shown = "  ".join(f"{end:.2f}" for end in ends) + "  " + "  ".join(map(str, counts))
+        print(
+            f"{key[0]:<17}{key[1]:<28}{key[2]:<15}{len(own)}  {shown}  {np.mean([row['seconds'] for row in own]):.0f}"
+        )
+    for kind in ("camera", "gain", "motion"):
+        own = [r for r in rows if r["labels"] == "labels" and r["change"].startswith(kind)]
+        loss, back = (sum(r[a] - r[b] for r in own) for a, b in (("unchanged", "before"), ("after", "before")))
+        share = back / loss if loss > 0 else np.nan
+        print(f"{kind}: share of the lost success that comes back {share:.2f}, {len(own)} cells")
+    if rows:
+        pq.write_table(pa.Table.from_pylist(rows), out / "lerobot_metaworld.parquet", compression="zstd")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Do the chosen parts for one task."""
+    folder, doing = options.out / options.task, options.do
+    robots = Robots(options.task, options.processes)
+    folder.mkdir(parents=True, exist_ok=True)
+    options.until, began = time.time() + 60 * options.total, time.time()
+    sizes = {"device": options.device, "batch": options.batch, "save": options.save, "workers": options.workers}
+    if doing in ("collect", "all") and not (folder / "dataset" / "meta" / "info.json").exists():
+        collect(robots, folder / "dataset", "nothing", TRAIN_SEED, options.demonstrations)
+        print(f"{options.task}: dataset after {time.time() - began:.0f} s", flush=True)
+    if doing in ("train", "all") and not (folder / "act" / "checkpoints" / "last").exists():
+        train(folder / "dataset", folder / "act", 60 * options.minutes, sizes)
+        print(f"{options.task}: {checkpoint(folder / 'act').resolve()} after {time.time() - began:.0f} s", flush=True)
+    if doing in ("evaluate", "all"):
+        plan = planner(checkpoint(folder / "act"), options.device)
+        cells = Cells(options.task, robots, plan, folder, options.episodes)
+        cells.measure(options.seeds, options.until)
+        if options.tune:
+            fine_tune(cells, folder, options, sizes)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run parts of the demonstration for one task, or print the table of all tasks."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("do", choices=("collect", "train", "evaluate", "all", "table"))
+    parser.add_argument("--task", choices=TASKS, default=TASKS[0])
+    parser.add_argument("--out", type=Path, default=Path("runs/lerobot_metaworld"))
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--processes", type=int, default=17, help="that simulate")
+    parser.add_argument("--demonstrations", type=int, default=DEMONSTRATIONS)
+    parser.add_argument("--episodes", type=int, default=REPORTED, help="of each measurement")
+    parser.add_argument("--seeds", type=int, default=3, help="of labels")
+    parser.add_argument("--minutes", type=float, default=4.5, help="of training")
+    parser.add_argument("--total", type=float, default=9.0, help="minutes after which no cell is begun")
+    parser.add_argument(
+        "--tune", type=float, default=0.0, help="seconds of fine-tuning by five demonstrations; 0: none"
+    )
+    parser.add_argument("--batch", type=int, default=64)
+    parser.add_argument("--save", type=int, default=500, help="steps between checkpoints")
+    parser.add_argument("--workers", type=int, default=12, help="that read the dataset")
+    options = parser.parse_args(arguments)
+    warnings.simplefilter("ignore")
+    if options.do == "table":
+        table(options.out)
+    else:
+        run(options)
+
+
+if __name__ == "__main__":
+    main()
