@@ -78,7 +78,7 @@ def test_what_follows_a_step_is_its_own_environments(steps):
     numbers = jnp.arange(oldest, steps)
     after = buffer.follow(rows, jnp.array(steps), numbers % 12, 4, 2)
     expected = np.arange(oldest, steps)[:, None] + 2 * np.arange(4)
-    np.testing.assert_array_equal(after.known, expected < steps)
+    np.testing.assert_array_equal(after.exists, expected < steps)
     for found, part in ((after.rewards, 0.5), (after.discounts, 0.6), (after.ended, 0.7)):
         np.testing.assert_allclose(np.asarray(found)[expected < steps], expected[expected < steps] + part, rtol=1e-5)
 
