@@ -85,9 +85,9 @@ def arrays_of(policy: Any, env: Any) -> Arrays:
             "lerobot_processor_cuelearner wrote, and adapt by --labels-from alone"
         )
     own = policy.correction
-    known, alpha = (np.asarray(part) for part in (own.known, own.alpha))
-    used = np.abs(alpha).max(-1, initial=0) > 0
-    if not used.any() and not np.any(np.asarray(own.change.action)):
+    situations, alpha = (np.asarray(part) for part in (own.known, own.alpha))
+    active = np.abs(alpha).max(-1, initial=0) > 0
+    if not active.any() and not np.any(np.asarray(own.change.action)):
         raise UserError("the answers asked for no change that was used, so there is nothing to export: ask for more")
     obs = golden_observations(env)
     act = jax.jit(lambda obs: policy.act(jax.random.key(0), None, obs))
@@ -96,8 +96,8 @@ def arrays_of(policy: Any, env: Any) -> Arrays:
         "high": space.high,
         "mean": own.frame.mean,
         "deviation": jnp.where(own.frame.varies > 0, own.frame.deviation, jnp.inf),
-        "known": known[used],
-        "alpha": alpha[used],
+        "known": situations[active],
+        "alpha": alpha[active],
         "length": own.length,
         "beta": own.change.action,
         "scale": own.scale,

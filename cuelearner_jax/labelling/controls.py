@@ -15,13 +15,13 @@ from cuelearner_jax.spaces import DIRECTIONS, UNSAID, Cue, Space
 # What the page calls the two turns, from the point of view of somebody walking along the arrow.
 WALKED = ("more to the left", "more to the right")
 BESIDE = {"ArrowLeft": "aA", "ArrowRight": "dD"}  # the same answers' keys for the other hand
-SHOWN = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # how the page writes these keys
-SHOWN |= {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
+KEY_SIGNS = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # how the page writes these keys
+KEY_SIGNS |= {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
 
 
 def key_words(key: str) -> str:
     """Return a key as the page writes it."""
-    return SHOWN.get(key, key.upper() if len(key) == 1 else key)
+    return KEY_SIGNS.get(key, key.upper() if len(key) == 1 else key)
 
 
 class Control(NamedTuple):

@@ -67,8 +67,8 @@ class Questions:
         """Return the task's drawings of where actions lead; empty where it draws none."""
         if self.pictures.trails is None:
             return {}
-        drawn = self.pictures.trails(self.env, item.guide.env, jnp.asarray(np.stack([*actions.values()])))
-        return {name: trail for name, trail in zip(actions, drawn, strict=True) if trail}
+        drawings = self.pictures.trails(self.env, item.guide.env, jnp.asarray(np.stack([*actions.values()])))
+        return {name: trail for name, trail in zip(actions, drawings, strict=True) if trail}
 
     def refine(self, item: Item) -> Item:
         """Add the newest model's action; a direction is drawn as an arrow, other actions as the task draws them."""

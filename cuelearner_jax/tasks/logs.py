@@ -341,23 +341,23 @@ def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
 def _sketch(env: Logs, state: SituationState) -> Sketch:
     frames, place = _frames(env, state.row)
     text = _recording(Path(env.path)).text(place)
-    drawn = pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
-    for _, (hand, *steps) in _seen(env, state, drawn, lambda hand: hand + STEP * np.eye(3))[:1]:
+    sketch = pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
+    for _, (hand, *steps) in _in_cameras(env, state, sketch, lambda hand: hand + STEP * np.eye(3))[:1]:
         ways = np.stack(steps) - hand
         ways /= np.linalg.norm(ways, axis=-1).max()
         points = [(x, y) if math.hypot(x, y) > LEAST_WAY else None for x, y in ways.tolist()]
-        drawn = drawn._replace(points=(*points, *[None] * (env.actions.size - len(points))))
-    return drawn
+        sketch = sketch._replace(points=(*points, *[None] * (env.actions.size - len(points))))
+    return sketch
 
 
-def _seen(
+def _in_cameras(
     env: Logs, state: SituationState, sketch: Sketch, places: Callable[[np.ndarray], np.ndarray]
 ) -> list[tuple[np.ndarray, Float[np.ndarray, "n 2"]]]:
     """Return, of each camera that sees the hand, its area in the sketch, and where the hand and other places appear.
 
     `places` is a function of the hand's position (3,) that returns others (n, 3).
     """
-    recording, seen = _recording(Path(env.path)), []
+    recording, cameras = _recording(Path(env.path)), []
     if recording.hands is None or not recording.about:
         return []
     hand = recording.hands[int(env.places[state.row])]
@@ -366,18 +366,18 @@ def _seen(
         across, depth = np.split(rows @ projection.T, [2], -1)
         points, box = across / depth * sketch.box[2:], area * np.tile(sketch.box[2:], 2)
         if (depth > 0).all() and ((box[:2] <= points[0]) & (points[0] <= box[:2] + box[2:])).all():
-            seen.append((box, points))
-    return seen
+            cameras.append((box, points))
+    return cameras
 
 
 def _trails(env: Logs, state: SituationState, actions: Float[Array, "n action"]) -> list[str]:
     """Draw each action as an arrow from the hand to where it leads, in the picture of each camera with the hand."""
     from cuelearner_jax.labelling import view
 
-    drawn, arrows = _sketch(env, state), [""] * len(actions)
-    for box, (hand, *ends) in _seen(env, state, drawn, lambda hand: np.asarray(actions)[:, :3]):
+    sketch, arrows = _sketch(env, state), [""] * len(actions)
+    for box, (hand, *ends) in _in_cameras(env, state, sketch, lambda hand: np.asarray(actions)[:, :3]):
         for number, (x, y) in enumerate(ends - hand):
-            own = drawn._replace(box=box, foot=hand, reach=(0.0, math.hypot(x, y)), turn=0.0)
+            own = sketch._replace(box=box, foot=hand, reach=(0.0, math.hypot(x, y)), turn=0.0)
             arrows[number] += view.arrow(own, math.degrees(math.atan2(-y, x)), "motion")
     return arrows
 

@@ -80,11 +80,11 @@ def test_positions_are_those_of_mujoco(hand, proposed):
 
 
 def test_joints_move_the_hand_within_their_limits(hand, proposed):
-    moved = hand.moved(proposed, lambda place: np.broadcast_to(OFF, place.shape))
+    moved = hand.move(proposed, lambda place: np.broadcast_to(OFF, place.shape))
     np.testing.assert_allclose(hand.place(moved) - hand.place(proposed), np.tile(OFF, (80, 1)), atol=1e-4)
     np.testing.assert_array_equal(moved[:, 6], proposed[:, 6])  # the gripper
-    np.testing.assert_array_equal(hand.moved(proposed, np.zeros_like), proposed)
-    far = hand.moved(proposed, lambda place: np.tile([1.0, 0, 0], (80, 1))) @ hand.joints  # beyond the arm's reach
+    np.testing.assert_array_equal(hand.move(proposed, np.zeros_like), proposed)
+    far = hand.move(proposed, lambda place: np.tile([1.0, 0, 0], (80, 1))) @ hand.joints  # beyond the arm's reach
     assert (far >= hand.low - 1e-9).all()
     assert (far <= hand.high + 1e-9).all()
 
@@ -106,11 +106,11 @@ def test_a_hand_beside_its_place_is_corrected_by_labels_in_its_own_frame(kinemat
         obs = np.column_stack([proposed[: len(places)], np.zeros(len(places)), places]).astype(np.float32)
         return np.asarray(act(obs)) - places
 
-    moved = again.moved(proposed, change)
+    moved = again.move(proposed, change)
     errors = np.linalg.norm(again.place(moved) - again.place(proposed) - OFF, axis=1)
     started = time.thread_time()
     for _ in range(100):
-        again.moved(proposed[:1], lambda place: np.broadcast_to(OFF, place.shape))
+        again.move(proposed[:1], lambda place: np.broadcast_to(OFF, place.shape))
     print(f"the hand is {1e3 * errors.mean():.1f} mm off (most {1e3 * errors.max():.1f}), before 36 mm; ", end="")
     print(f"kinematics take {10 * (time.thread_time() - started):.2f} ms an action")
     assert errors.max() < 0.008

@@ -15,9 +15,9 @@ def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser("lerobot_processor_cuelearner", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    judged = commands.add_parser("judge", help="tell which of two evaluations of the same episodes is better")
-    judged.add_argument("before", type=Path, help="output folder of lerobot-eval, of the policy as it was")
-    judged.add_argument("after", type=Path, help="the same of the corrected policy, with the same seed")
+    judging = commands.add_parser("judge", help="tell which of two evaluations of the same episodes is better")
+    judging.add_argument("before", type=Path, help="output folder of lerobot-eval, of the policy as it was")
+    judging.add_argument("after", type=Path, help="the same of the corrected policy, with the same seed")
     situations = commands.add_parser("situations", help="write recorded situations with a policy's proposed actions")
     situations.add_argument("--policy", required=True, help="checkpoint of a LeRobot policy (…/pretrained_model)")
     situations.add_argument("--dataset", type=Path, required=True, help="folder of a LeRobot dataset, format v3.0")

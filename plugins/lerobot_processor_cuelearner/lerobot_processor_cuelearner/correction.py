@@ -74,14 +74,14 @@ class Correction:
             )
         if proposed.device != self.device:
             self._set(proposed.device)
-        given = proposed.float()
-        action = torch.clamp(given, self.low, self.high)
-        obs = torch.cat([state.to(given), phase.to(given)[:, None], action], -1)
+        exact = proposed.float()
+        action = torch.clamp(exact, self.low, self.high)
+        obs = torch.cat([state.to(exact), phase.to(exact)[:, None], action], -1)
         even = 2 * (action - self.low) / self.range - 1
         z = torch.clamp((obs - self.mean) / self.deviation, -LARGEST, LARGEST)
         x = torch.cat([z, 2 * even], -1) / self.length
         square = (x**2).sum(-1, keepdim=True) + self.square - 2 * x @ self.known.T
         change = self.shift + even @ self.gain + torch.exp(-0.5 * square.clamp(min=0)) @ self.alpha
         change = torch.clamp(change, -self.bound, self.bound)
-        moved = torch.clamp(action + self.range * change, self.low, self.high)
-        return (given + (moved - action)).to(proposed.dtype)
+        goal = torch.clamp(action + self.range * change, self.low, self.high)
+        return (exact + (goal - action)).to(proposed.dtype)

@@ -52,7 +52,7 @@ class Hand:
         """Return the hand's positions (n, 3) for joint actions (n, action)."""
         return self._chain(actions.astype(np.float64) @ self.joints)[0]
 
-    def moved(self, actions: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    def move(self, actions: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return joint actions (n, action) that move the hand by `change`, a function of its positions (n, 3).
 
         Newton steps of damped least squares turn the hand as little as the joints allow. A joint stays within its

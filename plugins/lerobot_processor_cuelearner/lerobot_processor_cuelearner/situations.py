@@ -177,12 +177,12 @@ def _check_unit(hand: Hand, actions: np.ndarray) -> None:
 def _hands(states: np.ndarray, names: dict[str, list[str]], hand: Hand | None) -> np.ndarray:
     """Return where the hand is in states (n, 3). Raises SystemExit where the state does not tell."""
     own, entries = names[OBS_STATE], names[ACTION] if hand is not None else names[ACTION][:3]
-    used = [True] * len(entries) if hand is None else (hand.joints != 0).any(1)
+    moves = [True] * len(entries) if hand is None else (hand.joints != 0).any(1)
     values = np.zeros((len(states), len(entries)))
-    for place, (name, is_used) in enumerate(zip(entries, used, strict=True)):
-        if is_used and name not in own:
+    for place, (name, is_moved) in enumerate(zip(entries, moves, strict=True)):
+        if is_moved and name not in own:
             raise SystemExit(f"--projection needs the place of the hand, but {OBS_STATE} has no {name}")
-        if is_used:
+        if is_moved:
             values[:, place] = states[:, own.index(name)]
     return (values if hand is None else hand.place(values)).astype(np.float32)
 

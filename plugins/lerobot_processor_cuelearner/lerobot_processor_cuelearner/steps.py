@@ -120,8 +120,8 @@ class CorrectStep(_Step):
             place = torch.full((len(rows),), self._place.place)
         phase = (place / max(self.chunk - 1, 1)).clamp(max=1.0)
         corrected = self.correction(state, phase, rows) if self.hand is None else self._by_hand(state, phase, rows)
-        moved = {**transition, TransitionKey.ACTION: corrected.reshape(action.shape)}
-        return moved  # pyright: ignore[reportReturnType]
+        following = {**transition, TransitionKey.ACTION: corrected.reshape(action.shape)}
+        return following  # pyright: ignore[reportReturnType]
 
     def _by_hand(self, state: Tensor, phase: Tensor, rows: Tensor) -> Tensor:
         """Return joint actions that lead the hand to corrected positions. Raises ValueError for another robot's."""
@@ -138,8 +138,8 @@ class CorrectStep(_Step):
             proposed = torch.from_numpy(place).float()
             return (correction(state, phase, proposed) - proposed).numpy()
 
-        moved = hand.moved(rows.detach().to("cpu", torch.float32).numpy(), change)
-        return torch.from_numpy(moved).to(rows)
+        joints = hand.move(rows.detach().to("cpu", torch.float32).numpy(), change)
+        return torch.from_numpy(joints).to(rows)
 
     def get_config(self) -> dict[str, Any]:
         """Return the constructor's arguments."""
