@@ -181,7 +181,7 @@ PARTICIPLE = re.compile(  # besides `left`, the direction, and `done`, an episod
     re.IGNORECASE,
 )
 PUBLIC = {"api.adaptation": {"used", "judged"}, "api.policies": {"trained"}, "reading.result": {"used", "changed"}}
-STORED = {"reading.policy": {"known"}, "asking": {"asked"}, "guides.dcoach": {"learned"}}
+STORED = {"labelling.session": {"said"}, "reading.policy": {"known"}, "asking": {"asked"}, "guides.dcoach": {"learned"}}
 OPTIONS = {"billiards.table": {"speed_kept"}}
 
 

@@ -36,7 +36,7 @@ RECENT = 50  # number of answers from which the pace is computed
 class Response(NamedTuple):
     """The recorded response to an item."""
 
-    response: str  # one of `label_files.RESPONSES`
+    said: str  # one of `label_files.RESPONSES`
     obs: np.ndarray
     action: np.ndarray
     answer: np.ndarray | None
@@ -78,14 +78,14 @@ class Record:
         rows = self.rows.copy()
         return [rows[number] for number in sorted(rows)]
 
-    def count(self, response: str) -> int:
+    def count(self, said: str) -> int:
         """Return the number of items with this response."""
-        return sum(row.response == response for row in list(self.rows.values()))
+        return sum(row.said == said for row in list(self.rows.values()))
 
     def per_minute(self) -> float | None:
         """Return the answers a minute over the last questions; None without any."""
-        recent = [row for row in self.in_order() if row.response != UNDONE][-RECENT:]
-        seconds, count = sum(row.seconds for row in recent), sum(row.response == ANSWERED for row in recent)
+        recent = [row for row in self.in_order() if row.said != UNDONE][-RECENT:]
+        seconds, count = sum(row.seconds for row in recent), sum(row.said == ANSWERED for row in recent)
         return 60 * count / seconds if count and seconds > 0 else None
 
     def finish(self) -> Path:
@@ -160,7 +160,7 @@ class Session:
         else:
             pairs = enumerate(zip(situations, rows, strict=False))
             self._items = {n: Item(n, at, row.action) for n, (at, row) in pairs}
-        self.number = min((number for number in self._items if rows[number].response == UNDONE), default=count)
+        self.number = min((number for number in self._items if rows[number].said == UNDONE), default=count)
         self._learner.fit(self._labels())
         self._items[count] = questions.ask(count, situations[-1])
 
@@ -232,8 +232,8 @@ class Session:
                 self._fits.submit(self._fit)
             return True
 
-    def _save(self, item: Item, response: str, answer: np.ndarray | None, seconds: float) -> None:
-        self.record.save(item.number, Response(response, np.asarray(item.guide.obs), item.action, answer, seconds))
+    def _save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
+        self.record.save(item.number, Response(said, np.asarray(item.guide.obs), item.action, answer, seconds))
 
     def _labels(self) -> Label:
         """Return the answers in the order of their items, as a padded `Label`."""

@@ -127,7 +127,7 @@ def test_networks_see_entries_of_the_order_of_one(folder):
 
 def test_other_situations_in_the_folder_are_refused(folder):
     config = logs.task_of(folder, CUES, **BOUNDS).plain()
-    logs._read.cache_clear()
+    logs._recording.cache_clear()
     (folder / "situations.parquet").unlink()
     (folder / "pictures").rename(folder / "old")
     recorded.write(folder, rows=13)
