@@ -31,13 +31,12 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from _metaworld_pictures import CHANGES, SIZE, TASKS, Episode, Robots
+from _metaworld_pictures import CHANGES, SIZE, TASKS, TUNING, Episode, Robots
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 DEMONSTRATIONS, REPORTED = 50, 50  # episodes
 CHUNK, EXECUTED = 20, 10  # steps that ACT proposes at once, and those that are executed
 LABELS, ROUNDS, SITUATIONS = 100, 4, 6  # situations met for each question
-EPS = 0.05  # strength of an answer, as a share of the range
 MISTAKEN, SILENT = 0.05, 0.1  # shares of the answers about a cue
 TRAIN_SEED, LABEL_SEED, REPORT_SEED = 0, 100_000, 200_000  # of episodes
 CUES = "right,left;forward,back;up,down;close,open"
@@ -113,7 +112,7 @@ def planner(place: Path, device: str) -> Callable[[np.ndarray, np.ndarray], np.n
 class Labeller:
     """Labels about a policy in a changed world, and the correction that they give."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, eps: float) -> None:
         import jax
 
         import cuelearner_jax as cl  # noqa: F401
@@ -124,7 +123,8 @@ class Labeller:
         space = Box((-1.0,) * 4, (1.0,) * 4, cues_from(CUES, ("x", "y", "z", "grip"), "shares"))
         proposed = jax.jit(lambda obs: obs[:, 4:8])
         self.space, self.random, self.key = space, np.random.default_rng(seed), jax.random.key(seed)
-        self.make = lambda: Reading(proposed, ACTIONS_ALONE, space, EPS, LABELS)
+        self.make = lambda: Reading(proposed, ACTIONS_ALONE, space, eps, LABELS)
+        self.eps = eps
         self.reading = self.make()
 
     def correct(self, seen: np.ndarray) -> np.ndarray:
@@ -150,7 +150,7 @@ class Labeller:
         from cuelearner_jax.spaces import UNSAID
 
         off = np.asarray(self.space.log(action, intended))
-        answer = np.where(np.abs(off) <= EPS / 2, 0.0, np.sign(off))
+        answer = np.where(np.abs(off) <= self.eps / 2, 0.0, np.sign(off))
         chance = self.random.random(off.shape)
         answer = np.where(chance < MISTAKEN, self.random.integers(-1, 2, off.shape), answer)
         return np.where(chance > 1 - SILENT, UNSAID, answer).astype(np.float32)
@@ -167,8 +167,8 @@ class Labeller:
 class Cells:
     """The measurements of a task; those that its file has are not repeated."""
 
-    def __init__(self, task: str, robots: Robots, plan: Any, folder: Path, episodes: int) -> None:
-        self.task, self.robots, self.plan, self.episodes = task, robots, plan, episodes
+    def __init__(self, task: str, robots: Robots, plan: Any, folder: Path, episodes: int, eps: float) -> None:
+        self.task, self.robots, self.plan, self.episodes, self.eps = task, robots, plan, episodes, eps
         self.file = folder / "cells.parquet"
         self.rows: list[dict[str, Any]] = pq.read_table(self.file).to_pylist() if self.file.exists() else []
 
@@ -193,7 +193,7 @@ class Cells:
 
     def cell(self, change: str, seed: int, before: np.ndarray) -> Iterator[dict[str, Any]]:
         """Yield the row of a change, and of its control."""
-        began, labeller, count = time.time(), Labeller(seed), LABELS // ROUNDS
+        began, labeller, count = time.time(), Labeller(seed, self.eps), LABELS // ROUNDS
         for round_ in range(ROUNDS):
             first = LABEL_SEED + 1000 * seed + 100 * round_
             correct = labeller.correct if round_ else None
@@ -282,7 +282,7 @@ def run(options: argparse.Namespace) -> None:
         print(f"{options.task}: {checkpoint(folder / 'act').resolve()} after {time.time() - began:.0f} s", flush=True)
     if doing in ("evaluate", "all"):
         plan = planner(checkpoint(folder / "act"), options.device)
-        cells = Cells(options.task, robots, plan, folder, options.episodes)
+        cells = Cells(options.task, robots, plan, folder, options.episodes, options.eps)
         cells.measure(options.seeds, options.until)
         if options.tune:
             fine_tune(cells, folder, options, sizes)
@@ -292,7 +292,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run parts of the demonstration for one task, or print the table of all tasks."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("do", choices=("collect", "train", "evaluate", "all", "table"))
-    parser.add_argument("--task", choices=TASKS, default=TASKS[0])
+    parser.add_argument("--task", choices=(*TASKS, *TUNING), default=TASKS[0])
     parser.add_argument("--out", type=Path, default=Path("runs/lerobot_metaworld"))
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--processes", type=int, default=17, help="that simulate")
@@ -304,6 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--tune", type=float, default=0.0, help="seconds of fine-tuning by five demonstrations; 0: none"
     )
+    parser.add_argument("--eps", type=float, default=0.05, help="strength of an answer, as a share of the range")
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--save", type=int, default=500, help="steps between checkpoints")
     parser.add_argument("--workers", type=int, default=12, help="that read the dataset")
