@@ -14,10 +14,10 @@ too, see `storage.lerobot`. Columns of the table:
 
 With `phase`, the policy cannot be asked again: what it depends on, such as pictures, is not in the table. Observations
 then end with the phase and a slice `BASE`, the proposed action. The metadata `cuelearner` of a Parquet file may have
-the bounds of the actions, `low` and `high`; `hand`, the kinematics of a robot whose hand's positions they are;
-`projections` (cameras, 3, 4) from these positions to shares of the picture's width and height, and each camera's
-`areas` (cameras, 4) of it: left, top, width, height. Of a LeRobot dataset with pictures alone, observations are the
-actions.
+the bounds of the actions, `low` and `high`, and `hand`, the kinematics of a robot whose hand's positions they are. Its
+`projections` (cameras, 3, 4) lead from these positions to shares of the picture's width and height. Its `areas`
+(cameras, 4) are each camera's part of the picture: left, top, width, height.
+Of a LeRobot dataset with pictures alone, observations are the actions.
 In place of a list there may be one column per entry, `observation.NAME` or `action.NAME`, which names the entries.
 Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
 """

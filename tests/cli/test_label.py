@@ -179,5 +179,5 @@ def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
     refused(["labels", "merge", labelled / "one", "--out", both], "both.parquet exists: give another --out", tmp_path)
     refused(["labels", "export", both, labelled / "one", "--out", "x.csv"], "takes one label file", tmp_path)
     refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
-    refused(["labels", "inspect", both, "--teacher"], "replay its situations", tmp_path)
+    refused(["labels", "inspect", both, "--teacher"], "cannot be asked about this file", tmp_path)
     refused(["labels", "mend"], "Available subcommands: inspect, merge, export", tmp_path)
