@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ from cuelearner_jax.cli.sources import source_and_options, source_in
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.measurements import Difference
-from cuelearner_jax.runs import policy_sources
-from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
+from cuelearner_jax.runs.policy_sources import POLICIES, LaneChoice, PolicySource
 from cuelearner_jax.storage import policy_folders
+from cuelearner_jax.storage.results import LANE
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
 from cuelearner_jax.tasks import shipped
@@ -52,15 +53,25 @@ def run(arguments: list[str]) -> None:
     evaluate.amount(source.task, options)
     if options.out and options.out.exists():
         raise UserError(f"{options.out} exists: give another --out")
-    other = _other(source, options) if options.compare else None
+    requests: list[tuple[PolicySource, Evaluate]] = [(source, options)]
+    if options.compare:
+        other, policy = _other(source, options)
+        requests.append((other, replace(options, policy=policy, guidance=(), labels=(), seed=())))
+    plans = [evaluate.prepare(*request) for request in requests]
+    if options.compare:  # what cannot be compared is not measured first
+        measurements.differences(
+            *([row for block in lanes for row in evaluate.variants(env, block)] for env, lanes in plans)
+        )
     with progress_bars() as bars:
-        watch = watched_by(bars)
-        rows = evaluate.run(source, options, watch)
-        others = evaluate.run(other[0], replace(options, policy=other[1], guidance=()), watch) if other else []
-    _print_measured(source, options, rows, others)
+        rows, *others = [
+            evaluate.run(*request, watched_by(bars), plan) for request, plan in zip(requests, plans, strict=True)
+        ]
+    _print_measured(source, options, rows, *others)
 
 
-def _print_measured(source: PolicySource, options: Evaluate, rows: list[Measured], others: list[Measured]) -> None:
+def _print_measured(
+    source: PolicySource, options: Evaluate, rows: list[Measured], others: Sequence[Measured] = ()
+) -> None:
     """Print the measurements, or the comparison with others, and write them to the chosen file."""
     envs, steps = evaluate.amount(source.task, options)
     compared = measurements.differences(rows, others) if options.compare else None
@@ -92,8 +103,11 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
     if POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
     assert path is not None
-    kind = next(iter(options.guidance), None)
-    (policy,), _ = policy_sources.several(source, options.task, name, kind)
+    choice = {option: getattr(options, option) for option in LANE}
+    if wide := [option for option, values in choice.items() if len(values) > 1]:
+        raise UserError(f"--{wide[0]} has {len(choice[wide[0]])} values, but one policy answers: give one value")
+    one: dict[str, Any] = {option: next(iter(values), None) for option, values in choice.items()}
+    policy = LaneChoice(policy=name, **one).policy_in(source, options.task, None)
     result = agreement(policy, path)
     subject = options.subject if name == "own" else f"{source.folder}, {name}"
     title = f"{subject}: agreement with {result.labels} labels of {path}"

@@ -57,9 +57,6 @@ def run(arguments: list[str]) -> None:
     if options.only_correction:
         policy, view = correction.correction_of(policy, env)
         draw = lambda: correction.cases(env)  # noqa: E731
-    if policy_sources.POLICIES[name].from_run:
-        words = ", ".join(f"{option} {value}" for option, value in lane.items())
-        out.print(f"the run's lane of {words}; choose by --guidance, --labels and --seed")
     origin = {
         "subject": source.folder.name,
         "policy": name,

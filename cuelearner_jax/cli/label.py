@@ -90,12 +90,7 @@ class LabelOptions(NewWorld):
 
 
 def run(arguments: list[str]) -> None:
-    """Run the command.
-
-    Raises:
-        UserError: bad input, a port or folder in use, or a folder with labels of another session.
-        Interrupted: Ctrl-C or SIGTERM; every answer is saved.
-    """
+    """Run the command. Raises UserError for bad input or a port or folder in use; Interrupted once all is saved."""
     server = page_module("server")
     ahead = look_ahead_of(arguments, "label", LabelOptions)
     task = recorded_or_task(ahead)

@@ -84,11 +84,7 @@ def open_tracker(
 
 
 def means(row: dict[str, Any]) -> dict[str, float]:
-    """Return means over the seeds of each budget, as "metric/labels_N", without failed lanes.
-
-    Args:
-        row: the columns of one evaluation: scalars, or one entry per lane; "labels" gives the lanes' budgets.
-    """
+    """Return means of an evaluation over the seeds of each budget ("metric/labels_N"), without failed lanes."""
     budgets, result = np.asarray(row["labels"]), {}
     for name in (name for name in row.keys() - set(LANE) if np.ndim(row[name]) < 2):
         values = np.broadcast_to(np.asarray(row[name], float), budgets.shape)

@@ -8,7 +8,6 @@ with policy_folders.place_of(out) as place:
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -83,12 +82,11 @@ def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str
         raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
     if len(set(base.seeds)) < len(base.seeds):
         raise UserError("--base.seeds: give each seed once")
-    policies, lanes = policy_sources.several(
-        source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env
-    )
+    policies, lanes = base.lanes_in(source, world, env)
     seeds = tuple(lane["seed"] for lane in lanes)
-    choices = {option: value for option, value in dataclasses.asdict(base).items() if value not in (None, ())}
-    origin = {"folder": source.folder.name, **choices, "policy": name, "seeds": list(seeds)}
+    lane = {name: value for name, value in lanes[0].items() if name != "seed"}
+    lane |= {} if base.bound_deg is None else {"bound_deg": base.bound_deg}
+    origin = {"folder": source.folder.name, **lane, "policy": name, "seeds": list(seeds)}
     origin |= {"code": reference} if reference else {}
     bases = Common(policies[0]) if len(policies) == 1 else side_by_side(policies)
     return Subject(env, bases, seeds, origin, source.task)
@@ -139,16 +137,10 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     ) -> Any:
         """Return the default request; the only place where the rules of scenarios are applied.
 
-        Args:
-            task: the policy's task; None: an environment without one.
-            config: configuration of the policy's training, whose frame and scalars the model uses.
-            scenario: the changed world. Its suggestions apply to the kind of guidance that it suggests, and its shares
-                of a bound to judging on episodes.
-            guidance, judge_by: the chosen values; None: as the scenario suggests, or the general default.
-            labels_from: a label file, which determines budget and strength of answers.
-            eps_deg: strength of an answer [deg]; None: the file's, that of given scalars, the scenario's, or the
-                training's.
-            scalars: complete values in place of the defaults.
+        `task`: None for an environment without one. `config`: of the policy's training, whose frame and scalars the
+        model uses. `guidance`, `judge_by`: None for what the scenario suggests, or the general default; a scenario's
+        other suggestions apply to the kind that it suggests, its shares of a bound to judging on episodes. `eps_deg`:
+        None for the label file's, that of given scalars, the scenario's, or the training's.
         """
         rules = task.scenario(scenario) if task and scenario else AS_IT_IS
         kind = guidances.resolve(guidance or rules.guidance or ReadingGuide.name)

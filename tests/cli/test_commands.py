@@ -1,6 +1,7 @@
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from cuelearner_jax import studies
+from cuelearner_jax.api.policies import load_policy
 from cuelearner_jax.cli import dispatch, main
 from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.storage import results
@@ -70,9 +73,30 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     less = recorded["rows"][0]["reward"][0] - found["less"]["reward"][0]
     assert found["difference"]["reward"][0] == pytest.approx(less)
     assert main(["evaluate", "--compare", str(run_folder), "heuristic", *few]) == 0
-    assert (
-        capsys.readouterr().out.count("difference over seeds and 10 environments") == 3
-    )  # a table for each kind and budget
+    # a table for each kind and budget
+    assert capsys.readouterr().out.count("difference over seeds and 10 environments") == 3
+
+
+def test_lanes_are_chosen_and_what_cannot_be_is_refused_before_anything_is_measured(
+    run_folder, refused, tmp_path, monkeypatch
+):
+    command, out = ["evaluate", run_folder, "--steps", "20", "--envs", "10"], tmp_path / "rows.json"
+    chosen = ["--guidance", "relative", "--labels", "20", "--seed", "2001"]
+    assert main([str(word) for word in [*command, *chosen, "--out", out]]) == 0
+    (row,) = json.loads(out.read_text())["rows"]
+    assert (row["guidance"], row["labels"], row["seeds"]) == ("relative", 20, [2001])
+    monkeypatch.setattr(studies.evaluate, "rollout_lanes", None)
+    refused([*command, "--policy", "uniform", "--compare", run_folder], "has 3 variants", tmp_path)
+    refused([*command, "--seed", "5"], "no lane with seed 5: there are seeds 2000, 2001 and labels 0, 10, 20", tmp_path)
+    refused([*command, "--policy", "uniform", "--seed", "2000"], "belongs to no lane", tmp_path)
+    refused(["render", "shipped:billiards", "--policy", "heuristic", "--labels", "100"], "belongs to no lane", tmp_path)
+
+
+def test_a_run_without_records_asks_for_the_lane(run_folder, refused, tmp_path):
+    copy = shutil.copytree(run_folder, tmp_path / "copy", ignore=lambda *_: ["results.parquet"])
+    command = ["export", copy, "--format", "numpy", "--out", tmp_path / "new"]
+    refused(command, "choose the lane by --guidance, --labels and --seed", tmp_path)
+    assert load_policy(copy, guidance="relative", labels=20, seed=2001).lane["seed"] == 2001
 
 
 def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, capsys):
