@@ -242,7 +242,7 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
         if own not in own_seeds:
             raise UserError(
                 f"the label file has labels for the seeds {format_numbers(own_seeds.tolist())}, none for seed {seed}: "
-                "give --first-seed and --seeds (train: --seed) for these, or the labels of another run"
+                "give --seeds (train: --seed) for these, or the labels of another run"
             )
         if len(rows) < budget:
             raise UserError(

@@ -34,7 +34,7 @@ from cuelearner_jax.policies import Common, lanes_in, policy_of
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import adapted, policy_sources
-from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
+from cuelearner_jax.runs.grid import Grid, check_grid, parse_seeds
 from cuelearner_jax.runs.order import read_labels
 from cuelearner_jax.runs.policy_sources import BaseLanes, PolicySource
 from cuelearner_jax.storage import label_files
@@ -102,10 +102,9 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     bound_deg: tuple[float, ...] = ()
     """How far corrections may lead from the policy's own actions [deg]. One bound or several (default: the scenario's,
     as far as the labels of a file reach, or else a quarter of the space's reach, 45)."""
-    seeds: int = 1
-    """Number of seeds. Several base policies are each adapted with their own seed, so leave this out then."""
-    first_seed: int = 0
-    """First seed; the others count up from it."""
+    seeds: str = "1"
+    """Number of seeds, or a range such as 0:16, without its end. Several base policies are each adapted with their own
+    seed, so leave this out then."""
     guidance: str = ReadingGuide.name
     """Kind of guidance: what is asked, and what a model makes of the answers."""
     labels_from: Path | None = None
@@ -192,9 +191,9 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             raise UserError(f"changes is given, but guidance {kind.name!r} does not use it: give guidance reading")
         guidance = guidances.make(kind.name, sizes, env, kinds.get(kind.name))
         shared = lanes_in(bases) is None
-        if not shared and (self.seeds, self.first_seed) != (1, 0):
-            raise UserError("several base policies are adapted each with its own seed: leave out --seeds, --first-seed")
-        seeds = seeds_of(self.first_seed, self.seeds) if shared else subject.seeds
+        if not shared and self.seeds != AdaptRequest.seeds:
+            raise UserError("several base policies are adapted each with its own seed: leave out --seeds")
+        seeds = parse_seeds(self.seeds) if shared else subject.seeds
         grid = Grid((kind.name,), seeds, self.labels if subject.rows is None else (len(subject.rows.obs),))
         file = self._labels(subject, guidance, grid)
         bounds = self._bounds(subject, guidance, file)

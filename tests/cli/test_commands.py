@@ -114,6 +114,10 @@ def test_the_sweep_of_the_readme_would_begin(monkeypatch, tmp_path):
     monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
     assert main(shlex.split(line)) == 0
     assert orders[0].grid.guidance == ("none", "relative")
+    assert main(["sweep", "billiards", "--labels", "0", "50", "--seeds", "5:7", "--schedule.total-steps", "6e4"]) == 0
+    grid = orders[1].grid
+    assert (grid.guidance[0], grid.labels, grid.seeds) == ("none", (50,), (5, 6))
+    assert orders[1].config.schedule.total_steps == 60_000
 
 
 def test_a_report_has_curves_and_tables(run_folder, tmp_path):
