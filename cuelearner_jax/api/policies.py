@@ -148,8 +148,9 @@ def load_policy(
     config = world.config if world else source.config.task
     source.check(name, config)
     shape = shape_of(own_task, config)
-    choice = LaneChoice(policy=name, guidance=guidance, labels=labels, bound_deg=bound_deg, seed=seed)
-    (own_policy,), (lane,) = choice.lanes_in(source, config)
+    seeds = () if seed is None else (seed,)
+    choice = LaneChoice(policy=name, guidance=guidance, labels=labels, bound_deg=bound_deg, seed=seeds)
+    own_policy, lane = choice.lane_in(source, config)
     where, taught = world or World(own_task, config), policy_sources.POLICIES[name].taught
     return CallablePolicy(own_policy, shape.observation, taught, source.config, actions_of(shape), where, lane)
 

@@ -47,7 +47,7 @@ class Run:
         if guidance is not None and guidance not in self.trainings:
             raise UserError(f"no guidance {guidance!r} was trained{suggestion(guidance, self.trainings)}")
         seeds = () if seed is None else (seed,)
-        name, budget, seeds = best_lane(self.results, guidance, labels, seeds, options="guidance, labels and seed")
+        name, budget, seeds = best_lane(self.results, (guidance, labels, seeds))
         training = self.trainings[name or [*self.trainings][-1]]
         group = training.group
         lanes = np.flatnonzero((group.budgets == budget) & np.isin(group.seeds, seeds))

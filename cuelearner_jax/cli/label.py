@@ -223,7 +223,7 @@ def _base(task: Task, options: LabelOptions, source: PolicySource | None, env: A
         raise UserError(f"--questions is {questions}, but the questions are about {policy}: leave out one of them")
     if source is not None:
         name = lane.name_in(source, options.task)
-        return Base(lane.policy_in(source, options.task, None), f"{source.folder.resolve().name}, {name}")
+        return Base(lane.lane_in(source, options.task)[0], f"{source.folder.resolve().name}, {name}")
     if lane != LaneChoice():
         raise UserError("--base.… chooses a folder's lane, but no folder is given: leave it out")
     if policy is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +24,9 @@ from cuelearner_jax.storage import label_files, policy_folders, results
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Policy, Teacher
+
+Choice = tuple[str | None, int | None, tuple[int, ...]]  # guidance, labels and seeds of lanes; None and (): open
+OPTIONS = "--guidance, --labels and --seed (adapt, label: --base.guidance and so on)"  # that choose a lane
 
 
 class PolicyEntry(NamedTuple):
@@ -233,31 +236,25 @@ def check_no_lane(policy: str, *choices: Any) -> None:
         raise UserError(f"policy {policy!r} belongs to no lane of a run: leave out the options that choose a lane")
 
 
-def best_lane(
-    table: pa.Table,
-    guidance: str | None,
-    labels: int | None,
-    seeds: tuple[int, ...],
-    metric: str = "reward",
-    options: str = "--guidance, --labels and --seed",
-) -> tuple[str | None, int | None, tuple[int, ...]]:
+def best_lane(table: pa.Table, choice: Choice, metric: str = "reward") -> Choice:
     """Return a choice of lanes whose open parts are those of the lane with the best last value in a results table.
 
     Name that lane on the console. Raises UserError if several lanes fit and no value is recorded.
     """
+    guidance, labels, seeds = choice
     rows = table.select([*results.LANE, "step", metric]).sort_by("step").to_pylist()
     last = {tuple(row[part] for part in results.LANE): row[metric] for row in rows}
     fits = [lane for lane in last if guidance in (None, lane[0]) and labels in (None, lane[1])]
     fits = [lane for lane in fits if not seeds or lane[2] in seeds]
     if len({lane[:2] if seeds else lane for lane in fits}) < 2:
-        return (*fits[0][:2], seeds or fits[0][2:]) if fits else (guidance, labels, seeds)
+        return (*fits[0][:2], seeds or fits[0][2:]) if fits else choice
     finite = [lane for lane in fits if last[lane] is not None]
     if not finite:
-        raise UserError(f"no {metric} is recorded that tells which of {len(fits)} lanes is the best: give {options}")
+        raise UserError(f"no {metric} is recorded that tells which of {len(fits)} lanes is the best: give {OPTIONS}")
     best = max(finite, key=last.__getitem__)
     console.print(
         f"{variant_name(*best[:2])}, seed {best[2]}: the best of {len(fits)} lanes by the last recorded {metric} "
-        f"({last[best]:.4g}); {options} choose another"
+        f"({last[best]:.4g}); {OPTIONS} choose another"
     )
     return (*best[:2], seeds or best[2:])
 
@@ -265,10 +262,7 @@ def best_lane(
 def _select(
     blocks: list[Block], seeds: tuple[int, ...], labels: tuple[int, ...], within: tuple[float, str] = (0.0, "")
 ) -> list[Block]:
-    """Return the lanes of blocks with some seeds, label budgets and (0: any) a bound in a unit; empty: all.
-
-    Raises UserError for a seed or budget that no lane has.
-    """
+    """Return the lanes with some seeds, budgets (empty: all) and a bound in a unit (0: any), or raise UserError."""
     (bound, unit), rest = within, []
     for block in blocks:
         mask = np.isin(block.seeds, seeds or block.seeds) & np.isin(block.budgets, labels or block.budgets)
@@ -286,10 +280,8 @@ def _select(
 
 
 @dataclass(frozen=True, kw_only=True)
-class LanesChoice:
-    """Choice of a folder's policy, and of its lanes but for their seeds."""
-
-    OPTIONS: ClassVar[str] = "--guidance, --labels and --seed"
+class LaneChoice:
+    """Choice of a folder's policy, and of its lane, or of several lanes that differ in their seeds."""
 
     policy: str | None = None
     """Name of the acting policy, as for evaluate (default: the agent, or the adapted policy)."""
@@ -299,12 +291,9 @@ class LanesChoice:
     """Label budget of the lane (default: that of the run's best lane; of a policy folder the largest)."""
     bound_deg: float | None = None
     """Bound of a policy folder's lane (default: the largest) [deg]."""
-
-    @property
-    def lane_seeds(self) -> tuple[int, ...]:
-        """The seeds of the lanes; empty: open."""
-        one = getattr(self, "seed", None)
-        return getattr(self, "seeds", ()) if one is None else (one,)
+    seed: tuple[int, ...] = ()
+    """Seed of the lane; several where lanes are adapted, each with labels of its own (default: that of the run's best
+    lane; of a policy folder the first)."""
 
     def name_in(self, source: PolicySource, world: Any) -> str:
         """Return the policy's name. Raises UserError if the source has no such policy, or none for that world."""
@@ -312,33 +301,32 @@ class LanesChoice:
         source.check(name, world, guidance=self.guidance)
         return name
 
-    def _with_best(self, source: PolicySource, name: str) -> tuple[str | None, int | None, tuple[int, ...]]:
+    def _with_best(self, source: PolicySource, name: str) -> Choice:
         """Return guidance, labels and seeds; what is open in a run is that of its best lane."""
-        kind, labels, seeds, grid = self.guidance, self.labels, self.lane_seeds, source.grid
-        kind = guidances.kind_name(kind) if kind else None
+        grid, kind = source.grid, guidances.kind_name(self.guidance) if self.guidance else None
         if grid is None:
-            return kind, labels, seeds
+            return kind, self.labels, self.seed
         kind = grid.guidance[0] if kind is None and len(grid.guidance) == 1 else kind
-        if kind and (labels is not None or len(grid.labels) < 2) and (seeds or len(grid.seeds) == 1):
-            return kind, labels, seeds
+        choice = kind, self.labels, self.seed
+        if kind and (self.labels is not None or len(grid.labels) < 2) and (self.seed or len(grid.seeds) == 1):
+            return choice
         try:
             guides = results.read_guides([source.folder]) if name == "guide" else None
             table = results.read(source.folder) if guides is None else guides
         except UserError as error:
-            raise UserError(f"{error}; or choose the lane by {self.OPTIONS}") from error
-        return best_lane(table, kind, labels, seeds, "reward" if guides is None else "guide_reward", self.OPTIONS)
+            raise UserError(f"{error}; or choose the lane by {OPTIONS}") from error
+        return best_lane(table, choice, "reward" if guides is None else "guide_reward")
 
     def lanes_in(self, source: PolicySource, world: Any, env: Any = None) -> tuple[list[Any], list[dict[str, Any]]]:
-        """Return single policies of a folder's lanes that differ only in their seeds, and what chooses each lane.
+        """Return single policies, one a seed, and what chooses each lane: its "guidance", "labels" and "seed".
 
-        That is its "guidance", "labels" and "seed"; a policy of the task alone has the seed 0.
-
-        `env`: the world's environment, for a teacher (default: with its training episodes).
+        A policy of the task alone has the seed 0. `env`: the world's environment, for a teacher (default: with its
+        training episodes).
         """
         name = self.policy or source.default_policy
         entry = POLICIES[name]
         if not entry.from_folder:
-            check_no_lane(name, self.guidance, self.labels, self.lane_seeds, self.bound_deg)
+            check_no_lane(name, self.guidance, self.labels, self.seed, self.bound_deg)
         if entry.taught and env is None:
             env = source.task.environment(world)
         teacher = source.task.make_teacher(world, env) if entry.taught else None
@@ -358,24 +346,9 @@ class LanesChoice:
             lanes.append({"guidance": lane.guidance, "labels": labels, "seed": seed})
         return policies, lanes
 
-
-@dataclass(frozen=True, kw_only=True)
-class LaneChoice(LanesChoice):
-    """Choice of a folder's policy, and of its lane."""
-
-    seed: int | None = None
-    """Seed of the lane (default: that of the run's best lane; of a policy folder the first)."""
-
-    def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:
-        """Return the single policy. Raises UserError if there is no such lane."""
-        return self.lanes_in(source, world, env)[0][0]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaseLanes(LanesChoice):
-    """Choice of the lanes of the folder to adapt."""
-
-    OPTIONS: ClassVar[str] = "--base.guidance, --base.labels and --base.seeds"
-
-    seeds: tuple[int, ...] = ()
-    """Seeds of the lanes to adapt, each with labels of its own (default: that of the run's best lane)."""
+    def lane_in(self, source: PolicySource, world: Any, env: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Return the single policy and what chooses its lane. Raises UserError for several seeds, or no such lane."""
+        if len(self.seed) > 1:
+            raise UserError(f"--seed has {len(self.seed)} values, but one policy acts: give one seed")
+        (policy,), (lane,) = self.lanes_in(source, world, env)
+        return policy, lane

@@ -46,13 +46,8 @@ class Wandb:
         folder.mkdir(parents=True, exist_ok=True)
         kind, run = folder.parent.name, folder.parent.parent.name
         self._run = importlib.import_module(self.package).init(
-            mode="offline",
-            dir=str(folder),
-            config=contents,
-            reinit="create_new",
-            project="cuelearner",
-            group=run,
-            name=f"{run} {kind}",
+            **{"mode": "offline", "reinit": "create_new", "project": "cuelearner", "config": contents},
+            **{"dir": str(folder), "group": run, "name": f"{run} {kind}"},
             settings={"silent": True},  # its summary of forty lines would interrupt our output
         )
         self.close = self._run.finish

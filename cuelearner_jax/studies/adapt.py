@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,14 +36,11 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import adapted, policy_sources
 from cuelearner_jax.runs.grid import Grid, check_grid, parse_seeds
 from cuelearner_jax.runs.order import read_labels
-from cuelearner_jax.runs.policy_sources import BaseLanes, PolicySource
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Scenario, Task
 from cuelearner_jax.types import Label, Teacher
-
-TaskT = TypeVar("TaskT")
-KindsT = TypeVar("KindsT")
 
 MOST_ENVS = 100_000  # more do not fit into memory
 AS_IT_IS = Scenario("the world as it is", {})
@@ -64,14 +61,14 @@ class Subject(NamedTuple):
     prefer: Prefer | None = None  # who judges, where a person does
 
 
-def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str | None = None) -> Subject:
+def subject_of(source: PolicySource, world: Any, base: LaneChoice, reference: str | None = None) -> Subject:
     """Return the source's policies, or its code, in a world of its task.
 
     `reference`: package.module:NAME of code that acts or is in the folder.
     """
     env = source.task.environment(world)
     if source.code is not None:
-        if base != BaseLanes():
+        if base != LaneChoice():
             raise UserError(
                 f"--base.… chooses among the lanes of a folder, but {reference} is not a folder: leave it out"
             )
@@ -80,8 +77,8 @@ def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str
     name = base.name_in(source, world)
     if policy_sources.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
-    if len(set(base.seeds)) < len(base.seeds):
-        raise UserError("--base.seeds: give each seed once")
+    if len(set(base.seed)) < len(base.seed):
+        raise UserError("--base.seed: give each seed once")
     policies, lanes = base.lanes_in(source, world, env)
     seeds = tuple(lane["seed"] for lane in lanes)
     lane = {name: value for name, value in lanes[0].items() if name != "seed"}
@@ -93,10 +90,10 @@ def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptRequest(Generic[TaskT, KindsT]):
+class AdaptRequest:
     """A request to adapt a policy."""
 
-    task: TaskT
+    task: Any
     labels: tuple[int, ...] = (500,)
     """Label budgets (default with --labels-from: all labels in the file)."""
     bound_deg: tuple[float, ...] = ()
@@ -119,7 +116,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     the tuning episodes."""
     sizes: GuideSizes = by_model.SIZES
     scalars: Scalars = field(default_factory=Scalars)
-    kinds: KindsT = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+    kinds: dict[str, Any] = field(default_factory=dict)
     """Options of kinds of guidance, by the kind's name."""
 
     @classmethod

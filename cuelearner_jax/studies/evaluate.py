@@ -6,9 +6,9 @@ or within eps / 2 of the action asked about. Use answers that were not used for 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, mean_interval, part_of, rollout_lanes
+from cuelearner_jax.evaluate import episodes, ignore_progress, mean_interval, part_of, rollout_lanes
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
@@ -28,8 +28,7 @@ from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Label
 
-TaskT = TypeVar("TaskT")
-
+Ready = tuple[Any, list[Block]]  # the validation episodes, and the lanes that act in them
 Share = tuple[float, float, float]  # estimate, and the ends of its 95% interval
 
 MOST_ENVS = 100_000  # more do not fit into memory
@@ -37,10 +36,10 @@ MOST_STEPS = 1_000_000  # per environment
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateRequest(Generic[TaskT]):
+class EvaluateRequest:
     """A request to evaluate a policy."""
 
-    task: TaskT
+    task: Any
     policy: str = "agent"
     """Who acts."""
     guidance: tuple[str, ...] = ()
@@ -79,7 +78,7 @@ class Measured(NamedTuple):
         return "" if self.bound_deg is None else f"{self.bound_deg:g} {self.unit}"
 
 
-def amount(task: Task, request: EvaluateRequest[Any]) -> tuple[int, int]:
+def amount(task: Task, request: EvaluateRequest) -> tuple[int, int]:
     """Return the number of environments and the number of steps that they share."""
     longest = None if task.longest is None else task.longest(request.task)
     if request.episodes is not None:
@@ -100,7 +99,7 @@ def amount(task: Task, request: EvaluateRequest[Any]) -> tuple[int, int]:
     return envs, steps
 
 
-def prepare(source: PolicySource, request: EvaluateRequest[Any]) -> tuple[Any, list[Block]]:
+def prepare(source: PolicySource, request: EvaluateRequest) -> Ready:
     """Return the validation episodes of the request's world and the lanes that act in it, by guidance and step."""
     release_programs()
     entry, name = POLICIES[request.policy], request.policy
@@ -129,19 +128,15 @@ def variants(env: Any, block: Block, of_lanes: Sequence[dict[str, np.ndarray]] =
 
 
 def run(
-    source: PolicySource,
-    request: EvaluateRequest[Any],
-    watch: Callable[[str], Tell] = lambda kind: ignore_progress,
-    prepared: tuple[Any, list[Block]] | None = None,
+    source: PolicySource, request: EvaluateRequest, watch: Any = lambda _: ignore_progress, ready: Ready | None = None
 ) -> list[Measured]:
     """Return metrics of a policy on validation episodes of the request's world, for each guidance and budget.
 
-    `watch`: given a kind of guidance, returns the function that reports the progress of its lanes. `prepared`: the
-    result of `prepare`.
+    `watch`: given a kind of guidance, returns a `Tell` of its lanes. `ready`: the result of `prepare`.
     """
     num_envs, steps = amount(source.task, request)
     engine, key = source.task.engine(request.engine), episodes()
-    env, blocks = prepared or prepare(source, request)
+    env, blocks = ready or prepare(source, request)
     rows = []
     for block in blocks:
         count, is_shared = len(block.seeds), lanes_in(block.policy) is None

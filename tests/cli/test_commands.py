@@ -78,11 +78,13 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
 
 
 def test_lanes_are_chosen_and_what_cannot_be_is_refused_before_anything_is_measured(
-    run_folder, refused, tmp_path, monkeypatch
+    run_folder, refused, tmp_path, capsys, monkeypatch
 ):
     command, out = ["evaluate", run_folder, "--steps", "20", "--envs", "10"], tmp_path / "rows.json"
     chosen = ["--guidance", "relative", "--labels", "20", "--seed", "2001"]
-    assert main([str(word) for word in [*command, *chosen, "--out", out]]) == 0
+    capsys.readouterr()
+    assert main([str(word) for word in [*command, *chosen, "--out", out, "--json"]]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(out.read_text())
     (row,) = json.loads(out.read_text())["rows"]
     assert (row["guidance"], row["labels"], row["seeds"]) == ("relative", 20, [2001])
     monkeypatch.setattr(studies.evaluate, "rollout_lanes", None)
@@ -120,11 +122,16 @@ def test_the_sweep_of_the_readme_would_begin(monkeypatch, tmp_path):
     assert orders[1].config.schedule.total_steps == 60_000
 
 
-def test_a_report_has_curves_and_tables(run_folder, tmp_path):
+def test_a_report_has_curves_and_tables(run_folder, tmp_path, capsys):
     out = tmp_path / "report"
     assert main(["report", str(run_folder), "--out", str(out)]) == 0
     assert ElementTree.parse(out / "curves.svg").getroot().tag.endswith("svg")
     assert imageio.imread(out / "curves.png").std() > 1
+    capsys.readouterr()
+    assert main(["report", str(run_folder), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["guidance"], row["labels"]) for row in rows] == [("none", 0), ("relative", 10), ("relative", 20)]
+    assert all(row["final_lower"] <= row["final"] <= row["final_upper"] for row in rows)
     table = (out / "report.md").read_text()
     assert "| relative | 20 | 2 |" in table
     assert (out / "label_efficiency.png").exists()

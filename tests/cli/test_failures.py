@@ -32,6 +32,7 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--task.table", "one_ball", "--policy", "teacher"], "--task.teacher search"),
     (["report", "--out", "report"], "no folder to report on"),
     (["report", "nowhere", "--out", "report"], "no results at or below"),
+    (["report", "nowhere"], "give one of --out FOLDER and --json"),
 ]
 
 

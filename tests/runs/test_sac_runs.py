@@ -49,7 +49,7 @@ def rows(out):
 
 def policy_of(folder, seed=1):
     source = PolicySource.of_folder(folder, lambda name: TASK)
-    return LaneChoice(seed=seed).policy_in(source, WalkConfig(), None)
+    return LaneChoice(seed=(seed,)).lane_in(source, WalkConfig())[0]
 
 
 @pytest.fixture(scope="module")
