@@ -62,9 +62,9 @@ def main(arguments: Sequence[str], steps: int = 8_000) -> dict[str, dict[str, ja
         found[name] = evaluate_policy(env, policy, episodes(), num_envs=200, steps=steps)
         told = ", ".join(f"{metric} {float(value):.3f}" for metric, value in found[name].items())
         print(f"{name}: {told}")
-    files = filming.files(Path(arguments[0] if arguments else "pictures"), "leaning", "gif")
-    filming.film(TASK.pictures(), env, policy, episode=0, steps=30, to=files)
-    print(f"wrote {files.film} and {files.still}")
+    film, still, _ = filming.files(Path(arguments[0] if arguments else "pictures"), "leaning", "gif")
+    filming.film(TASK.pictures(), env, policy, 0, 30, film, still)
+    print(f"wrote {film} and {still}")
     return found
 
 

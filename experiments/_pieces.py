@@ -73,7 +73,9 @@ def words_of(options: Options) -> list[str]:
 
 def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]:
     """Return the command line of a piece that is a sweep."""
-    own: dict[str, object] = {"first-seed": FIRST_SEED, **piece.options, "guidance": piece.kinds, "seeds": piece.seeds}
+    own: dict[str, object] = {"first-seed": FIRST_SEED, **piece.options, "guidance": piece.kinds}
+    first = own.pop("first-seed")  # no option: the first of the seeds
+    own["seeds"] = f"{first}:{int(str(first)) + piece.seeds}"
     own |= {"labels": piece.labels} if piece.labels else {}
     folder = out / piece.path
     going_on = ["--resume"] if resume and (folder / "config.json").exists() else []

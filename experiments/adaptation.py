@@ -135,7 +135,7 @@ def commands(_: str, piece: Piece, out: Path, resume: bool) -> list[list[str]]:
     if not piece.labels:
         return [["evaluate", str(agents), "--policy", *piece.kinds, *world, *robot, *measure]]
     seeds = tuple(json.loads((agents / "config.json").read_text())["grid"]["seeds"])
-    ask = words_of({"base.seeds": seeds, "guidance": piece.kinds, "labels": piece.labels, **own})
+    ask = words_of({"base.seed": seeds, "guidance": piece.kinds, "labels": piece.labels, **own})
     adapt = ["adapt", str(agents), *ask, *world, *robot, "--out", str(folder), *(["--overwrite"] if resume else [])]
     return [adapt, ["evaluate", str(folder), "--compare", "base", *robot, *measure]]
 

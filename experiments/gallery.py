@@ -68,7 +68,7 @@ FILMS = (
         make=(
             (
                 "billiards",
-                "sweep billiards --preset quickstart --seeds 1 --first-seed 2002 --schedule.total-steps 600",
+                "sweep billiards --preset quickstart --seeds 2002:2003 --schedule.total-steps 600",
             ),
         ),
         before="WORK/billiards --guidance none --steps 3",

@@ -35,7 +35,7 @@ from cuelearner_jax.policies import policy_of
 from cuelearner_jax.reading import Distortion, Reading, Unknown, Walk, declared_distortions, simulator_distortion
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.report.statistics import RESAMPLES
-from cuelearner_jax.runs.policy_sources import PolicySource, several
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
@@ -118,7 +118,7 @@ def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, An
     source = PolicySource.of_folder(folder, registry.find)
     assert source.grid is not None
     env = task.environment(source.config.task)
-    policies, _ = several(source, source.config.task, "agent", None, None, source.grid.seeds, env=env)
+    policies, _ = LaneChoice(seed=source.grid.seeds).lanes_in(source, source.config.task, env)
     return source.config.task, source.config.scalars, dict(zip(source.grid.seeds, policies, strict=True))
 
 

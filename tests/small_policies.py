@@ -54,4 +54,4 @@ def write(folder, overwrite=False, origin="run", read=False):
         block = ReadingLanes(LANES.base, both, block.labels, block.bound, yes, np.zeros(2), yes, ~yes)
     found = AdaptationResult(of, LANES, block, judged)
     with policy_folders.place_of(folder, overwrite) as place:
-        adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})
+        adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin}, {})

@@ -182,7 +182,7 @@ def adapt(
         "judge_bounds": None if judge_bounds is None else tuple(map(float, judge_bounds)),
     }
     options: dict[str, Any] = {name: value for name, value in optional.items() if value is not None}
-    options |= {"task": config.task, "first_seed": seed, "judge_episodes": judge_episodes}
+    options |= {"task": config.task, "seeds": f"{seed}:{seed + 1}", "judge_episodes": judge_episodes}
     prefer, judge_by = (judge_by, PERSON) if callable(judge_by) else (None, judge_by)
     request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, scalars)
     about = {"task": task, "teacher": teacher, "rows": rows, "changes": changes, "prefer": prefer}

@@ -21,6 +21,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import FILES, Policy, call_policy, policy_name, policy_of
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import policy_sources
+from cuelearner_jax.runs.policy_sources import LaneChoice
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
@@ -47,6 +48,7 @@ class CallablePolicy:
     trained: RunConfig | None = None  # configuration of its training; None: not known
     actions: Space = DIRECTIONS  # space of its actions
     world: World | None = None  # world in which it was corrected, or loaded for; None: not known
+    lane: dict[str, Any] = dataclasses.field(default_factory=dict)  # what chooses its lane; empty: not of a folder
 
     def __post_init__(self) -> None:
         """Make a policy of an object that acts. Raises UserError for any other."""
@@ -128,10 +130,9 @@ def load_policy(
         folder: folder of a run, of a sweep in pieces, or of a policy; or a shipped agent, as "shipped:navigation".
         policy: "agent", "guided" or another that `evaluate TASK --help` lists (default: the trained agent, or the
             adapted policy).
-        guidance: the lane's kind of guidance (default: the run's last).
-        labels: the lane's label budget (default: the largest).
+        guidance, labels, seed: of the lane (default: the run's lane with the best last reward, which is printed; of a
+            policy folder the largest budget and the first seed).
         bound_deg: bound [deg] of a lane of a policy folder (default: the largest).
-        seed: the lane's seed (default: the first).
         base: the policy that was adapted, where it is code: the folder names it, and does not hold it.
         changes: the distortions of your own that a reading corrected: the folder names them, and does not hold them.
         task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
@@ -148,9 +149,10 @@ def load_policy(
     source.check(name, config)
     shape = shape_of(own_task, config)
     seeds = () if seed is None else (seed,)
-    (lane,), _ = policy_sources.several(source, config, name, guidance, labels, seeds, bound_deg)
+    choice = LaneChoice(policy=name, guidance=guidance, labels=labels, bound_deg=bound_deg, seed=seeds)
+    own_policy, lane = choice.lane_in(source, config)
     where, taught = world or World(own_task, config), policy_sources.POLICIES[name].taught
-    return CallablePolicy(lane, shape.observation, taught, source.config, actions_of(shape), where)
+    return CallablePolicy(own_policy, shape.observation, taught, source.config, actions_of(shape), where, lane)
 
 
 @user_code.report_user_errors
@@ -242,7 +244,9 @@ def _world_of(policy: Any, world: World | None) -> World:
 
 
 def _about(policy: Any, world: World) -> dict[str, Any]:
-    return {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
+    lane = getattr(policy, "lane", None)  # of a `PolicyNode` a method
+    head = {"subject": type(policy).__name__, **(lane if isinstance(lane, dict) else {})}
+    return {**head, "world": {"name": world.task.name, **to_json(world.config)}}
 
 
 def load_exported(folder: str | Path) -> Any:

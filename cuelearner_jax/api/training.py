@@ -24,6 +24,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.order import TrainRequest
+from cuelearner_jax.runs.policy_sources import best_lane
 from cuelearner_jax.runs.training import Training
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.studies import train as study
@@ -42,25 +43,20 @@ class Run:
     trainings: dict[str, Training]  # the trained lanes, by kind of guidance
 
     def policy(self, guidance: str | None = None, labels: int | None = None, seed: int | None = None) -> CallablePolicy:
-        """Return one lane's trained agent.
-
-        Args:
-            guidance: kind of guidance (default: the last).
-            labels: label budget (default: the largest).
-            seed: seed (default: the first).
-        """
-        name = list(self.trainings)[-1] if guidance is None else guidance
-        if name not in self.trainings:
-            raise UserError(f"no guidance {name!r} was trained{suggestion(name, self.trainings)}")
-        training = self.trainings[name]
+        """Return one lane's trained agent: that of the best last reward among those that fit, which is printed."""
+        if guidance is not None and guidance not in self.trainings:
+            raise UserError(f"no guidance {guidance!r} was trained{suggestion(guidance, self.trainings)}")
+        seeds = () if seed is None else (seed,)
+        name, budget, seeds = best_lane(self.results, (guidance, labels, seeds))
+        training = self.trainings[name or [*self.trainings][-1]]
         group = training.group
-        budget = int(group.budgets.max()) if labels is None else labels
-        wanted = int(group.seeds[0]) if seed is None else seed
-        lanes = np.flatnonzero((group.seeds == wanted) & (group.budgets == budget))
+        lanes = np.flatnonzero((group.budgets == budget) & np.isin(group.seeds, seeds))
         if not len(lanes):
-            raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
+            raise UserError(f"no lane with seed {seed} and {labels} labels was trained")
         agents = training.policies(view_of(group.env))
-        return CallablePolicy(agents.lane(int(lanes[0])), self.world.observation, actions=self.world.actions)
+        lane = {"guidance": name, "labels": budget, "seed": seeds[0]}
+        space = self.world.actions
+        return CallablePolicy(agents.lane(int(lanes[0])), self.world.observation, actions=space, lane=lane)
 
 
 @user_code.report_user_errors

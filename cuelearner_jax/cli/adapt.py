@@ -15,7 +15,7 @@ from cuelearner_jax.cli.options import Finished, Flag, Kinds, about, look_ahead_
 from cuelearner_jax.cli.sources import source_of
 from cuelearner_jax.errors import NotFinite
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs.policy_sources import BaseLanes
+from cuelearner_jax.runs.policy_sources import LaneChoice
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies.adapt import AdaptRequest, subject_of
 from cuelearner_jax.task import Task
@@ -24,7 +24,7 @@ from cuelearner_jax.terminal import progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adapt(Finished, AdaptRequest[Any, Kinds]):
+class Adapt(Finished, AdaptRequest):
     """Correct a finished policy by labels about what the policy does in a changed world.
 
     The policy lies in a run folder or a policy folder; or, with --task, it is package.module:NAME, any function of
@@ -34,7 +34,8 @@ class Adapt(Finished, AdaptRequest[Any, Kinds]):
     """Policy folder to write."""
     overwrite: Flag[bool] = False
     """Delete an existing policy folder."""
-    base: BaseLanes = field(default_factory=BaseLanes)
+    base: LaneChoice = field(default_factory=LaneChoice)
+    kinds: Kinds = field(default_factory=dict)
 
 
 def run(arguments: list[str]) -> None:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from cuelearner_jax.api.adaptation import agreement
-from cuelearner_jax.cli.options import Finished, out
+from cuelearner_jax.cli.options import Finished, Flag, out
 from cuelearner_jax.cli.sources import source_and_options, source_in
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.measurements import Difference
-from cuelearner_jax.runs import policy_sources
-from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
+from cuelearner_jax.runs.policy_sources import POLICIES, LaneChoice, PolicySource
 from cuelearner_jax.storage import policy_folders
+from cuelearner_jax.storage.results import LANE
+from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
 from cuelearner_jax.tasks import shipped
@@ -25,7 +27,7 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Finished, EvaluateRequest[Any]):
+class Evaluate(Finished, EvaluateRequest):
     """Measure a policy on validation episodes, or compare two; in any changed world.
 
     The policy is of a run or a policy folder, or a task's teacher, heuristic or chance; or, with --env, it is
@@ -39,6 +41,8 @@ class Evaluate(Finished, EvaluateRequest[Any]):
     ONNX; beside the policy as it was and "already right" always."""
     out: Path | None = None
     """Also write the measurements to this JSON file."""
+    json: Flag[bool] = False
+    """Print the measurements, with intervals, as JSON in place of tables."""
 
 
 def run(arguments: list[str]) -> None:
@@ -52,15 +56,25 @@ def run(arguments: list[str]) -> None:
     evaluate.amount(source.task, options)
     if options.out and options.out.exists():
         raise UserError(f"{options.out} exists: give another --out")
-    other = _other(source, options) if options.compare else None
+    requests: list[tuple[PolicySource, Evaluate]] = [(source, options)]
+    if options.compare:
+        other, policy = _other(source, options)
+        requests.append((other, replace(options, policy=policy, guidance=(), labels=(), seed=())))
+    plans = [evaluate.prepare(*request) for request in requests]
+    if options.compare:  # what cannot be compared is not measured first
+        measurements.differences(
+            *([row for block in lanes for row in evaluate.variants(env, block)] for env, lanes in plans)
+        )
     with progress_bars() as bars:
-        watch = watched_by(bars)
-        rows = evaluate.run(source, options, watch)
-        others = evaluate.run(other[0], replace(options, policy=other[1], guidance=()), watch) if other else []
-    _print_measured(source, options, rows, others)
+        rows, *others = [
+            evaluate.run(*request, watched_by(bars), plan) for request, plan in zip(requests, plans, strict=True)
+        ]
+    _print_measured(source, options, rows, *others)
 
 
-def _print_measured(source: PolicySource, options: Evaluate, rows: list[Measured], others: list[Measured]) -> None:
+def _print_measured(
+    source: PolicySource, options: Evaluate, rows: list[Measured], others: Sequence[Measured] = ()
+) -> None:
     """Print the measurements, or the comparison with others, and write them to the chosen file."""
     envs, steps = evaluate.amount(source.task, options)
     compared = measurements.differences(rows, others) if options.compare else None
@@ -68,20 +82,25 @@ def _print_measured(source: PolicySource, options: Evaluate, rows: list[Measured
     about = {name: value for name, value in about.items() if value}
     lane = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
     title, other = ", ".join([options.policy, *about.values(), lane]), " ".join(options.compare[-1:])
+    both = None if compared is None else (other, compared)
+    described = about | ({"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {})
+    text = measurements.to_json(source, options, rows, described, both)
     if options.out:  # first: whoever reads the table may leave before its end
-        both = None if compared is None else (other, compared)
-        described = about | ({"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {})
-        measurements.write(options.out, source, options.task, options.policy, envs, steps, rows, described, both)
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(options.out) as file:
+            file.write(text + "\n")
     shares = f"{envs:,} episodes" if source.task.longest else f"{envs:,} environments of {steps // envs:,} steps"
-    if compared is None:
+    if options.json:
+        print(text)
+    elif compared is None:
         out.print_table(_measurements(rows, title, shares))
-    for difference in compared or ():
+    for difference in () if options.json else compared or ():
         out.print_table(_comparison(difference, other, title, shares))
         out.print(_verdict(difference))
     if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in [*rows, *others]):
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
     if options.out:
-        out.print(f"wrote {options.out}")
+        (console if options.json else out).print(f"wrote {options.out}")
 
 
 def _print_agreement(source: PolicySource, options: Evaluate) -> None:
@@ -92,10 +111,17 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
     if POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
     assert path is not None
-    kind = next(iter(options.guidance), None)
-    (policy,), _ = policy_sources.several(source, options.task, name, kind)
+    for option in LANE:
+        if len(values := getattr(options, option)) > 1:
+            raise UserError(f"--{option} has {len(values)} values, but one policy answers: give one value")
+    kind, budget = next(iter(options.guidance), None), next(iter(options.labels), None)
+    choice = LaneChoice(policy=name, guidance=kind, labels=budget, seed=options.seed)
+    policy, _ = choice.lane_in(source, options.task)
     result = agreement(policy, path)
     subject = options.subject if name == "own" else f"{source.folder}, {name}"
+    if options.json:
+        print(json.dumps({"subject": subject, "labels": result.labels, "shares": dict(result.rows())}, indent=1))
+        return
     title = f"{subject}: agreement with {result.labels} labels of {path}"
     table = Table("", "share of answers", "95% interval", title=title)
     for row, share in result.rows():
@@ -124,14 +150,6 @@ def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
     return other, policy
 
 
-def _table(*columns: str, **about: Any) -> Table:
-    """Return an empty table whose numbers are never cut."""
-    table = Table(*columns, **about)
-    for column in table.columns:
-        column.no_wrap = True
-    return table
-
-
 def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
     """Return a table of means with intervals (single policies: over `episodes`), by guidance and budget."""
     columns = {
@@ -152,7 +170,7 @@ def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
         "seeds": f"several seeds: interquartile mean and bootstrap over seeds and {episodes}",
     }
     caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, rows))
-    table = _table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
+    table = Table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
     for row in rows:
         own = [text(row) for text in columns.values()]
         for name, values in row.metrics.items():
@@ -176,7 +194,7 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
         name + (f" ({variant})" if variant else "") for name, variant in ((title, mine), (other, its))
     )
     caption = f"mean [95% bootstrap interval]; of the difference over {over}"
-    table = _table("metric", "policy", "against", "difference", title=heading, caption=caption, padding=0)
+    table = Table("metric", "policy", "against", "difference", title=heading, caption=caption, padding=0)
     for name, less in difference.metrics.items():
         both = (measurements.spread(row, name) for row in (difference.row, difference.other))
         table.add_row(name, *map(str, both), f"{less.estimate:+.3f} [{less.lower:+.3f}, {less.upper:+.3f}]")

@@ -52,14 +52,11 @@ def run(arguments: list[str]) -> None:
     env = source.task.environment(options.task)
     if options.only_correction and source.adapted is not None:
         source = replace(source, adapted=replace(source.adapted, code=source.adapted.code or uniform_in(env)))
-    (policy,), (lane,) = options.lanes_in(source, options.task, env)
+    policy, lane = options.lane_in(source, options.task, env)
     draw, view = (lambda: decisions.observations(env, policy)), env
     if options.only_correction:
         policy, view = correction.correction_of(policy, env)
         draw = lambda: correction.cases(env)  # noqa: E731
-    if policy_sources.POLICIES[name].from_run:
-        words = ", ".join(f"{option} {value}" for option, value in lane.items())
-        out.print(f"the run's lane of {words}; choose by --guidance, --labels and --seed")
     origin = {
         "subject": source.folder.name,
         "policy": name,
@@ -81,7 +78,7 @@ def _into_checkpoint(source: PolicySource, options: Export) -> None:
     if source.adapted is None or options.policy in (None, source.default_policy):
         raise UserError("--format lerobot is for a policy folder and a checkpoint: give both, the latter by --policy")
     env = source.task.environment(options.task)
-    policy = replace(options, policy=None).policy_in(source, options.task, env)
+    policy, _ = replace(options, policy=None).lane_in(source, options.task, env)
     names = tuple(getattr(options.task, "cue_names", ()))
     hand = json.loads(getattr(options.task, "hand", "") or "{}")
     checkpoint = lerobot.write(policy, env, names, Path(options.policy), options.out, hand)

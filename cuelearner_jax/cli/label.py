@@ -90,12 +90,7 @@ class LabelOptions(NewWorld):
 
 
 def run(arguments: list[str]) -> None:
-    """Run the command.
-
-    Raises:
-        UserError: bad input, a port or folder in use, or a folder with labels of another session.
-        Interrupted: Ctrl-C or SIGTERM; every answer is saved.
-    """
+    """Run the command. Raises UserError for bad input or a port or folder in use; Interrupted once all is saved."""
     server = page_module("server")
     ahead = look_ahead_of(arguments, "label", LabelOptions)
     task = recorded_or_task(ahead)
@@ -228,7 +223,7 @@ def _base(task: Task, options: LabelOptions, source: PolicySource | None, env: A
         raise UserError(f"--questions is {questions}, but the questions are about {policy}: leave out one of them")
     if source is not None:
         name = lane.name_in(source, options.task)
-        return Base(lane.policy_in(source, options.task, None), f"{source.folder.resolve().name}, {name}")
+        return Base(lane.lane_in(source, options.task)[0], f"{source.folder.resolve().name}, {name}")
     if lane != LaneChoice():
         raise UserError("--base.… chooses a folder's lane, but no folder is given: leave it out")
     if policy is not None:

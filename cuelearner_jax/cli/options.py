@@ -55,6 +55,20 @@ class _Output(Console):
 out = _Output(**PLAIN)
 
 
+def _whole(words: list[str]) -> int:
+    """Return a whole number, which may have an exponent. Raises ValueError for any other word."""
+    if "e" in words[0].lower() and not float(words[0]).is_integer():
+        raise ValueError(f"{words[0]} is not a whole number")
+    return int(float(words[0])) if "e" in words[0].lower() else int(words[0])
+
+
+WHOLE = tyro.constructors.PrimitiveConstructorSpec(
+    1, "INT", _whole, lambda value: type(value) is int, lambda one: [str(one)]
+)
+NUMBERS = tyro.constructors.ConstructorRegistry()
+NUMBERS.primitive_rule(lambda info: WHOLE if info.type is int else None)
+
+
 @dataclass(frozen=True)
 class Unnamed:
     """Options of a task that is not named yet."""
@@ -153,7 +167,7 @@ def parse(kind: Any, arguments: list[str], command: str, default: Any = None, ab
     `about`: the text above the options (default: the docstring of `kind`).
     """
     errors = io.StringIO()
-    values: dict[str, Any] = {} if default is None else {"default": default}
+    values: dict[str, Any] = {"registry": NUMBERS} | ({} if default is None else {"default": default})
     try:
         with contextlib.redirect_stderr(errors):
             options = tyro.cli(kind, args=arguments, prog=f"cuelearner {command}", description=about or None, **values)

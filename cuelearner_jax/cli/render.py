@@ -8,6 +8,7 @@ from pathlib import Path
 
 from cuelearner_jax.cli.options import Finished, Flag, check_numbers, out
 from cuelearner_jax.cli.sources import source_and_options
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import filming
 from cuelearner_jax.runs.policy_sources import LaneChoice
 
@@ -40,14 +41,15 @@ def run(arguments: list[str]) -> None:
     check_numbers(options, steps=(1, MOST), episode=(0, MOST))
     robot = "-".join(part for part in re.split(r"[^\w.-]+", options.robot or "") if part.strip("."))
     names = [source.folder.name, robot, options.scenario, policy_name]
-    files = filming.files(options.out, "-".join(name for name in names if name), options.film)
-    targets = (files.question,) if options.question else (files.film, files.still)
-    filming.check_free(*targets, overwrite=options.overwrite)
+    film, still, question = filming.files(options.out, "-".join(name for name in names if name), options.film)
+    targets = (question,) if options.question else (film, still)
+    if there := [file for file in targets if file.exists() and not options.overwrite]:
+        raise UserError(f"{there[0]} exists: give --overwrite to replace it, or another --out")
     env = source.task.environment(options.task, "validation")
-    policy = options.policy_in(source, options.task, env)
+    policy, _ = options.lane_in(source, options.task, env)
     if options.question:
-        filming.question(pictures, env, policy, options.episode, files.question)
-        out.print(f"wrote {files.question}")
+        filming.question(pictures, env, policy, options.episode, question)
+        out.print(f"wrote {question}")
         return
-    rewards = filming.film(pictures, env, policy, options.episode, options.steps, files)
-    out.print(f"rewards {' '.join(f'{reward:g}' for reward in rewards)}; wrote {files.film} and {files.still}")
+    rewards = filming.film(pictures, env, policy, options.episode, options.steps, film, still)
+    out.print(f"rewards {' '.join(f'{reward:g}' for reward in rewards)}; wrote {film} and {still}")

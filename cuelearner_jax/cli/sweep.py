@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from cuelearner_jax.cli.train import TrainingOptions, parse_training, suggested
-from cuelearner_jax.runs.grid import Grid, seeds_of
+from cuelearner_jax.runs.grid import Grid, parse_seeds
 from cuelearner_jax.runs.shards import Shard
 
 
@@ -19,11 +19,9 @@ class Sweep(TrainingOptions):
     guidance: tuple[str, ...] = ()
     """Kinds of guidance."""
     labels: tuple[int, ...] = (500,)
-    """Label budgets; guidance without labels runs once per seed."""
-    seeds: int = 5
-    """Number of seeds."""
-    first_seed: int = 0
-    """First seed; the others count up from it."""
+    """Label budgets, 0 for the unguided agent; guidance without labels runs once per seed."""
+    seeds: str = "5"
+    """Number of seeds, from the preset's first seed on, or a range such as 0:16, without its end."""
     chosen_shard: Annotated[str | None, tyro.conf.arg(name="shard")] = None
     """Run only shard i of n, given as i/n: its share of the seeds, in a folder of its own below --out. An interrupted
     shard is continued."""
@@ -32,8 +30,8 @@ class Sweep(TrainingOptions):
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
     task, grid, default = suggested(arguments, "sweep", Sweep)
-    seeds, first = len(grid.seeds), grid.seeds[0]
-    default = replace(default, guidance=grid.guidance, labels=grid.labels, seeds=seeds, first_seed=first)
+    first, seeds = grid.seeds[0], f"{grid.seeds[0]}:{grid.seeds[-1] + 1}"
+    default = replace(default, guidance=grid.guidance, labels=grid.labels, seeds=seeds)
     options = parse_training(arguments, "sweep", task, default)
-    grid = Grid(options.guidance, seeds_of(options.first_seed, options.seeds), options.labels)
+    grid = Grid(options.guidance, parse_seeds(options.seeds, first), options.labels)
     options.train(grid, Shard.parse(options.chosen_shard) if options.chosen_shard else None)

@@ -73,7 +73,7 @@ class Train(TrainingOptions):
     guidance: str = ""
     """Kind of guidance."""
     labels: int = 500
-    """Number of labels to ask the teacher for."""
+    """Number of labels to ask the teacher for; 0: the unguided agent."""
     seed: int = 0
     """Seed of the run."""
 

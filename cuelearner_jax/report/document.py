@@ -52,17 +52,10 @@ def report(
     overwrite: bool = False,
     command: str = "",
 ) -> Path:
-    """Write the report of any number of runs, finished or not; return the path of `report.md`.
+    """Write the report of run folders, or of folders above them, into `out`; return the path of `report.md`.
 
-    Args:
-        folders: run folders, or folders above them.
-        out: folder of the report.
-        metric: metric column to report.
-        split: "validation" or "training".
-        lower_is_better: smaller values of the metric are better, for the best value and for reaching a value.
-        by_run: reports each folder separately, under its name, as needed where the runs' configurations differ.
-        study: called with the variants; returns additions to the report.
-        command: command line that makes this report, recorded in it.
+    `by_run`: report each folder separately, under its name, as needed where configurations differ. `study`: called with
+    the variants; returns additions. `command`: the command line that makes this report, recorded in it.
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)

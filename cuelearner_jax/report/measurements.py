@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
 
-from cuelearner_jax.config import to_json
+from cuelearner_jax import config
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import group_means, mean_interval
 from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
 from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
-from cuelearner_jax.storage.whole import replacing
-from cuelearner_jax.studies.evaluate import Measured
+from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured, amount
 
 
 def is_single(row: Measured) -> bool:
@@ -110,28 +108,25 @@ def _row(row: Measured) -> dict[str, Any]:
     }
 
 
-def write(
-    path: Path,
+def to_json(
     source: PolicySource,
-    world: Any,
-    policy: str,
-    num_envs: int,
-    steps: int,
+    request: EvaluateRequest,
     rows: Sequence[Measured],
     body: dict[str, str],
     compared: tuple[str, Sequence[Difference]] | None = None,
-) -> None:
-    """Write measurements as JSON: the world, the rows with intervals, and the provenance.
+) -> str:
+    """Return measurements as JSON: the world, the rows with intervals, and the provenance.
 
     `body`: robot, engine and scenario, where they are not the defaults. `compared`: the other policy.
     """
+    envs, steps = amount(source.task, request)
     contents = {
         "subject": source.folder.name,
-        "world": {"name": source.task.name, **to_json(world)},
-        **({"files": files} if POLICIES[policy].taught and (files := source.task.files(world)) else {}),
-        "policy": policy,
+        "world": {"name": source.task.name, **config.to_json(request.task)},
+        **({"files": files} if POLICIES[request.policy].taught and (files := source.task.files(request.task)) else {}),
+        "policy": request.policy,
         **body,
-        "envs": num_envs,
+        "envs": envs,
         "steps": steps,
         **provenance(),
         "rows": [_row(row) for row in rows],
@@ -144,6 +139,4 @@ def write(
             for one in pairs
         ]
         contents["compared"] = {"with": name, "differences": entries}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        file.write(json.dumps(contents, indent=1) + "\n")
+    return json.dumps(contents, indent=1)

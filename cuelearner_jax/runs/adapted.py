@@ -101,17 +101,12 @@ def open_folder(
 
 
 def write(
-    place: Place,
-    result: AdaptationResult,
-    task: Task,
-    world: Any,
-    origin: dict[str, Any],
-    inputs: dict[str, str | None] | None = None,
+    place: Place, result: AdaptationResult, task: Task, world: Any, origin: dict[str, Any], more: dict[str, str | None]
 ) -> None:
     """Write a policy folder of lanes that were adapted in a task's world.
 
-    `origin`: the base policies in plain values: "folder" and which lanes of it, or "code". `inputs`: further inputs by
-    name: the label file, another robot.
+    `origin`: the base policies in plain values: "folder" and which lanes of it, or "code". `more`: the label file and
+    another robot, by name.
     """
     lanes, judgement, env = result.lanes, result.judgement, shape_of(task, world)
     block = replace(result.policy(env), base=result.of.bases)
@@ -139,7 +134,7 @@ def write(
             "rewarded_steps": judgement.rewarded_steps.tolist(),
         },
         **({"reading": [one.to_json() for one in result.results]} if result.results else {}),
-        **{name: value for name, value in (inputs or {}).items() if value},
+        **{name: value for name, value in more.items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,
         **provenance(),

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
-import jax
 import numpy as np
 import pyarrow as pa
 
@@ -37,17 +35,13 @@ def summary(table: pa.Table) -> str:
     return f"{len(steps)} of {results.lanes(table)} lanes failed, no longer finite ({which})" if steps else ""
 
 
-def without_failed(groups: Sequence[Any]) -> list[Any]:
-    """Drop the failed lanes of trained lanes (`run_folders.RunLanes`) and name them on the console."""
-    rest = []
-    for lanes in groups:
-        mask = np.asarray(lanes.policies["failed"])
-        if mask.any():
-            names = name_lanes(lanes.seeds[mask], lanes.budgets[mask])
-            console.print(f"{lanes.guidance.name}: {names} failed, no longer finite: left out")
-        if not mask.all():
-            policies = jax.tree.map(lambda leaf, mask=mask: leaf[~mask], lanes.policies)
-            rest.append(replace(lanes, seeds=lanes.seeds[~mask], budgets=lanes.budgets[~mask], policies=policies))
+def without_failed(blocks: Sequence[Any]) -> list[Any]:
+    """Drop the failed lanes of blocks (`policy_sources.Block`) and name them on the console."""
+    for block in blocks:
+        if block.failed.any():
+            names = name_lanes(block.seeds[block.failed], block.budgets[block.failed])
+            console.print(f"{block.guidance}: {names} failed, no longer finite: left out")
+    rest = [block.lanes(~block.failed) for block in blocks if not block.failed.all()]
     if not rest:
         raise UserError("all of these lanes failed: there is nothing to evaluate; train again with other settings")
     return rest

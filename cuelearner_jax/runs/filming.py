@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -17,46 +17,29 @@ from cuelearner_jax.task import Pictures
 FILMS = ("gif", "mp4")
 
 
-class Files(NamedTuple):
-    """Paths of a policy's pictures."""
-
-    film: Path
-    still: Path
-    question: Path
-
-
-def files(folder: Path, name: str, film: str) -> Files:
-    """Return the paths of the pictures of a name in a folder. Raises UserError for an unknown film format."""
+def files(folder: Path, name: str, film: str) -> tuple[Path, Path, Path]:
+    """Return the paths of a name's film, still and question in a folder. Raises UserError for an unknown format."""
     if film not in FILMS:
         raise UserError(f"--film is {film!r}: choose gif or mp4")
-    return Files(folder / f"{name}.{film}", folder / f"{name}.png", folder / f"{name}-question.png")
+    return folder / f"{name}.{film}", folder / f"{name}.png", folder / f"{name}-question.png"
 
 
-def check_free(*wanted: Path, overwrite: bool) -> None:
-    """Raise UserError if one of the files exists and may not be replaced."""
-    for file in wanted:
-        if file.exists() and not overwrite:
-            raise UserError(f"{file} exists: give --overwrite to replace it, or another --out")
-
-
-def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, steps: int, to: Files) -> list[float]:
-    """Write a film and a still of a policy's steps from a validation episode on; return the reward of each step.
+def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, steps: int, *to: Path) -> list[float]:
+    """Write a film and a still (`to`) of a policy's steps from a validation episode on; return each step's reward.
 
     As many episodes are played as needed. Raises UserError, and writes nothing, if the first action is not finite.
     """
     _first(env, policy, episode)
     frames, rewards = pictures.record(env, policy, _start(episode), steps)
-    to.film.parent.mkdir(parents=True, exist_ok=True)
-    pictures.still(env, frames, to.still)
-    pictures.animate(env, frames, to.film)
+    animation, still = to
+    still.parent.mkdir(parents=True, exist_ok=True)
+    pictures.still(env, frames, still)
+    pictures.animate(env, frames, animation)
     return rewards
 
 
 def question(pictures: Pictures, env: Environment, policy: Policy, episode: int, to: Path) -> None:
-    """Write a picture of a validation episode's first situation, with the policy's action as the asked action.
-
-    Raises UserError, and writes nothing, if that action is not finite.
-    """
+    """Write a picture of a validation episode's first situation and the policy's action, if that action is finite."""
     state, obs, action = _first(env, policy, episode)
     to.parent.mkdir(parents=True, exist_ok=True)
     pictures.question(env, state, obs, action, to)

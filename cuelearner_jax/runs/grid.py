@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from cuelearner_jax import run_config
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.guides.base import Guide, NoGuide
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage import formats, label_files
 from cuelearner_jax.storage.folders import CONFIG
@@ -42,12 +43,27 @@ class Grid:
 def seeds_of(first: int, count: int) -> tuple[int, ...]:
     """Return `count` seeds from `first` on. Raises UserError for an impossible number before making any."""
     if count < 1:
-        raise UserError(f"--seeds is {count}: give --seeds of at least 1")
+        raise UserError(f"--seeds makes {count} seeds: give --seeds of at least 1, or a range such as 0:16")
     if first < 0 or first + count > LARGEST_SEED:
-        raise UserError(
-            f"--seeds {count} from --first-seed {first} on: seeds are numbers from 0 to {LARGEST_SEED - 1}, give others"
-        )
+        raise UserError(f"--seeds is {first}:{first + count}: seeds are numbers from 0 to {LARGEST_SEED - 1}")
     return tuple(range(first, first + count))
+
+
+def parse_seeds(words: str, first: int = 0) -> tuple[int, ...]:
+    """Return the seeds of a number of them, from `first` on, or of a range such as 0:16, without its end."""
+    if (match := re.fullmatch(r"(?:([0-9]{1,12}):)?([0-9]{1,12})", words)) is None:
+        raise UserError(f"--seeds is {words!r}: give a number of seeds, or a range such as 0:16")
+    start, number = match.groups()
+    return seeds_of(first, int(number)) if start is None else seeds_of(int(start), int(number) - int(start))
+
+
+def with_control(grid: Grid) -> Grid:
+    """Return a grid with the unguided agent in place of the label budget 0."""
+    if 0 not in grid.labels:
+        return grid
+    labels = tuple(budget for budget in grid.labels if budget)
+    others = [kind for kind in grid.guidance if kind != NoGuide.name and (labels or not guidances.find(kind).asks)]
+    return Grid((NoGuide.name, *others), grid.seeds, labels or (0,))
 
 
 def check_grid(grid: Grid, adapts: bool = False) -> None:
@@ -66,7 +82,7 @@ def check_grid(grid: Grid, adapts: bool = False) -> None:
         if min(grid.labels) < 1:
             raise UserError(
                 f"a label budget of {min(grid.labels)} teaches nothing: give --labels of at least 1, "
-                "and --guidance none for the unguided agent"
+                "or, in training, 0 for the unguided agent"
             )
         if max(grid.labels) >= LARGEST_BUDGET:
             raise UserError(f"a label budget of {max(grid.labels)} cannot be counted: give less than {LARGEST_BUDGET}")

@@ -19,7 +19,6 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import group_means, rollout_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Clock, TrainState
-from cuelearner_jax.policies import PolicyNode
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.program import Program, make_program
@@ -127,15 +126,9 @@ class LaneGroup:
         )
 
     def evaluate(
-        self,
-        policy_of: Callable[[TrainState], PolicyNode],
-        env: Environment,
-        key: PRNGKeyArray,
-        num_envs: int,
-        steps: int,
-        blocks: list[TrainState],
+        self, policy_of: Any, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int, blocks: list[TrainState]
     ) -> dict[str, np.ndarray]:
-        """Return metrics (lanes,) of a policy of each block on the same episodes, and their `group_means`."""
+        """Return metrics (lanes,) of each block's policy (`policy_of`) on the same episodes, and `group_means`."""
         mesh = self.mesh if self.mesh.size > 1 else None
 
         def measure(block: TrainState) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.grid import Grid, check_grid, describe
+from cuelearner_jax.runs.grid import Grid, check_grid, describe, with_control
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import label_files, tracking
 from cuelearner_jax.storage.folders import CONFIG, check_folder
@@ -60,7 +60,7 @@ def resolve_request(request: RequestT) -> RequestT:
     run_config.check(request.config)
     # loads the code of kinds from outside
     names = tuple(guidances.resolve(kind).name for kind in request.grid.guidance)
-    request = replace(request, grid=replace(request.grid, guidance=names))
+    request = replace(request, grid=with_control(replace(request.grid, guidance=names)))
     check_grid(request.grid)
     request.task.check_evaluations(request.config)
     return request

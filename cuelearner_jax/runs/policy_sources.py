@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.environment import actions_of, check_layout, offers, spaces_of, view_of
@@ -16,13 +17,16 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Taught, asked_from, policy_of, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
-from cuelearner_jax.runs.failures import without_failed
+from cuelearner_jax.runs.failures import variant_name, without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.run_folders import Piece, RunLanes, lanes_of, open_run
-from cuelearner_jax.storage import label_files, policy_folders
+from cuelearner_jax.storage import label_files, policy_folders, results
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Policy, Teacher
+
+Choice = tuple[str | None, int | None, tuple[int, ...]]  # guidance, labels and seeds of lanes; None and (): open
+OPTIONS = "--guidance, --labels and --seed (adapt, label: --base.guidance and so on)"  # that choose a lane
 
 
 class PolicyEntry(NamedTuple):
@@ -64,6 +68,13 @@ class Block(NamedTuple):
     step: int
     policy: Any  # a block, or `Common`
     failed: np.ndarray  # (lanes,) bool
+
+    def lanes(self, mask: np.ndarray) -> Block:
+        """Return the lanes of a mask (lanes,)."""
+        if mask.all():
+            return self
+        columns = {name: getattr(self, name)[mask] for name in ("seeds", "budgets", "bounds", "failed")}
+        return self._replace(**columns, policy=self.policy.lane(np.flatnonzero(mask)))
 
 
 @dataclass(frozen=True)
@@ -127,7 +138,6 @@ class PolicySource:
         if absent := [need for need in entry.needs if not offers(after, need)]:
             raise UserError(f"{self.task.name} has no {absent[0]}: choose another policy")
         if not entry.from_folder:
-            check_no_lane(policy, guidance)
             return
         what, own = "run" if self.grid else "policy", shape_of(self.task, self.config.task)
         check_layout(f"the {what}", own.observation, actions_of(own), after)
@@ -167,9 +177,16 @@ class PolicySource:
         return Heuristic(view) if name == "heuristic" else uniform_in(view)
 
     def blocks(
-        self, name: str, view: Any, teacher: Teacher | None, kinds: tuple[str, ...], failed_too: bool = False
+        self,
+        name: str,
+        view: Any,
+        teacher: Teacher | None,
+        kinds: tuple[str, ...] = (),
+        labels: tuple[int, ...] = (),
+        seeds: tuple[int, ...] = (),
+        failed_too: bool = False,
     ) -> list[Block]:
-        """Return a policy of the folder, in blocks of lanes of some kinds of guidance (none named: all).
+        """Return a policy of the folder, in blocks of lanes of some kinds, budgets and seeds (none named: all).
 
         `view`, `teacher`: those of the world that it acts in. Raises UserError if it is not available.
         """
@@ -179,25 +196,23 @@ class PolicySource:
             policy = own.policy(view)
             policy = policy if name == "adapted" else policy.base
             columns = (own.lanes.seed, own.lanes.budget, own.bounds_deg)
-            return [Block(own.guidance, *columns, 0, policy, np.zeros(own.lanes.number, bool))]
-        groups, blocks = self.load(kinds), []
-        for lanes in groups if failed_too else without_failed(groups):
-            policy, mask = self._acting(name, lanes, view, teacher), np.asarray(lanes.policies["failed"])
-            columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
-            blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, mask))
-        return blocks
+            blocks = [Block(own.guidance, *columns, 0, policy, np.zeros(own.lanes.number, bool))]
+        else:
+            blocks = [self._block(name, lanes, view, teacher) for lanes in self.load(kinds)]
+        blocks = _select(blocks, seeds, labels)
+        return blocks if failed_too else without_failed(blocks)
 
-    def _acting(self, name: str, lanes: RunLanes, view: Any, teacher: Teacher | None) -> Policy:
+    def _block(self, name: str, lanes: RunLanes, view: Any, teacher: Teacher | None) -> Block:
         """Return a trained policy of a run's lanes, as a block."""
-        config = self.config
-        agent = Agent(lanes.policies["params"], config.agent_in(view), view)
-        if name == "agent":
-            return agent
+        config, no_bounds, mask = self.config, np.zeros(len(lanes.seeds)), np.asarray(lanes.policies["failed"])
+        policy = agent = Agent(lanes.policies["params"], config.agent_in(view), view)
         if name == "corrected":
             assert teacher is not None
-            return Corrected(agent, teacher, config.scalars, actions_of(view))
-        base = asked_from(view, config.sizes) if name == "guide" else agent
-        return Guided(base, lanes.policies["guidance"], view, config.scalars, lanes.guidance)
+            policy = Corrected(agent, teacher, config.scalars, actions_of(view))
+        elif name != "agent":
+            base = asked_from(view, config.sizes) if name == "guide" else agent
+            policy = Guided(base, lanes.policies["guidance"], view, config.scalars, lanes.guidance)
+        return Block(lanes.guidance.name, lanes.seeds, lanes.budgets, no_bounds, lanes.step, policy, mask)
 
 
 def _with_labels(task: Task, folder: Path) -> Task:
@@ -221,70 +236,64 @@ def check_no_lane(policy: str, *choices: Any) -> None:
         raise UserError(f"policy {policy!r} belongs to no lane of a run: leave out the options that choose a lane")
 
 
-def several(
-    source: PolicySource,
-    world: Any,
-    name: str,
-    kind: str | None,
-    labels: int | None = None,
-    seeds: tuple[int, ...] = (),
-    bound_deg: float | None = None,
-    env: Any = None,
-) -> tuple[list[Any], list[dict[str, Any]]]:
-    """Return single policies of a folder's lanes that differ only in their seeds, and what chooses each lane.
+def best_lane(table: pa.Table, choice: Choice, metric: str = "reward") -> Choice:
+    """Return a choice of lanes whose open parts are those of the lane with the best last value in a results table.
 
-    That is its "guidance", "labels" and "seed"; a policy of the task alone has the seed 0. What is not given is the
-    run's last kind, the largest budget, the first seed and the largest bound.
-
-    `env`: the world's environment, for a teacher (default: with its training episodes).
+    Name that lane on the console. Raises UserError if several lanes fit and no value is recorded.
     """
-    entry = POLICIES[name]
-    if entry.taught and env is None:
-        env = source.task.environment(world)
-    teacher = source.task.make_teacher(world, env) if entry.taught else None
-    view = source.task.view(world) if env is None else view_of(env)
-    if not entry.from_folder:
-        check_no_lane(name, kind, labels, seeds, bound_deg)
-        return [source.alone(name, view, teacher)], [{"seed": 0}]
-    kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
-    blocks = source.blocks(name, view, teacher, kinds, failed_too=True)
-    budget = int(max(block.budgets.max() for block in blocks)) if labels is None else labels
-    bound = float(max(block.bounds.max() for block in blocks)) if bound_deg is None else bound_deg
-    seeds, unit = seeds or (int(blocks[0].seeds[0]),), actions_of(view).unit
-    lanes = [{"guidance": blocks[0].guidance, "labels": budget, "seed": seed} for seed in seeds]
-    return [_lane(blocks, seed, budget, bound, unit) for seed in seeds], lanes
-
-
-def _lane(blocks: list[Block], seed: int, budget: int, bound: float, unit: str) -> Any:
-    """Return the policy of a lane. Raises UserError if no block has the lane."""
-    for block in blocks:
-        within = np.isclose(block.bounds, bound, rtol=1e-4)
-        for index in np.flatnonzero((block.seeds == seed) & (block.budgets == budget) & within)[:1].tolist():
-            if block.failed[index]:
-                console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
-            return block.policy.lane(index)
-    seeds, budgets, bounds = (
-        format_numbers(np.concatenate([getattr(block, part) for block in blocks]).tolist())
-        for part in ("seeds", "budgets", "bounds")
+    guidance, labels, seeds = choice
+    rows = table.select([*results.LANE, "step", metric]).sort_by("step").to_pylist()
+    last = {tuple(row[part] for part in results.LANE): row[metric] for row in rows}
+    fits = [lane for lane in last if guidance in (None, lane[0]) and labels in (None, lane[1])]
+    fits = [lane for lane in fits if not seeds or lane[2] in seeds]
+    if len({lane[:2] if seeds else lane for lane in fits}) < 2:
+        return (*fits[0][:2], seeds or fits[0][2:]) if fits else choice
+    finite = [lane for lane in fits if last[lane] is not None]
+    if not finite:
+        raise UserError(f"no {metric} is recorded that tells which of {len(fits)} lanes is the best: give {OPTIONS}")
+    best = max(finite, key=last.__getitem__)
+    console.print(
+        f"{variant_name(*best[:2])}, seed {best[2]}: the best of {len(fits)} lanes by the last recorded {metric} "
+        f"({last[best]:.4g}); {OPTIONS} choose another"
     )
-    within, others = (f" within {bound:g} {unit}", f" within {bounds} {unit}") if bound else ("", "")
+    return (*best[:2], seeds or best[2:])
+
+
+def _select(
+    blocks: list[Block], seeds: tuple[int, ...], labels: tuple[int, ...], within: tuple[float, str] = (0.0, "")
+) -> list[Block]:
+    """Return the lanes with some seeds, budgets (empty: all) and a bound in a unit (0: any), or raise UserError."""
+    (bound, unit), rest = within, []
+    for block in blocks:
+        mask = np.isin(block.seeds, seeds or block.seeds) & np.isin(block.budgets, labels or block.budgets)
+        if (mask := mask & (np.isclose(block.bounds, bound, rtol=1e-4) if bound else True)).any():
+            rest.append(block.lanes(mask))
+    there = [{*np.concatenate([getattr(block, part) for block in blocks]).tolist()} for part in Block._fields[1:4]]
+    if rest and {*seeds} <= there[0] and {*labels} <= there[1]:
+        return rest
+    words = [f"seed {format_numbers(seeds)}"] * bool(seeds) + [f"{format_numbers(labels)} labels"] * bool(labels)
+    near, others = (f" within {text} {unit}" if bound else "" for text in (f"{bound:g}", format_numbers(there[2])))
     raise UserError(
-        f"no lane with seed {seed} and {budget} labels{within}: there are seeds {seeds} and labels {budgets}{others}"
+        f"no lane with {' and '.join(words)}{near}: there are seeds {format_numbers(there[0])} and labels "
+        f"{format_numbers(there[1])}{others}"
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class LanesChoice:
-    """Choice of a folder's policy, and of its lanes but for their seeds."""
+class LaneChoice:
+    """Choice of a folder's policy, and of its lane, or of several lanes that differ in their seeds."""
 
     policy: str | None = None
     """Name of the acting policy, as for evaluate (default: the agent, or the adapted policy)."""
     guidance: str | None = None
-    """Kind of guidance of the lane (default: the run's last)."""
+    """Kind of guidance of the lane (default: that of the run's lane with the best last evaluation)."""
     labels: int | None = None
-    """Label budget of the lane (default: the largest)."""
+    """Label budget of the lane (default: that of the run's best lane; of a policy folder the largest)."""
     bound_deg: float | None = None
     """Bound of a policy folder's lane (default: the largest) [deg]."""
+    seed: tuple[int, ...] = ()
+    """Seed of the lane; several where lanes are adapted, each with labels of its own (default: that of the run's best
+    lane; of a policy folder the first)."""
 
     def name_in(self, source: PolicySource, world: Any) -> str:
         """Return the policy's name. Raises UserError if the source has no such policy, or none for that world."""
@@ -292,27 +301,54 @@ class LanesChoice:
         source.check(name, world, guidance=self.guidance)
         return name
 
+    def _with_best(self, source: PolicySource, name: str) -> Choice:
+        """Return guidance, labels and seeds; what is open in a run is that of its best lane."""
+        grid, kind = source.grid, guidances.kind_name(self.guidance) if self.guidance else None
+        if grid is None:
+            return kind, self.labels, self.seed
+        kind = grid.guidance[0] if kind is None and len(grid.guidance) == 1 else kind
+        choice = kind, self.labels, self.seed
+        if kind and (self.labels is not None or len(grid.labels) < 2) and (self.seed or len(grid.seeds) == 1):
+            return choice
+        try:
+            guides = results.read_guides([source.folder]) if name == "guide" else None
+            table = results.read(source.folder) if guides is None else guides
+        except UserError as error:
+            raise UserError(f"{error}; or choose the lane by {OPTIONS}") from error
+        return best_lane(table, choice, "reward" if guides is None else "guide_reward")
 
-@dataclass(frozen=True, kw_only=True)
-class LaneChoice(LanesChoice):
-    """Choice of a folder's policy, and of its lane."""
+    def lanes_in(self, source: PolicySource, world: Any, env: Any = None) -> tuple[list[Any], list[dict[str, Any]]]:
+        """Return single policies, one a seed, and what chooses each lane: its "guidance", "labels" and "seed".
 
-    seed: int | None = None
-    """Seed of the lane (default: the first)."""
+        A policy of the task alone has the seed 0. `env`: the world's environment, for a teacher (default: with its
+        training episodes).
+        """
+        name = self.policy or source.default_policy
+        entry = POLICIES[name]
+        if not entry.from_folder:
+            check_no_lane(name, self.guidance, self.labels, self.seed, self.bound_deg)
+        if entry.taught and env is None:
+            env = source.task.environment(world)
+        teacher = source.task.make_teacher(world, env) if entry.taught else None
+        view = source.task.view(world) if env is None else view_of(env)
+        if not entry.from_folder:
+            return [source.alone(name, view, teacher)], [{"seed": 0}]
+        kind, labels, seeds = self._with_best(source, name)
+        blocks = source.blocks(name, view, teacher, (kind,) if kind else (), failed_too=True)
+        labels = int(max(block.budgets.max() for block in blocks)) if labels is None else labels
+        bound = float(max(block.bounds.max() for block in blocks)) if self.bound_deg is None else self.bound_deg
+        policies, lanes = [], []
+        for seed in seeds or (int(blocks[0].seeds[0]),):
+            lane = _select(blocks, (seed,), (labels,), (bound, actions_of(view).unit))[0]
+            if lane.failed[0]:
+                console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
+            policies.append(lane.policy.lane(0))
+            lanes.append({"guidance": lane.guidance, "labels": labels, "seed": seed})
+        return policies, lanes
 
-    def lanes_in(self, source: PolicySource, world: Any, env: Any) -> tuple[list[Any], list[dict[str, Any]]]:
-        """Return the single policy and what chooses its lane, see `trained.several`."""
-        name, seeds = self.policy or source.default_policy, () if self.seed is None else (self.seed,)
-        return several(source, world, name, self.guidance, self.labels, seeds, self.bound_deg, env)
-
-    def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:
-        """Return the single policy. Raises UserError if there is no such lane."""
-        return self.lanes_in(source, world, env)[0][0]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaseLanes(LanesChoice):
-    """Choice of the lanes of the folder to adapt."""
-
-    seeds: tuple[int, ...] = ()
-    """Seeds of the lanes to adapt, each with labels of its own (default: the first lane)."""
+    def lane_in(self, source: PolicySource, world: Any, env: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Return the single policy and what chooses its lane. Raises UserError for several seeds, or no such lane."""
+        if len(self.seed) > 1:
+            raise UserError(f"--seed has {len(self.seed)} values, but one policy acts: give one seed")
+        (policy,), (lane,) = self.lanes_in(source, world, env)
+        return policy, lane

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from contextlib import nullcontext
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -30,31 +30,19 @@ class Runner:
     """Writes a `Training`'s labels, rows and checkpoints to disk."""
 
     def __init__(
-        self,
-        group: LaneGroup,
-        eval_env: Environment,
-        order: Order,
-        contents: dict[str, Any],
-        stopping: threading.Event,
-        bars: Progress,
+        self, group: LaneGroup, env: Environment, order: Order, config: dict[str, Any], stopping: Event, bars: Progress
     ) -> None:
-        """Prepare without starting.
-
-        `contents`: of config.json. `stopping`: set by Ctrl-C. For `eval_env` see `Training`.
-        """
-        self.training = Training(group, eval_env, order.split)
-        self.group, self.order, self.contents = group, order, contents
+        """Prepare without starting. `env`: of evaluations. `config`: of config.json. `stopping`: set by Ctrl-C."""
+        self.training = Training(group, env, order.split)
+        self.group, self.order, self.contents = group, order, config
         self.stopping, self.bars = stopping, bars
         self.name = group.guidance.name
         self.folder = order.out / self.name
-        self.key = run_key(contents, self.name)
+        self.key = run_key(config, self.name)
         self.failed = np.zeros(len(group.seeds), bool)  # lanes whose failure has been reported
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
-        """Train from where the group stands to its end. `labels`: a file's labels in place of the teacher's.
-
-        Raises Interrupted when asked to stop, once everything is saved.
-        """
+        """Train to the end, with a file's labels or the teacher's. Raises Interrupted once everything is saved."""
         if (self.folder / results.PARQUET).exists():
             self._check_rows(self.group.config.schedule.total_steps)
             console.print(f"{self.name}: finished before, left as it is")
@@ -120,10 +108,7 @@ class Runner:
     def _label(
         self, store: Checkpoints, guides: TableWriter, teacher: Teacher | None, labels: label_files.LabelFile | None
     ) -> None:
-        """Take the labels of a file, or ask the teacher for missing ones; write the label file.
-
-        A kill may have torn the file, so it is written anew whenever a run goes on.
-        """
+        """Take the labels of a file, or ask for missing ones; write the label file anew, since a kill may tear it."""
         now, asks = self.training, not self.training.labelled
         if asks:
             bar = self.bars.add_task(f"{self.name}: labels", total=self.group.rounds, note="", completed=now.round)

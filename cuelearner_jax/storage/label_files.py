@@ -119,11 +119,9 @@ class LabelWriter(tables.TableWriter):
     def append(
         self, *, seed: int, obs: np.ndarray, action: np.ndarray, answer: np.ndarray | None, **person: Any
     ) -> None:
-        """Append one row, with columns of the names at the top of this module.
+        """Append one row, with columns of the names at the top of this module, or raise as `TableWriter.append`.
 
-        Raises:
-            ValueError: a number is not finite, or a width differs from that of the labels before.
-            OSError: the disk refuses the row. The row is not in the file, now or later; the call may be repeated.
+        Raises ValueError if a number is not finite, or a width differs from that of the labels before.
         """
         values = {name: value for name, value in zip(ROW, (obs, action, answer), strict=True) if value is not None}
         columns = {name: np.asarray(value, np.float32) for name, value in values.items()}
@@ -244,7 +242,7 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
         if own not in own_seeds:
             raise UserError(
                 f"the label file has labels for the seeds {format_numbers(own_seeds.tolist())}, none for seed {seed}: "
-                "give --first-seed and --seeds (train: --seed) for these, or the labels of another run"
+                "give --seeds (train: --seed) for these, or the labels of another run"
             )
         if len(rows) < budget:
             raise UserError(

@@ -7,13 +7,7 @@ from typing import NamedTuple
 
 from cuelearner_jax.errors import UserError, format_value
 
-KINDS = {
-    ".png": "image/png",
-    ".jpg": "image/jpeg",
-    ".jpeg": "image/jpeg",
-    ".gif": "image/gif",
-    ".mp4": "video/mp4",
-}
+KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".gif": "image/gif", ".mp4": "video/mp4"}
 
 
 class Picture(NamedTuple):

@@ -106,12 +106,8 @@ class TableWriter(contextlib.AbstractContextManager):
     def append(self, **columns: Any) -> None:
         """Append rows.
 
-        Args:
-            columns: values for all rows (a scalar; for a column of lists, one list), or arrays with the rows as leading
-                axis, all of one length. For instance `append(step=1000, seed=seeds, reward=rewards)`.
-
-        Raises:
-            OSError: the disk refuses the rows. None of them is in the table, now or later; the call may be repeated.
+        `columns`: values for all rows (a scalar; for a column of lists, one list), or arrays with the rows as leading
+        axis. If the disk refuses the rows (OSError), none is in the table, and the call may be repeated.
         """
         arrays = {name: np.asarray(value) for name, value in columns.items()}
         many = {name for name, array in arrays.items() if array.ndim > self._schema.is_list(name)}

@@ -46,13 +46,8 @@ class Wandb:
         folder.mkdir(parents=True, exist_ok=True)
         kind, run = folder.parent.name, folder.parent.parent.name
         self._run = importlib.import_module(self.package).init(
-            mode="offline",
-            dir=str(folder),
-            config=contents,
-            reinit="create_new",
-            project="cuelearner",
-            group=run,
-            name=f"{run} {kind}",
+            **{"mode": "offline", "reinit": "create_new", "project": "cuelearner", "config": contents},
+            **{"dir": str(folder), "group": run, "name": f"{run} {kind}"},
             settings={"silent": True},  # its summary of forty lines would interrupt our output
         )
         self.close = self._run.finish
@@ -84,11 +79,7 @@ def open_tracker(
 
 
 def means(row: dict[str, Any]) -> dict[str, float]:
-    """Return means over the seeds of each budget, as "metric/labels_N", without failed lanes.
-
-    Args:
-        row: the columns of one evaluation: scalars, or one entry per lane; "labels" gives the lanes' budgets.
-    """
+    """Return means of an evaluation over the seeds of each budget ("metric/labels_N"), without failed lanes."""
     budgets, result = np.asarray(row["labels"]), {}
     for name in (name for name in row.keys() - set(LANE) if np.ndim(row[name]) < 2):
         values = np.broadcast_to(np.asarray(row[name], float), budgets.shape)

@@ -8,11 +8,10 @@ with policy_folders.place_of(out) as place:
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,16 +34,13 @@ from cuelearner_jax.policies import Common, lanes_in, policy_of
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import adapted, policy_sources
-from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
+from cuelearner_jax.runs.grid import Grid, check_grid, parse_seeds
 from cuelearner_jax.runs.order import read_labels
-from cuelearner_jax.runs.policy_sources import BaseLanes, PolicySource
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Scenario, Task
 from cuelearner_jax.types import Label, Teacher
-
-TaskT = TypeVar("TaskT")
-KindsT = TypeVar("KindsT")
 
 MOST_ENVS = 100_000  # more do not fit into memory
 AS_IT_IS = Scenario("the world as it is", {})
@@ -65,14 +61,14 @@ class Subject(NamedTuple):
     prefer: Prefer | None = None  # who judges, where a person does
 
 
-def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str | None = None) -> Subject:
+def subject_of(source: PolicySource, world: Any, base: LaneChoice, reference: str | None = None) -> Subject:
     """Return the source's policies, or its code, in a world of its task.
 
     `reference`: package.module:NAME of code that acts or is in the folder.
     """
     env = source.task.environment(world)
     if source.code is not None:
-        if base != BaseLanes():
+        if base != LaneChoice():
             raise UserError(
                 f"--base.… chooses among the lanes of a folder, but {reference} is not a folder: leave it out"
             )
@@ -81,33 +77,31 @@ def subject_of(source: PolicySource, world: Any, base: BaseLanes, reference: str
     name = base.name_in(source, world)
     if policy_sources.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
-    if len(set(base.seeds)) < len(base.seeds):
-        raise UserError("--base.seeds: give each seed once")
-    policies, lanes = policy_sources.several(
-        source, world, name, base.guidance, base.labels, base.seeds, base.bound_deg, env
-    )
+    if len(set(base.seed)) < len(base.seed):
+        raise UserError("--base.seed: give each seed once")
+    policies, lanes = base.lanes_in(source, world, env)
     seeds = tuple(lane["seed"] for lane in lanes)
-    choices = {option: value for option, value in dataclasses.asdict(base).items() if value not in (None, ())}
-    origin = {"folder": source.folder.name, **choices, "policy": name, "seeds": list(seeds)}
+    lane = {name: value for name, value in lanes[0].items() if name != "seed"}
+    lane |= {} if base.bound_deg is None else {"bound_deg": base.bound_deg}
+    origin = {"folder": source.folder.name, **lane, "policy": name, "seeds": list(seeds)}
     origin |= {"code": reference} if reference else {}
     bases = Common(policies[0]) if len(policies) == 1 else side_by_side(policies)
     return Subject(env, bases, seeds, origin, source.task)
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptRequest(Generic[TaskT, KindsT]):
+class AdaptRequest:
     """A request to adapt a policy."""
 
-    task: TaskT
+    task: Any
     labels: tuple[int, ...] = (500,)
     """Label budgets (default with --labels-from: all labels in the file)."""
     bound_deg: tuple[float, ...] = ()
     """How far corrections may lead from the policy's own actions [deg]. One bound or several (default: the scenario's,
     as far as the labels of a file reach, or else a quarter of the space's reach, 45)."""
-    seeds: int = 1
-    """Number of seeds. Several base policies are each adapted with their own seed, so leave this out then."""
-    first_seed: int = 0
-    """First seed; the others count up from it."""
+    seeds: str = "1"
+    """Number of seeds, or a range such as 0:16, without its end. Several base policies are each adapted with their own
+    seed, so leave this out then."""
     guidance: str = ReadingGuide.name
     """Kind of guidance: what is asked, and what a model makes of the answers."""
     labels_from: Path | None = None
@@ -122,7 +116,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     the tuning episodes."""
     sizes: GuideSizes = by_model.SIZES
     scalars: Scalars = field(default_factory=Scalars)
-    kinds: KindsT = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+    kinds: dict[str, Any] = field(default_factory=dict)
     """Options of kinds of guidance, by the kind's name."""
 
     @classmethod
@@ -139,16 +133,10 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     ) -> Any:
         """Return the default request; the only place where the rules of scenarios are applied.
 
-        Args:
-            task: the policy's task; None: an environment without one.
-            config: configuration of the policy's training, whose frame and scalars the model uses.
-            scenario: the changed world. Its suggestions apply to the kind of guidance that it suggests, and its shares
-                of a bound to judging on episodes.
-            guidance, judge_by: the chosen values; None: as the scenario suggests, or the general default.
-            labels_from: a label file, which determines budget and strength of answers.
-            eps_deg: strength of an answer [deg]; None: the file's, that of given scalars, the scenario's, or the
-                training's.
-            scalars: complete values in place of the defaults.
+        `task`: None for an environment without one. `config`: of the policy's training, whose frame and scalars the
+        model uses. `guidance`, `judge_by`: None for what the scenario suggests, or the general default; a scenario's
+        other suggestions apply to the kind that it suggests, its shares of a bound to judging on episodes. `eps_deg`:
+        None for the label file's, that of given scalars, the scenario's, or the training's.
         """
         rules = task.scenario(scenario) if task and scenario else AS_IT_IS
         kind = guidances.resolve(guidance or rules.guidance or ReadingGuide.name)
@@ -200,9 +188,9 @@ class AdaptRequest(Generic[TaskT, KindsT]):
             raise UserError(f"changes is given, but guidance {kind.name!r} does not use it: give guidance reading")
         guidance = guidances.make(kind.name, sizes, env, kinds.get(kind.name))
         shared = lanes_in(bases) is None
-        if not shared and (self.seeds, self.first_seed) != (1, 0):
-            raise UserError("several base policies are adapted each with its own seed: leave out --seeds, --first-seed")
-        seeds = seeds_of(self.first_seed, self.seeds) if shared else subject.seeds
+        if not shared and self.seeds != AdaptRequest.seeds:
+            raise UserError("several base policies are adapted each with its own seed: leave out --seeds")
+        seeds = parse_seeds(self.seeds) if shared else subject.seeds
         grid = Grid((kind.name,), seeds, self.labels if subject.rows is None else (len(subject.rows.obs),))
         file = self._labels(subject, guidance, grid)
         bounds = self._bounds(subject, guidance, file)

@@ -6,9 +6,9 @@ or within eps / 2 of the action asked about. Use answers that were not used for 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,17 +19,16 @@ from cuelearner_jax import user_code
 from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, mean_interval, part_of, rollout_lanes
+from cuelearner_jax.evaluate import episodes, ignore_progress, mean_interval, part_of, rollout_lanes
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
-from cuelearner_jax.runs.policy_sources import POLICIES, Block, PolicySource
+from cuelearner_jax.runs.policy_sources import POLICIES, Block, PolicySource, check_no_lane
 from cuelearner_jax.spaces import Space, is_answered, says_something
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Label
 
-TaskT = TypeVar("TaskT")
-
+Ready = tuple[Any, list[Block]]  # the validation episodes, and the lanes that act in them
 Share = tuple[float, float, float]  # estimate, and the ends of its 95% interval
 
 MOST_ENVS = 100_000  # more do not fit into memory
@@ -37,14 +36,18 @@ MOST_STEPS = 1_000_000  # per environment
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateRequest(Generic[TaskT]):
+class EvaluateRequest:
     """A request to evaluate a policy."""
 
-    task: TaskT
+    task: Any
     policy: str = "agent"
     """Who acts."""
     guidance: tuple[str, ...] = ()
-    """Kinds of guidance of the run to evaluate (default: all)."""
+    """Kinds of guidance of the lanes to evaluate (default: all)."""
+    labels: tuple[int, ...] = ()
+    """Label budgets of the lanes to evaluate (default: all)."""
+    seed: tuple[int, ...] = ()
+    """Seeds of the lanes to evaluate (default: all)."""
     episodes: int | None = None
     """Number of whole episodes per lane, where the task counts episodes (default: 100)."""
     steps: int | None = None
@@ -75,7 +78,7 @@ class Measured(NamedTuple):
         return "" if self.bound_deg is None else f"{self.bound_deg:g} {self.unit}"
 
 
-def amount(task: Task, request: EvaluateRequest[Any]) -> tuple[int, int]:
+def amount(task: Task, request: EvaluateRequest) -> tuple[int, int]:
     """Return the number of environments and the number of steps that they share."""
     longest = None if task.longest is None else task.longest(request.task)
     if request.episodes is not None:
@@ -96,30 +99,48 @@ def amount(task: Task, request: EvaluateRequest[Any]) -> tuple[int, int]:
     return envs, steps
 
 
+def prepare(source: PolicySource, request: EvaluateRequest) -> Ready:
+    """Return the validation episodes of the request's world and the lanes that act in it, by guidance and step."""
+    release_programs()
+    entry, name = POLICIES[request.policy], request.policy
+    choice = request.labels, request.seed
+    if not entry.from_folder:
+        check_no_lane(name, request.guidance, *choice)
+    env = source.task.environment(request.task, "validation")
+    teacher = source.task.make_teacher(request.task, env) if entry.taught else None
+    if entry.from_folder:
+        return env, source.blocks(
+            name, view_of(env), teacher, tuple(map(guidances.kind_name, request.guidance)), *choice
+        )
+    none = np.zeros(1, int)
+    return env, [Block("-", none, none, none, 0, Common(source.alone(name, view_of(env), teacher)), none > 0)]
+
+
+def variants(env: Any, block: Block, of_lanes: Sequence[dict[str, np.ndarray]] = ({}, {})) -> list[Measured]:
+    """Return a block's lanes by bound and budget, with their metrics and environments' values (each by lane)."""
+    unit, is_shared, rows = actions_of(env).unit.replace("degrees", "deg"), lanes_in(block.policy) is None, []
+    for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
+        own = (block.budgets == budget) & (block.bounds == bound)
+        mine, apart = ({metric: values[own] for metric, values in of.items()} for of in of_lanes)
+        variant = block.guidance, budget, block.step, block.seeds[own]
+        rows.append(Measured(*variant, mine, apart, bound or None, is_shared, unit))
+    return rows
+
+
 def run(
-    source: PolicySource, request: EvaluateRequest[Any], watch: Callable[[str], Tell] = lambda kind: ignore_progress
+    source: PolicySource, request: EvaluateRequest, watch: Any = lambda _: ignore_progress, ready: Ready | None = None
 ) -> list[Measured]:
     """Return metrics of a policy on validation episodes of the request's world, for each guidance and budget.
 
-    `watch`: given a kind of guidance, returns the function that reports the progress of its lanes.
+    `watch`: given a kind of guidance, returns a `Tell` of its lanes. `ready`: the result of `prepare`.
     """
-    release_programs()
-    task, world, name = source.task, request.task, request.policy
-    num_envs, steps = amount(task, request)
-    engine, key = task.engine(request.engine), episodes()
-    env = task.environment(world, "validation")
-    entry, unit = POLICIES[name], actions_of(env).unit.replace("degrees", "deg")
-    teacher = task.make_teacher(world, env) if entry.taught else None
-    if entry.from_folder:
-        blocks = source.blocks(name, view_of(env), teacher, tuple(map(guidances.kind_name, request.guidance)))
-    else:
-        policy = source.alone(name, view_of(env), teacher)
-        none = np.zeros(1, int)
-        blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
+    num_envs, steps = amount(source.task, request)
+    engine, key = source.task.engine(request.engine), episodes()
+    env, blocks = ready or prepare(source, request)
     rows = []
     for block in blocks:
         count, is_shared = len(block.seeds), lanes_in(block.policy) is None
-        tell = watch(name if block.guidance == "-" else block.guidance)
+        tell = watch(request.policy if block.guidance == "-" else block.guidance)
         if engine:
             tells = [part_of(tell, lane, count) for lane in range(count)]
             lanes = [engine(block.policy.lane(lane), env, key, num_envs, steps, tells[lane]) for lane in range(count)]
@@ -128,11 +149,7 @@ def run(
         else:
             means, each, _ = rollout_lanes(env, block.policy, key, num_envs, steps, tell)
         place = np.zeros(count, int) if is_shared and not engine else np.arange(count)  # row of each lane
-        for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
-            own = (block.budgets == budget) & (block.bounds == bound)
-            mine, apart = ({metric: np.asarray(of[metric])[place[own]] for metric in of} for of in (means, each))
-            variant = block.guidance, budget, block.step, block.seeds[own]
-            rows.append(Measured(*variant, mine, apart, bound or None, is_shared, unit))
+        rows += variants(env, block, [{name: np.asarray(of[name])[place] for name in of} for of in (means, each)])
     return rows
 
 

@@ -62,14 +62,10 @@ def _teacher(request: TrainRequest, groups: list[LaneGroup], labels: Any, find: 
 
 
 def run(order: Order) -> None:
-    """Train every lane of the grid and write the results to the order's folder.
+    """Train every lane of the grid (with a shard, of its seeds) and write the results to the order's folder.
 
-    With a shard, train only its share of the seeds, resuming where the shard stands.
-
-    Raises:
-        UserError: invalid configuration, or a folder in use; nothing has been changed.
-        Interrupted: Ctrl-C or SIGTERM; everything is saved.
-        NotFinite: everything is finished, but some lanes stopped being finite.
+    Raises UserError before anything is changed, Interrupted once everything is saved, and NotFinite at the end if some
+    lanes stopped being finite.
     """
     release_programs()
     plan = make_plan(order)
@@ -98,9 +94,7 @@ def in_memory(
 ) -> tuple[pa.Table, dict[str, Training]]:
     """Train every lane of the grid; write nothing. `env`, `examined`: environments for learning and for evaluations.
 
-    Returns:
-        A row per lane and evaluation (guidance, labels, seed, step, wall_s, failed and metrics); and the trainings by
-        kind of guidance, in their final state.
+    Returns a row per lane and evaluation, as `api.training.Run` has them, and the trainings by kind of guidance.
     """
     release_programs()
     request = resolve_request(request)

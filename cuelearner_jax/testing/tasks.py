@@ -91,9 +91,9 @@ def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
 def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
     """Check a film, a still and a question of a few random steps."""
     pictures, env = task.pictures(), task.environment(config, "validation")
-    files = filming.files(folder, task.name, "gif")
-    rewards = filming.film(pictures, env, uniform_in(env), 0, FILMED, files)
-    filming.question(pictures, env, uniform_in(env), 0, files.question)
+    film, still, question = files = filming.files(folder, task.name, "gif")
+    rewards = filming.film(pictures, env, uniform_in(env), 0, FILMED, film, still)
+    filming.question(pictures, env, uniform_in(env), 0, question)
     laws.hold(len(rewards) == FILMED, f"`record` returns {len(rewards)} rewards of {FILMED} steps: one a step")
     for file in files:
         laws.hold(file.is_file() and file.stat().st_size, f"{file.name} was not written: write the file that is named")

@@ -174,6 +174,8 @@ def test_training_from_python_gives_what_the_command_gives(folder):
     run = cl.train(WORLD, TEACHER, probes.CONFIG, **how)
     assert rows_of(run.results.to_pylist(), COLUMNS) == rows_of(results.read(folder).to_pylist(), COLUMNS)
     assert run.policy(guidance="relative", seed=5)(SEEN).shape == (200, 2)
+    last = {row["seed"]: row["reward"] for row in run.results.sort_by("step").to_pylist()}
+    assert run.policy().lane == {"guidance": "relative", "labels": 10, "seed": max(last, key=last.get)}
     with pytest.raises(cl.UserError, match="no lane with seed 9"):
         run.policy(seed=9)
 

@@ -131,10 +131,11 @@ def test_lanes_of_a_run_are_adapted_one_each_and_again(home, tmp_path):
     sweep = ["sweep", "own_turned:TASK", "--guidance", "none", "--seeds", "2", "--schedule.total-steps", "960"]
     assert main([*sweep, "--schedule.eval-every", "960", "--schedule.checkpoint-every", "960", "--out", str(run)]) == 0
     adapt = ["adapt", str(run), "--scenario", "aslant", *FIT, "--labels", "40", "--judge-episodes", "20"]
-    assert main([*adapt, "--base.seeds", "1", "0", "--out", str(out)]) == 0
+    assert main([*adapt, "--base.seed", "1", "0", "--out", str(out)]) == 0
     values = json.loads((out / "policy.json").read_text())
     assert (values["lanes"]["seeds"], values["lanes"]["base"], values["rows"]) == ([1, 0], [0, 1], 2)
-    assert values["of"] == {"folder": "run", "policy": "agent", "seeds": [1, 0]}
+    of = {"folder": "run", "guidance": "none", "labels": 0, "policy": "agent", "seeds": [1, 0]}
+    assert values["of"] == of
     (row,) = measured(tmp_path, out)
     (alone,) = measured(tmp_path, run, "--scenario", "aslant")
     (base,) = measured(tmp_path, out, "--policy", "base")
@@ -143,7 +144,7 @@ def test_lanes_of_a_run_are_adapted_one_each_and_again(home, tmp_path):
     assert np.mean(row["reward"]) > np.mean(base["reward"])
     agent = cl.load_policy(run, seed=0)
     np.testing.assert_array_equal(cl.load_policy(out, policy="base", seed=0)(SEEN), agent(SEEN))
-    assert main([*["adapt", str(out), *FIT, "--labels", "10"], "--base.seeds", "0", "--out", str(chain)]) == 0
+    assert main([*["adapt", str(out), *FIT, "--labels", "10"], "--base.seed", "0", "--out", str(chain)]) == 0
     moved = cl.load_policy(chain, policy="base")(SEEN)
     np.testing.assert_array_equal(moved, cl.load_policy(out, seed=0)(SEEN))
 
@@ -163,7 +164,7 @@ def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path):
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
     refused([*plain, "--judge-by", "hits"], "not a metric of turned, did you mean 'hit'", tmp_path)
     refused([*plain, "--judge-bounds", "0.5", "--judge-by", "labels"], "judge_bounds needs episodes", tmp_path)
-    refused([*plain, "--base.seeds", "3"], "own_turned:straight is not a folder: leave it out", tmp_path)
+    refused([*plain, "--base.seed", "3"], "own_turned:straight is not a folder: leave it out", tmp_path)
     refused([*CODE, "--out", adapted], "is not empty: give --overwrite", adapted)
     refused([*CODE, "--out", adapted.parent, "--overwrite"], "is not a policy folder", adapted)
     refused(["evaluate", adapted, *TASK], "add --base own_turned:straight if you trust that code", adapted)

@@ -1,6 +1,7 @@
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from cuelearner_jax import studies
+from cuelearner_jax.api.policies import load_policy
 from cuelearner_jax.cli import dispatch, main
 from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.storage import results
@@ -70,9 +73,32 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     less = recorded["rows"][0]["reward"][0] - found["less"]["reward"][0]
     assert found["difference"]["reward"][0] == pytest.approx(less)
     assert main(["evaluate", "--compare", str(run_folder), "heuristic", *few]) == 0
-    assert (
-        capsys.readouterr().out.count("difference over seeds and 10 environments") == 3
-    )  # a table for each kind and budget
+    # a table for each kind and budget
+    assert capsys.readouterr().out.count("difference over seeds and 10 environments") == 3
+
+
+def test_lanes_are_chosen_and_what_cannot_be_is_refused_before_anything_is_measured(
+    run_folder, refused, tmp_path, capsys, monkeypatch
+):
+    command, out = ["evaluate", run_folder, "--steps", "20", "--envs", "10"], tmp_path / "rows.json"
+    chosen = ["--guidance", "relative", "--labels", "20", "--seed", "2001"]
+    capsys.readouterr()
+    assert main([str(word) for word in [*command, *chosen, "--out", out, "--json"]]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(out.read_text())
+    (row,) = json.loads(out.read_text())["rows"]
+    assert (row["guidance"], row["labels"], row["seeds"]) == ("relative", 20, [2001])
+    monkeypatch.setattr(studies.evaluate, "rollout_lanes", None)
+    refused([*command, "--policy", "uniform", "--compare", run_folder], "has 3 variants", tmp_path)
+    refused([*command, "--seed", "5"], "no lane with seed 5: there are seeds 2000, 2001 and labels 0, 10, 20", tmp_path)
+    refused([*command, "--policy", "uniform", "--seed", "2000"], "belongs to no lane", tmp_path)
+    refused(["render", "shipped:billiards", "--policy", "heuristic", "--labels", "100"], "belongs to no lane", tmp_path)
+
+
+def test_a_run_without_records_asks_for_the_lane(run_folder, refused, tmp_path):
+    copy = shutil.copytree(run_folder, tmp_path / "copy", ignore=lambda *_: ["results.parquet"])
+    command = ["export", copy, "--format", "numpy", "--out", tmp_path / "new"]
+    refused(command, "choose the lane by --guidance, --labels and --seed", tmp_path)
+    assert load_policy(copy, guidance="relative", labels=20, seed=2001).lane["seed"] == 2001
 
 
 def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, capsys):
@@ -90,13 +116,22 @@ def test_the_sweep_of_the_readme_would_begin(monkeypatch, tmp_path):
     monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
     assert main(shlex.split(line)) == 0
     assert orders[0].grid.guidance == ("none", "relative")
+    assert main(["sweep", "billiards", "--labels", "0", "50", "--seeds", "5:7", "--schedule.total-steps", "6e4"]) == 0
+    grid = orders[1].grid
+    assert (grid.guidance[0], grid.labels, grid.seeds) == ("none", (50,), (5, 6))
+    assert orders[1].config.schedule.total_steps == 60_000
 
 
-def test_a_report_has_curves_and_tables(run_folder, tmp_path):
+def test_a_report_has_curves_and_tables(run_folder, tmp_path, capsys):
     out = tmp_path / "report"
     assert main(["report", str(run_folder), "--out", str(out)]) == 0
     assert ElementTree.parse(out / "curves.svg").getroot().tag.endswith("svg")
     assert imageio.imread(out / "curves.png").std() > 1
+    capsys.readouterr()
+    assert main(["report", str(run_folder), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["guidance"], row["labels"]) for row in rows] == [("none", 0), ("relative", 10), ("relative", 20)]
+    assert all(row["final_lower"] <= row["final"] <= row["final_upper"] for row in rows)
     table = (out / "report.md").read_text()
     assert "| relative | 20 | 2 |" in table
     assert (out / "label_efficiency.png").exists()

@@ -17,6 +17,7 @@ ARGUMENTS = [
     ([*QUICK, "--task.table", "snooker"], "'one_ball', 'easy', 'regulation'"),
     ([*QUICK, "--guidance", "relativ"], "unknown guidance 'relativ', did you mean 'relative'"),
     ([*QUICK, "--seeds", "0"], "give --seeds"),
+    ([*QUICK, "--schedule.total-steps", "1.5e0"], "1.5e0 is not a whole number"),
     ([*QUICK, "--agent", "sax"], "unknown agent 'sax', did you mean 'sac'"),
     (["train", "billiards", "--preset", "quickstart", "--agent", "sac"], "acts in boxes, not in directions: give"),
     (["evaluate", "nowhere"], "neither a run folder nor a task"),
@@ -31,6 +32,7 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--task.table", "one_ball", "--policy", "teacher"], "--task.teacher search"),
     (["report", "--out", "report"], "no folder to report on"),
     (["report", "nowhere", "--out", "report"], "no results at or below"),
+    (["report", "nowhere"], "give one of --out FOLDER and --json"),
 ]
 
 

@@ -12,7 +12,7 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.shards import Shard
 
-SWEEP = ["sweep", BANDIT, "--seeds", "3", "--first-seed", "7", "--guidance", "none"]
+SWEEP = ["sweep", BANDIT, "--seeds", "7:10", "--guidance", "none"]
 
 
 @pytest.fixture(scope="module")

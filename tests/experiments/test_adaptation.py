@@ -70,7 +70,7 @@ def test_a_piece_that_was_measured_is_not_run_again(study, monkeypatch, tmp_path
     assert study.main(arguments) == 0
     assert [line[0] for line in lines] == ["evaluate", "adapt", "evaluate"]
     assert lines[1][1:] == [
-        str(tmp_path / "navigation/bases/none"), "--base.seeds", "5000", "5001", "--guidance", "intent",
+        str(tmp_path / "navigation/bases/none"), "--base.seed", "5000", "5001", "--guidance", "intent",
         "--labels", "100", "250", "1000", "--scenario", "rooms", "--out", str(tmp_path / "navigation/rooms/intent"),
     ]  # fmt: skip
     (tmp_path / "navigation/rooms").mkdir()

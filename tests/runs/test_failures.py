@@ -103,7 +103,7 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
     assert "none: seed 5 failed, no longer finite: left out" in capsys.readouterr().err
     source = policy_sources.PolicySource(TASK, CONFIG, GRID, sick)
     for seed, says in ((3, ""), (5, "seed 5 failed, no longer finite: this is its last finite state\n")):
-        policy_sources.several(source, CONFIG.task, "agent", "none", None, (seed,))
+        policy_sources.LaneChoice(guidance="none", seed=(seed,)).lane_in(source, CONFIG.task)
         assert capsys.readouterr().err == says
 
 

@@ -123,7 +123,7 @@ def test_the_description_of_another_program_is_not_loaded(out, change, message):
         (Grid(("none",), (-1,), (10,)), "seeds must be different numbers"),
         (Grid(("relative",), (0,), ()), "--labels: give each budget once"),
         (Grid(("relative",), (0,), (10, 10)), "--labels: give each budget once"),
-        (Grid(("relative",), (0,), (10, 0)), "a label budget of 0 teaches nothing"),
+        (Grid(("relative",), (0,), (10, -1)), "a label budget of -1 teaches nothing"),
     ],
 )
 def test_grids_that_make_no_sense_are_refused(grid, message, tmp_path):
@@ -132,6 +132,25 @@ def test_grids_that_make_no_sense_are_refused(grid, message, tmp_path):
     with pytest.raises(UserError, match=message):
         train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_budget_0_is_the_unguided_agent():
+    both = Grid(("relative", "heuristic"), (4,), (0, 10))
+    assert runs.with_control(both) == Grid(("none", "relative", "heuristic"), (4,), (10,))
+    assert runs.with_control(runs.with_control(both)) == runs.with_control(both)
+    assert runs.with_control(Grid(("relative", "none", "heuristic"), (4,), (0,))).guidance == ("none", "heuristic")
+
+
+@pytest.mark.parametrize(
+    ("words", "seeds"),
+    [("3", (7, 8, 9)), ("0:2", (0, 1)), ("2:2", "makes 0 seeds"), ("5:2", "makes -3 seeds"), ("1-3", "such as 0:16")],
+)
+def test_seeds_are_a_number_or_a_range(words, seeds):
+    if isinstance(seeds, tuple):
+        assert runs.parse_seeds(words, first=7) == seeds
+        return
+    with pytest.raises(UserError, match=seeds):
+        runs.parse_seeds(words, first=7)
 
 
 def test_grids_that_make_sense():

@@ -21,7 +21,7 @@ from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
-from cuelearner_jax.runs.policy_sources import PolicySource, several
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 from cuelearner_jax.storage import results
 from cuelearner_jax.studies import train
 from cuelearner_jax.terminal import Interrupted
@@ -49,7 +49,7 @@ def rows(out):
 
 def policy_of(folder, seed=1):
     source = PolicySource.of_folder(folder, lambda name: TASK)
-    return several(source, WalkConfig(), "agent", None, None, (seed,))[0][0]
+    return LaneChoice(seed=(seed,)).lane_in(source, WalkConfig())[0]
 
 
 @pytest.fixture(scope="module")

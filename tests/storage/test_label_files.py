@@ -73,7 +73,7 @@ def test_one_set_serves_every_seed_and_missing_labels_are_refused(path):
     written(path)
     with pytest.raises(UserError, match="has 20 labels for seed 4, the budget is 21"):
         files.for_lanes(files.read(path), np.array([4]), np.array([21]), 30)
-    with pytest.raises(UserError, match="labels for the seeds 4, 9, none for seed 5: give --first-seed"):
+    with pytest.raises(UserError, match="labels for the seeds 4, 9, none for seed 5: give --seeds"):
         files.for_lanes(files.read(path), np.array([5]), np.array([1]), 30)
     written(path, seeds=(3, 4, 5, 6))
     with pytest.raises(UserError, match="labels for the seeds 3 to 6, none for seed 7"):
