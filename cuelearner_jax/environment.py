@@ -30,8 +30,8 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import EnvState, Step
 
-OWN, PROPOSED = "own", "proposed"
-KINDS = ("", OWN, PROPOSED, "beams", "directions")
+OWN, PROPOSED, EFFECT = "own", "proposed", "effect"
+KINDS = ("", OWN, PROPOSED, EFFECT, "beams", "directions")
 BASE = "base action"  # the last slice of an observation that holds the action of a policy elsewhere
 SYMBOLS = (
     *("m", "cm", "mm", "km", "rad", "deg", "s", "ms", "kg", "g", "N"),
@@ -50,7 +50,8 @@ class Quantity(NamedTuple):
     unit: str  # unit of an entry, as "m", "rad" or "1" for a pure number
     about: str = ""  # meaning, source and order of the entries, in a few words
     # "beams" at equal angles, counterclockwise, or "directions", unit vectors: what a sensor turns with; "own": what a
-    # robot measures of itself, which no displaced sensor shifts; "proposed": the action of a policy elsewhere
+    # robot measures of itself, which no displaced sensor shifts; "proposed": the action of a policy elsewhere;
+    # "effect": change of that action by one unit of each of the first entries of the observation (entry, action)
     kind: str = ""
     step_deg: float = 0.0  # angle between neighbouring beams
     # Of a place in metres (x, y, perhaps z): the point about which a sensor that is turned turns the place; None: no

@@ -17,18 +17,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.environment import BASE, actions_of
+from cuelearner_jax.environment import BASE, EFFECT, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.reading import ReadingPolicy
-from cuelearner_jax.reading.families import ACTIONS_ALONE
+from cuelearner_jax.reading.families import ACTIONS_ALONE, has_effects
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.storage.situations import PHASE
 from cuelearner_jax.storage.whole import is_occupied, place_of
 
 NAME = "lerobot"
 ABOUT = "for LeRobot: the checkpoint of --policy with the correction in its processors"
-VERSION = 1  # of the arrays, as the steps read them
+VERSION = 2  # of the arrays, as the steps read them
 STEPS = "lerobot_processor_cuelearner.steps"
 STATE_FILE = "policy_postprocessor_cuelearner.safetensors"
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
@@ -55,12 +55,13 @@ def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: 
         size, names = (len(hand["joints"]), tuple(hand["entries"])) if hand else (space.size, names)
         arrays |= {f"hand_{name}": np.asarray(hand[name], np.float32) for name in hand if name != "entries"}
         config, pre, post = (_read(checkpoint / name) for name in ("config.json", PRE, POST))
-        state_size = env.obs_size - 1 - space.size
+        state_size = arrays["golden_obs"].shape[1] - 1 - space.size
         _check(checkpoint, config, {"observation.state": state_size, "action": size}, names)
         _check_steps(checkpoint, pre, post)
         digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays.values())).hexdigest()[:16]
         more = {"chunk": int(config.get("n_action_steps") or 1), "version": VERSION}
-        pre["steps"].insert(_place(pre, NORMALIZER), _step("StateStep", digest))
+        shift = {"state_shift": arrays.pop("state_shift").tolist()}
+        pre["steps"].insert(_place(pre, NORMALIZER), _step("StateStep", digest, shift))
         post["steps"].insert(_place(post, UNNORMALIZER) + 1, _step("CorrectStep", digest, more))
         post["steps"][_place(post, UNNORMALIZER) + 1]["state_file"] = STATE_FILE
         post["steps"].insert(0, _step("PlaceStep", digest))
@@ -75,11 +76,14 @@ def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: 
 def arrays_of(policy: Any, env: Any) -> Arrays:
     """Return the arrays of a correction and its golden cases, as the steps read them.
 
+    `state_shift` is added to the state that the policy sees, so that golden cases have no effects of the state.
+
     Raises UserError for a policy that is no correction of proposed actions, or that changes nothing.
     """
-    space = actions_of(env)
-    sound = isinstance(policy, ReadingPolicy) and isinstance(policy.base, Heuristic) and policy.family == ACTIONS_ALONE
-    if not sound or not isinstance(space, Box) or [part.name for part in env.observation[-2:]] != [PHASE, BASE]:
+    space, slices = actions_of(env), [part for part in env.observation if part.kind != EFFECT]
+    sound = isinstance(policy, ReadingPolicy) and isinstance(policy.base, Heuristic)
+    sound = sound and (policy.family == ACTIONS_ALONE or has_effects(policy.family))
+    if not sound or not isinstance(space, Box) or [part.name for part in slices[-2:]] != [PHASE, BASE]:
         raise UserError(
             "this policy is no correction of proposed actions: label situations that the package "
             "lerobot_processor_cuelearner wrote, and adapt by --labels-from alone"
@@ -87,34 +91,40 @@ def arrays_of(policy: Any, env: Any) -> Arrays:
     own = policy.correction
     situations, alpha = (np.asarray(part) for part in (own.known, own.alpha))
     active = np.abs(alpha).max(-1, initial=0) > 0
-    if not active.any() and not np.any(np.asarray(own.change.action)):
+    size, theta = sum(part.size for part in slices), np.asarray(own.change.theta)
+    if not active.any() and not np.any(np.asarray(own.change.action)) and not theta.any():
         raise UserError("the answers asked for no change that was used, so there is nothing to export: ask for more")
     obs = golden_observations(env)
+    own_entries = np.r_[: size - space.size, env.obs_size - space.size : env.obs_size]  # all but the effects
+    inputs = np.r_[own_entries, env.obs_size : env.obs_size + space.size]  # and the action again
     act = jax.jit(lambda obs: policy.act(jax.random.key(0), None, obs))
     arrays = {
         "low": space.low,
         "high": space.high,
-        "mean": own.frame.mean,
-        "deviation": jnp.where(own.frame.varies > 0, own.frame.deviation, jnp.inf),
-        "known": situations[active],
+        "mean": own.frame.mean[own_entries],
+        "deviation": jnp.where(own.frame.varies > 0, own.frame.deviation, jnp.inf)[own_entries],
+        "known": situations[active][:, inputs],
         "alpha": alpha[active],
-        "length": own.length,
+        "length": own.length[inputs],
         "beta": own.change.action,
         "scale": own.scale,
         "bound": policy.bound,
-        "golden_obs": obs,
+        "state_shift": -theta,
+        "golden_obs": obs[:, own_entries],
         "golden_action": act(jnp.asarray(obs)),
     }
     return {name: np.asarray(array, np.float32) for name, array in arrays.items()}
 
 
 def golden_observations(env: Any) -> np.ndarray:
-    """Return labelled situations, and as many with other phases and actions (cases, obs)."""
-    space, rows = actions_of(env), np.asarray(env.rows, np.float32)
+    """Return labelled situations without effects, and as many with other phases and actions (cases, obs)."""
+    space, rows = actions_of(env), np.array(env.rows, np.float32)
+    end = sum(part.size for part in env.observation if part.kind != EFFECT) - space.size
     rows = rows[:: max(1, len(rows) // (CASES // 2))][: CASES // 2]
     k_phase, k_action = jax.random.split(jax.random.key(0))
+    rows[:, end : -space.size] = 0.0
     others = rows.copy()
-    others[:, -1 - space.size] = np.asarray(jax.random.uniform(k_phase, (len(rows),)))
+    others[:, end - 1] = np.asarray(jax.random.uniform(k_phase, (len(rows),)))
     others[:, -space.size :] = np.asarray(space.sample(k_action, (len(rows),)))
     return np.concatenate([rows, others])
 

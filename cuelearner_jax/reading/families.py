@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cuelearner_jax.environment import PROPOSED, Quantity
+from cuelearner_jax.environment import EFFECT, PROPOSED, Quantity, actions_of
 from cuelearner_jax.errors import UserError
 
 AXES = ("x", "y", "z")
@@ -44,6 +44,7 @@ class Distortion(NamedTuple):
     sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
     acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
     plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulator`
+    effect: tuple[int, int] = (0, 0)  # first entry of the observation that `plans` alone reads, and the end of these
 
 
 Family = tuple[Distortion, ...]
@@ -115,10 +116,11 @@ def declared_distortions(env: Any) -> Family:
 
     Slices in metres or radians of the same size shift together, and those in metres may be scaled. Beams at equal
     angles roll. Directions turn, and places with an `origin` turn about that. A change of the actions needs no
-    declaration. Of actions that are proposed elsewhere nothing is seen aside: they alone may have changed.
+    declaration. Of actions that are proposed elsewhere the robot's state is seen aside where its effect is recorded,
+    or else nothing: they alone may have changed.
     """
     if any(quantity.kind == PROPOSED for quantity in env.observation):
-        return ACTIONS_ALONE
+        return (_state(env),) if any(quantity.kind == EFFECT for quantity in env.observation) else ACTIONS_ALONE
     places = _places(env.observation)
     distortions: list[Distortion] = []
     for (unit, size), slices in _alike(places).items():
@@ -129,6 +131,25 @@ def declared_distortions(env: Any) -> Family:
     distortions += [_roll(quantity, start) for quantity, start in places if quantity.kind == "beams"]
     distortions += [_turned(quantity, start) for quantity, start in places if quantity.kind == "directions"]
     return check_family(distortions) if distortions else ()
+
+
+def has_effects(family: Family) -> bool:
+    """Return whether a family changes proposed actions by recorded effects of the robot's state."""
+    return any(one.effect[1] for one in family)
+
+
+def _state(env: Any) -> Distortion:
+    """Return a shift of the robot's state against what else the policy sees, by the effect of each entry."""
+    (effect, start), (_, end), space = *_places(env.observation)[-2:], actions_of(env)
+    names = [
+        f"{one.name} {entry + 1}" if one.size > 1 else one.name for one in env.observation for entry in range(one.size)
+    ]
+    unknowns = tuple(Unknown(f"state {name}", "") for name in names[: effect.size // space.size])
+
+    def plans(theta: Array, obs: Array, action: Array) -> Array:
+        return space.retract(action - theta @ obs[start:end].reshape(len(theta), space.size))
+
+    return Distortion("state", unknowns, plans=plans, effect=(start, end))
 
 
 def _places(observation: Sequence[Quantity]) -> list[tuple[Quantity, int]]:

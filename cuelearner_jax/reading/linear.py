@@ -18,7 +18,14 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax.reading.families import Family, undo_action, undo_observation, undo_physics, unknowns_of
+from cuelearner_jax.reading.families import (
+    Family,
+    has_effects,
+    undo_action,
+    undo_observation,
+    undo_physics,
+    unknowns_of,
+)
 from cuelearner_jax.reading.likelihood import Answers, intervals
 from cuelearner_jax.reading.posterior import PRIORS, Data
 from cuelearner_jax.spaces import DIRECTIONS, Space
@@ -131,6 +138,8 @@ def frame_of(
     mean = weight @ labels.obs
     deviation = jnp.sqrt(weight @ (labels.obs - mean[None]) ** 2)
     varies = deviation > 1e-5 * (1e-3 + jnp.abs(mean))
+    for distortion in family:
+        varies = varies.at[slice(*distortion.effect)].set(False)
     if step is None:
         step = jnp.where(varies, STEP * deviation, 0.0)
     mixed = jnp.zeros(0, jnp.int32) if mixed is None else mixed
@@ -218,7 +227,7 @@ def data(
     x = features(space, frame, slope, labels.obs, base)
     cut = size + len(frame.mixed) ** 2
     offset = space.log(labels.action, base) / scale - x[:, :, :cut] @ weights_of(frame, change)[:cut]
-    situation = inputs(space, frame, labels.obs, actions[0])
+    situation = inputs(space, frame, labels.obs, whole[0] if has_effects(family) else actions[0])
     return Data(offset, x, situation, answers_of(space, labels, eps), groups(space, family, len(frame.mean)))
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, describe
 from cuelearner_jax.reading import linear, posterior
-from cuelearner_jax.reading.families import Family, unknowns_of
+from cuelearner_jax.reading.families import Family, has_effects, unknowns_of
 from cuelearner_jax.reading.linear import SCALE, Change, ObservationFrame
 from cuelearner_jax.reading.posterior import Posterior, Priors
 from cuelearner_jax.spaces import Space
@@ -67,10 +67,11 @@ def corrected(
     Args:
         space, family, correction: the correction.
         obs, before: observations as they are, and as they would be without the change (`linear.undone`).
-        first, action: what the policy does about the two.
+        first, action: what the policy does about the two. With recorded effects of the state, the process depends on
+            the action about the shifted state in place of `first`: where the policy runs, it acts about that alone.
     """
     base = linear.meant(family, correction.change.theta, before, action)
-    more = correction.more(space, obs, first)
+    more = correction.more(space, obs, base if has_effects(family) else first)
     return space.exp(base, correction.scale * (linear.basis(space, base) @ correction.change.action.T + more))
 
 
@@ -125,7 +126,8 @@ def _bounded(
     space: Space, family: Family, correction: Correction, bound: Array, obs: Array, *rest: Array
 ) -> Float[Array, "n action"]:
     """Return corrected actions, within a bound of the base's; `rest`: what `corrected` takes after `obs`."""
-    return space.clip(corrected(space, family, correction, obs, *rest), rest[1], bound)
+    around = linear.meant(family, correction.change.theta, rest[0], rest[2]) if has_effects(family) else rest[1]
+    return space.clip(corrected(space, family, correction, obs, *rest), around, bound)
 
 
 def unread(

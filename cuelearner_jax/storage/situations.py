@@ -11,12 +11,13 @@ too, see `storage.lerobot`. Columns of the table:
 | text        | string                      | optional: what the robot was told to do                             |
 | phase       | float, 0 to 1               | optional: the action's place in the chunk that its policy proposed  |
 | hand        | list of floats (3,)         | optional: where the hand is, in the frame of the actions [m]        |
+| effect      | list of floats (obs*action) | optional: change of the proposed action by one unit of each entry   |
 
 With `phase`, the policy cannot be asked again: what it depends on, such as pictures, is not in the table. Observations
-then end with the phase and a slice `BASE`, the proposed action. The metadata `cuelearner` of a Parquet file may have
-the bounds of the actions, `low` and `high`, and `hand`, the kinematics of a robot whose hand's positions they are. Its
-`projections` (cameras, 3, 4) lead from these positions to shares of the picture's width and height. Its `areas`
-(cameras, 4) are each camera's part of the picture: left, top, width, height.
+then end with the phase, the effects if there are any, and a slice `BASE`, the proposed action. The metadata
+`cuelearner` of a Parquet file may have the bounds of the actions, `low` and `high`, and `hand`, the kinematics of a
+robot whose hand's positions they are. Its `projections` (cameras, 3, 4) lead from these positions to shares of the
+picture's width and height. Its `areas` (cameras, 4) are each camera's part of the picture: left, top, width, height.
 Of a LeRobot dataset with pictures alone, observations are the actions.
 In place of a list there may be one column per entry, `observation.NAME` or `action.NAME`, which names the entries.
 Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
@@ -38,7 +39,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 from pyarrow import csv
 
-from cuelearner_jax.environment import BASE, PROPOSED, Quantity
+from cuelearner_jax.environment import BASE, EFFECT, PROPOSED, Quantity
 from cuelearner_jax.errors import UserError, format_numbers, format_value
 from cuelearner_jax.storage import lerobot
 from cuelearner_jax.storage.picture_files import Picture, read_picture
@@ -71,7 +72,7 @@ def read(path: Path) -> Situations:
         return _situations_of(path, *lerobot.read(path))
     table = _table_in(path)
     columns = _columns(table)
-    standard = (OBSERVATION, ACTION, PICTURE, TEXT, PHASE, HAND)
+    standard = (OBSERVATION, ACTION, PICTURE, TEXT, PHASE, HAND, EFFECT)
     if strange := [name for name in columns if name not in standard and name.partition(".")[0] not in standard[:2]]:
         raise UserError(
             f"{table} has an unknown column {format_value(strange[0])}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
@@ -87,7 +88,11 @@ def read(path: Path) -> Situations:
         return read_picture(table.parent, str(files[row])) if files is not None and files[row] else None
 
     phase = _numbers(table, PHASE, columns[PHASE], 1) if PHASE in columns else None
-    situations = _situations_of(table, observations, actions, names, entries, None if files is None else picture, phase)
+    effect = _numbers(table, EFFECT, columns[EFFECT], 2) if EFFECT in columns else None
+    if effect is not None and (phase is None or effect.shape[1] != observations.shape[1] * actions.shape[1]):
+        raise UserError(f"{table}: give a phase, and in effect as many numbers as observation times action entries")
+    pictures = None if files is None else picture
+    situations = _situations_of(table, observations, actions, names, entries, pictures, phase, effect)
     text: Callable[[int], str] = lambda row: str(texts[row] or "") if texts is not None else ""  # noqa: E731
     hands = _numbers(table, HAND, columns[HAND], 2) if HAND in columns else None
     return situations._replace(text=text, about=_about(table, actions.shape[1]), hands=hands)
@@ -101,12 +106,13 @@ def _situations_of(
     entries: tuple[str, ...],
     picture: Callable[[int], Picture | None] | None,
     phase: Float[np.ndarray, " n"] | None = None,
+    effect: Float[np.ndarray, "n effect"] | None = None,
 ) -> Situations:
     """Build `Situations`. Raises UserError if there are none or a number is not finite."""
     own, is_proposed = observations.shape[-1], phase is not None or observations.shape[-1] == 0 < len(observations)
     if is_proposed:
-        parts = [observations, *([] if phase is None else [phase[:, None]]), actions]
-        observations = np.concatenate(parts, -1)
+        parts = [observations, None if phase is None else phase[:, None], effect, actions]
+        observations = np.concatenate([part for part in parts if part is not None], -1)
     for name, rows in ((OBSERVATION, observations), (ACTION, actions)):
         if not rows.size:
             raise UserError(f"{path} holds no {name}s: record some situations first")
@@ -119,6 +125,8 @@ def _situations_of(
         slices = tuple(Quantity(name, 1, "1", "as recorded") for name in names)
     if is_proposed:
         places = () if phase is None else (Quantity(PHASE, 1, "1", "place in the chunk"),)
+        if effect is not None:
+            places = (*places, Quantity(EFFECT, effect.shape[1], "1", "of the state on the action", EFFECT))
         slices = (*slices, *places, Quantity(BASE, actions.shape[1], "1", "as recorded", PROPOSED))
     contents = hashlib.sha256()
     for rows in (observations, actions):

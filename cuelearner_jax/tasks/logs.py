@@ -29,7 +29,7 @@ from cuelearner_jax import pictures
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.config import Sizes
-from cuelearner_jax.environment import BASE, PROPOSED, Features, Quantity, WholeObservations, offers
+from cuelearner_jax.environment import BASE, EFFECT, PROPOSED, Features, Quantity, WholeObservations, offers
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.policies import Heuristic, PolicyNode
@@ -294,6 +294,8 @@ def filled(config: LogsConfig, observations: Any = None, actions: Any = None) ->
     slices = [Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True)]
     if slices[-1].name == BASE and slices[-1].size == space.size:
         slices[-1] = slices[-1]._replace(kind=PROPOSED)
+        if slices[-2:][0].name == EFFECT:
+            slices[-2] = slices[-2]._replace(kind=EFFECT)
     if observations is None:
         observations, actions = jnp.zeros((config.rows, size)), jnp.zeros((config.rows, space.size))
     centre = jnp.asarray(config.centre or (0.0,) * size, jnp.float32)

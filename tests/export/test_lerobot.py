@@ -1,5 +1,6 @@
 """A correction of proposed actions in a copy of a LeRobot checkpoint: its files, its golden cases, what is refused."""
 
+import dataclasses
 import importlib.util
 import json
 from pathlib import Path
@@ -10,12 +11,12 @@ import numpy as np
 import pytest
 
 from cuelearner_jax.adaptation.judging import PairedTest
-from cuelearner_jax.environment import BASE
+from cuelearner_jax.environment import BASE, EFFECT
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import lerobot
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.reading import ReadingPolicy
-from cuelearner_jax.reading.families import ACTIONS_ALONE
+from cuelearner_jax.reading.families import ACTIONS_ALONE, declared_distortions
 from cuelearner_jax.reading.policy import unread
 from cuelearner_jax.tasks import logs
 
@@ -87,6 +88,18 @@ def test_a_checkpoint_gets_the_steps_the_arrays_and_the_golden_cases(env, policy
     assert post[2]["config"] == {"pair": pre[1]["config"]["pair"], "chunk": 5, "version": lerobot.VERSION}
 
 
+def test_a_shift_of_the_state_goes_to_the_policy_and_effects_do_not_go_along(env, tmp_path):
+    config = dataclasses.replace(CONFIG, names=(*CONFIG.names[:3], EFFECT, BASE), entries=(1, 1, 1, 4, 2))
+    wide = logs.filled(config, np.insert(np.asarray(env.rows), [3] * 4, 1.0, 1), np.asarray(env.recorded))
+    read = unread(Heuristic(wide.view()), wide.actions, declared_distortions(wide), wide.obs_size)
+    change = read.correction.change.replace(theta=jnp.array([0.5, -1.0]))
+    read = read.replace(correction=read.correction.replace(change=change))
+    arrays = lerobot.arrays_of(read, wide)
+    np.testing.assert_allclose(arrays["golden_action"], arrays["golden_obs"][:, 3:], atol=1e-6)  # of the shifted state
+    lerobot.write(read, wide, (), checkpoint(tmp_path / "before"), tmp_path / "after", {})
+    assert json.loads((tmp_path / "after" / lerobot.PRE).read_text())["steps"][1]["config"]["state_shift"] == [-0.5, 1]
+
+
 def test_a_correction_of_a_hand_brings_its_kinematics_to_the_checkpoint_of_the_joints(env, policy, tmp_path):
     joints = {"entries": ["pan", "lift", "jaw"], "joints": [[1, 0], [0, 1], [0, 0]], "high": [float("inf"), 2.0]}
     arm = {"output_features": {"action": {"shape": [3]}}, "action_feature_names": ["pan", "lift", "jaw"]}
@@ -109,7 +122,7 @@ def test_the_steps_decide_as_jax_does(env, policy, tmp_path):
     assert torch.allclose(moved[1], at_bound[0], atol=1e-6)  # as far as the action at the bounds
     assert not torch.allclose(moved[0], moved[1], atol=1e-3)  # the phase matters
     with pytest.raises(ValueError, match="decides golden cases otherwise"):
-        module.Correction(arrays | {"beta": arrays["beta"] + 0.1})
+        type(decide)(arrays | {"beta": arrays["beta"] + 0.1})
     with pytest.raises(ValueError, match="state and action have 3 and 2 entries"):
         decide(torch.zeros(1, 3), torch.zeros(1), beyond[:1])
 

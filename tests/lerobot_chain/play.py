@@ -47,19 +47,20 @@ def main(before: str, after: str, dataset: str) -> None:
     """Play frames in their order, with a reset in the middle of a chunk."""
     data = LeRobotDataset("tiny", root=dataset)
     policy, pre, post = load(before, data)
-    _, pre2, post2 = load(after, data)
+    policy2, pre2, post2 = load(after, data)
     moves, phases, correct = [], [], post2.steps[2]
+    acts = (policy.select_action, pre), (policy2.select_action, pre2)
     for frame in range(FRAMES):
         if frame == FRAMES - 5:
             policy.reset()
+            policy2.reset()
         item = data[frame]
         batch = {key: value[None] for key, value in item.items() if key.startswith("observation.")}
-        pre2({**batch, "task": [item["task"]]})
         action = policy.select_action(pre({**batch, "task": [item["task"]]}))
-        moves += apart(correct, post(action), post2(action))
+        moves += apart(correct, post(action), post2(policy2.select_action(pre2({**batch, "task": [item["task"]]}))))
         phases.append(post2.steps[0].place)
-    chunk = torch.stack([policy.select_action(pre({**batch, "task": [""]})) for _ in range(3)], 1)
-    moved = apart(correct, post(chunk)[0], post2(chunk)[0])
+    both = [[own(before({**batch, "task": [""]})) for _ in range(3)] for own, before in acts]
+    moved = apart(correct, post(torch.stack(both[0], 1))[0], post2(torch.stack(both[1], 1))[0])
     added = seconds(post2, action) - seconds(post, action) + seconds(pre2.steps[3], {"observation": batch})
     names = [type(step).__name__ for step in (*pre2.steps, *post2.steps)]
     again = Path(after).with_name("saved_again")

@@ -102,6 +102,10 @@ def test_proposed_actions_are_part_of_what_is_observed(tmp_path):
     np.testing.assert_array_equal(found.observations, [[0.0, 1.0, 0.0, 0.5], [2.0, 3.0, 0.5, 0.25]])
     assert [(one.name, one.size) for one in found.slices] == [("observation", 2), ("phase", 1), (BASE, 1)]
     assert (found.about["low"], found.about["high"], found.text(0)) == ([-1.0], [2.0], "pick")
+    table(tmp_path / "more", **columns, effect=[[0.1, 0.2], [0.3, 0.4]])
+    found = situations.read(tmp_path / "more")
+    np.testing.assert_allclose(found.observations[1], [2.0, 3.0, 0.5, 0.3, 0.4, 0.25])
+    assert [(one.name, one.kind) for one in found.slices[-2:]] == [("effect", "effect"), (BASE, PROPOSED)]
 
 
 def table(folder, **columns):
@@ -118,6 +122,7 @@ GOOD = {"observation": [[0.0, 1.0], [2.0, 3.0]], "action": [[0.5], [0.25]]}
         ({"action": None}, "has the columns observation: give one column action"),
         ({"observation": [[0.0, 1.0], [2.0]]}, "give the same number of numbers in every row of the column obser"),
         ({"observation": [[0.0, 1.0], [2.0, float("nan")]]}, "the rows 1 are not finite"),
+        ({"phase": [0.0, 0.0], "effect": [[0.1], [0.2]]}, "in effect as many numbers as observation times action"),
     ],
 )
 def test_what_does_not_fit_is_told(changed, told, tmp_path):

@@ -33,6 +33,9 @@ def main() -> None:
     situations.add_argument(
         "--projection", action="append", default=[], metavar="CAMERA=FILE", help="3x4 matrix from metres to pixels"
     )
+    situations.add_argument(
+        "--no-effects", action="store_true", help="do not ask the policy how its actions change with the state"
+    )
     options = parser.parse_args()
     if options.command == "judge":
         print(judge(options.before, options.after))
@@ -43,7 +46,16 @@ def main() -> None:
         parser.error(f"--projection {wrong[0]} names no file: give CAMERA=matrix.json")
     matrices = {name: Path(file) for name, _, file in (text.partition("=") for text in options.projection)}
     hand = partial(hand_of, options.mjcf, options.site, options.joints, options.joint_unit) if options.mjcf else None
-    count = write(options.policy, options.dataset, options.out, options.count, options.seed, hand, matrices)
+    count = write(
+        options.policy,
+        options.dataset,
+        options.out,
+        options.count,
+        options.seed,
+        hand,
+        matrices,
+        not options.no_effects,
+    )
     cues = "forward,back;left,right;up,down" if hand else "left,right;up,down"
     print(f'wrote {count} situations; next: cuelearner label {options.out} --cues "{cues}"')
 

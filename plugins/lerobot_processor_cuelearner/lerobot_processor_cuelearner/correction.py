@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-VERSION = 1  # of the arrays
+VERSION = 2  # of the arrays
 LARGEST = 5.0  # standard deviations at which inputs are cut
 ARRAYS = ("low", "high", "mean", "deviation", "known", "alpha", "length", "beta", "scale", "bound")
 GOLDEN = ("golden_obs", "golden_action")  # observations (cases, obs), and the actions that JAX decided on

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from PIL import Image
 from lerobot_processor_cuelearner.kinematics import Hand
 from lerobot_processor_cuelearner.steps import PlaceStep
 
-LEAST_RANGE = 1e-6  # of an entry of the action that counts as moving
+LEAST_RANGE = 1e-6  # of an entry that counts as moving
+SHARE = 0.05  # of an entry's range, by which the state is shifted to both sides
 PLACE = ["x", "y", "z"]  # entries of an action that is a hand's position
 MARGIN = 0.1, 0.1  # of the positions' bounds: at least [m], and as a share of their range
 BEYOND = 0.1, 0.2  # beyond a joint's limits by this much [rad], most proposals that a right unit leaves there
@@ -36,6 +38,7 @@ def write(
     seed: int = 0,
     hand_of: Callable[[Sequence[str]], Hand] | None = None,
     matrices: Mapping[str, Path] | None = None,
+    effects: bool = True,
 ) -> int:
     """Write situations at random frames of a dataset; return their number.
 
@@ -45,6 +48,7 @@ def write(
 
     With `hand_of`, a function of the names of the action's entries, the position that the hand is led to stands for the
     action. With `matrices`, files with a 3x4 projection of a camera, the page shows in pictures where the hand goes.
+    With `effects`, the policy is asked twice more an entry of the state, at both sides of it.
 
     Raises SystemExit, with one line, for a dataset, policy or file that does not fit, or a folder in use.
     """
@@ -55,7 +59,7 @@ def write(
     hand = hand_of(names[ACTION]) if hand_of else None
     projections = _projections(matrices or {}, data)
     policy, config, pre, post = _load(checkpoint, data)
-    chunk = int(getattr(config, "n_action_steps", 1))
+    chunk, steps = int(getattr(config, "n_action_steps", 1)), _steps(data) if effects else None
     frames = np.random.default_rng(seed).permutation(len(data))[:count]
     where = np.random.default_rng(seed + 1).uniform(size=len(frames))
     (out / "pictures").mkdir(parents=True)
@@ -63,16 +67,19 @@ def write(
     for number, (frame, share) in enumerate(zip(frames.tolist(), where, strict=True)):
         now = data[frame]
         before = int(share * min(chunk, int(now["frame_index"]) + 1))
-        action, place = _proposed(policy, pre, post, data[frame - before] if before else now, before)
+        then = data[frame - before] if before else now
+        propose = partial(_proposed, policy, pre, post, then, before, number)
+        action, place = propose(torch.zeros(()))
+        sides = [propose(way)[0] for way in _both_sides(steps)] if steps is not None else []
         picture = f"pictures/{number:06d}.jpg"
         cameras = [now[key] for key in data.meta.camera_keys]
         if cameras:
             _side_by_side(cameras).save(out / picture, quality=92)
         rows.append(
             {"state": now[OBS_STATE].reshape(-1).numpy(), "action": action, "phase": place / max(chunk - 1, 1)}
-            | {"text": str(now.get("task", "")), "picture": picture if cameras else ""}
+            | {"sides": sides, "text": str(now.get("task", "")), "picture": picture if cameras else ""}
         )
-    pq.write_table(_table(rows, data, names, hand, projections), out / "situations.parquet")
+    pq.write_table(_table(rows, data, names, hand, projections, steps), out / "situations.parquet")
     return len(rows)
 
 
@@ -100,15 +107,45 @@ def _load(checkpoint: str, data: LeRobotDataset) -> tuple[Any, Any, Any, Any]:
 
 
 @torch.no_grad()
-def _proposed(policy: Any, pre: Any, post: Any, item: dict[str, Any], before: int) -> tuple[np.ndarray, int]:
-    """Return the action after `before` others of a chunk that is predicted at a frame, and its place in the chunk."""
+def _proposed(
+    policy: Any, pre: Any, post: Any, item: dict[str, Any], before: int, seed: int, shift: torch.Tensor
+) -> tuple[np.ndarray, int]:
+    """Return the action after `before` others of a chunk that is predicted at a frame, and its place in the chunk.
+
+    `shift` is added to the state. A policy that draws its actions draws them from `seed`.
+    """
     policy.reset()
+    torch.manual_seed(seed)
     place, action = PlaceStep("situations"), None
     for _ in range(before + 1):
         batch = {key: value[None] for key, value in item.items() if key.startswith("observation.")}
+        batch[OBS_STATE] = batch[OBS_STATE] + shift
         action = policy.select_action(pre({**batch, "task": [str(item.get("task", ""))]}))
         place({TransitionKey.ACTION: action})  # pyright: ignore[reportArgumentType]
     return post(action).reshape(-1).to("cpu", torch.float32).numpy(), place.place
+
+
+def _steps(data: LeRobotDataset) -> np.ndarray:
+    """Return the step of each entry of the state, by which effects are measured; 0 for one that does not move."""
+    stats = (data.meta.stats or {}).get(OBS_STATE, {})
+    low, high = (np.asarray(stats.get(name, 0.0), np.float64).reshape(-1) for name in ("min", "max"))
+    steps = np.where(high - low < LEAST_RANGE, 0.0, SHARE * (high - low))
+    return np.broadcast_to(steps, data.meta.features[OBS_STATE]["shape"])
+
+
+def _both_sides(steps: np.ndarray) -> Iterator[torch.Tensor]:
+    """Return the shifts of the state to both sides of each entry that moves."""
+    for entry in np.flatnonzero(steps):
+        way = torch.zeros(len(steps))
+        way[entry] = float(steps[entry])
+        yield from (-way, way)
+
+
+def _effects(sides: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return the change of an action by one unit of each entry (n, entries * action); sides: (n, 2 moving, action)."""
+    effects = np.zeros((len(sides), len(steps), sides.shape[-1]), np.float32)
+    effects[:, steps > 0] = (sides[:, 1::2] - sides[:, ::2]) / (2 * steps[steps > 0, None])
+    return effects.reshape(len(sides), -1)
 
 
 def _side_by_side(cameras: list[torch.Tensor]) -> Image.Image:
@@ -128,11 +165,15 @@ def _table(
     names: dict[str, list[str]],
     hand: Hand | None,
     projections: Sequence[tuple[Any, Any]],
+    steps: np.ndarray | None,
 ) -> pa.Table:
     """Return the table of situations; its metadata has the bounds of the actions, the hand and the projections."""
     states, actions = (np.stack([row[name] for row in rows]) for name in ("state", "action"))
     stats, own = (data.meta.stats or {}).get(ACTION, {}), names[ACTION]
     hands = _hands(states, names, hand) if projections else None
+    sides = np.stack([row["sides"] for row in rows]) if steps is not None and steps.any() else None
+    if sides is not None and hand is not None:
+        sides = hand.place(sides.reshape(-1, actions.shape[1])).reshape(*sides.shape[:2], 3)
     if hand is not None:
         _check_unit(hand, actions)
         actions, stats, own = hand.place(actions).astype(np.float32), {}, PLACE
@@ -147,6 +188,8 @@ def _table(
         columns["picture"] = [row["picture"] for row in rows]
     if hands is not None:
         columns["hand"] = list(hands)
+    if sides is not None and steps is not None:
+        columns["effect"] = list(_effects(sides, steps))
     low = np.minimum(np.asarray(stats.get("min", actions.min(0)), np.float64).reshape(-1), actions.min(0))
     high = np.maximum(np.asarray(stats.get("max", actions.max(0)), np.float64).reshape(-1), actions.max(0))
     margin = 0.0 if hand is None else np.maximum(MARGIN[0], MARGIN[1] * (high - low))

@@ -47,16 +47,31 @@ class _Step(ProcessorStep):
 
 @dataclass
 class StateStep(_Step):
-    """Remember `observation.state`, before it is normalised."""
+    """Remember `observation.state`, before it is normalised, and shift what the policy sees of it."""
 
+    state_shift: list[float] = field(default_factory=list)  # is added to each entry; empty: nothing
     state: Tensor | None = field(default=None, init=False, repr=False)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Return the transition as it is."""
+        """Return the transition with the shifted state. Raises ValueError for another robot's state."""
         observation = transition.get(TransitionKey.OBSERVATION) or {}
-        if (state := observation.get(OBS_STATE)) is not None:
-            self.state = state.detach().reshape(-1, state.shape[-1])
-        return transition
+        if (state := observation.get(OBS_STATE)) is None:
+            return transition
+        self.state = state.detach().reshape(-1, state.shape[-1])
+        if not self.state_shift:
+            return transition
+        if state.shape[-1] != len(self.state_shift):
+            raise ValueError(
+                f"{OBS_STATE} has {state.shape[-1]} entries, but the correction is of a robot with "
+                f"{len(self.state_shift)}: use the checkpoint that it was exported for"
+            )
+        observation = {**observation, OBS_STATE: state + torch.tensor(self.state_shift).to(state)}
+        following = {**transition, TransitionKey.OBSERVATION: observation}
+        return following  # pyright: ignore[reportReturnType]
+
+    def get_config(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        return {**super().get_config(), "state_shift": self.state_shift}
 
     def reset(self) -> None:
         """Forget the state."""

@@ -1,0 +1,81 @@
+"""A policy whose pictures and state disagree: labels about its proposals find the shift of the state.
+
+The policy walks a point half of the way to a goal, 5 cm a step at most. The goal is not recorded, as in pictures.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_jax.environment import BASE, EFFECT
+from cuelearner_jax.policies import Heuristic
+from cuelearner_jax.reading import Reading, declared_distortions, families
+from cuelearner_jax.tasks import logs
+
+MOST, LABELS, STEP, SEEN = 0.05, 60, 0.05, np.array([0.08, -0.05])
+PARTS = {"names": ("x", "y", "phase", EFFECT, BASE), "entries": (1, 1, 1, 4, 2)}
+ENV = logs.filled(logs.LogsConfig(**PARTS, low=(-MOST, -MOST), high=(MOST, MOST)))
+STATE = declared_distortions(ENV)
+
+
+def policy(place, goal):
+    return np.clip(0.5 * (goal - place), -MOST, MOST)
+
+
+def situations(seed, count, aside):
+    """Return places on the way to goals seen aside, and the goals."""
+    random = np.random.default_rng(seed)
+    place, goal = random.uniform(0, 1, (count, 2)), random.uniform(0.1, 0.9, (count, 2))
+    for _ in range(25):
+        place = np.where(random.uniform(size=(count, 1)) < 0.5, place + policy(place, goal + aside), place)
+    return place, goal
+
+
+def read(aside, seed, family):
+    """Return the reading of labels by a script that knows the goal; effects are zero for another family."""
+    place, goal = situations(seed, LABELS, aside)
+    action, right = policy(place, goal + aside), policy(place, goal)
+    sides = [policy(place + way, goal + aside) - policy(place - way, goal + aside) for way in STEP * np.eye(2)]
+    effect = np.concatenate(sides, 1) / (2 * STEP) * (family == STATE)
+    rows = np.concatenate([place, 0 * place[:, :1], effect, action], 1)
+    reading = Reading(Heuristic(ENV.view()), family, ENV.actions, 1 / 36, LABELS, ENV.observation)
+    for key in jax.random.split(jax.random.key(seed), 5):
+        at, asked = reading.questions(rows, LABELS // 5, key)
+        share = (right[at] - asked) / (2 * MOST)
+        reading.learn(rows[at], asked, np.where(np.abs(share) < 1 / 72, 0.0, np.sign(share)))
+    return reading
+
+
+def play(corrected):
+    """Return the error of actions, in shares of the range, and the share of goals met within 2 cm after 50 steps."""
+    (place, goal), (reached, other) = situations(10, 300, SEEN), situations(11, 300, 0.0)
+    apply, none = jax.jit(partial(corrected.act, jax.random.key(0), None)), np.zeros((300, 5))
+    shift = np.append(corrected.correction.change.theta, [0.0, 0.0])[:2]  # none by actions alone
+
+    def act(place, goal):  # as a corrected checkpoint does
+        return np.asarray(apply(np.concatenate([place, none, policy(place - shift, goal + SEEN)], 1)))
+
+    error = np.abs(act(place, goal) - policy(place, goal)).mean() / (2 * MOST)
+    for _ in range(50):
+        reached = reached + act(reached, other)
+    return error, (np.linalg.norm(reached - other, axis=1) < 0.02).mean()
+
+
+def test_a_shift_of_the_state_is_found_and_only_where_there_is_one():
+    corrected, (state,) = read(SEEN, 2, STATE).policy(), STATE
+    np.testing.assert_allclose(corrected.correction.change.theta, -SEEN, atol=0.02)
+    assert play(corrected)[0] < 0.02  # 0.27 before
+    assert not read(0 * SEEN, 0, STATE).result().used
+    obs = jnp.array([0.3, 0.4, 0.0, -0.5, 0.0, 0.0, -0.25, 0.02, 0.01])
+    np.testing.assert_allclose(state.plans(jnp.array([0.04, -0.02]), obs, obs[-2:]), [0.04, 0.005], atol=1e-7)
+
+
+@pytest.mark.long
+def test_the_state_tells_more_than_actions_alone():
+    found = [[play(read(SEEN, n, family).policy()) for n in range(3)] for family in (families.ACTIONS_ALONE, STATE)]
+    (error, success), (error_state, success_state) = np.mean(found, 1)
+    print(f"error {error:.3f} by actions alone, {error_state:.3f} by the state; success {success}, {success_state}")
+    assert (error_state < error, success_state) == (True, 1.0)
