@@ -54,15 +54,9 @@ def report(
 ) -> Path:
     """Write the report of any number of runs, finished or not; return the path of `report.md`.
 
-    Args:
-        folders: run folders, or folders above them.
-        out: folder of the report.
-        metric: metric column to report.
-        split: "validation" or "training".
-        lower_is_better: smaller values of the metric are better, for the best value and for reaching a value.
-        by_run: reports each folder separately, under its name, as needed where the runs' configurations differ.
-        study: called with the variants; returns additions to the report.
-        command: command line that makes this report, recorded in it.
+    `folders` are run folders, or folders above them; `by_run` reports each under its own name, as needed where the
+    runs' configurations differ. `split`: "validation" or "training". `study` makes additions of the variants. `command`
+    is the command line to record in the report.
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
