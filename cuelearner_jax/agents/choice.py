@@ -34,13 +34,8 @@ def best_near_peaks(
 ) -> Float[Array, "n action"]:
     """Return the choice of `best_of`, if the largest value lies next to a high peak of a coarse first look.
 
-    Args:
-        value: the value function, as in `best_of`.
-        rough: an approximation of `value`, which only decides where to search.
-        options: evenly spaced, the last beside the first.
-        obs: situations.
-        coarse: actions of the first look, evenly spaced among the options.
-        peaks: number of local maxima of the first look to search around, up to their neighbours.
+    The `options` are evenly spaced, the last beside the first. `rough` approximates `value` for the first look, at
+    `coarse` of them, and the search goes on around so many of its `peaks`, up to their neighbours.
     """
     stride = len(options) // coarse
 

@@ -74,11 +74,6 @@ def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm:
     return MLP(tuple(layers), 1, dtype, layer_norm)
 
 
-def residual_network(layers: Sequence[int], outputs: int) -> MLP:
-    """Return a network phi(s, a), whose output is added to an action."""
-    return MLP(tuple(layers), outputs)
-
-
 def as_function(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
     """Return a network as a function (params, obs (..., obs), actions (..., action)) -> (..., outputs)."""
     return lambda params, obs, actions: jnp.asarray(network.apply(params, obs, actions))

@@ -6,7 +6,6 @@ write stays one in-place slice update.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -52,19 +51,6 @@ class LaterSteps(NamedTuple):
     exists: Bool[Array, "batch n"]  # False past the newest step
 
 
-class RingBuffer(NamedTuple):
-    """Pure functions over rows (capacity, width). `step`: all rows written so far, overwritten ones included."""
-
-    width: int
-    empty: Callable[[int], Float[Array, "capacity width"]]
-    pack: Callable[[StoredStep], Array]  # steps (n, ...) -> rows (n, width)
-    add: Callable[[Array, Array, StoredStep], Array]  # (rows, step, steps (n, ...)) -> rows
-    draw: Callable[[PRNGKeyArray, Array, Array, int], Array]  # (key, rows, step, batch_size) -> rows' numbers
-    read: Callable[[Array, Array], StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
-    # (rows, step, numbers (batch,), n, num_envs) -> Following
-    follow: Callable[[Array, Array, Array, int, int], LaterSteps]
-
-
 @jax.custom_batching.custom_vmap
 def _write(
     rows: Num[Array, "*lanes capacity width"], packed: Num[Array, "*lanes n width"], start: Int[Array, ""]
@@ -82,50 +68,54 @@ def _write_lanes(axis_size: int, batched: list[bool], rows: Array, packed: Array
     return _write(rows, packed, start), True
 
 
-def ring_buffer(example: StoredStep) -> RingBuffer:
-    """Build the buffer for steps shaped like `example`.
+class RingBuffer:
+    """Pure functions over rows (capacity, width) of packed steps. `step`: all rows written so far, overwritten too."""
 
-    `add` requires the capacity to be a multiple of the number of steps added at once: one of each environment. So the
-    next step of an environment lies that many rows further.
-    """
-    row, unravel = ravel_pytree(example)
-    width = row.shape[0]
-    reward_column = example.obs.size + example.action.size  # the fields lie in the order of their declaration
+    def __init__(self, example: StoredStep) -> None:
+        """Make the buffer for steps shaped like `example`."""
+        row, self._unravel = ravel_pytree(example)
+        self.width = row.shape[0]
+        self._reward_column = example.obs.size + example.action.size  # the fields lie in the order of their declaration
 
-    def empty(capacity: int) -> Float[Array, "capacity width"]:
-        return jnp.zeros((capacity, width), jnp.float32)
+    def empty(self, capacity: int) -> Float[Array, "capacity width"]:
+        """Return rows of zeros."""
+        return jnp.zeros((capacity, self.width), jnp.float32)
 
-    def pack(steps: StoredStep) -> Float[Array, "n width"]:
+    def pack(self, steps: StoredStep) -> Float[Array, "n width"]:
+        """Return steps (n, ...) as rows."""
         return jax.vmap(lambda item: ravel_pytree(item)[0])(steps).astype(jnp.float32)
 
     def add(
-        rows: Float[Array, "capacity width"], step: Int[Array, ""], steps: StoredStep
+        self, rows: Float[Array, "capacity width"], step: Int[Array, ""], steps: StoredStep
     ) -> Float[Array, "capacity width"]:
-        packed = pack(steps)
+        """Return the rows with steps (n, ...), one of each environment; n must divide the capacity.
+
+        So the next step of an environment lies n rows further.
+        """
+        packed = self.pack(steps)
         if rows.shape[0] % packed.shape[0]:
             raise ValueError(f"capacity {rows.shape[0]} is no multiple of the {packed.shape[0]} steps added")
         return _write(rows, packed, jnp.mod(step, rows.shape[0]))
 
-    def draw(
-        key: PRNGKeyArray, rows: Float[Array, "capacity width"], step: Int[Array, ""], batch_size: int
-    ) -> Int[Array, " batch"]:
+    def draw(self, key: PRNGKeyArray, rows: Array, step: Int[Array, ""], batch_size: int) -> Int[Array, " batch"]:
+        """Draw numbers of rows."""
         return jax.random.randint(key, (batch_size,), 0, jnp.clip(step, 1, rows.shape[0]))
 
-    def read(rows: Float[Array, "capacity width"], numbers: Int[Array, " batch"]) -> StoredStep:
-        return jax.vmap(unravel)(rows[numbers])
+    def read(self, rows: Float[Array, "capacity width"], numbers: Int[Array, " batch"]) -> StoredStep:
+        """Return the steps (batch, ...) in rows."""
+        return jax.vmap(self._unravel)(rows[numbers])
 
     def follow(
-        rows: Float[Array, "capacity width"], step: Int[Array, ""], numbers: Int[Array, " batch"], n: int, num_envs: int
+        self, rows: Array, step: Int[Array, ""], numbers: Int[Array, " batch"], n: int, num_envs: int
     ) -> LaterSteps:
+        """Return the steps in rows and the n - 1 steps that follow each in its environment."""
         capacity = rows.shape[0]
         further = jnp.arange(n) * num_envs
         newer = jnp.mod(step - 1 - numbers, capacity)  # rows written after each
         places = jnp.mod(numbers[:, None] + further[None], capacity)
         # Three neighbouring numbers of each row, not the row.
-        later = rows[places[..., None], reward_column + jnp.arange(3)[None, None]]
+        later = rows[places[..., None], self._reward_column + jnp.arange(3)[None, None]]
         return LaterSteps(*jnp.moveaxis(later, -1, 0), exists=further[None] <= newer[:, None])
-
-    return RingBuffer(width, empty, pack, add, draw, read, follow)
 
 
 class Memory(NamedTuple):
@@ -280,7 +270,7 @@ def buffer_for(env: Environment, bootstraps: bool) -> RingBuffer:
         return stored_step(env.remember(state, obs), action, env.step(key, state, action)[1], bootstraps)
 
     shapes = jax.eval_shape(one_step, env, jax.random.key(0))
-    return ring_buffer(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
+    return RingBuffer(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
 
 
 def stored_step(

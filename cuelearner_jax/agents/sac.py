@@ -217,7 +217,7 @@ class SoftActorCritic:
             (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
             targets = self.targets(scalars.discount, actor, target_critics, temperature, batch, k_target)
             unit = self.in_unit(batch.action)
-            error = lambda critics: loss_of(self.values(critics, batch.obs, unit), targets)  # noqa: E731
+            error = lambda critics: jnp.mean(jnp.square(self.values(critics, batch.obs, unit) - targets[None]))  # noqa: E731
             loss, gradient = jax.value_and_grad(error)(critics)
             critics, opt_state = optimizer_step(options.critic_rate, most, gradient, opt_state, critics)
             if self.bootstraps:
@@ -306,12 +306,8 @@ def squashed_log_density(
 ) -> Float[Array, " n"]:
     """Return log p(tanh(u)) of u = mean + std * noise, independent entries (Haarnoja et al., appendix C).
 
-    log(1 - tanh(u)^2) is written as 2 (log 2 - u - softplus(-2 u)), which is finite for any u.
-
-    Args:
-        noise: standard normal.
-        log_std: logarithm of std.
-        before: u.
+    `noise` is standard normal, `log_std` the logarithm of std, and `before` is u. log(1 - tanh(u)^2) is written as
+    2 (log 2 - u - softplus(-2 u)), which is finite for any u.
     """
     normal = -0.5 * (noise**2 + math.log(2 * math.pi)) - log_std
     squashed = 2 * (math.log(2) - before - jax.nn.softplus(-2 * before))
@@ -324,8 +320,3 @@ def optimizer_step(
     """Return parameters and Adam's state after a step whose gradient is clipped to a norm."""
     change, opt_state = optimizer("adam", rate, max_norm).update(gradient, opt_state, params)
     return optax.apply_updates(params, change), opt_state
-
-
-def loss_of(values: Float[Array, "critics batch"], targets: Float[Array, " batch"]) -> Float[Array, ""]:
-    """Return the mean squared error of all critics."""
-    return jnp.mean(jnp.square(values - targets[None]))

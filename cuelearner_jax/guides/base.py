@@ -5,7 +5,6 @@ What a teacher *said* (its answer, kept in labels) and what a network *predicts*
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -19,11 +18,11 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
-from cuelearner_jax.guides.fitting import Example, GuideModel, examples, fit_least_squares, guide_model
+from cuelearner_jax.guides.fitting import Example, GuideModel, fit_least_squares, guide_model
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
+from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-NAME = re.compile(r"[a-z][a-z0-9_-]*")  # names of kinds, also in files: neither a path nor a reference to code
 Observations = Float[Array, "n obs"]
 Actions = Float[Array, "n action"]
 Rows = Bool[Array, " n"]  # which rows
@@ -61,8 +60,6 @@ class Guide:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if not NAME.fullmatch(name := vars(cls).get("name", "inherited")):
-            raise ValueError(f"a guidance is called {name!r}: give lower-case letters, digits, - and _")
         cls.asks = cls.form is not None
         cls.needs_cues = cls.by_cues or (cls.form is not None and cls.form.by_eps)
         cls.adapts_only = cls.sees_base or cls.by_evidence
@@ -109,9 +106,14 @@ class Guide:
         return GuidanceModel(self.network.init(key), jnp.array(False))
 
     def examples(self, labels: Label, scalars: GuideScalars) -> Example:
-        """Return labels (slots, ...) with their targets."""
-        space = self.spaces.actions if self.form is not None and self.form.by_eps else None
-        return examples(labels, self.target, scalars, space)
+        """Return labels (slots, ...) with their targets; a label that names no cue is not valid."""
+        targets = jax.vmap(lambda label: self.target(label, scalars))(labels)
+        # Rounded here: fused with later operations, the targets' last bits would depend on the compiler.
+        rows = Example(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
+        if self.form is None or not self.form.by_eps or len(self.spaces.actions.cues) == 1:
+            return rows
+        cues = is_answered(labels.answer)
+        return rows.replace(valid=labels.valid & cues.any(-1), cues=cues, space=self.spaces.actions)
 
     def augmented(self, key: PRNGKeyArray, batch: Example) -> Example:
         """Return the batch to train on in place of a batch (n, ...) of examples."""

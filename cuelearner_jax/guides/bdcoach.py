@@ -11,8 +11,8 @@ labels (s, a, h), h_c in {-1, 0, 1} or not said of each cue c:
     pi <- pi - Adam(grad of sum over cues of (d log (pi(s) - y))_c^2)
     a <- clip(retract(pi(s)), a, tau_max)
 
-A new label is in a minibatch of H, then in one of the policy, with its own target exp(a, eps h). `batch_steps` times
-`human_steps` minibatches of H and one of the policy follow (3 to 1, as in that code).
+A new label is in a minibatch of H, then in one of the policy, with its own target exp(a, eps h). `BATCH_STEPS` times
+`HUMAN_STEPS` minibatches of H and one of the policy follow (3 to 1, as in that code).
 
 What differs, and why: that code takes 500 such turns at the end of an episode, of which it may have many corrections or
 one; here each label has its turns, since rounds of questions are no episodes. "Already right" is an answer here, on
@@ -23,28 +23,21 @@ cue, as no answer is. A cue of which nothing was said teaches H nothing, and H t
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from cuelearner_jax.config import POSITIVE, GuideScalars, part
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.dcoach import Coached, Correct, DeepCoach
 from cuelearner_jax.guides.fitting import Example, optimizer, squared_errors
 from cuelearner_jax.types import Label, Params
 
-
-@part
-class BDCoachConfig:
-    """Options of BD-COACH."""
-
-    batch_steps: Annotated[int, POSITIVE] = 5
-    """Gradient steps of the policy on the whole buffer after each new label."""
-    human_steps: Annotated[int, POSITIVE] = 3
-    """Gradient steps of the human model before each of these."""
+BATCH_STEPS = 5  # gradient steps of the policy on the whole buffer after each new label
+HUMAN_STEPS = 3  # gradient steps of the human model before each of these
 
 
 class BatchCoached(Coached):
@@ -58,7 +51,7 @@ class BatchCoach(DeepCoach):
     """A guide that acts as a cloned policy does, and learns from a model of its teacher."""
 
     name, about, title = "bdcoach", "a policy moved by a model of its teacher", "BD-COACH"
-    colour, config = "#CC6677", BDCoachConfig
+    colour = "#CC6677"
 
     def begin(self, key: PRNGKeyArray) -> BatchCoached:
         """Return one member's policy without corrections, and its untrained human model."""
@@ -123,10 +116,10 @@ class BatchCoach(DeepCoach):
                 def one(coached: BatchCoached, key: PRNGKeyArray) -> tuple[BatchCoached, None]:
                     return teach_human(coached, batch_of(key, number)[1]), None
 
-                coached, _ = jax.lax.scan(one, coached, jax.random.split(k_human, self.options.human_steps))
+                coached, _ = jax.lax.scan(one, coached, jax.random.split(k_human, HUMAN_STEPS))
                 return move(k_see, coached, batch_of(k_batch, number)[0], jnp.zeros_like(first)), None
 
-            coached, _ = jax.lax.scan(turn, coached, jax.random.split(keys[2], self.options.batch_steps))
+            coached, _ = jax.lax.scan(turn, coached, jax.random.split(keys[2], BATCH_STEPS))
             return coached.replace(learned=number + 1)
 
         return correct

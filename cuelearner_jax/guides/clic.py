@@ -6,14 +6,14 @@ x = log(a, b) / eps along the cues of which a label (s, a, h) speaks, zero along
 
     pi(b | s) = exp(-E(s, b)) / Z,  over sampled actions b
     A = {b : |x - gamma h| < |x|}                        (half-space: nearer to the better action than to a)
-      and {b : |x - h| < |x - g_i|},  g_i = gamma h + (1 - gamma) u_i, u_i as long as h and `angle` away from it
+      and {b : |x - h| < |x - g_i|},  g_i = gamma h + (1 - gamma) u_i, u_i as long as h and `ANGLE` away from it
       and {b : |x_c| < |x_c - 1|, |x_c| < |x_c + 1|}     (of a cue c that is already right)
     log p(b in A) = SHARPNESS * mean over these pairs of log sigmoid(difference of the two distances / SOFTNESS)
     E = argmin over labels of -log sum over b of pi(b | s) p(b in A)
     a <- argmin over b within tau_max of a of E(s, b)
 
 A demonstration a+ of what to do in place of a (`clic_shown`, absolute corrections) has one set in place of these,
-A = {b : |log(a+, b)| < radius |log(a+, a)|}, of the same form and half that softness.
+A = {b : |log(a+, b)| < RADIUS |log(a+, a)|}, of the same form and half that softness.
 
 What differs, and why. The paper's loss is KL(target || pi) with target ~ pi p held fixed; the one above has the same
 gradient, is a likelihood of labels, and so can choose parameters by held-out labels. As for every kind here these are
@@ -27,7 +27,7 @@ here where silence is meant there. A cue of which nothing was said is no part of
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.agents.choice import each_in_portions
-from cuelearner_jax.config import POSITIVE, SHARE, Bounds, GuideScalars, part
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
 from cuelearner_jax.guides.fitting import GuideModel, fit_model, guide_model
@@ -49,36 +49,12 @@ NEAR = 2.0  # standard deviation of the actions sampled around the one asked abo
 FIRST_PAIRS = 0.3  # weight of the half-space beside all implicit pairs together
 PASSES = 6  # passes of the search around the best action so far, each in a box of half the size
 AROUND = 4  # actions of such a pass, for each cue
-
-
-@part
-class Searching:
-    """Options of the search for the action of least energy."""
-
-    sampled_actions: Annotated[int, Bounds(4)] = 32
-    """Actions between which the energy is compared in a step of a fit, for each label."""
-    searched_actions: Annotated[int, Bounds(2)] = 256
-    """Actions among which the search for the least energy begins."""
-
-
-@part
-class CLICConfig(Searching):
-    """Options of CLIC."""
-
-    implicit_pairs: Annotated[int, POSITIVE] = 8
-    """Pairs of actions that narrow a half-space, drawn again in each step of a fit."""
-    angle_deg: Annotated[float, Bounds(0, 90)] = 30.0
-    """How far the worse actions of these pairs lie from the answer's direction [deg]: 0 leaves the half-space."""
-    gamma: Annotated[float, SHARE] = 0.1
-    """How far along the answer the better action of the half-space lies, in units of eps."""
-
-
-@part
-class ShownConfig(Searching):
-    """Options of CLIC from demonstrations."""
-
-    radius: Annotated[float, SHARE] = 0.5
-    """Radius of the set around what was shown, as a share of the way there from the action asked about."""
+SAMPLED = 32  # actions between which the energy is compared in a step of a fit, for each label
+SEARCHED = 256  # actions among which the search for the least energy begins
+PAIRS = 8  # implicit pairs that narrow a half-space, drawn again in each step of a fit
+ANGLE = 30.0  # how far the worse actions of these pairs lie from the answer's direction [deg]
+GAMMA = 0.1  # how far along the answer the better action of the half-space lies, in units of eps
+RADIUS = 0.5  # of the set around a demonstration, as a share of the way there from the action asked about
 
 
 class Contrast(struct.PyTreeNode):
@@ -102,11 +78,8 @@ def log_desired(
 ) -> Float[Array, ""]:
     """Return the mean over pairs of the log-probabilities that an action lies on the desired side, see the module.
 
-    Args:
-        x: the action as seen from the one asked about, along the cues, in units of eps.
-        h: the answer, with `UNSAID`.
-        implicit: directions u_i, as long as h.
-        gamma: see `CLICConfig`.
+    `x` is the action as seen from the one asked about, along the cues, in units of eps; `h` the answer, with `UNSAID`;
+    `implicit` are directions u_i, as long as h.
     """
     spoken = is_answered(h)
     x, h = jnp.where(spoken, x, 0.0), jnp.where(spoken, h, 0.0)
@@ -143,7 +116,7 @@ class Clic(Guide):
 
     name, title = "clic", "CLIC"
     about = "an energy over actions, low in the sets that corrections leave possible"
-    form, colour, config = RELATIVE, "#117733", CLICConfig
+    form, colour = RELATIVE, "#117733"
 
     @cached_property
     def network(self) -> GuideModel:
@@ -171,15 +144,15 @@ class Clic(Guide):
         self, key: PRNGKeyArray, row: Contrast, actions: Float[Array, "m action"], scalars: GuideScalars
     ) -> Float[Array, " m"]:
         """Return log p(b in A) of actions b, where A is the desired set of one label."""
-        space, options = self.spaces.actions, self.options
+        space = self.spaces.actions
         x = space.log(jnp.broadcast_to(row.action, actions.shape), actions) / space.from_unit(scalars.eps_deg)
-        angle, keys = jnp.deg2rad(options.angle_deg), jax.random.split(key, options.implicit_pairs)
+        angle, keys = jnp.deg2rad(ANGLE), jax.random.split(key, PAIRS)
         implicit = jax.vmap(lambda key: direction_at(key, row.answer, angle))(keys)
-        return SHARPNESS * jax.vmap(lambda x: log_desired(x, row.answer, implicit, options.gamma))(x)
+        return SHARPNESS * jax.vmap(lambda x: log_desired(x, row.answer, implicit, GAMMA))(x)
 
     def sample_actions(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Float[Array, "m action"]:
         """Return the sampled actions of one label: two known ones, uniform ones, and ones near a."""
-        space, count = self.spaces.actions, self.options.sampled_actions - 2
+        space, count = self.spaces.actions, SAMPLED - 2
         k_any, k_near = jax.random.split(key)
         change = NEAR * space.from_unit(scalars.eps_deg) * jax.random.normal(k_near, (count // 2, len(space.cues)))
         from_label = jnp.stack([row.action, self.target_action(row, scalars)])
@@ -228,7 +201,6 @@ class Clic(Guide):
         """Return the action of least energy within tau_max of `base`, by a deterministic search."""
         space, cues = self.spaces.actions, len(self.spaces.actions.cues)
         bound = jnp.minimum(space.from_unit(scalars.tau_max_deg), space.from_unit(space.reach))
-        count = self.options.searched_actions
 
         def best(actions: Float[Array, "m action"]) -> Float[Array, " action"]:
             actions = space.clip(actions, jnp.broadcast_to(base, actions.shape), bound)
@@ -239,9 +211,8 @@ class Clic(Guide):
             offsets = Box((-1.0,) * cues, (1.0,) * cues).spread(count)
             return space.exp(jnp.broadcast_to(center, (count, space.size)), half * offsets)
 
-        everywhere = count // 2
-        lowest = best(jnp.concatenate([base[None], space.spread(everywhere), box(base, bound, count - everywhere)]))
-        half = 2.0 * bound * count ** (-1.0 / cues)
+        lowest = best(jnp.concatenate([base[None], space.spread(SEARCHED // 2), box(base, bound, SEARCHED // 2)]))
+        half = 2.0 * bound * SEARCHED ** (-1.0 / cues)
         for number in range(PASSES):
             lowest = best(jnp.concatenate([lowest[None], box(lowest, 0.5**number * half, AROUND * cues)]))
         return lowest
@@ -256,7 +227,7 @@ class Clic(Guide):
             own_obs, base = jnp.split(where, [obs.shape[1]])
             return self.minimise_energy(env, model.params, own_obs, base, scalars)
 
-        best = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
+        best = each_in_portions(choose, jnp.concatenate([obs, actions], -1), SEARCHED)
         return replaced(best, actions, guided)
 
 
@@ -265,7 +236,7 @@ class ClicShown(Clic):
 
     name, title = "clic_shown", "CLIC, demonstrations"
     about = "an energy over actions, low around what the teacher shows"
-    form, colour, config, by_cues = DEMONSTRATION, "#44AA99", ShownConfig, True
+    form, colour, by_cues = DEMONSTRATION, "#44AA99", True
 
     def target_action(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
         """Return the demonstrated action."""
@@ -282,5 +253,5 @@ class ClicShown(Clic):
         space = self.spaces.actions
         eps = space.from_unit(scalars.eps_deg)
         away = jax.vmap(lambda action: _size(space.log(row.answer, action) / eps))(actions)
-        radius = self.options.radius * _size(space.log(row.answer, row.action) / eps)
+        radius = RADIUS * _size(space.log(row.answer, row.action) / eps)
         return SHARPNESS * log_nearer(radius, away, SOFTNESS / 2)

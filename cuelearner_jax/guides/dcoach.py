@@ -12,7 +12,7 @@ the target, and one on a minibatch of a replay of the newest corrections. (Their
 Differences and their reasons. Corrections come in rounds, so the corrections of a round are learned one after another
 at the round's end (`--sizes.labels-per-round 1` learns each at once). "Already right" is an answer here, which holds
 the policy in place; in the paper it is silence. The paper also learns from the replay at every tenth step, of which a
-person corrects few; here every step is asked about, and `replay_steps` minibatches follow a correction. Adam replaces
+person corrects few; here every step is asked about, and `REPLAY_STEPS` minibatches follow a correction. Adam replaces
 their SGD, since the CueLearner paper's appendix gives all auxiliary policies the same optimiser. The members of an
 ensemble are corrected separately, and differ by their initial parameters and their draws from the replay.
 """
@@ -22,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.config import POSITIVE, GuideScalars, part
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Actions, Observations, Rows
 from cuelearner_jax.guides.demonstration import Demonstration
@@ -38,15 +38,8 @@ from cuelearner_jax.guides.fitting import Example, for_each, optimizer, squared_
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-
-@part
-class DeepCoachConfig:
-    """Options of deep COACH."""
-
-    replay_steps: Annotated[int, POSITIVE] = 5
-    """Gradient steps on earlier corrections after each new one."""
-    correction_replay: Annotated[int, POSITIVE] = 50
-    """Newest corrections that the policy keeps learning from."""
+REPLAY_STEPS = 5  # gradient steps on earlier corrections after each new one
+CORRECTION_REPLAY = 50  # newest corrections that the policy keeps learning from
 
 
 class Coached(struct.PyTreeNode):
@@ -64,7 +57,7 @@ class DeepCoach(Demonstration):
     """A guide that acts as a cloned policy does, and is updated by each correction."""
 
     name, about, title = "dcoach", "a policy moved by each correction", "deep COACH"
-    form, colour, config = RELATIVE, "#56B4E9", DeepCoachConfig
+    form, colour = RELATIVE, "#56B4E9"
 
     @cached_property
     def member(self) -> DeepCoach:
@@ -113,7 +106,7 @@ class DeepCoach(Demonstration):
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
 
         def correct(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
-            oldest = jnp.maximum(number + 1 - self.options.correction_replay, 0)
+            oldest = jnp.maximum(number + 1 - CORRECTION_REPLAY, 0)
 
             def replay(coached: Coached, key: PRNGKeyArray) -> tuple[Coached, None]:
                 k_draw, k_see = jax.random.split(key)
@@ -122,7 +115,7 @@ class DeepCoach(Demonstration):
 
             k_new, k_replay = jax.random.split(jax.random.fold_in(key, number))
             coached = step(coached, number[None], k_new)
-            coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, self.options.replay_steps))
+            coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, REPLAY_STEPS))
             return coached.replace(learned=number + 1)
 
         return correct

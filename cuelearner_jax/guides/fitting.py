@@ -8,6 +8,7 @@ parameters have a leading axis of members; of one member there is no such axis, 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -21,8 +22,8 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 from cuelearner_jax.agents import networks
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.spaces import Space, is_answered
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.spaces import Space
+from cuelearner_jax.types import GuidanceModel, Params
 
 Init = Callable[[PRNGKeyArray], Params]
 Predict = Callable[[Any, Params, Array, Array], Array]  # (env, params, obs (n, ...), actions (n, ...)) -> (n, outputs)
@@ -55,15 +56,11 @@ def ensemble(members: int, init: Init, predict: Predict) -> GuideModel:
 def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, beside: int = 0) -> GuideModel:
     """Return the networks of these sizes. Raises UserError for a frame in which the environment cannot be seen.
 
-    Args:
-        sizes: sizes of the networks.
-        spaces: the environment's.
-        outputs: number of outputs, such as the value of an action; None: a vector to be added to the
-            action, whichever frame it is seen in.
-        beside: numbers that they see beside observation and action: actions then have so many entries more, at the end.
+    `outputs`: their number, such as 1 for an action's value; None: a vector to be added to the action, whichever frame
+    it is seen in. `beside`: entries of actions, at their end, that the networks see beside observation and action.
     """
     size = spaces.actions.size
-    network = networks.residual_network(sizes.feedback_layers, size if outputs is None else outputs)
+    network = networks.MLP(sizes.feedback_layers, size if outputs is None else outputs)
     own, turned = networks.widths(sizes.frame, spaces)
 
     def init(key: PRNGKeyArray) -> Params:
@@ -110,22 +107,6 @@ class Example(struct.PyTreeNode):
     space: Space | None = struct.field(pytree_node=False, default=None)  # the space of these cues
 
 
-def examples(
-    labels: Label, target: Callable[[Label, GuideScalars], Array], scalars: GuideScalars, space: Space | None = None
-) -> Example:
-    """Return labels (slots, ...) with their targets; `space`: of answers that may leave cues out.
-
-    A label that names no cue is not valid.
-    """
-    targets = jax.vmap(lambda label: target(label, scalars))(labels)
-    # Rounded here: fused with later operations, the targets' last bits would depend on the compiler.
-    rows = Example(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
-    if space is None or len(space.cues) == 1:
-        return rows
-    cues = is_answered(labels.answer)
-    return rows.replace(valid=labels.valid & cues.any(-1), cues=cues, space=space)
-
-
 def squared_errors(rows: Example, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
     """Return the squared errors of predictions, L = |f - y|^2 (paper, Eq. 3).
 
@@ -135,7 +116,7 @@ def squared_errors(rows: Example, predicted: Float[Array, "n outputs"]) -> Float
     off = predicted - rows.target
     if rows.cues is None:
         return jnp.sum(jnp.square(off), -1)
-    assert rows.space is not None  # `examples` gives it with `said`
+    assert rows.space is not None  # `Guide.examples` gives both
     along = jax.vmap(rows.space.along)(rows.action[..., : rows.space.size], off)
     return jnp.sum(jnp.square(along), -1, where=rows.cues)
 
@@ -145,38 +126,21 @@ def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate))
 
 
-def keep_batch(key: PRNGKeyArray, batch: Any) -> Any:
-    """Return the batch itself."""
-    return batch
-
-
 def held_out(count: int) -> Bool[np.ndarray, " count"]:
     """Return which of so many labels are held out for validation."""
     return np.arange(count) % VALIDATION_STRIDE == VALIDATION_STRIDE - 1
 
 
 def fit_least_squares(
-    key: PRNGKeyArray,
-    rows: Example,
-    scalars: GuideScalars,
-    *,
-    init: Init,
-    apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
-    sizes: GuideSizes,
-    augment: Augment = keep_batch,
+    key: PRNGKeyArray, rows: Example, scalars: GuideScalars, *, apply: Callable[..., Array], **how: Any
 ) -> GuidanceModel:
-    """Fit by least squares (paper, Eq. 3), as `fit_model`.
+    """Fit by least squares (paper, Eq. 3), as `fit_model`. `apply`: (params, obs, actions) -> predictions (n, outputs).
 
     Examples are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
     answer in the mirror image is mostly not the mirror image of its answer.
-
-    `apply`: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
     """
-
-    def errors(params: Params, rows: Example) -> Float[Array, " n"]:
-        return squared_errors(rows, apply(params, rows.obs, rows.action))
-
-    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, augment=augment)
+    losses = lambda params, rows: squared_errors(rows, apply(params, rows.obs, rows.action))  # noqa: E731
+    return fit_model(key, rows, scalars, losses=losses, **how)
 
 
 def fit_model(
@@ -187,7 +151,7 @@ def fit_model(
     init: Init,
     losses: Callable[[Params, Any], Float[Array, " n"]],
     sizes: GuideSizes,
-    augment: Augment = keep_batch,
+    augment: Augment = lambda key, batch: batch,
 ) -> GuidanceModel:
     """Fit a model from scratch, and keep the parameters with the least validation loss.
 
@@ -198,27 +162,12 @@ def fit_model(
     `rows` are what is learned from (slots, ...), such as examples, of which the `valid` ones count; `init` gives the
     parameters of `sizes.ensemble` members, which are fitted each by itself; `losses` gives the loss of each row.
     """
-
-    def fit(key: PRNGKeyArray, init: Init) -> GuidanceModel:
-        return _fit_member(key, rows, scalars, init, losses, sizes, augment)
-
-    if sizes.ensemble == 1:
-        return fit(key, init)
-    # A member is fitted as an ensemble of one, whose mean is its own prediction.
-    first = lambda key: jax.tree.map(lambda leaf: leaf[:1], init(key))  # noqa: E731
-    each = jax.vmap(lambda key: fit(key, first))(jax.random.split(key, sizes.ensemble))
-    return GuidanceModel(jax.tree.map(lambda leaf: leaf[:, 0], each.params), each.fitted.all())
-
-
-def _fit_member(
-    key: PRNGKeyArray,
-    rows: Any,
-    scalars: GuideScalars,
-    init: Init,
-    losses: Callable[[Params, Any], Float[Array, " n"]],
-    sizes: GuideSizes,
-    augment: Augment,
-) -> GuidanceModel:
+    if sizes.ensemble > 1:
+        # A member is fitted as an ensemble of one, whose mean is its own prediction.
+        one: dict[str, Any] = {"losses": losses, "sizes": dataclasses.replace(sizes, ensemble=1), "augment": augment}
+        one["init"] = lambda key: jax.tree.map(lambda leaf: leaf[:1], init(key))
+        each = jax.vmap(lambda key: fit_model(key, rows, scalars, **one))(jax.random.split(key, sizes.ensemble))
+        return GuidanceModel(jax.tree.map(lambda leaf: leaf[:, 0], each.params), each.fitted.all())
     held = held_out(rows.valid.shape[0])
     validation, training = rows.valid & held, rows.valid & ~held
     order, count = jnp.argsort(~training, stable=True), jnp.maximum(training.sum(), 1)

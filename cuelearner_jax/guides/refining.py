@@ -49,25 +49,17 @@ def refine(
     tau_max: Float[Array, ""] | float,
     k_max: Int[Array, ""] | int,
 ) -> Refinement:
-    """Refine a batch of actions.
+    """Refine a batch of actions from `first`, a_0, by at most `k_max` passes; rows that are not active do not change.
 
-    Args:
-        residual: phi(s, .) of the rows' own observations: actions -> residuals.
-        first: a_0.
-        active: rows to refine; the others come back untouched.
-        space: the action space.
-        tau: a row stops once a pass moves it by less than this along every cue, in the unit of `space.log`.
-        tau_max: bound on the way from `first` along each cue; every iterate is clipped to it.
-        k_max: largest number of passes.
+    `residual` is phi(s, .) of the rows' own observations. A row stops once a pass moves it by less than `tau` along
+    every cue, in the unit of `space.log`; every iterate is clipped to within `tau_max` of `first` along each cue.
     """
 
-    def unfinished(carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array]) -> jax.Array:
+    def unfinished(carry: tuple[Array, ...]) -> Array:
         _, done, _, k = carry
         return (k < k_max) & ~jnp.all(done)
 
-    def one_pass(
-        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    def one_pass(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         current, done, passes, k = carry
         done = done | (k >= k_max)  # reached between two looks
         proposal = space.retract(current + residual(current))

@@ -44,16 +44,11 @@ def world_of(task: Task, file: LabelFile) -> Any:
 
 
 def with_teacher(
-    task: Task,
-    file: LabelFile,
-    rows: list[dict[str, Any]],
-    scalars: Scalars,
-    tell: Callable[[str], None] = lambda words: None,
+    task: Task, file: LabelFile, rows: list[dict[str, Any]], scalars: Scalars, tell: Callable[[str], None]
 ) -> AnswerAgreement:
     """Return how well a page's labels agree with the answers of the task's teacher, simulated without mistakes.
 
-    The situations of all `rows` (`label_files.history`) are replayed. Raises UserError where they cannot be, or without
-    a teacher.
+    The situations of all `rows` (`label_files.history`) are replayed.
     """
     form = form_of(file)
     if form is None or file.people is None or file.session is None:
@@ -75,15 +70,11 @@ def with_teacher(
 
 
 def between(one: LabelFile, other: LabelFile, env: Any) -> AnswerAgreement:
-    """Return how well two files agree on the questions both answered (equal observation and action).
-
-    Raises UserError if the two files differ in the form, space or strength of their answers.
-    """
+    """Return how well two files agree on the questions both answered (equal observation and action)."""
     form = form_of(one)
     if form is None or (one.answers, one.space, one.eps) != (other.answers, other.space, other.eps):
         kinds = [
-            f"{file.answers}" + ("" if file.eps is None else f" ({file.eps:g} {file.space.unit})")
-            for file in (one, other)
+            file.answers + ("" if file.eps is None else f" ({file.eps:g} {file.space.unit})") for file in (one, other)
         ]
         raise UserError(f"the files hold {' and '.join(kinds)} answers: give two of one form")
     mine, theirs = (dict(zip(_questions(file), np.asarray(file.labels.answer), strict=True)) for file in (one, other))
@@ -101,25 +92,18 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     """Concatenate the labels of several files; return the merged file and the number of duplicates left out.
 
     A label is a duplicate if an earlier file has a label of equal observation, action and answer, and of equal person
-    and time where all files record them.
-
-    Raises UserError if the files differ in task, world, form or strength, or if one file holds several seeds' labels.
+    and time where all files record them. Raises UserError if the files differ in task, world, form or strength.
     """
-    files = list(files)
+    files, earlier, fresh = list(files), set(), []
     first, everyone = files[0], all(file.people is not None for file in files)
-    earlier: set[Any] = set()
-    fresh: list[bool] = []
     for file in files:
         if len(np.unique(file.seeds)) > 1:
             raise UserError("a file holds the labels of several seeds: merge files of one seed each")
         for name in ("task", "answers", "space", "eps"):
             if (other := getattr(file, name)) != (own := getattr(first, name)):
                 raise UserError(f"the files differ in {name} ({own}, {other}): merge only files that agree in it")
-        if file.labels.obs.shape[1] != first.labels.obs.shape[1]:
-            raise UserError("the files' observations differ in size: merge files of one world")
-        keys: list[Any] = list(zip(_questions(file), map(bytes, np.asarray(file.labels.answer)), strict=True))
-        if everyone and file.people is not None:
-            keys = list(zip(keys, file.people.who.tolist(), file.people.when.tolist(), strict=True))
+        people = (file.people.who.tolist(), file.people.when.tolist()) if everyone and file.people else ()
+        keys = list(zip(_questions(file), map(bytes, np.asarray(file.labels.answer)), *people, strict=True))
         fresh += [key not in earlier for key in keys]
         earlier.update(keys)
     mask = np.array(fresh, bool)

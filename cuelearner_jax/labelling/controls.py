@@ -80,13 +80,8 @@ def _of_cue(number: int, space: Space, one_cue: bool) -> tuple[Control, ...]:
         Control(f"pick-{number}-{way}", words, keys, (h,), colour, number) for way, h, colour, words, keys in sides
     )
     if one_cue:
-        return tuple(
-            one._replace(
-                name=one.name.replace("pick", "only"),
-                answer=(*others[:number], *(one.answer or ()), *others[number + 1 :]),
-            )
-            for one in (more, less)
-        )
+        whole = lambda one: (*others[:number], *(one.answer or ()), *others[number + 1 :])  # noqa: E731
+        return tuple(one._replace(name=one.name.replace("pick", "only"), answer=whole(one)) for one in (more, less))
     right = Control(f"pick-{number}-right", "already right", (), (0.0,), "asked", number)
     return more, right, less, Control(f"pick-{number}-unsaid", "not said", (), (UNSAID,), "", number)
 
@@ -134,10 +129,7 @@ def controls(
 def check(form: AnswerForm, space: Space) -> None:
     """Raise UserError for answers that the page does not support in a space, or two cues with one key."""
     if form.is_action and space != DIRECTIONS:
-        raise UserError(
-            f"{form.name} answers are given by pointing, which the page supports only for "
-            f"directions: give --guidance relative"
-        )
+        raise UserError(f"the page supports {form.name} answers only for directions: give --guidance relative")
     if form.by_eps and not space.cues:
         raise UserError(f"the space {space.name} has no cues to ask about: give --guidance scalar")
     keys = [key for control in answers(form, space) for key in control.keys]

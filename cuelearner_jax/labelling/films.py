@@ -7,77 +7,57 @@ import queue
 import secrets
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import uvicorn
 from fastapi import FastAPI
 from fastapi.requests import Request
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
 
-from cuelearner_jax.labelling.server import HOST, bind, guard
+from cuelearner_jax.labelling.server import HOST, PAGE, bind, guard
 from cuelearner_jax.signals import Interrupted, interruptible
 
-WORDS = {"left": -1, "same": 0, "right": 1}  # answers, and what they say of the right film
-BUTTONS = {"left": "Left is better", "same": "No difference", "right": "Right is better"}
+# answers: what they say of the right film, and their buttons
+WORDS = {"left": (-1, "Left is better"), "same": (0, "No difference"), "right": (1, "Right is better")}
 SHOWN_WITHIN = 5.0  # time for the browser to load the last page before the server stops [s]
-PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>which is better?</title>
-<meta name="viewport" content="width=device-width">{head}<style>:root {{ color-scheme: light dark; }}
-body {{ font: 1.1rem/1.6 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }}
-.films {{ display: flex; gap: 1rem; }} .films img {{ flex: 1; min-width: 0; }}
-form {{ display: flex; gap: 1rem; margin-top: 1rem; }} button {{ flex: 1; font: inherit; padding: 0.6rem; }}
-</style></head><body>{body}</body></html>"""
-WAITING = PAGE.format(head='<meta http-equiv="refresh" content="1">', body="<p>The next two films are being made.</p>")
-LAST = PAGE.format(head="", body="<h1>Thank you.</h1><p>It is decided. You may close this tab.</p>")
-
-
-class Pair(NamedTuple):
-    """Two films of the same start."""
-
-    number: int
-    left: Path
-    right: Path
+LOOK = partial(PAGE.format, title="which is better?")
+WAITING = LOOK(head='<meta http-equiv="refresh" content="1">', body="<p>The next two films are being made.</p>")
+LAST = LOOK(head="", body="<h1>Thank you.</h1><p>It is decided. You may close this tab.</p>")
 
 
 class _Desk:
     """The pair that is shown, and the answers."""
 
     def __init__(self) -> None:
-        self.pair: Pair | None = None
+        self.number, self.films = -1, {}  # the films by their sides; empty between two pairs
         self.answers: queue.Queue[int] = queue.Queue()
-        self.over = False
-        self.last_shown = threading.Event()
+        self.over, self.last_shown = False, threading.Event()
 
-    def page(self) -> HTMLResponse:
+    def page(self, request: Request) -> Response:
         """Return the page of the moment."""
         if self.over:
             self.last_shown.set()
-            return HTMLResponse(LAST)
-        if self.pair is None:
-            return HTMLResponse(WAITING)
-        number = self.pair.number
-        films = "".join(f'<img src="film/{number}/{side}" alt="the {side} film">' for side in ("left", "right"))
-        answers = "".join(
-            f'<button formaction="answer/{number}/{word}">{text}</button>' for word, text in BUTTONS.items()
-        )
-        words = f"<p>Pair {number + 1}: both start alike. Which does the task better?</p>"
-        return HTMLResponse(
-            PAGE.format(head="", body=f'{words}<div class="films">{films}</div><form method="post">{answers}</form>')
-        )
+        if self.over or not self.films:
+            return HTMLResponse(LAST if self.over else WAITING)
+        words = f"<p>Pair {self.number + 1}: both start alike. Which does the task better?</p>"
+        films = "".join(f'<img src="film/{self.number}/{side}" alt="the {side} film">' for side in ("left", "right"))
+        buttons = ((word, text) for word, (_, text) in WORDS.items())
+        answers = "".join(f'<button formaction="answer/{self.number}/{word}">{text}</button>' for word, text in buttons)
+        body = f'{words}<div class="films">{films}</div><form method="post">{answers}</form>'
+        return HTMLResponse(LOOK(head="", body=body))
 
     def film(self, request: Request) -> Response:
         """Return a film of the pair that is shown."""
-        number, side, pair = request.path_params["number"], request.path_params["side"], self.pair
-        if pair is None or number != pair.number or side not in ("left", "right"):
-            return PlainTextResponse("this film is no longer shown\n", 404)
-        return FileResponse(getattr(pair, side))
+        file = self.films.get(request.path_params["side"]) if request.path_params["number"] == self.number else None
+        return FileResponse(file) if file else PlainTextResponse("this film is no longer shown\n", 404)
 
     def answer(self, request: Request) -> Response:
         """Take the answer about the pair that is shown; a second one about it says nothing."""
-        number, word, pair = request.path_params["number"], request.path_params["word"], self.pair
-        if pair is not None and number == pair.number and word in WORDS:
-            self.pair = None
-            self.answers.put(WORDS[word])
+        word = request.path_params["word"]
+        if self.films and request.path_params["number"] == self.number and word in WORDS:
+            self.films = {}
+            self.answers.put(WORDS[word][0])
         return RedirectResponse("../../", 303)
 
 
@@ -93,7 +73,7 @@ def film_page(port: int, tell: Callable[[str], None]) -> Iterator[Callable[[Path
     with bind(port) as listening:
         token, desk = secrets.token_urlsafe(18), _Desk()
         app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-        app.add_route("/", lambda request: desk.page())
+        app.add_route("/", desk.page)
         app.add_route("/film/{number:int}/{side}", desk.film)
         app.add_route("/answer/{number:int}/{word}", desk.answer, methods=["POST"])
         gate = guard(app, listening.getsockname()[1], token)
@@ -101,10 +81,9 @@ def film_page(port: int, tell: Callable[[str], None]) -> Iterator[Callable[[Path
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
         thread.start()
         tell(f"http://{HOST}:{listening.getsockname()[1]}/?token={token}")
-        numbers = iter(range(10**9))
 
         def ask(left: Path, right: Path) -> int:
-            desk.pair = Pair(next(numbers), left, right)
+            desk.number, desk.films = desk.number + 1, {"left": left, "right": right}
             with interruptible("the answer of the moment") as stopping:
                 while not stopping.is_set():
                     with contextlib.suppress(queue.Empty):

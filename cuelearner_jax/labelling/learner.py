@@ -159,9 +159,8 @@ class Learner:
     def fit(self, labels: Label) -> None:
         """Fit to these labels."""
         if (count := int(labels.valid.sum())) and self._reads:
-            self.newest = self._reading_of(
-                [np.asarray(part)[:count] for part in (labels.obs, labels.action, labels.answer)]
-            )
+            rows = labels.obs, labels.action, labels.answer
+            self.newest = self._reading_of([np.asarray(part)[:count] for part in rows])
         elif count:
             self.newest = self._model_of(labels, count)
 

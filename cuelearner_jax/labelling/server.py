@@ -27,6 +27,13 @@ HOST = "127.0.0.1"
 FINISHED = "/finished"  # address of the last page
 SHOWN_WITHIN = 10.0  # time for all browsers to load the last page before the server stops [s]
 RECONNECT = 60.0  # time for which the page of a broken connection is kept [s]
+PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<meta name="viewport" content="width=device-width">{head}<style>:root {{ color-scheme: light dark; }}
+body {{ font: 1.1rem/1.6 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }}
+pre {{ background: #80808022; padding: 0.8rem; white-space: pre-wrap; overflow-wrap: anywhere; }}
+.films {{ display: flex; gap: 1rem; }} .films img {{ flex: 1; min-width: 0; }}
+form {{ display: flex; gap: 1rem; margin-top: 1rem; }} button {{ flex: 1; font: inherit; padding: 0.6rem; }}
+</style></head><body>{body}</body></html>"""
 HEADERS = (
     (b"referrer-policy", b"no-referrer"),  # the address contains the token
     (b"x-frame-options", b"DENY"),
@@ -52,14 +59,11 @@ class Ending(NamedTuple):
     def page(self) -> str:
         """The last page as HTML, which needs no server once shown."""
         line, following, again = map(html.escape, self)
-        return f"""<!doctype html><html lang="en"><head><meta charset="utf-8"><title>finished</title>
-<meta name="viewport" content="width=device-width"><style>:root {{ color-scheme: light dark; }}
-body {{ font: 1.1rem/1.6 system-ui, sans-serif; max-width: 46rem; margin: 3rem auto; padding: 0 1rem; }}
-pre {{ background: #80808022; padding: 0.8rem; white-space: pre-wrap; overflow-wrap: anywhere; }}</style></head><body>
-<h1>Finished. Thank you.</h1><p class="saved">{line}</p>
+        body = f"""<h1>Finished. Thank you.</h1><p class="saved">{line}</p>
 <h2>What to type next</h2><pre id="next">{following}</pre>
 <h2>To add labels later</h2><pre>{again}</pre>
-<p>The command in the terminal has ended by itself. You may close this tab.</p></body></html>"""
+<p>The command in the terminal has ended by itself. You may close this tab.</p>"""
+        return PAGE.format(title="finished", head="", body=body)
 
 
 def end_session(session: Session, commands: Commands) -> Ending:

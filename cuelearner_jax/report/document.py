@@ -54,8 +54,9 @@ def report(
 ) -> Path:
     """Write the report of run folders, or of folders above them, into `out`; return the path of `report.md`.
 
-    `by_run`: report each folder separately, under its name, as needed where configurations differ. `study`: called with
-    the variants; returns additions. `command`: the command line that makes this report, recorded in it.
+    `folders` are run folders, or folders above them; `by_run` reports each under its own name, as needed where the
+    runs' configurations differ. `split`: "validation" or "training". `study` makes additions of the variants. `command`
+    is the command line to record in the report.
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)

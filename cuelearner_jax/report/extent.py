@@ -20,8 +20,8 @@ from cuelearner_jax.storage.folders import CONFIG
 
 def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[str]:
     """Return one line for everything planned that the table lacks, or whose plan is unknown."""
-    ends = table.group_by("folder").aggregate([("step", "max")])
-    last = dict(zip(*(ends[name].to_pylist() for name in ("folder", "step_max")), strict=True))
+    ends = table.group_by("folder").aggregate([("step", "max")]).to_pylist()
+    last = {row["folder"]: row["step_max"] for row in ends}
     # the config.json of each folder with results; a run's lies above the folders of its kinds of guidance
     places = {folder: (Path(folder) / CONFIG, Path(folder).parent / CONFIG) for folder in last}
     configurations = {folder: next((file for file in files if file.exists()), None) for folder, files in places.items()}
@@ -99,20 +99,14 @@ def _short(table: pa.Table, variants: Sequence[Variant]) -> list[str]:
         rows = (guidance == variant.guidance) & (labels == variant.labels)
         furthest, last = int(table["step"].to_numpy()[rows].max()), int(variant.curve.steps[-1])
         if furthest > last:
-            lines.append(
-                f"{variant.name}: some seeds have reached step {furthest:,}; the curve ends at {last:,}, "
-                "the last step of all seeds"
-            )
+            words = f"the curve ends at {last:,}, the last step of all seeds"
+            lines.append(f"{variant.name}: some seeds have reached step {furthest:,}; {words}")
         if len(variant.seeds) == 1:
             lines.append(f"{variant.name}: a single seed, so there is no interval")
         elif not variant.episodes:
-            lines.append(
-                f"{variant.name}: the run keeps no results of episodes, so intervals leave out the evaluation's error"
-            )
-    hashes = sorted(set(table["config_hash"].to_pylist()))
-    if len(hashes) > 1:
-        where = f" of {variants[0].run}" if variants and variants[0].run else ""
-        lines.append(
-            f"the runs{where} differ in more than guidance, labels and seed: configurations {', '.join(hashes)}"
-        )
+            words = "the run keeps no results of episodes, so intervals leave out the evaluation's error"
+            lines.append(f"{variant.name}: {words}")
+    if len(hashes := sorted(set(table["config_hash"].to_pylist()))) > 1:
+        where, names = f" of {variants[0].run}" if variants and variants[0].run else "", ", ".join(hashes)
+        lines.append(f"the runs{where} differ in more than guidance, labels and seed: configurations {names}")
     return lines

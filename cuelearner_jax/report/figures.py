@@ -9,13 +9,11 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib import ticker
-from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from cuelearner_jax.errors import one_line
 from cuelearner_jax.guides import registry
-from cuelearner_jax.report.statistics import Curve, Interval
 from cuelearner_jax.report.variants import Variant, guidance_name
 
 # Palette of Okabe and Ito, distinguishable with any colour vision, without the colours of the package's kinds.
@@ -63,48 +61,30 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
 
 
 def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) -> Figure:
-    """Draw interquartile means against the label budget; a kind without labels is a horizontal band."""
+    """Draw means over the curve against the label budget; a kind without labels is a horizontal band."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(8, 4.2), layout="constrained")
-        left, right = figure.subplots(1, 2, sharey=True)
-        shared = min(int(variant.curve.steps[-1]) for variant in variants)
-        last = [_at(variant.curve, shared) for variant in variants]
-        draw_budgets(left, variants, last, f"at step {shared:,}, reached by all")
-        draw_budgets(right, variants, [variant.mean for variant in variants], "mean over the curve")
-        left.set_ylabel(axis_name(metric))
-        handles, names = left.get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=min(5, len(names)))
+        figure = Figure(figsize=(7, 4.2), layout="constrained")
+        axes = figure.add_subplot()
+        for place, kind in enumerate(dict.fromkeys(variant.guidance for variant in variants)):
+            look: dict[str, Any] = {"color": colour_of(kind), "label": guidance_name(kind)}
+            points = np.array([(one.labels, *one.mean) for one in variants if one.guidance == kind], float)
+            for _, estimate, lower, upper in points[points[:, 0] == 0]:
+                axes.axhspan(lower, upper, color=look["color"], alpha=0.12, linewidth=0)
+                axes.axhline(estimate, linewidth=1.5, linestyle="--", **look)
+            if len(points := points[points[:, 0] > 0]):
+                labels, estimate, lower, upper = points.T
+                bars = np.nan_to_num([estimate - lower, upper - estimate])
+                # All points stand on their budget's tick; caps of different widths tell intervals at one budget apart.
+                axes.errorbar(labels, estimate, bars, marker="o", capsize=3 + 2 * place, **look)
+        budgets = sorted({variant.labels for variant in variants if variant.labels})
+        axes.set_xscale("log")
+        axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets], rotation=45)
+        axes.minorticks_off()
+        axes.set_xlabel("labels")
+        axes.set_ylabel(f"{axis_name(metric)}, mean over the curve")
+        figure.legend(loc="outside lower center", ncols=5)
         figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
-
-
-def _at(curve: Curve, step: int) -> Interval:
-    """Return the last evaluation up to a step, so that no curve is compared beyond its end."""
-    place = max(0, int(np.searchsorted(curve.steps, step, side="right")) - 1)
-    return Interval(*(values[place] for values in curve[1:]))
-
-
-def draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[Interval], panel: str) -> None:
-    """Draw intervals against the label budget, one line per kind of guidance; a kind without labels is a level."""
-    kinds = list(dict.fromkeys(variant.guidance for variant in variants))
-    for place, kind in enumerate(kinds):
-        colour, name = colour_of(kind), guidance_name(kind)
-        pairs = zip(variants, intervals, strict=True)
-        points = [(variant.labels, *at) for variant, at in pairs if variant.guidance == kind]
-        for _, estimate, lower, upper in (point for point in points if not point[0]):
-            axes.axhspan(float(lower), float(upper), color=colour, alpha=0.12, linewidth=0)
-            axes.axhline(float(estimate), color=colour, label=name, linewidth=1.5, linestyle="--")
-        if any(point[0] for point in points):
-            labels, estimate, lower, upper = np.array([point for point in points if point[0]], float).T
-            bars = np.nan_to_num([estimate - lower, upper - estimate])
-            # All points stand on their budget's tick; caps of different widths tell intervals at one budget apart.
-            axes.errorbar(labels, estimate, bars, color=colour, label=name, marker="o", capsize=3 + 2 * place)
-    budgets = sorted({variant.labels for variant in variants if variant.labels})
-    axes.set_xscale("log")
-    axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets], rotation=45)
-    axes.minorticks_off()
-    axes.set_xlabel("labels")
-    axes.set_title(panel, fontsize=10)
 
 
 def save_figure(figure: Figure, stem: Path) -> None:

@@ -11,14 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from cuelearner_jax.errors import one_line
-from cuelearner_jax.report.statistics import (
-    Interval,
-    censored_interval,
-    interquartile_mean,
-    resampled,
-    steps_to_level,
-    stretches_apart,
-)
+from cuelearner_jax.report import statistics
+from cuelearner_jax.report.statistics import Interval
 from cuelearner_jax.report.variants import Variant
 
 Row = dict[str, str | int | float]  # of a table
@@ -59,7 +53,7 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
         if unguided is not None and variant is not unguided:
             row |= _steps_to(variant, sign, sign * unguided.curve.estimate[-1])
             for column, pair in (("above", (variant, unguided)), ("below", (unguided, variant))):
-                apart = stretches_apart(*(each.curve for each in pair))
+                apart = statistics.stretches_apart(*(each.curve for each in pair))
                 row[f"{column}_unguided"] = "; ".join(f"{start}-{end}" for start, end in apart)
         rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
     return rows
@@ -67,9 +61,10 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
 
 def _steps_to(variant: Variant, sign: float, level: float) -> Row:
     """Return the columns of the step from which a variant's seeds stay at a level; an interval for several seeds."""
-    bounds = lambda curves: steps_to_level(variant.curve.steps, sign * curves, level)  # noqa: E731
-    ends = censored_interval(resampled(variant.groups, of=bounds)) if len(variant.seeds) > 1 else ()
-    numbers = (interquartile_mean(bounds(variant.values))[1], *ends)
+    bounds = lambda curves: statistics.steps_to_level(variant.curve.steps, sign * curves, level)  # noqa: E731
+    draws = statistics.resampled(variant.groups, of=bounds)
+    ends = statistics.censored_interval(draws) if len(variant.seeds) > 1 else ()
+    numbers = (statistics.interquartile_mean(bounds(variant.values))[1], *ends)
     return dict(zip(REACHES, (round(float(step)) if np.isfinite(step) else "never" for step in numbers), strict=False))
 
 

@@ -145,9 +145,7 @@ def _guides(rows: pa.Table, metric: str, guides: pa.Table | None) -> np.ndarray:
     return np.array([latest[seed] for seed in sorted(latest)])
 
 
-def _matrix(
-    table: pa.Table, metric: str, kind: str, labels: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.ndarray, ...]:
     """Return a variant's seeds (seeds,), the steps (steps,) that all seeds have, values (seeds, steps) and `each`."""
     seeds, row = np.unique(table["seed"].to_numpy(), return_inverse=True)
     steps, column = np.unique(table["step"].to_numpy(), return_inverse=True)

@@ -60,7 +60,8 @@ def pictures_of(
 
     def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
         see = lambda env, state, action, step: (drawable(state), action, step.reward)  # noqa: E731
-        states, actions, rewards = record_steps(env, policy, key, steps, see)
+        rows = record_steps(env, policy, key, steps, see)
+        states, actions, rewards = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         user_code.tell()
         return film(env, states, actions), rewards.tolist()
 

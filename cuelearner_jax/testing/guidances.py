@@ -2,46 +2,32 @@
 
 from __future__ import annotations
 
-import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
+from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of, offers, spaces_of
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.testing.laws import Laws, change_floats, counted_jit, shapes_of
-from cuelearner_jax.types import EnvState, GuidanceModel, Label
+from cuelearner_jax.testing.laws import Laws, shapes_of
+from cuelearner_jax.types import GuidanceModel, Label
 
 SMALL = GuideSizes(feedback_layers=(8, 8), labels_per_round=4, fit_steps=8, fit_batch_size=4, validate_every=4)
 ROWS = 6  # situations, of which every second is guided; as many labels
 SCALARS = GuideScalars()
 
 
-class Steady(struct.PyTreeNode):
-    """A teacher whose best action is always the same."""
+def check_guidance(kind: type[Guide], env: Environment, sizes: GuideSizes = SMALL) -> None:
+    """Check that a kind of guidance keeps its laws in an environment that it can be had in, with a small model.
 
-    action: Float[Array, " action"]
-
-    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """Return that action."""
-        return self.action
-
-
-def check_guidance(kind: type[Guide], env: Environment, sizes: GuideSizes = SMALL, tolerance: float = 1e-5) -> None:
-    """Check that a kind of guidance keeps its laws. Raises AssertionError for the first law that is broken.
-
-    Args:
-        kind: the class of the guide.
-        env: an environment that it can be had in.
-        sizes: small sizes of its model.
-        tolerance: relative and absolute, of actions.
+    Raises AssertionError for the first law that is broken.
     """
-    laws = Laws(f"guidance {kind.name}", tolerance)
+    laws = Laws(f"guidance {kind.name}")
     for need in kind.needs:
         laws.hold(offers(env, need), f"it needs a {need}, which {type(env).__name__} lacks: check it in another one")
     guide = kind(sizes, spaces_of(env))
@@ -51,27 +37,18 @@ def check_guidance(kind: type[Guide], env: Environment, sizes: GuideSizes = SMAL
     fitted = _fitted(laws, guide, env, model, _labels(laws, guide, env, states, obs, actions)) if guide.form else model
     _check_act(laws, guide, env, model, fitted, obs, actions)
     action = jax.jit(guide.question)(jax.random.key(3), fitted, env, obs[0], actions[0], SCALARS)
-    laws.hold(action.shape == actions[0].shape, f"`question` returns shape {action.shape}: ask about one action")
     laws.actions(actions_of(env), action, "what `question` asks about")
-    if guide.form is not None:
-        members = kind(dataclasses.replace(sizes, ensemble=2), spaces_of(env))
-        apart = jax.jit(members.disagreement)(members.init(jax.random.key(4)), env, obs, actions)
-        sound = apart.shape == (ROWS,) and np.isfinite(apart).all() and (apart >= 0).all()
-        laws.hold(sound, f"`disagreement` of {ROWS} rows is {apart}: give a number of each, at least 0")
 
 
 def _labels(laws: Laws, guide: Guide, env: Any, states: Any, obs: Array, actions: Array) -> Label:
     """Return labels (rows, ...) of a simulated teacher."""
     space, form = actions_of(env), guide.form
     assert form is not None
-    width, teacher = form.width(space), Steady(space.spread(8)[3])
-
-    def each(key: Array, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
-        return form.answer(key, env, teacher, state, obs, action, Scalars())
-
-    answers, answered = jax.jit(jax.vmap(each))(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)
-    laws.hold(answers.shape == (ROWS, width), f"an answer has shape {answers.shape[1:]}: its form says ({width},)")
-    laws.hold(answered.shape == (ROWS,) and answered.dtype == bool, "`answered` is no bool: say whether it answered")
+    teacher: Any = SimpleNamespace(best_action=lambda state, obs: space.spread(8)[3])
+    answer = jax.vmap(lambda key, *situation: form.answer(key, env, teacher, *situation, Scalars()))
+    answers, answered = jax.jit(answer)(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)
+    shape = (ROWS, form.width(space))
+    laws.hold(answers.shape == shape, f"{ROWS} answers have shape {answers.shape}: their form says {shape}")
     labels = Label(obs, actions, answers, answered, base=actions if guide.sees_base else None)
     targets = jax.vmap(lambda label: guide.target(label, SCALARS))(labels)
     sound = targets.ndim == 2 and np.isfinite(targets).all()
@@ -89,8 +66,7 @@ def _fitted(laws: Laws, guide: Guide, env: Any, model: GuidanceModel, labels: La
     laws.hold(fits.fitted[0], "`fit` of valid labels returns an unfitted model: set `fitted`")
     laws.hold(not fits.fitted[1], "`fit` without a valid label returns a fitted model: `fitted` must be False there")
     one = jax.tree.map(lambda leaf: leaf[0], fits)
-    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(one.params))
-    laws.hold(finite, "`fit` returns parameters that are not finite")
+    laws.hold(all_finite(one), "`fit` returns parameters that are not finite")
     return one
 
 
@@ -98,12 +74,9 @@ def _check_act(
     laws: Laws, guide: Guide, env: Any, unfitted: GuidanceModel, fitted: GuidanceModel, obs: Array, actions: Array
 ) -> None:
     """Check the changes to a batch of actions."""
-    active, (act, traces) = jnp.arange(ROWS) % 2 == 0, counted_jit(guide.act)
+    active, act = jnp.arange(ROWS) % 2 == 0, jax.jit(guide.act)
     refined, passes = act(fitted, env, obs, actions, active, SCALARS)
-    act(fitted, env, obs, actions, active, change_floats(SCALARS))
     alone = act(unfitted, env, obs, actions, jnp.ones(ROWS, bool), SCALARS).actions
-    laws.hold(len(traces) == 1, "`act` is traced anew for other scalars: no Python branch may look at them")
-    laws.hold(refined.shape == actions.shape, f"`act` returns actions of shape {refined.shape}")
     laws.actions(actions_of(env), refined, "an action that `act` returns")
     counts = passes.shape == (ROWS,) and jnp.issubdtype(passes.dtype, jnp.integer)
     laws.hold(counts, "`act` returns passes that are no count for each row: how often was each moved?")

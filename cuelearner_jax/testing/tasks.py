@@ -22,21 +22,13 @@ from cuelearner_jax.types import ValuesDirections
 FILMED = 3  # steps
 
 
-def check_task(
-    task: Task, small: Any = None, steps: int = 64, pictures: Path | None = None, tolerance: float = 1e-5
-) -> None:
-    """Check that a task keeps its laws. Without a small world nothing is compiled.
+def check_task(task: Task, small: Any = None, steps: int = 64, pictures: Path | None = None) -> None:
+    """Check that a task keeps its laws. Raises AssertionError for the first law that is broken.
 
-    Raises AssertionError for the first law that is broken.
-
-    Args:
-        task: the task.
-        small: a configuration of it that compiles quickly: its environment is checked, its teacher asked.
-        steps: steps of that environment's roll-out.
-        pictures: an empty folder, for pictures of the small world (default: none are drawn).
-        tolerance: as for `check_environment`.
+    `small` is a configuration that compiles quickly: its environment is checked for some steps, its teacher asked.
+    Without one nothing is compiled. `pictures`: an empty folder for pictures of the small world (default: none).
     """
-    laws = Laws(f"task {task.name}", tolerance)
+    laws = Laws(f"task {task.name}")
     for name, preset in task.presets.items():
         check(preset.config)
         task.check_evaluations(preset.config)
@@ -58,7 +50,7 @@ def check_task(
     if small is not None:
         laws.hold(isinstance(small, task.config), f"`small` is a {type(small).__name__}: give a {task.config.__name__}")
         env = task.environment(small)
-        check_environment(env, steps, tolerance=tolerance)
+        check_environment(env, steps)
         _check_teacher(laws, task, small, env)
         if pictures is not None:
             _check_pictures(laws, task, small, pictures)

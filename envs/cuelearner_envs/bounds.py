@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Iterable
 from typing import Any
-
-import numpy as np
 
 from cuelearner_jax.errors import UserError, format_value, suggestion
 
 MOST_STEPS = 1_000_000  # of an episode: counters are of 32 bits
 MOST_SEED = 2**32 - 1  # of a key
-LARGEST = float(np.finfo(np.float32).max)
 
 
 def check_number(
@@ -25,13 +23,13 @@ def check_number(
     whole: bool = False,
     unit: str = "",
 ) -> None:
-    """Raise UserError unless a field holds a number that stays one in single precision, and lies within bounds.
+    """Raise UserError unless a field holds a finite number within bounds.
 
     `least` and `most` are allowed; a `positive` number is above 0. `unit` is for the message, in words.
     """
-    kind = (int, np.integer) if whole else (int, float, np.integer, np.floating)
-    in_bounds = isinstance(value, kind) and not isinstance(value, bool) and least <= value <= most
-    if in_bounds and abs(value) <= LARGEST and not (positive and np.float32(value) <= 0):
+    kind: Any = numbers.Integral if whole else numbers.Real
+    is_number = isinstance(value, kind) and not isinstance(value, bool)
+    if is_number and least <= value <= most and math.isfinite(value) and not (positive and value <= 0):
         return
     wanted = f"a {'whole' if whole else 'positive' if positive else 'finite'} number"
     wanted += f" from {_digits(least)}" if least > -math.inf else ""

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 
 
-def save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
+def save(figure: Figure, file: str | os.PathLike[str]) -> None:
     """Write a picture with no date: the same drawing, the same bytes."""
     with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
-        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
+        figure.savefig(file, metadata={"Date": None} if str(file).endswith(".svg") else None)
 
 
 def edged(width: float, colour: str) -> list[Any]:

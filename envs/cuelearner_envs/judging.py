@@ -34,8 +34,8 @@ def rollout(
     `begin` makes robots side by side, each in an episode: their `state` and `obs` lead with (robots,), and `step` takes
     actions and returns outcomes and whether the episodes ended, each (robots,).
 
-    Returns:
-        Outcomes of each episode (num_envs,), nan where it has not ended within `steps` shared by all, and "finished".
+    Returns outcomes of each episode (num_envs,), nan where it has not ended within `steps` shared by all, and
+    "finished".
     """
     k_reset, k_run = jax.random.split(key)
     course = begin(jax.random.split(k_reset, num_envs))

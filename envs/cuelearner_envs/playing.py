@@ -18,7 +18,7 @@ def record_steps(
     key: PRNGKeyArray,
     steps: int,
     see: Callable[[Any, Any, jax.Array, Step], Any],
-) -> Any:
+) -> list[Any]:
     """Return `see(env, state, action, step)` of each step in NumPy arrays; a new episode follows the end of one."""
 
     @jax.jit
@@ -35,4 +35,5 @@ def record_steps(
 
         return jax.lax.scan(advance, env.reset(k_reset), jnp.arange(steps))[1]
 
-    return jax.device_get(play(env, key))
+    rows = jax.device_get(play(env, key))
+    return [jax.tree.map(lambda leaf, number=number: leaf[number], rows) for number in range(steps)]

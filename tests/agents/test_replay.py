@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.agents.replay import StoredStep, count_guided, draw_sorts, ring_buffer
+from cuelearner_jax.agents.replay import RingBuffer, StoredStep, count_guided, draw_sorts
 
 EXAMPLE = StoredStep(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.zeros(3))
 
@@ -32,7 +32,7 @@ def filled(buffer, capacity, at_once, steps, bootstraps=True):
 
 
 def test_rows_lie_in_the_order_of_time_with_every_field():
-    buffer = ring_buffer(EXAMPLE)
+    buffer = RingBuffer(EXAMPLE)
     assert buffer.width == 11
     rows = np.asarray(filled(buffer, capacity=6, at_once=2, steps=4))
     assert rows.shape == (6, 11)
@@ -41,7 +41,7 @@ def test_rows_lie_in_the_order_of_time_with_every_field():
 
 
 def test_the_oldest_rows_are_written_over():
-    rows = filled(ring_buffer(EXAMPLE), capacity=6, at_once=2, steps=10)
+    rows = filled(RingBuffer(EXAMPLE), capacity=6, at_once=2, steps=10)
     np.testing.assert_array_equal(np.asarray(rows)[:, 0], [6, 7, 8, 9, 4, 5])
 
 
@@ -50,7 +50,7 @@ def drawn_from(buffer, rows, key, steps, count):
 
 
 def test_samples_are_whole_steps():
-    buffer = ring_buffer(EXAMPLE)
+    buffer = RingBuffer(EXAMPLE)
     drawn = drawn_from(buffer, filled(buffer, 6, 2, 6), 0, 6, 50)
     number = np.asarray(drawn.reward) - 0.5
     np.testing.assert_allclose(drawn.obs, number[:, None] + [0.0, 0.1, 0.2], rtol=1e-5)
@@ -64,7 +64,7 @@ def test_samples_are_whole_steps():
     ("steps", "numbers"), [(1, {0}), (4, {0, 1, 2, 3}), (8, set(range(8))), (14, set(range(6, 14)))]
 )
 def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
-    buffer = ring_buffer(EXAMPLE)
+    buffer = RingBuffer(EXAMPLE)
     drawn = drawn_from(buffer, filled(buffer, 8, 1, steps), 1, steps, 500)
     assert set((np.asarray(drawn.reward) - 0.5).tolist()) == numbers  # an empty row would be -0.5
 
@@ -72,7 +72,7 @@ def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
 @pytest.mark.parametrize("steps", [10, 16, 24])
 def test_what_follows_a_step_is_its_own_environments(steps):
     """Two environments in turn, 12 rows: row n's followers are n + 2, n + 4, ... up to the newest, across the seam."""
-    buffer = ring_buffer(EXAMPLE)
+    buffer = RingBuffer(EXAMPLE)
     rows = filled(buffer, 12, 2, steps)
     oldest = max(0, steps - 12)
     numbers = jnp.arange(oldest, steps)
@@ -84,7 +84,7 @@ def test_what_follows_a_step_is_its_own_environments(steps):
 
 
 def test_in_lanes_the_write_stays_one_slice_update():
-    buffer = ring_buffer(EXAMPLE)
+    buffer = RingBuffer(EXAMPLE)
     rows = jnp.stack([buffer.empty(6), buffer.empty(6)])
     lanes = jax.tree.map(lambda *leaves: jnp.stack(leaves), numbered(10, 2), numbered(20, 2))
     add = jax.vmap(buffer.add, (0, None, 0))

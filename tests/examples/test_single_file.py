@@ -13,7 +13,7 @@ from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.table import Table
 from cuelearner_envs.billiards.teacher import SearchTeacher
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.replay import Memory, StoredStep, ring_buffer
+from cuelearner_jax.agents.replay import Memory, RingBuffer, StoredStep
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.environment import spaces_of
@@ -103,7 +103,7 @@ def test_one_update_of_double_dqn(discount):
         (params, rest), kept = double_dqn.init(key), slice(None) if discount else slice(0)
         rest = rest.replace(target_params=double_dqn.init(jax.random.key(1))[0] if discount else None)
         steps = StoredStep(obs, action, reward, goes_on[:, None][:, kept], goes_on[:, None][:, kept], obs[::-1, kept])
-        buffer = ring_buffer(jax.tree.map(lambda leaf: leaf[0], steps))
+        buffer = RingBuffer(jax.tree.map(lambda leaf: leaf[0], steps))
         rows = buffer.add(buffer.empty(40), jnp.array(0), steps)
         memory = Memory(ENV, buffer, rows, jnp.array(40), 10, discount > 0)
         targets = double_dqn.targets(ENV, options, discount, params, rest.target_params, memory.batches(key, 8))

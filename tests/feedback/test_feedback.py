@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.agents.networks import as_function, residual_network
+from cuelearner_jax.agents.networks import MLP, as_function
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides.fitting import Example, fit_least_squares
@@ -74,7 +74,7 @@ def test_feedback_is_the_turn_that_comes_nearest(eps_deg):
 SIZES = Sizes(feedback_layers=(32, 32), fit_steps=600, fit_batch_size=32, validate_every=20)
 SCALARS = Scalars(feedback_learning_rate=5e-3)
 ROWS = 100
-NETWORK = residual_network(SIZES.feedback_layers, 2)
+NETWORK = MLP(SIZES.feedback_layers, 2)
 HELD_OUT = np.arange(ROWS) % 5 == 4
 
 

@@ -17,7 +17,8 @@ from cuelearner_jax.environment import Quantity, Spaces, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import human_answer
 from cuelearner_jax.guides import registry
-from cuelearner_jax.guides.fitting import examples, squared_errors
+from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.guides.fitting import squared_errors
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.spaces import UNSAID, Box, Choices, Cue
 from cuelearner_jax.types import Label
@@ -136,7 +137,7 @@ def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
     labels = Label(obs, action, answer, jnp.ones(2, bool))
     scalars = scalars_of(space)
     guide = Relative(SIZES, Spaces(2, space))
-    rows = jax.jit(lambda labels: examples(labels, guide.target, scalars, space))(labels)
+    rows = jax.jit(lambda labels: Guide.examples(guide, labels, scalars))(labels)
     eps = scalars.eps_deg
     np.testing.assert_allclose(rows.target, [[2 * eps, 0, 0], [0, -4 * eps, 0]], atol=1e-6)
     off = jnp.array([[0.2, 77.0, 0.0], [-5.0, 0.4, 3.0]])

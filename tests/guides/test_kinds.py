@@ -121,9 +121,10 @@ def test_answers_that_are_missing_are_no_corrections():
     assert not bool(fit(KEY, ENV, first(0, given), fresh, SCALARS).fitted)
 
 
-def test_a_correction_moves_the_policy_its_way_by_eps():
+def test_a_correction_moves_the_policy_its_way_by_eps(monkeypatch):
     bundle, _, act = compiled("dcoach")
-    fit = jax.jit(dataclasses.replace(bundle, options=dcoach.DeepCoachConfig(correction_replay=1)).fit)
+    monkeypatch.setattr(dcoach, "CORRECTION_REPLAY", 1)
+    fit = jax.jit(bundle.fit)
     model = bundle.init(KEY).replace(fitted=jnp.array(True))
     scalars = dataclasses.replace(SCALARS, feedback_learning_rate=1e-2)
     everywhere = jnp.ones(4, bool)

@@ -86,7 +86,7 @@ def test_of_one_cue_the_page_has_its_words_and_shows_what_answers_would_make_of_
 
 
 def test_what_a_page_cannot_ask_is_refused():
-    with pytest.raises(UserError, match="given by pointing, which the page supports only for directions"):
+    with pytest.raises(UserError, match="the page supports demonstration answers only for directions"):
         planned(guidance="demonstration")
     with pytest.raises(UserError, match="no cues to ask about"):
         controls.check(RELATIVE, Choices(3))

@@ -230,7 +230,7 @@ def test_labels_are_compared_with_the_teacher_in_the_situations_they_were_given_
     session.answer(5, 1 - np.abs(expert(session.item)))  # wrong
     rows = label_files.history(tmp_path / "labels" / JSONL)
     file = label_files.read(tmp_path / "labels")
-    found = comparing.with_teacher(page_task.TASK, file, rows, probes.SCALARS)
+    found = comparing.with_teacher(page_task.TASK, file, rows, probes.SCALARS, print)
     assert (found.count, found.value) == (6, pytest.approx(5 / 6))
 
 

@@ -1,4 +1,4 @@
-"""What figures show: points on their ticks, budgets at a step that all have, names in the order of the curves."""
+"""What figures show: points on their ticks, names in the order of the curves."""
 
 import matplotlib
 import numpy as np
@@ -28,15 +28,6 @@ def test_points_stand_on_their_ticks():
         assert len(drawn) == 2
         for labels in drawn:
             np.testing.assert_array_equal(labels, ticks)
-
-
-def test_budgets_are_compared_at_a_step_that_all_have():
-    rising = [variant("none", 0, 0.2), variant("relative", 100, 0.3), variant("relative", 500, 0.3)]
-    rising[1].curve.estimate[-1] = 0.9  # after the step at which the other was stopped
-    stopped = variant("heuristic", 0, 0.25, steps=9)
-    left = draw_label_efficiency([*rising, stopped], "title", "reward").axes[0]
-    assert left.get_title("left") == "at step 80,000, reached by all"
-    np.testing.assert_allclose(left.containers[0][0].get_ydata(), [0.3, 0.3])
 
 
 def test_curves_are_named_in_the_order_of_their_ends_whatever_their_names_hold():

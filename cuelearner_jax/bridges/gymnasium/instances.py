@@ -274,7 +274,7 @@ class Instances:
         """`make` returns an environment; `size`: entries of an observation by the task."""
         self.make, self.whose, self.max_steps, self.size = make, whose, max_steps, size
         self.running: list[Running] = []
-        self.cameras: dict[bool, Running] = {}  # the instances that are filmed: for stills (True), and for films
+        self.camera: Running | None = None  # the instance that is filmed
         self.calls = self.replays = 0  # number of calls, and of replayed steps
 
     def carry_out(self, requests: Sequence[Request]) -> list[Went | str | None]:
@@ -350,9 +350,8 @@ class Instances:
 
         There are fewer pictures where the episode ends before its actions do.
         """
-        still = first == len(actions)
         try:
-            one = self.cameras[still] = self.cameras.get(still) or self._new()
+            one = self.camera = self.camera or self._new()
             goes_on = one.seed == seed and one.steps <= first and len(one.filmed) == one.steps
             if not goes_on or not np.array_equal(one.filmed, actions[: one.steps]):
                 one.reset(seed)
@@ -366,12 +365,13 @@ class Instances:
             one.filmed = actions[: one.steps]
             return frames
         except UserError as error:
-            if still in self.cameras:
-                self.cameras.pop(still).close()
+            if self.camera is not None:
+                self.camera.close()
+            self.camera = None
             return str(error)
 
     def close(self) -> None:
         """Close all instances."""
-        for one in (*self.running, *self.cameras.values()):
+        for one in (*self.running, *filter(None, [self.camera])):
             one.close()
-        self.running, self.cameras = [], {}
+        self.running, self.camera = [], None

@@ -15,8 +15,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from ctypes.util import find_library
 from multiprocessing.connection import Connection
@@ -30,8 +28,6 @@ from cuelearner_jax.bridges.gymnasium.source import Source
 from cuelearner_jax.errors import UserError, user_code_error
 
 PACKAGES = Path(__file__).parents[3]  # folder that this package is imported from
-MOST_POOLS = 8  # most pools open at once
-CHECK_PERIOD = 1.0  # time between two checks of the parent [s]
 
 
 class Process:
@@ -50,13 +46,7 @@ class Process:
                 "function or class of a module, or processes 1"
             ) from error
         ours, theirs = socket.socketpair()
-        command = [
-            sys.executable,
-            "-m",
-            "cuelearner_jax.bridges.gymnasium.pool",
-            str(theirs.fileno()),
-            str(os.getpid()),
-        ]
+        command = [sys.executable, "-m", "cuelearner_jax.bridges.gymnasium.pool", str(theirs.fileno())]
         paths = os.pathsep.join([str(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])
         environ = {**os.environ, "PYTHONPATH": paths, **(drawing_variables() if source.draws else {})}
         # An environment's prints must not mix with our output.
@@ -176,33 +166,24 @@ def drawing_variables() -> dict[str, str]:
     return {"MUJOCO_GL": "osmesa" if find_library("OSMesa") else "egl"}
 
 
-_pools: OrderedDict[Source, Pool] = OrderedDict()
-_opening = threading.Lock()
+_pools: dict[Source, Pool] = {}
 
 
 def pool_of(source: Source) -> Pool:
-    """Return the pool of a source, opened when it is first asked for. Pools that were not used for long are closed."""
-    with _opening:
-        if source not in _pools:
-            _pools[source] = Pool(source)
-        _pools.move_to_end(source)
-        while len(_pools) > MOST_POOLS:
-            _pools.popitem(last=False)[1].close()
-        return _pools[source]
+    """Return the pool of a source; its processes start when they are needed."""
+    return _pools.setdefault(source, Pool(source))
 
 
 @atexit.register
 def close_all() -> None:
     """Close all pools; one that is used again opens again."""
-    with _opening:
-        while _pools:
-            _pools.popitem()[1].close()
+    while _pools:
+        _pools.popitem()[1].close()
 
 
-def main(descriptor: int, parent: int) -> None:
+def main(descriptor: int) -> None:
     """Serve instances until the pool closes its end, or its process is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles an interrupt, and then ends this process
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     link, instances, fault = Connection(descriptor), None, ""
     with contextlib.suppress(EOFError, OSError):
         sys.path[:] = link.recv()
@@ -219,12 +200,5 @@ def main(descriptor: int, parent: int) -> None:
         instances.close()
 
 
-def _end_with(parent: int) -> None:
-    """End this process once its parent is gone, even in the middle of a step."""
-    while os.getppid() == parent:
-        time.sleep(CHECK_PERIOD)
-    os._exit(1)
-
-
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    main(int(sys.argv[1]))

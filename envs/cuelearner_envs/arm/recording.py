@@ -36,10 +36,8 @@ def scene_of(env: Arm, state: Situation, action: Any = None) -> Scene:
 
 def record(env: Arm, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Picture], list[float]]:
     """Return a picture and the reward of each of so many steps; a new episode follows the end of one."""
-
-    states, rewards = record_steps(env, policy, key, steps, lambda env, state, action, step: (state, step.reward))
-    each = (jax.tree.map(lambda leaf, number=number: leaf[number], states) for number in range(steps))
-    return [draw(scene_of(env, state)) for state in each], [float(reward) for reward in rewards]
+    rows = record_steps(env, policy, key, steps, lambda env, state, action, step: (state, step.reward))
+    return [draw(scene_of(env, state)) for state, _ in rows], [float(reward) for _, reward in rows]
 
 
 def question(env: Arm, state: Situation, obs: Float[Array, " obs"], action: Float[Array, "4"], file: Path) -> None:

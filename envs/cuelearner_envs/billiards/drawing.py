@@ -35,14 +35,14 @@ HOLD_BEFORE, HOLD_AFTER = 0.8, 0.5  # of an animated shot, at rest [s]
 _positions_at = jax.jit(positions_at)
 
 
-def still(table: Table, path: Trajectory, file: str | os.PathLike[str], dpi: int = 160) -> None:
+def still(table: Table, path: Trajectory, file: str | os.PathLike[str]) -> None:
     """Write a picture of one shot: pale balls where it began, the way of each, solid balls where they came to rest."""
-    figure, axes = _figure(table, dpi)
+    figure, axes = _figure(table)
     _draw_tracks(axes, table, path)
     _balls(axes, table, path.positions[-1], path.pocketed[-1])
     _balls(axes, table, path.positions[0], path.pocketed[0], ghosts=True)
     _arrow(axes, table, path.positions[0], path.velocities[0, 0])
-    canvas.save(figure, file, dpi)
+    canvas.save(figure, file)
 
 
 def question(
@@ -51,26 +51,20 @@ def question(
     pocketed: Bool[ArrayLike, "balls"],
     action: Float[ArrayLike, "2"],
     file: str | os.PathLike[str],
-    dpi: int = 160,
 ) -> None:
     """Write a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it."""
-    figure, axes = _figure(table, dpi)
+    figure, axes = _figure(table)
     _balls(axes, table, positions, pocketed)
     _arrow(axes, table, positions, action)
-    canvas.save(figure, file, dpi)
+    canvas.save(figure, file)
 
 
-def animate(
-    table: Table, shots: Sequence[Trajectory], file: str | os.PathLike[str], fps: float = 30.0, speed: float = 1.0
-) -> None:
-    """Write an animation (.gif or .mp4) of shots; before each, an arrow shows its direction.
-
-    `speed`: seconds of the game in a second of the film.
-    """
+def animate(table: Table, shots: Sequence[Trajectory], file: str | os.PathLike[str], fps: float = 30.0) -> None:
+    """Write an animation (.gif or .mp4) of shots; before each, an arrow shows its direction."""
     pictures.check_film(file, fps)
     # The first picture shows every ball and the arrow.
-    palette = pictures.palette_of(next(_frames(table, shots, fps, speed)), 255)
-    pictures.write_film(file, fps, lambda rate: _frames(table, shots, rate, speed), palette)
+    palette = pictures.palette_of(next(_frames(table, shots, fps)), 255)
+    pictures.write_film(file, fps, lambda rate: _frames(table, shots, rate), palette)
 
 
 def limits(table: Table) -> tuple[float, float, float, float]:
@@ -80,7 +74,7 @@ def limits(table: Table) -> tuple[float, float, float, float]:
     return -x, x, -y - 3.4 * float(table.ball_radius), y
 
 
-def _figure(table: Table, dpi: float) -> tuple[Figure, Axes]:
+def _figure(table: Table, dpi: float = 160) -> tuple[Figure, Axes]:
     """A figure that is all axes, its sides even numbers of dots, with everything that does not move."""
     left, right, bottom, top = limits(table)
     dots = 2 * round(WIDTH_INCHES * dpi / 2)
@@ -145,18 +139,16 @@ def _draw_tracks(axes: Axes, table: Table, path: Trajectory) -> None:
             axes.plot(*points.T, color=ball_colour(ball), linewidth=1.4, zorder=4, path_effects=edge)
 
 
-def _frames(
-    table: Table, shots: Sequence[Trajectory], fps: float, speed: float
-) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def _frames(table: Table, shots: Sequence[Trajectory], fps: float) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Pictures of the shots at a fixed rate. The table is drawn once; each frame draws only what moves over it."""
     figure, axes = _figure(table, dpi=100)
     corner = limits(table)[1] - 0.012, _tray(table)[0, 1]
     over = canvas.Backdrop(figure)
     held, after = round(HOLD_BEFORE * fps), round(HOLD_AFTER * fps)
     for number, path in enumerate(shots, start=1):
-        frames = held + math.ceil(float(path.times[-1]) / speed * fps) + 1 + after
+        frames = held + math.ceil(float(path.times[-1]) * fps) + 1 + after
         padded = np.arange(128 * math.ceil(frames / 128))  # few different lengths: few compilations
-        times = jnp.asarray(np.maximum(padded - held, 0) * speed / fps, path.times.dtype)
+        times = jnp.asarray(np.maximum(padded - held, 0) / fps, path.times.dtype)
         positions, pocketed = map(np.asarray, _positions_at(table, path, times))
         for frame in range(frames):
             artists = _balls(axes, table, positions[frame], pocketed[frame])

@@ -24,6 +24,7 @@ from cuelearner_envs.billiards.contacts import (
 )
 from cuelearner_envs.billiards.table import Scalar, Table, as_arrays, parking_place
 
+BLOCK = 4096  # shots that `simulate_many` simulates at once
 BEND = 1e-5  # largest departure of a flight between two kicks from the true parabola [m]
 
 
@@ -267,13 +268,12 @@ def simulate_many(
     positions: Float[Array | np.ndarray, "shots balls 2"],
     pocketed: Bool[Array | np.ndarray, "shots balls"],
     angles: Float[Array | np.ndarray, "shots"],
-    block: int = 4096,
 ) -> Shot:
     """`vmap(simulate)` in blocks: working memory stays in cache, and a long shot holds up only its block.
 
     Every field of the result leads with (shots,).
     """
-    shots, block = len(angles), min(block, len(angles))
+    shots, block = len(angles), min(BLOCK, len(angles))
     rows = np.minimum(np.arange(-(-shots // block) * block), shots - 1)  # the last block is filled up
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], (positions, pocketed, angles))
     result = jax.lax.map(lambda one: simulate(table, *one), scene, batch_size=block)

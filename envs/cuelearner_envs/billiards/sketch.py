@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any
 
 import jax
@@ -23,8 +22,7 @@ CLOTH, CUSHION, RAIL, HOLE, CUE = "#2f7f5f", "#1d5741", "#6d4a32", "#15110e", "#
 TARGETS = ("#f2b01e", "#2b62c4", "#d1382c", "#6b3fa0", "#ef7d22", "#0f9d8a", "#8c1d40", "#3a3a3a")
 FRAMES = 90  # of a film
 LONGEST = 3.0  # a film [s]: longer shots are shown faster
-TRAIL = 181  # moments of a trail
-BEND = 0.03  # sine of the least angle of a trail's bend
+TRAIL = 91  # moments of a trail
 TRAIL_SECONDS = 3.0  # so much of a shot a trail tells at most [s]
 LEAST_MOVE = 1e-4  # what a ball moves by that was hit, at least [m]
 
@@ -61,9 +59,8 @@ def solids(table: Table) -> Iterator[tuple[np.ndarray, np.ndarray, float, str]]:
 def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tuple[list[Trajectory], list[float]]:
     """Return paths and rewards of `shots` shots of a policy; a new rack follows the end of an episode."""
     see = lambda env, state, action, step: (env.path(state, action), step.reward)  # noqa: E731
-    paths, rewards = record_steps(env, policy, key, shots, see)
-    each = (jax.tree.map(lambda leaf, shot=shot: leaf[shot], paths) for shot in range(shots))
-    return list(each), [float(reward) for reward in rewards]
+    rows = record_steps(env, policy, key, shots, see)
+    return [path for path, _ in rows], [float(reward) for _, reward in rows]
 
 
 def sketch(env: Billiards, state: Balls) -> Sketch:
@@ -145,7 +142,7 @@ def _trail(radius: float, positions: np.ndarray, pocketed: np.ndarray) -> str:
 def _way(radius: float, number: int, places: np.ndarray, gone: np.ndarray) -> str:
     """Return one ball's path, which ends where the ball falls."""
     places = places[: max(int(gone.argmax()), 1)] if gone.any() else places
-    rows = _corners(np.asarray(places, float) * [1.0, -1.0])
+    rows = np.asarray(places, float) * [1.0, -1.0]
     dashes = f";stroke-dasharray:{svg.number(0.7 * radius)} {svg.number(0.5 * radius)}" if number else ""
     line = svg.element("polyline", points=svg.points(rows), style=_stroke(0.2 * radius) + dashes)
     x, y = rows[-1]
@@ -160,17 +157,6 @@ def _way(radius: float, number: int, places: np.ndarray, gone: np.ndarray) -> st
 def _stroke(width: float, fill: str = "fill:none;") -> str:
     """Return the SVG stroke of a line [m]; a page may draw a wider one underneath to set it off."""
     return f"{fill}stroke-width:calc({width:.5f}px*var(--wider,1));stroke-linejoin:round"
-
-
-def _corners(rows: np.ndarray) -> np.ndarray:
-    """The places of a way (n, 2) at which it bends, its first and its last."""
-    corners = [rows[0]]
-    for place, following in pairwise(rows[1:]):
-        way, onward = place - corners[-1], following - place
-        bent = abs(way[0] * onward[1] - way[1] * onward[0]) > BEND * np.hypot(*way) * np.hypot(*onward)
-        if np.hypot(*way) > LEAST_MOVE and (bent or way @ onward < 0):
-            corners.append(place)
-    return np.array([*corners, rows[-1]])
 
 
 def _ball(number: int, radius: float) -> str:

@@ -117,10 +117,8 @@ def look_ahead(
     Lengths are metres in the body's frame. `points` are what beams hit, `ways` unit vectors all round in order, so that
     neighbours lie side by side; `free` is how far a disc of the radius can walk along each.
 
-    Returns:
-        the straight distance that is left after both legs; the detour, both legs and what is left less the straight
-        distance from here; the length of the first leg. Without room for a first leg: the straight distance from here,
-        infinity, 0.
+    Returns the straight distance that is left after both legs; the detour, both legs and what is left less the straight
+    distance from here; the length of the first leg. Without room for a first leg: the distance from here, infinity, 0.
     """
     legs = _stations(ways, free, goal)
     second_legs = lambda leg: _second_legs(points, ways, leg, goal, radius)  # noqa: E731

@@ -49,11 +49,11 @@ HOLD_AFTER = 1.2  # at the end of an animated episode [s]
 Picture = UInt8[np.ndarray, "height width 3"]
 
 
-def still(robot: Robot, frames: Sequence[RecordedStep], file: str | os.PathLike[str], dpi: int = 160) -> None:
+def still(robot: Robot, frames: Sequence[RecordedStep], file: str | os.PathLike[str]) -> None:
     """Write a picture of the first episode: its way, and halfway what the lidar saw and what was chosen."""
     episode = [frame for frame in frames if frame.episode == frames[0].episode]
     middle, last, way = episode[len(episode) // 2], episode[-1], _way(episode)
-    figure, axes, strip = _figure(episode[0], np.asarray(episode[0].world.extent), dpi, COURSE)
+    figure, axes, strip = _figure(episode[0], np.asarray(episode[0].world.extent), 160, COURSE)
     _lidar(axes, middle)
     axes.plot(*way[:, :2].T, color=BODY, linewidth=1.8, zorder=4)
     ghosts = [middle.pose, way[-1]]
@@ -67,17 +67,17 @@ def still(robot: Robot, frames: Sequence[RecordedStep], file: str | os.PathLike[
     words = WORDS.get(last.outcome, "still walking after")
     length = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=-1).sum()
     _caption(strip, f"{words} {last.seconds:.1f} s, {length:.1f} m", OUTCOMES.get(last.outcome, INK))
-    canvas.save(figure, file, dpi)
+    canvas.save(figure, file)
 
 
-def question(robot: Robot, frame: RecordedStep, file: str | os.PathLike[str], dpi: int = 160) -> None:
+def question(robot: Robot, frame: RecordedStep, file: str | os.PathLike[str]) -> None:
     """Write a picture of one situation and of the direction in question as an arrow, for somebody to judge it."""
-    figure, axes, strip = _figure(frame, np.asarray(frame.world.extent), dpi, ("goal", "lidar", QUESTION))
+    figure, axes, strip = _figure(frame, np.asarray(frame.world.extent), 160, ("goal", "lidar", QUESTION))
     _lidar(axes, frame)
     _body(axes, robot, frame.pose)
     _arrow(axes, frame)
     _caption(strip, f"{np.linalg.norm(frame.goal - frame.pose[:2]):.1f} m from the goal")
-    canvas.save(figure, file, dpi)
+    canvas.save(figure, file)
 
 
 def animate(robot: Robot, frames: Sequence[RecordedStep], file: str | os.PathLike[str], fps: float = 10.0) -> None:

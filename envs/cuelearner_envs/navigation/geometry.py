@@ -5,12 +5,20 @@ And how far a disc walks among points, of whose solids nothing is known.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.navigation.world import NavigationWorld
 from cuelearner_jax.devices import goes_through
+
+
+def fixed_point(function: Callable[[Array], Array], start: Array) -> Array:
+    """Return what a function makes of an array when it is applied until nothing changes."""
+    more = lambda carry: (carry[1], function(carry[1]))  # noqa: E731
+    return jax.lax.while_loop(lambda carry: (carry[0] != carry[1]).any(), more, (start, function(start)))[1]
 
 
 def in_frame(boxes: Float[Array, "boxes 5"], point: Float[Array, "2"]) -> Float[Array, "boxes 2"]:

@@ -53,11 +53,9 @@ def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tu
         ends = jnp.stack([step.outcome.get(name, jnp.zeros(())) for name in ENDS])  # only legged robots fall
         return {**_view(env, state, env.move(state, action)), "action": action}, ends, step.reward
 
-    views, ends, rewards = record_steps(env, policy, key, steps, see)
-    finished = np.cumsum(ends.any(-1)) - ends.any(-1)  # episodes before each step
-    frames = []
-    for number in range(steps):
-        outcome = "".join(name for name, ended in zip(ENDS, ends[number], strict=True) if ended)
-        one = jax.tree.map(lambda leaf, number=number: leaf[number], views)
-        frames.append(RecordedStep(**one, outcome=outcome, episode=int(finished[number])))
-    return frames, [float(reward) for reward in rewards]
+    frames, episode, rows = [], 0, record_steps(env, policy, key, steps, see)
+    for view, ends, _ in rows:
+        outcome = "".join(name for name, ended in zip(ENDS, ends, strict=True) if ended)
+        frames.append(RecordedStep(**view, outcome=outcome, episode=episode))
+        episode += bool(outcome)
+    return frames, [float(reward) for *_, reward in rows]

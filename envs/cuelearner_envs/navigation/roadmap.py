@@ -16,7 +16,7 @@ from flax import struct
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from cuelearner_envs.navigation.environment import AnyWalker, Navigation
-from cuelearner_envs.navigation.geometry import clearance, line_clearance
+from cuelearner_envs.navigation.geometry import clearance, fixed_point, line_clearance
 from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import NavigationWorld, closed, heading
 from cuelearner_jax.spaces.directions import from_angle, retract, rotate
@@ -59,13 +59,7 @@ def distances(
     useful = jnp.isfinite(roadmap.lengths).any(-1)
     start = jnp.where(useful & (_view(roadmap, world, robot, goal) >= 0), direct, jnp.inf)
 
-    def relax(length: jax.Array) -> jax.Array:
-        return jnp.minimum(length, (roadmap.lengths + length[None]).min(-1))
-
-    def more(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        return carry[1], relax(carry[1])
-
-    return jax.lax.while_loop(lambda carry: (carry[0] != carry[1]).any(), more, (start, relax(start)))[1]
+    return fixed_point(lambda length: jnp.minimum(length, (roadmap.lengths + length[None]).min(-1)), start)
 
 
 def way(

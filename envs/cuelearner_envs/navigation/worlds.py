@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_envs.navigation.geometry import clearance
+from cuelearner_envs.navigation.geometry import clearance, fixed_point
 from cuelearner_envs.navigation.layouts import STYLES, Layout
 from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import NavigationWorld
@@ -26,12 +26,12 @@ ROUTES = 16
 WORLDS_AT_ONCE = 64  # worlds generated together on an accelerator, which bounds the memory of their grids
 
 
-def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) -> NavigationWorld:
+def generate(key: PRNGKeyArray, style: str = "clutter") -> NavigationWorld:
     """Return a random world of a style (see `layouts`), whose every start reaches its goal, 5 to 15 m away."""
 
     def attempt(key: PRNGKeyArray) -> tuple[NavigationWorld, Bool[Array, ""]]:
         k_layout, k_routes = jax.random.split(key)
-        return _with_routes(k_routes, STYLES[style](k_layout), routes)
+        return _with_routes(k_routes, STYLES[style](k_layout))
 
     def again(key: PRNGKeyArray) -> tuple[PRNGKeyArray, NavigationWorld, Bool[Array, ""]]:
         key, next_key = jax.random.split(key)
@@ -41,11 +41,11 @@ def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) ->
     return world
 
 
-@partial(jax.jit, static_argnames=("count", "style", "routes"))
-def generate_many(key: PRNGKeyArray, count: int, style: str = "clutter", routes: int = ROUTES) -> NavigationWorld:
+@partial(jax.jit, static_argnames=("count", "style"))
+def generate_many(key: PRNGKeyArray, count: int, style: str = "clutter") -> NavigationWorld:
     """`count` worlds (leading axis). World i does not depend on how many there are."""
     keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(count))
-    return jax.lax.map(partial(generate, style=style, routes=routes), keys, batch_size=together())
+    return jax.lax.map(partial(generate, style=style), keys, batch_size=together())
 
 
 def together() -> int | None:
@@ -74,11 +74,7 @@ def flood(passable: Bool[Array, "cells cells"], seed: Bool[Array, "cells cells"]
         sides = padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
         return (reached | sides) & passable
 
-    def more(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        return carry[1], spread(spread(carry[1]))
-
-    start = seed & passable
-    return jax.lax.while_loop(lambda carry: (carry[0] != carry[1]).any(), more, (start, spread(start)))[1]
+    return fixed_point(lambda reached: spread(spread(reached)), seed & passable)
 
 
 def any_of(key: PRNGKeyArray, usable: Bool[Array, " all"]) -> Int[Array, ""]:
@@ -91,9 +87,9 @@ def any_of(key: PRNGKeyArray, usable: Bool[Array, " all"]) -> Int[Array, ""]:
     return jnp.argmax(jnp.where(usable, draws, -1.0))
 
 
-def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[NavigationWorld, Bool[Array, ""]]:
+def _with_routes(key: PRNGKeyArray, layout: Layout) -> tuple[NavigationWorld, Bool[Array, ""]]:
     """The world of a layout, and whether all its routes are as they should be."""
-    nowhere = jnp.zeros((routes, 2))
+    nowhere = jnp.zeros((ROUTES, 2))
     world = NavigationWorld(*layout, starts=nowhere, goals=nowhere)
     distance = free_space(world)
     passable = distance >= Robot().reach + CELL / 2
@@ -105,7 +101,7 @@ def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[Naviga
     usable = (roomy & reached).ravel()
     # A world whose seed cell is cut off from the rest is rejected.
     connected = (passable & reached).sum() >= 0.8 * passable.sum()
-    starts, goals, exists = jax.vmap(partial(_route, usable))(jax.random.split(k_routes, routes))
+    starts, goals, exists = jax.vmap(partial(_route, usable))(jax.random.split(k_routes, ROUTES))
     return world.replace(starts=starts, goals=goals), connected & exists.all()
 
 

@@ -1,11 +1,10 @@
 """A zoo: small robots drawn by chance, in changed worlds, on which methods that correct policies are judged.
 
 `robots` draws a group; `change` the world of an error; `rollout` plays an episode; `answer` is the teacher's. All are
-pure JAX. `robots` and `measure` take many robots, the others one world, to be mapped by `jax.vmap`.
+pure JAX. `robots` takes many robots, the others one world, to be mapped by `jax.vmap`.
 """
 
 from cuelearner_envs.zoo.distil import robots
-from cuelearner_envs.zoo.measure import Scores, measure
 from cuelearner_envs.zoo.robots import TASKS, ZooRobot, policy
 from cuelearner_envs.zoo.worlds import (
     ERRORS,
@@ -19,28 +18,10 @@ from cuelearner_envs.zoo.worlds import (
     right,
     rollout,
     step,
-    success,
     unchanged,
-)
+)  # fmt: skip
 
 __all__ = [
-    "ERRORS",
-    "STEPS",
-    "TASKS",
-    "Scores",
-    "State",
-    "ZooRobot",
-    "ZooWorld",
-    "answer",
-    "change",
-    "measure",
-    "observe",
-    "policy",
-    "reset",
-    "right",
-    "robots",
-    "rollout",
-    "step",
-    "success",
-    "unchanged",
+    "ERRORS", "STEPS", "TASKS", "State", "ZooRobot", "ZooWorld", "answer", "change", "observe", "policy", "reset",
+    "right", "robots", "rollout", "step", "unchanged",
 ]  # fmt: skip

@@ -28,12 +28,7 @@ def robots(
     The policies of odd robots are networks, unless a network succeeds in fewer than `ENOUGH` of the episodes. A robot
     is the same, to rounding, in whatever piece of its group it is drawn. Jit with `cues`, `count`, `split` static.
 
-    Args:
-        key: of all groups and splits.
-        cues: of every robot of the group; 1: directions.
-        count: number of robots.
-        split: "tuning" for settings, "held_out" for reports.
-        first: number of the first robot; it must be even.
+    `cues` 1: directions. `split`: "tuning" for settings, "held_out" for reports. `first` must be even.
     """
     key = jax.random.fold_in(jax.random.fold_in(key, SPLITS[split]), cues)
     keys = jax.vmap(lambda number: jax.random.fold_in(key, number))(first + jnp.arange(count))

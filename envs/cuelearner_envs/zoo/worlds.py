@@ -242,12 +242,8 @@ def answer(
 ) -> Float[Array, " cues"]:
     """Return a relative answer about an action: h in {-1, 0, 1} for each cue, `UNSAID` where nothing is said.
 
-    Args:
-        key: of the teacher's faults.
-        world, state, action: the situation, and the action in question.
-        eps: strength of an answer, in shares of the range or rad: differences below eps / 2 are answered by 0.
-        wrong: share of answers with the wrong sign.
-        one_cue: whether one cue alone is answered, the one that differs most.
+    `eps` is the strength of an answer, in shares of the range or rad: differences below eps / 2 are answered by 0.
+    `wrong` is the share of answers with the wrong sign. With `one_cue` the cue that differs most is answered alone.
     """
     change = world.robot.log(action, right(world, state))
     h = jnp.where(jnp.abs(change) > eps / 2, jnp.sign(change), 0.0)

@@ -14,7 +14,7 @@ from cuelearner_envs.navigation.lidar import Lidar
 
 AHEAD = 135  # number of the middle beam; neighbours are a degree apart
 
-generate_one = jax.jit(generate, static_argnames=("style", "routes"))
+generate_one = jax.jit(generate, static_argnames="style")
 scan_one = jax.jit(scan)
 scan_many = jax.jit(jax.vmap(scan, (None, 0)))
 read = jax.jit(Lidar.read)

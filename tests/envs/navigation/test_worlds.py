@@ -26,7 +26,7 @@ NEEDED = math.hypot(REACH, GRID / 2)
 
 # Runs 300 times: optimising it costs less than it saves.
 OPTIMISED = {"xla_backend_optimization_level": 1}
-generate_one = jax.jit(generate, static_argnames=("style", "routes"), compiler_options=OPTIMISED)
+generate_one = jax.jit(generate, static_argnames="style", compiler_options=OPTIMISED)
 
 
 @pytest.fixture(scope="module", params=long_but(["rooms"], STYLES))
