@@ -1,7 +1,4 @@
-"""A policy whose pictures and state disagree: labels about its proposals find the shift of the state.
-
-The policy walks a point half of the way to a goal, 5 cm a step at most. The goal is not recorded, as in pictures.
-"""
+"""A policy that walks to an unrecorded goal seen aside: labels about its proposals find the shift of the state."""
 
 from functools import partial
 
@@ -26,7 +23,6 @@ def policy(place, goal):
 
 
 def situations(seed, count, aside):
-    """Return places on the way to goals seen aside, and the goals."""
     random = np.random.default_rng(seed)
     place, goal = random.uniform(0, 1, (count, 2)), random.uniform(0.1, 0.9, (count, 2))
     for _ in range(25):
@@ -44,8 +40,7 @@ def read(aside, seed, family):
     reading = Reading(Heuristic(ENV.view()), family, ENV.actions, 1 / 36, LABELS, ENV.observation)
     for key in jax.random.split(jax.random.key(seed), 5):
         at, asked = reading.questions(rows, LABELS // 5, key)
-        share = (right[at] - asked) / (2 * MOST)
-        reading.learn(rows[at], asked, np.where(np.abs(share) < 1 / 72, 0.0, np.sign(share)))
+        reading.learn(rows[at], asked, np.sign(np.trunc((right[at] - asked) / (2 * MOST) * 72)))
     return reading
 
 
@@ -54,10 +49,7 @@ def play(corrected):
     (place, goal), (reached, other) = situations(10, 300, SEEN), situations(11, 300, 0.0)
     apply, none = jax.jit(partial(corrected.act, jax.random.key(0), None)), np.zeros((300, 5))
     shift = np.append(corrected.correction.change.theta, [0.0, 0.0])[:2]  # none by actions alone
-
-    def act(place, goal):  # as a corrected checkpoint does
-        return np.asarray(apply(np.concatenate([place, none, policy(place - shift, goal + SEEN)], 1)))
-
+    act = lambda place, goal: np.asarray(apply(np.concatenate([place, none, policy(place - shift, goal + SEEN)], 1)))  # noqa: E731
     error = np.abs(act(place, goal) - policy(place, goal)).mean() / (2 * MOST)
     for _ in range(50):
         reached = reached + act(reached, other)
