@@ -143,7 +143,7 @@ def test_time_runs_out_after_the_last_step_and_is_told_from_termination():
 
 def test_the_last_observation_is_of_where_the_step_led_and_the_next_of_a_new_start():
     before = walker((1.0, -1.0, 0.4), (1.5, -1.0), steps=8, previous=[[0.0, 1.0]] * 3)
-    after = moved(HALL, before, AHEAD)
+    after = move(HALL, before, AHEAD)
     state, result = step(HALL, before, AHEAD)
     assert bool(result.terminated)
     np.testing.assert_allclose(result.aftermath, after.pose, atol=1e-6)

@@ -85,7 +85,7 @@ def test_an_end_is_followed_by_a_new_episode_of_any_world_and_nothing_else_is(pl
     assert_begun(env, jax.tree.map(lambda leaf: leaf[ended], following))
     assert len(set(np.asarray(following.world)[ended].tolist())) == 3
     went_on = jax.tree.map(lambda leaf: leaf[~ended], following)
-    expected = jax.tree.map(lambda leaf: leaf[~ended], jax.vmap(jax.vmap(env.moved))(states, action))
+    expected = jax.tree.map(lambda leaf: leaf[~ended], jax.vmap(jax.vmap(env.move))(states, action))
     chex.assert_trees_all_close(went_on, expected, atol=1e-5)
     np.testing.assert_array_equal(np.asarray(following.steps), np.where(ended, 0, states.steps + 1))
 
