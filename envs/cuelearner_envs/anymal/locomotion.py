@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from brax import envs
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.physics import AnymalGround, AnymalState, Felt, control, standing
@@ -157,7 +157,9 @@ class Locomotion(envs.Env):
         body, felt = control(push_randomly(k_push, before.body, self.trial), action, before.ground)
         # A body whose numbers diverged counts as fallen; NaN must not reach the network.
         body = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(body.qvel).all(), new, old), body, before.body)
-        in_air, landed = _steps(before.in_air, felt.foot_heights < TOUCHING)
+        touching = felt.foot_heights < TOUCHING
+        landed = jnp.where(touching, before.in_air, 0.0)  # for how long feet that have just landed were in the air [s]
+        in_air = jnp.where(touching, 0.0, before.in_air + robot.CONTROL_PERIOD)
         terms = reward(before, body, felt, action, landed)
         total = jnp.maximum(sum(terms.values()), 0.0) * robot.CONTROL_PERIOD
         total = jnp.where(jnp.isfinite(total), total, 0.0)
@@ -173,9 +175,3 @@ class Locomotion(envs.Env):
             metrics={**state.metrics, "error": error},
             info={**state.info, "rng": k_next},
         )
-
-
-def _steps(in_air: Float[Array, "4"], touching: Bool[Array, "4"]) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Return each foot's time in the air [s], and the time of feet that have just landed (0: others)."""
-    landed = jnp.where(touching, in_air, 0.0)
-    return jnp.where(touching, 0.0, in_air + robot.CONTROL_PERIOD), landed

@@ -100,11 +100,8 @@ class Arm(WholeObservations, struct.PyTreeNode):
     def command(self, state: Situation, action: Float[Array, "4"]) -> physics.Command:
         """Return the targets of the drives that an action means."""
         fingers = state.body.qpos[physics.FINGERS] if self.has_object else jnp.zeros(2)
-        return physics.command(self.gripper(state), fingers, action, self._post, self.grasps)
-
-    @property
-    def _post(self) -> Scalar:
-        return self.ground.post if self.has_object else 0.0
+        post = self.ground.post if self.has_object else 0.0
+        return physics.command(self.gripper(state), fingers, action, post, self.grasps)
 
     def after(self, state: Situation, body: ArmState) -> Situation:
         """Return the state that physics has led to; what blew up stays where it was."""

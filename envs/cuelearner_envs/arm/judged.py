@@ -59,14 +59,8 @@ class MujocoArm:
         return ArmState(*(jnp.asarray(np.stack(column), jnp.float32) for column in zip(*rows, strict=True)))
 
 
-@jax.jit
-def _begin(env: Arm, keys: Key[Array, " grippers"]) -> Any:
-    return jax.vmap(env.reset)(keys)
-
-
-@jax.jit
-def _targets(env: Arm, states: Any, actions: Array) -> Array:
-    return jax.vmap(lambda state, action: env.command(state, action).all(env.has_object))(states, actions)
+_begin = jax.jit(lambda env, keys: jax.vmap(env.reset)(keys))
+_targets = jax.jit(lambda env, *rows: jax.vmap(lambda *one: env.command(*one).all(env.has_object))(*rows))
 
 
 @jax.jit

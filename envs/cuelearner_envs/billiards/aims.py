@@ -37,7 +37,10 @@ def aims_of(table: Table, obs: Float[Array, " obs"]) -> Aims:
     """Return the shot of every target into every pocket, targets first; see `Billiards.aims`."""
     balls = obs.reshape(-1, 3)
     targets, on_table = balls[1:, :2], balls[1:, 2] < 0
-    mouths, openings = _mouths(table)
+    places = pockets(table)
+    corner = jnp.abs(places[:, :1]) > 0.0
+    mouths = jnp.where(corner, places - INWARD * corner_gap(table) * jnp.sign(places), places)  # to aim at [m]
+    openings = retract(jnp.where(corner, jnp.sign(places), places))  # straight through each pocket
     ball, pocket = (index.ravel() for index in jnp.indices((targets.shape[0], mouths.shape[0])))
 
     def one(ball: Int[Array, ""], pocket: Int[Array, ""]) -> Aims:
@@ -65,22 +68,10 @@ def contact_for(
 
     contact = seen_along(way)
     for _ in range(THROWS):
-        contact = seen_along(rotate(way, jnp.sign(contact.cut) * _throw(table, contact.cut)))
+        slip = jnp.tan(jnp.minimum(jnp.abs(contact.cut), 1.5)) / (2.0 * TANGENT_PER_DISC)
+        throw = jnp.arctan(jnp.minimum(table.friction, slip))  # from the line of centres to the target's way [rad]
+        contact = seen_along(rotate(way, jnp.sign(contact.cut) * throw))
     return contact
-
-
-def _throw(table: Table, cut: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the angle between the line of centres and the target's direction [rad]."""
-    slip = jnp.tan(jnp.minimum(jnp.abs(cut), 1.5)) / (2.0 * TANGENT_PER_DISC)
-    return jnp.arctan(jnp.minimum(table.friction, slip))
-
-
-def _mouths(table: Table) -> tuple[Float[Array, "pockets 2"], Float[Array, "pockets 2"]]:
-    """Return each pocket's point to aim at [m], and the direction straight through it."""
-    places = pockets(table)
-    corner = jnp.abs(places[:, :1]) > 0.0
-    outward = retract(jnp.where(corner, jnp.sign(places), places))
-    return jnp.where(corner, places - INWARD * corner_gap(table) * jnp.sign(places), places), outward
 
 
 def _features(

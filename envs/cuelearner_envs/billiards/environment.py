@@ -183,15 +183,10 @@ def _jittered_rack(key: PRNGKeyArray, table: Table) -> Float[Array, "balls 2"]:
     standing = rack(table)
     noise = table.rack_jitter * jax.random.normal(key, (PLACEMENTS, table.balls - 1, 2))
     draws = jnp.concatenate([jnp.broadcast_to(standing[:1], (PLACEMENTS, 1, 2)), standing[None, 1:] + noise], axis=1)
-    clearance = jax.vmap(_smallest_distance)(draws) - 2 * table.ball_radius
+    offsets = draws[:, :, None] - draws[:, None]
+    squared = jnp.sum(offsets**2, -1) + jnp.where(jnp.eye(table.balls, dtype=bool), jnp.inf, 0.0)[None]
+    clearance = jnp.sqrt(squared.min((1, 2))) - 2 * table.ball_radius  # of the two closest balls [m]
     return draws[jnp.argmax(jnp.where(clearance > 0, 1.0, clearance))]
-
-
-def _smallest_distance(positions: Float[Array, "balls 2"]) -> Float[Array, ""]:
-    """Distance between the two closest balls [m]."""
-    offsets = positions[:, None] - positions[None]
-    squared = jnp.sum(offsets**2, -1) + jnp.where(jnp.eye(positions.shape[0], dtype=bool), jnp.inf, 0.0)
-    return jnp.sqrt(squared.min())
 
 
 def _free_place(key: PRNGKeyArray, table: Table, state: Balls) -> Float[Array, "2"]:

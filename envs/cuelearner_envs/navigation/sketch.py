@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from cuelearner_envs import svg
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
-from cuelearner_envs.navigation.robot import Robot, hull
+from cuelearner_envs.navigation.robot import hull
 from cuelearner_envs.navigation.world import solids_of
 from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Reel, Sketch
@@ -34,7 +34,8 @@ def sketch(env: Navigation, state: Any) -> Sketch:
     world, goal, pose, ranges = jax.device_get(_view(env, state))
     parts = [svg.rectangle(-AROUND, -AROUND, 2 * AROUND, 2 * AROUND, "fill:var(--floor)")]
     solids = [(height, _box(row, height, pose)) for row, height in solids_of(world.boxes, world.box_heights)]
-    solids += [(height, _disc(row, height, pose)) for row, height in solids_of(world.circles, world.circle_heights)]
+    for row, height in solids_of(world.circles, world.circle_heights):
+        solids.append((height, svg.circle(_placed(row[None, :2], pose)[0], float(row[2]), _fill(height))))
     parts += [shape for _, shape in sorted(solids)]  # from above, the tall covers the low
     ends = _up(ranges[:, None] * np.stack([np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES)], axis=-1))
     parts.append(svg.polygon([(0.0, 0.0), *ends], "fill:var(--free);fill-opacity:0.25"))
@@ -44,10 +45,12 @@ def sketch(env: Navigation, state: Any) -> Sketch:
     parts.append(svg.element("path", d=dots, style=line))
     at, away = _placed(goal[None], pose)[0], float(np.linalg.norm(goal - pose[:2]))
     parts.append(_goal(at, float(env.goal_radius), away))
+    body, chevron = hull(env.robot)
+    look = "fill:var(--body);stroke:#222222;stroke-width:0.04"
     return Sketch(
         box=(-ASIDE, -AHEAD, 2 * ASIDE, AHEAD + BEHIND),
         still="".join(parts),
-        movers={"robot": _robot(env.robot)},
+        movers={"robot": svg.polygon(body, look) + svg.polygon(chevron, "fill:#222222")},
         places={"robot": (0.0, 0.0, -90.0)},
         foot=(0.0, 0.0),
         reach=(0.55, 2.2),
@@ -112,10 +115,6 @@ def _box(row: np.ndarray, height: float, pose: np.ndarray) -> str:
     return svg.polygon(corner_points, _fill(height))
 
 
-def _disc(row: np.ndarray, height: float, pose: np.ndarray) -> str:
-    return svg.circle(tuple(_placed(row[None, :2], pose)[0]), float(row[2]), _fill(height))
-
-
 def _goal(at: np.ndarray, radius: float, away: float) -> str:
     low, high = np.array([-ASIDE, -AHEAD]) + INSET, np.array([ASIDE, BEHIND]) - INSET
     ring = svg.circle(tuple(at), radius, "fill:var(--goal);fill-opacity:0.25;stroke:var(--goal);stroke-width:0.06")
@@ -131,8 +130,3 @@ def _goal(at: np.ndarray, radius: float, away: float) -> str:
     inside = edge * (1 - 1.6 / max(float(np.linalg.norm(edge)), 1.6))
     words = svg.text(tuple(inside), 0.4, f"goal {away:.0f} m", "fill:var(--goal);font-weight:bold")
     return mark + svg.element("g", head, transform=place) + words
-
-
-def _robot(robot: Robot) -> str:
-    body, chevron = hull(robot)
-    return svg.polygon(body, "fill:var(--body);stroke:#222222;stroke-width:0.04") + svg.polygon(chevron, "fill:#222222")
