@@ -58,8 +58,8 @@ def parse_seeds(words: str, first: int = 0) -> tuple[int, ...]:
 
 
 def with_control(grid: Grid) -> Grid:
-    """Return a grid with the unguided agent in place of the label budget 0."""
-    if 0 not in grid.labels:
+    """Return a grid with the unguided agent in place of the label budget 0 of kinds that ask."""
+    if 0 not in grid.labels or not any(guidances.find(kind).asks for kind in grid.guidance):
         return grid
     labels = tuple(budget for budget in grid.labels if budget)
     others = [kind for kind in grid.guidance if kind != NoGuide.name and (labels or not guidances.find(kind).asks)]

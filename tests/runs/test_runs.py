@@ -138,6 +138,8 @@ def test_the_budget_0_is_the_unguided_agent():
     both = Grid(("relative", "heuristic"), (4,), (0, 10))
     assert runs.with_control(both) == Grid(("none", "relative", "heuristic"), (4,), (10,))
     assert runs.with_control(runs.with_control(both)) == runs.with_control(both)
+    alone = Grid(("heuristic",), (4,), (0,))  # asks nothing, whatever the budgets
+    assert runs.with_control(alone) == alone
     assert runs.with_control(Grid(("relative", "none", "heuristic"), (4,), (0,))).guidance == ("none", "heuristic")
 
 
