@@ -2,7 +2,7 @@
 
     lerobot-eval --env.discover_packages_path=_metaworld_pictures --env.type=metaworld_pictures --env.task=reach-v3 ...
 
-Needs lerobot 0.6.1 and `pip install --no-deps metaworld`. What is seen is one picture of the camera `corner2`, and the
+Needs lerobot 0.6.1 and `pip install --no-deps metaworld`. A policy sees one picture of the camera `corner2`, and the
 hand's place and opening. Its reset of the gripper's weld writes 11 numbers where MuJoCo 3.17 has 12 columns: the first
 11 are filled.
 """
@@ -29,11 +29,11 @@ TUNING = ("door-close-v3", "drawer-close-v3", "handle-press-v3", "window-open-v3
 SIZE = 128  # of a picture [pixels]
 STEPS = 200  # of an episode at most
 CAMERA, PLACE = 2, (0.75, 0.075, 0.7)  # `corner2`, where LeRobot has it [m]
-DISTURBED = 0.3  # spread of the disturbance of a demonstration's motion, so that recoveries are seen
+DISTURBED = 0.3  # spread of the disturbance of a demonstration's motion, so that recoveries are shown
 
 
 class Change(NamedTuple):
-    """What is wrong in a world."""
+    """The change of a world."""
 
     aside: float = 0.0  # of the camera, along the picture's horizontal [m]
     pan: float = 0.0  # of the camera, about the vertical [deg]
@@ -95,7 +95,7 @@ class ChangedMetaworld(of_lerobot.MetaworldEnv):
         model.cam_quat[CAMERA] = turned
 
     def start(self, change: str, seed: int) -> np.ndarray:
-        """Begin an episode and return all that the simulator tells (39,)."""
+        """Begin an episode and return the whole observation (39,)."""
         self.change = CHANGES[change]
         self.move_camera()
         self._env.seed(seed)
@@ -105,9 +105,9 @@ class ChangedMetaworld(of_lerobot.MetaworldEnv):
         """Execute the changed action."""
         return super().step(motion(self.change, action))
 
-    def intended(self, told: np.ndarray) -> np.ndarray:
+    def intended(self, obs: np.ndarray) -> np.ndarray:
         """Return the script's action, for the world as it is."""
-        return motion(self.change, np.clip(self.expert_policy.get_action(told), -1, 1), back=True)
+        return motion(self.change, np.clip(self.expert_policy.get_action(obs), -1, 1), back=True)
 
 
 def _reset_welds(env: Any) -> None:
@@ -136,7 +136,7 @@ class PicturesConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """What an environment is made with."""
+        """Arguments of an environment."""
         return {"change": self.change}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> Any:
@@ -147,7 +147,7 @@ class PicturesConfig(EnvConfig):
 
 
 Plan = Callable[[np.ndarray, np.ndarray], np.ndarray]  # pictures (n, h, w, 3), states (n, 4) -> chunks (n, T, 4)
-Correct = Callable[[np.ndarray], np.ndarray]  # what is seen (n, 9) -> actions (n, 4)
+Correct = Callable[[np.ndarray], np.ndarray]  # inputs (n, 9), as in `Episode` -> actions (n, 4)
 
 
 class Demonstration(NamedTuple):
@@ -162,7 +162,7 @@ class Episode(NamedTuple):
     """An episode of a policy."""
 
     success: bool
-    seen: np.ndarray  # (steps, 9): state, proposed action, phase in the chunk
+    inputs: np.ndarray  # (steps, 9): state, proposed action, phase in the chunk
     intended: np.ndarray  # (steps, 4): the script's actions in these situations
 
 
@@ -195,7 +195,7 @@ class Robots:
         return episodes[:count]
 
     def play(self, change: str, seeds: Sequence[int], plan: Plan, correct: Correct | None, every: int) -> list[Episode]:
-        """Return an episode a seed; `plan` gives a chunk every `every` steps, `correct` the action of what is seen."""
+        """Return an episode a seed; `plan` gives a chunk every `every` steps, `correct` the action of inputs."""
         episodes: list[Episode] = []
         for start in range(0, len(seeds), len(self.pipes)):
             episodes += self._wave(change, seeds[start : start + len(self.pipes)], plan, correct, every)
@@ -204,31 +204,31 @@ class Robots:
     def _wave(
         self, change: str, seeds: Sequence[int], plan: Plan, correct: Correct | None, every: int
     ) -> list[Episode]:
-        told = self.call({number: ("start", change, seed) for number, seed in enumerate(seeds)})
-        seen: list[list[np.ndarray]] = [[] for _ in seeds]
+        replies = self.call({number: ("start", change, seed) for number, seed in enumerate(seeds)})
+        inputs: list[list[np.ndarray]] = [[] for _ in seeds]
         intended: list[list[np.ndarray]] = [[] for _ in seeds]
         success, chunks = np.zeros(len(seeds), bool), np.zeros((len(seeds), every, 4), np.float32)
         for step in range(STEPS):
-            active, phase = list(told), step % every
+            active, phase = list(replies), step % every
             if phase == 0:
                 pictures, states = (
-                    np.stack([told[number][name] for number in active]) for name in ("picture", "state")
+                    np.stack([replies[number][name] for number in active]) for name in ("picture", "state")
                 )
                 chunks[active] = plan(pictures, states)[:, :every]
             proposed = np.clip(chunks[active, phase], -1, 1)
-            states = np.stack([told[number]["state"] for number in active])
+            states = np.stack([replies[number]["state"] for number in active])
             rows = np.concatenate([states, proposed, np.full((len(active), 1), phase / every)], 1).astype(np.float32)
             actions = proposed if correct is None else correct(rows)
             for number, row in zip(active, rows, strict=True):
-                seen[number].append(row)
-                intended[number].append(told[number]["intended"])
+                inputs[number].append(row)
+                intended[number].append(replies[number]["intended"])
             looks = phase == every - 1
-            told = self.call({n: ("step", action, looks) for n, action in zip(active, actions, strict=True)})
-            success[[number for number, one in told.items() if one["success"]]] = True
-            told = {number: one for number, one in told.items() if not one["success"]}
-            if not told:
+            replies = self.call({n: ("step", action, looks) for n, action in zip(active, actions, strict=True)})
+            success[[number for number, one in replies.items() if one["success"]]] = True
+            replies = {number: one for number, one in replies.items() if not one["success"]}
+            if not replies:
                 break
-        return [Episode(bool(success[n]), np.stack(seen[n]), np.stack(intended[n])) for n in range(len(seeds))]
+        return [Episode(bool(success[n]), np.stack(inputs[n]), np.stack(intended[n])) for n in range(len(seeds))]
 
 
 def _serve(task: str, pipe: Any) -> None:
@@ -245,23 +245,23 @@ def _serve(task: str, pipe: Any) -> None:
 def _played(world: ChangedMetaworld, what: str, first: Any, second: Any) -> dict[str, Any]:
     success = False
     if what == "start":
-        told, looks = world.start(first, second), True
+        obs, looks = world.start(first, second), True
     else:
-        told, _, _, _, info = world._env.step(motion(world.change, first))
+        obs, _, _, _, info = world._env.step(motion(world.change, first))
         success, looks = bool(info["success"]), second
     picture = world.render() if looks and not success else None
-    state = told[:4].astype(np.float32)
-    return {"state": state, "picture": picture, "intended": world.intended(told), "success": success}
+    state = obs[:4].astype(np.float32)
+    return {"state": state, "picture": picture, "intended": world.intended(obs), "success": success}
 
 
 def _record(world: ChangedMetaworld, change: str, seed: int) -> Demonstration | None:
     """Return an episode of the script, or None if it fails."""
-    told, random, rows = world.start(change, seed), np.random.default_rng(seed), []
+    obs, random, rows = world.start(change, seed), np.random.default_rng(seed), []
     for _ in range(STEPS):
-        action = world.intended(told)
-        rows.append((np.ascontiguousarray(world.render()), told[:4].astype(np.float32), action))
+        action = world.intended(obs)
+        rows.append((np.ascontiguousarray(world.render()), obs[:4].astype(np.float32), action))
         disturbed = action + DISTURBED * random.normal(size=4) * (1, 1, 1, 0)
-        told, _, _, _, info = world._env.step(motion(world.change, np.clip(disturbed, -1, 1)))
+        obs, _, _, _, info = world._env.step(motion(world.change, np.clip(disturbed, -1, 1)))
         if info["success"]:
             return Demonstration(*(np.stack(column) for column in zip(*rows, strict=True)))
     return None

@@ -127,23 +127,23 @@ class Labeller:
         self.eps = eps
         self.reading = self.make()
 
-    def correct(self, seen: np.ndarray) -> np.ndarray:
+    def correct(self, inputs: np.ndarray) -> np.ndarray:
         """Return corrected actions; rows are filled up, so that one program serves."""
-        rows = np.concatenate([seen, np.repeat(seen[-1:], -len(seen) % 32, 0)])
-        return np.asarray(self.reading.act(rows))[: len(seen)]
+        rows = np.concatenate([inputs, np.repeat(inputs[-1:], -len(inputs) % 32, 0)])
+        return np.asarray(self.reading.act(rows))[: len(inputs)]
 
     def ask(self, episodes: Sequence[Episode], count: int) -> None:
         """Ask about situations of failed episodes, or of all where none failed."""
         import jax
 
         failed = [one for one in episodes if not one.success] or list(episodes)
-        seen, intended = (
-            np.concatenate(part) for part in zip(*((one.seen, one.intended) for one in failed), strict=True)
+        inputs, intended = (
+            np.concatenate(part) for part in zip(*((one.inputs, one.intended) for one in failed), strict=True)
         )
-        some = self.random.choice(len(seen), min(SITUATIONS * count, len(seen)), replace=False)
+        some = self.random.choice(len(inputs), min(SITUATIONS * count, len(inputs)), replace=False)
         self.key, key = jax.random.split(self.key)
-        index, action = self.reading.questions(seen[some], count, key)
-        self.reading.learn(seen[some][index], action, self.answers(action, intended[some][index]))
+        index, action = self.reading.questions(inputs[some], count, key)
+        self.reading.learn(inputs[some][index], action, self.answers(action, intended[some][index]))
 
     def answers(self, action: np.ndarray, intended: np.ndarray) -> np.ndarray:
         """Return a person's answers about each cue: some are mistaken, and of some nothing is said."""

@@ -44,7 +44,7 @@ TASKS = (
 
 
 class Change(NamedTuple):
-    """What is wrong in a world."""
+    """The change of a world."""
 
     aside: tuple[float, float] = (0.0, 0.0)  # what the camera sees is displaced [m]
     seen_turn: float = 0.0  # and turned about `CENTRE` [deg]

@@ -102,6 +102,8 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
         for name in ("task", "answers", "space", "eps"):
             if (other := getattr(file, name)) != (own := getattr(first, name)):
                 raise UserError(f"the files differ in {name} ({own}, {other}): merge only files that agree in it")
+        if file.labels.obs.shape[1] != first.labels.obs.shape[1]:
+            raise UserError("the files' observations differ in size: merge files of one world")
         people = (file.people.who.tolist(), file.people.when.tolist()) if everyone and file.people else ()
         keys = list(zip(_questions(file), map(bytes, np.asarray(file.labels.answer)), *people, strict=True))
         fresh += [key not in earlier for key in keys]

@@ -8,26 +8,23 @@ estimate `ROUNDS` times. They are compared by how well each answer is predicted 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.reading import linear, posterior
-from cuelearner_jax.reading.families import Family, undo_observation, unknowns_of
+from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.likelihood import Habits, curvature, log_likelihood, predictive_log_likelihood
-from cuelearner_jax.reading.linear import PARTS, SCALE, Change, ObservationFrame, RelativeLabels
+from cuelearner_jax.reading.linear import PARTS, SCALE, Acts, Change, ObservationFrame, RelativeLabels
 from cuelearner_jax.reading.policy import Correction, corrected, correction_of
 from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, ModelParts, Posterior, Priors
 from cuelearner_jax.spaces import Space
 
-Acts = Callable[[Float[Array, "n obs"]], Float[Array, "n action"]]
 ROUNDS = 3  # linearisations of each fit
 TRUST = 1.0  # largest step of a weight at one linearisation, in standard deviations of its prior's middle
 HYPOTHESES: tuple[tuple[str, ...], ...] = (
@@ -392,43 +389,3 @@ def _together(first: Fit, second: Fit) -> Fit:
 
 
 # --- steps of unknowns: so large that a change moves a policy's actions by a usual correction ---
-
-STEP_SITUATIONS = 16
-STEP_SIZES = np.geomspace(1e-4, 1e3, 29)  # tried, in the unknown's unit
-LARGEST_STEP = 1 / 4  # largest mean change of the actions, as a share of the space's reach
-
-
-def steps_of(
-    space: Space, family: Family, acts: Acts, obs: Float[Array, "n obs"], eps: float
-) -> Float[Array, " unknowns"]:
-    """Return the size of each unknown: its own scale, or the least that moves actions by `linear.SCALE` eps.
-
-    An unknown that moves no action so far has the size that moves actions by half of the most.
-    """
-    obs = jnp.asarray(obs)[:: max(1, len(obs) // STEP_SITUATIONS)][:STEP_SITUATIONS]
-    target = min(linear.SCALE * eps, float(space.from_unit(LARGEST_STEP * space.reach)))
-    steps = []
-    for place, unknown in enumerate(unknowns_of(family)):
-        if unknown.scale is not None:
-            steps.append(unknown.scale)
-            continue
-        sizes = STEP_SIZES[max(unknown.most / 4, STEP_SIZES[0]) >= STEP_SIZES]
-        thetas = jnp.zeros((1 + len(sizes), len(unknowns_of(family)))).at[1:, place].set(jnp.asarray(sizes))
-        before = _undone(family, thetas, obs)
-        actions = acts(before.reshape(-1, before.shape[-1])).reshape(*before.shape[:2], -1)
-        effects = np.asarray(_effects(space, family, thetas, before, actions))
-        effects = np.minimum(effects, 3 * target).mean(1)
-        enough = np.flatnonzero(effects >= min(target, 0.5 * max(effects.max(), 1e-12)))
-        steps.append(float(sizes[enough[0]]) if effects.max() > 0 else float(sizes[-1]))
-    return jnp.asarray(steps, jnp.float32)
-
-
-@partial(jax.jit, static_argnames="family")
-def _undone(family: Family, thetas: Array, obs: Array) -> Array:
-    return jax.vmap(lambda theta: jax.vmap(partial(undo_observation, family, theta))(obs))(thetas)
-
-
-@partial(jax.jit, static_argnames=("space", "family"))
-def _effects(space: Space, family: Family, thetas: Array, before: Array, actions: Array) -> Array:
-    whole = jax.vmap(partial(linear.meant, family))(thetas, before, actions)
-    return jnp.abs(space.log(whole[:1], whole[1:])).max(-1)

@@ -9,6 +9,7 @@ both sides of each unknown (`probes`), and `data` makes the central differences 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -30,11 +31,15 @@ from cuelearner_jax.reading.likelihood import Answers, intervals
 from cuelearner_jax.reading.posterior import PRIORS, Data
 from cuelearner_jax.spaces import DIRECTIONS, Space
 
+Acts = Callable[[Float[Array, "n obs"]], Float[Array, "n action"]]
 SCALE = 3.0  # unit of changes of an action, in eps: the size of a usual correction
 STEP = 0.35  # of the central differences of an entry, in its standard deviations
 MIXED = 8  # largest number of entries that may mix, of the observation and of the action
 PARTS = ("seen", "mixed", "shift", "gain")  # groups of weights: of what is seen, and of the action
 JUMP = 4.0  # change of an action, in `SCALE` eps, from which a bend is a jump
+STEP_SITUATIONS = 16  # in which the size of an unknown is looked for
+STEP_SIZES = np.geomspace(1e-4, 1e3, 29)  # tried, in the unknown's unit
+LARGEST_STEP = 1 / 4  # largest mean change of the actions, as a share of the space's reach
 LARGEST = 5.0  # standard deviations at which inputs of the process are cut
 
 
@@ -281,3 +286,39 @@ def change_of(frame: ObservationFrame, weights: Float[Array, " p"], like: Change
         whole = whole.at[frame.mixed[:, None], frame.mixed[None]].set(part)
     action = jnp.zeros_like(like.action).at[tuple(terms(*like.action.shape))].set(action)
     return Change(theta * frame.step, whole, frame.mean, action)
+
+
+def steps_of(
+    space: Space, family: Family, acts: Acts, obs: Float[Array, "n obs"], eps: float
+) -> Float[Array, " unknowns"]:
+    """Return the size of each unknown: its own scale, or the least that moves actions by `SCALE` eps.
+
+    An unknown that moves no action so far has the size that moves actions by half of the most.
+    """
+    obs = jnp.asarray(obs)[:: max(1, len(obs) // STEP_SITUATIONS)][:STEP_SITUATIONS]
+    target = min(SCALE * eps, float(space.from_unit(LARGEST_STEP * space.reach)))
+    steps = []
+    for place, unknown in enumerate(unknowns_of(family)):
+        if unknown.scale is not None:
+            steps.append(unknown.scale)
+            continue
+        sizes = STEP_SIZES[max(unknown.most / 4, STEP_SIZES[0]) >= STEP_SIZES]
+        thetas = jnp.zeros((1 + len(sizes), len(unknowns_of(family)))).at[1:, place].set(jnp.asarray(sizes))
+        before = _undone(family, thetas, obs)
+        actions = acts(before.reshape(-1, before.shape[-1])).reshape(*before.shape[:2], -1)
+        effects = np.asarray(_effects(space, family, thetas, before, actions))
+        effects = np.minimum(effects, 3 * target).mean(1)
+        enough = np.flatnonzero(effects >= min(target, 0.5 * max(effects.max(), 1e-12)))
+        steps.append(float(sizes[enough[0]]) if effects.max() > 0 else float(sizes[-1]))
+    return jnp.asarray(steps, jnp.float32)
+
+
+@partial(jax.jit, static_argnames="family")
+def _undone(family: Family, thetas: Array, obs: Array) -> Array:
+    return jax.vmap(lambda theta: jax.vmap(partial(undo_observation, family, theta))(obs))(thetas)
+
+
+@partial(jax.jit, static_argnames=("space", "family"))
+def _effects(space: Space, family: Family, thetas: Array, before: Array, actions: Array) -> Array:
+    whole = jax.vmap(partial(meant, family))(thetas, before, actions)
+    return jnp.abs(space.log(whole[:1], whole[1:])).max(-1)

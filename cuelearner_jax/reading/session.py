@@ -28,8 +28,8 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_name, policy_of
 from cuelearner_jax.reading import fitting, linear
 from cuelearner_jax.reading.families import Family
-from cuelearner_jax.reading.fitting import Fit, Reader, steps_of
-from cuelearner_jax.reading.linear import RelativeLabels
+from cuelearner_jax.reading.fitting import Fit, Reader
+from cuelearner_jax.reading.linear import RelativeLabels, steps_of
 from cuelearner_jax.reading.policy import ReadingPolicy, unread
 from cuelearner_jax.reading.result import Result, describe_fit
 from cuelearner_jax.spaces import Space
@@ -176,7 +176,7 @@ class Reading:
         return self._reader
 
 
-def acts_of(policy: Any) -> fitting.Acts:
+def acts_of(policy: Any) -> linear.Acts:
     """Return a policy's actions as a function that refuses those that are none. Plain Python is not compiled in."""
     name, run = policy_name(policy), run_of(policy)
 

@@ -30,6 +30,7 @@ import json
 import re
 import zipfile
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,6 +65,12 @@ class Situations(NamedTuple):
     text: Callable[[int], str] = lambda row: ""  # row -> what the robot was told to do
     about: dict[str, Any] = {}  # the table's metadata  # noqa: RUF012
     hands: Float[np.ndarray, "n 3"] | None = None  # where the hand is; None: not known
+
+
+@lru_cache(maxsize=4)
+def read_once(path: Path) -> Situations:
+    """Read situations as `read` does, and those of the same path only once."""
+    return read(path)
 
 
 def read(path: Path) -> Situations:

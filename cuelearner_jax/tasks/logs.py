@@ -10,22 +10,18 @@ labels about them is loaded without the folder.
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
-import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
-import imageio.v2 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax import pictures
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.config import Sizes
@@ -38,18 +34,15 @@ from cuelearner_jax.spaces import DIRECTIONS, Box, Choices, Space, cues_from
 from cuelearner_jax.spaces.box import SHARE
 from cuelearner_jax.spaces.choices import STEPS
 from cuelearner_jax.storage import situations
-from cuelearner_jax.storage.situations import Situations
-from cuelearner_jax.task import PAPER, Body, Pictures, Preset, Task
+from cuelearner_jax.task import PAPER, Body, Preset, Task
+from cuelearner_jax.tasks.logs_pictures import PICTURES
 from cuelearner_jax.terminal import console
-from cuelearner_jax.types import Reel, Sketch, Step
+from cuelearner_jax.types import Step
 
 NAME = "logs"
 Actions = Literal["box", "directions", "choices"]
 Order = Literal["shuffled", "recorded"]
-CLIP_FRAMES, CLIP_PERIOD = 60, 0.1  # most frames of a clip, and the time between two of them [s]
 FARTHEST = 5.0  # networks' input entries are clipped at this many spreads from the centre
-STEP = 0.01  # move by which a picture shows where an axis points [m]
-LEAST_WAY = 0.2  # an axis that appears shorter, beside the longest, points nowhere in a picture
 FRAME = "action"  # frame of the networks' input, computed by `Logs.features`
 
 
@@ -195,7 +188,7 @@ def task_of(
         actions: kind of action space, "box", "directions" or "choices".
         note: called with one line about each value that had to be chosen.
     """
-    recording = _recording(Path(folder))
+    recording = situations.read_once(Path(folder))
     if actions not in get_args(Actions):
         raise UserError(f"actions is {actions!r}{suggestion(actions, get_args(Actions))}")
     size, names = recording.actions.shape[1], ()
@@ -277,12 +270,6 @@ def bounds_of(
     return least, most
 
 
-@lru_cache(maxsize=4)
-def _recording(path: Path) -> Situations:
-    """Read situations once."""
-    return situations.read(path)
-
-
 def filled(config: LogsConfig, observations: Any = None, actions: Any = None) -> Logs:
     """Return the environment of situations (n, obs) and (n, action) in their order; zeros where none are given."""
     space, size = space_of(config), sum(config.entries)
@@ -308,7 +295,7 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     """Return the situations of a configuration, which are equal in every split."""
     if not config.path:
         raise UserError("no situations are given: name their folder, as logs:FOLDER or by --task.path")
-    recording, layout = _recording(Path(config.path)), filled(config)
+    recording, layout = situations.read_once(Path(config.path)), filled(config)
     if config.digest not in ("", recording.digest):
         raise UserError(f"{config.path} holds other situations than before: restore the folder, or collect new labels")
     sizes = (recording.observations.shape[1], recording.actions.shape[1])
@@ -321,89 +308,6 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     return env.replace(places=jnp.asarray(places, jnp.int32))
 
 
-def _frames(env: Logs, row: Any) -> tuple[list[Any], int]:
-    """Return the frames of a row's picture or clip, and the row's place in the recording."""
-    if not env.path:
-        raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
-    place = int(env.places[row])
-    picture = _recording(Path(env.path)).picture(place)
-    if picture is None:
-        raise UserError(f"{env.path} has no picture of row {place}: add a column `picture` with the name of its file")
-    if picture.kind.startswith("image/") and picture.kind != "image/gif":
-        return [picture.data], place
-    try:
-        suffix = "." + picture.kind.partition("/")[2]
-        film = imageio.mimread(io.BytesIO(picture.data), format=suffix, memtest=False)  # pyright: ignore
-    except Exception as error:  # film readers raise many exception types
-        raise UserError(f"a clip cannot be read ({' '.join(str(error).split())[:80]}): give GIF or MP4") from error
-    numbers = np.unique(np.linspace(0, len(film) - 1, min(len(film), CLIP_FRAMES)).round().astype(int))
-    return [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in numbers], place
-
-
-def _sketch(env: Logs, state: SituationState) -> Sketch:
-    frames, place = _frames(env, state.row)
-    text = _recording(Path(env.path)).text(place)
-    sketch = pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
-    for _, (hand, *steps) in _in_cameras(env, state, sketch, lambda hand: hand + STEP * np.eye(3))[:1]:
-        ways = np.stack(steps) - hand
-        ways /= np.linalg.norm(ways, axis=-1).max()
-        points = [(x, y) if math.hypot(x, y) > LEAST_WAY else None for x, y in ways.tolist()]
-        sketch = sketch._replace(points=(*points, *[None] * (env.actions.size - len(points))))
-    return sketch
-
-
-def _in_cameras(
-    env: Logs, state: SituationState, sketch: Sketch, places: Callable[[np.ndarray], np.ndarray]
-) -> list[tuple[np.ndarray, Float[np.ndarray, "n 2"]]]:
-    """Return, of each camera that sees the hand, its area in the sketch, and where the hand and other places appear.
-
-    `places` is a function of the hand's position (3,) that returns others (n, 3).
-    """
-    recording, cameras = _recording(Path(env.path)), []
-    if recording.hands is None or not recording.about:
-        return []
-    hand = recording.hands[int(env.places[state.row])]
-    rows = np.pad(np.vstack([hand, places(hand)]), ((0, 0), (0, 1)), constant_values=1.0)
-    for projection, area in zip(recording.about["projections"], recording.about["areas"], strict=True):
-        across, depth = np.split(rows @ projection.T, [2], -1)
-        points, box = across / depth * sketch.box[2:], area * np.tile(sketch.box[2:], 2)
-        if (depth > 0).all() and ((box[:2] <= points[0]) & (points[0] <= box[:2] + box[2:])).all():
-            cameras.append((box, points))
-    return cameras
-
-
-def _trails(env: Logs, state: SituationState, actions: Float[Array, "n action"]) -> list[str]:
-    """Draw each action as an arrow from the hand to where it leads, in the picture of each camera with the hand."""
-    from cuelearner_jax.labelling import view
-
-    sketch, arrows = _sketch(env, state), [""] * len(actions)
-    for box, (hand, *ends) in _in_cameras(env, state, sketch, lambda hand: np.asarray(actions)[:, :3]):
-        for number, (x, y) in enumerate(ends - hand):
-            own = sketch._replace(box=box, foot=hand, reach=(0.0, math.hypot(x, y)), turn=0.0)
-            arrows[number] += view.arrow(own, math.degrees(math.atan2(-y, x)), "motion")
-    return arrows
-
-
-def _reel(env: Logs, state: SituationState, action: Any) -> Reel | None:
-    frames, _ = _frames(env, state.row)
-    return pictures.clip(frames, CLIP_PERIOD, "as recorded") if len(frames) > 1 else None
-
-
-def _record(env: Logs, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Any], list[float]]:
-    """Return one picture per situation, in order; there are no rewards."""
-    return [pictures.pixels(_frames(env, row % len(env.rows))[0][0]) for row in range(steps)], [0.0] * steps
-
-
-PICTURES = Pictures(
-    record=_record,
-    still=lambda env, frames, file: pictures.still(frames, file),
-    animate=lambda env, frames, file: pictures.animate(frames, file, fps=4.0),
-    question=lambda env, state, obs, action, file: pictures.still(_frames(env, state.row)[0][:1], file),
-    sketch=_sketch,
-    reel=_reel,
-    trails=_trails,
-    simulates=False,
-)
 BODY = Body("recording", "situations as they were recorded", _environment, pictures=lambda: PICTURES, filled=filled)
 LOGS = Task(
     name=NAME,

@@ -9,6 +9,7 @@ import recorded_situations as recorded
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box
+from cuelearner_jax.storage import situations
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import logs, registry
 
@@ -127,7 +128,7 @@ def test_networks_see_entries_of_the_order_of_one(folder):
 
 def test_other_situations_in_the_folder_are_refused(folder):
     config = logs.task_of(folder, CUES, **BOUNDS).plain()
-    logs._recording.cache_clear()
+    situations.read_once.cache_clear()
     (folder / "situations.parquet").unlink()
     (folder / "pictures").rename(folder / "old")
     recorded.write(folder, rows=13)

@@ -73,9 +73,9 @@ class Hand:
             weight = turn.transpose(0, 2, 1) @ turn + (STIFFNESS + 1e6 * blocked)[:, None] * self._eye
             ways = np.linalg.solve(weight, jacobian.transpose(0, 2, 1))
             step = (ways @ np.linalg.solve(jacobian @ ways + DAMPING**2 * np.eye(3), error[..., None]))[..., 0]
-            wanted = joints + step / np.maximum(1.0, np.abs(step).max(1, keepdims=True) / LARGEST)
-            joints = np.clip(wanted, low, high)
-            blocked = np.maximum(blocked, joints != wanted)
+            unlimited = joints + step / np.maximum(1.0, np.abs(step).max(1, keepdims=True) / LARGEST)
+            joints = np.clip(unlimited, low, high)
+            blocked = np.maximum(blocked, joints != unlimited)
             place, jacobian, turn = self._chain(joints)
         return actions + (best - start) @ self._entries
 
