@@ -222,6 +222,9 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
     assert (len(again.seeds), left_out) == (16, 16)
     nobodys = [one._replace(people=None) for one in (file, merged)]
     assert [comparing.merge([one, file])[1] for one in nobodys] == [8, 8]
+    narrower = file._replace(labels=file.labels.replace(obs=np.asarray(file.labels.obs)[:, :-1]))
+    with pytest.raises(UserError, match="observations differ in size"):
+        comparing.merge([file, narrower])
 
 
 def test_labels_are_compared_with_the_teacher_in_the_situations_they_were_given_in(opened, tmp_path):
