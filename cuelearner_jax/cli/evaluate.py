@@ -194,7 +194,7 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
         name + (f" ({variant})" if variant else "") for name, variant in ((title, mine), (other, its))
     )
     caption = f"mean [95% bootstrap interval]; of the difference over {over}"
-    table = Table("metric", "policy", "against", "difference", title=heading, caption=caption, padding=0)
+    table = Table("metric", "policy", "against", "difference", title=heading, caption=caption)
     for name, less in difference.metrics.items():
         both = (measurements.spread(row, name) for row in (difference.row, difference.other))
         table.add_row(name, *map(str, both), f"{less.estimate:+.3f} [{less.lower:+.3f}, {less.upper:+.3f}]")
