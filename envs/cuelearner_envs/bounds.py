@@ -11,6 +11,7 @@ from cuelearner_jax.errors import UserError, format_value, suggestion
 
 MOST_STEPS = 1_000_000  # of an episode: counters are of 32 bits
 MOST_SEED = 2**32 - 1  # of a key
+LARGEST = 3.4028e38  # in single precision
 
 
 def check_number(
@@ -23,13 +24,13 @@ def check_number(
     whole: bool = False,
     unit: str = "",
 ) -> None:
-    """Raise UserError unless a field holds a finite number within bounds.
+    """Raise UserError unless a field holds a number within bounds that is finite in single precision.
 
     `least` and `most` are allowed; a `positive` number is above 0. `unit` is for the message, in words.
     """
     kind: Any = numbers.Integral if whole else numbers.Real
     is_number = isinstance(value, kind) and not isinstance(value, bool)
-    if is_number and least <= value <= most and math.isfinite(value) and not (positive and value <= 0):
+    if is_number and max(least, -LARGEST) <= value <= min(most, LARGEST) and not (positive and value < 1e-45):
         return
     wanted = f"a {'whole' if whole else 'positive' if positive else 'finite'} number"
     wanted += f" from {_digits(least)}" if least > -math.inf else ""
