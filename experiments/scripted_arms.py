@@ -119,7 +119,9 @@ class MetaWorld(gymnasium.Wrapper):
         base: Any = importlib.import_module("metaworld.sawyer_xyz_env").SawyerMocapBase
         base.reset_mocap_welds = _reset_welds
         tasks: Any = importlib.import_module("metaworld.env_dict").ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
-        super().__init__(tasks[f"{task}-v3-goal-observable"](seed=0))
+        env = tasks[f"{task}-v3-goal-observable"](seed=0)
+        env._freeze_rand_vec, env.seeded_rand_vec = False, True  # or else all episodes start alike
+        super().__init__(env)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode."""
