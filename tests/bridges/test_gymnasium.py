@@ -280,6 +280,13 @@ def test_what_is_no_environment_is_told_in_one_line(make, words):
         cl.from_gymnasium(make, num_envs=1, processes=1)
 
 
+def test_episodes_that_all_begin_alike_are_told_once(capsys):
+    cl.from_gymnasium(World, num_envs=1, processes=1)
+    assert capsys.readouterr().err.count("all episodes begin alike, whatever their seed") == 1
+    cl.from_gymnasium("Pendulum-v1", num_envs=1, processes=1)
+    assert "alike" not in capsys.readouterr().err
+
+
 def test_an_id_of_the_callers_own_is_played_in_other_processes():
     gymnasium.register(id="doors/World-v0", entry_point=World, max_episode_steps=5)
     found = cl.measure(lambda obs: obs, cl.from_gymnasium("doors/World-v0", num_envs=2, processes=2), episodes=2)
