@@ -58,8 +58,9 @@ class CallablePolicy:
         """Return one line: the policy's name, the sizes of observation and action, its world and its lane."""
         sizes = f"obs ({sum(quantity.size for quantity in self.observation) or '?'},) -> action ({self.actions.size},)"
         where = [self.world.task.name] if self.world else []
-        own = [policy_name(self.policy).removeprefix("policy "), sizes, *where, *(f"{name}={value!r}" for name, value in self.lane.items())]
-        return f"{type(self).__name__}({', '.join(own)})"
+        where += [f"{name}={value!r}" for name, value in self.lane.items()]
+        words = ", ".join([policy_name(self.policy).removeprefix("policy "), sizes, *where])
+        return f"{type(self).__name__}({words})"
 
     @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
