@@ -13,7 +13,8 @@
     table = cl.read_run("runs/study")                       # recorded results as one table (Arrow)
     arm = cl.from_gymnasium("FetchReach-v4")                # a world as well: any Gymnasium environment
 
-Arguments and results are described in each function's docstring. All other modules are internal.
+Arguments and results are described in each function's docstring. Parts of your own import from the public modules,
+which docs/reference/interfaces.md lists. All other modules are internal.
 """
 
 import os
