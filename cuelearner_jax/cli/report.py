@@ -64,10 +64,10 @@ def run(arguments: list[str]) -> None:
         out.print(f"wrote {report(options.folders, options.out, options.metric, **how, **more)}")
         return
     contents = contents_of(options.folders, options.metric, **how)
-    written = {"metric": options.metric, "split": options.split, "rows": plain_rows(contents.rows)}
+    answers = {"metric": options.metric, "split": options.split, "rows": plain_rows(contents.rows)}
     if (answer := contents.efficiency) is not None:
-        written |= {"level": answer.level, **{name: plain_rows(table) for name, table in answer.tables.items()}}
-    print(json.dumps(written | {"missing": contents.missing}, indent=1))
+        answers |= {"level": answer.level, **{name: plain_rows(table) for name, table in answer.tables.items()}}
+    print(json.dumps(answers | {"missing": contents.missing}, indent=1))
 
 
 def plain_rows(rows: list[Row]) -> list[Row]:

@@ -85,7 +85,7 @@ def ratio_bounds(above: Bounds, below: Bounds) -> Bounds:
 def labels_for(
     budgets: Int[np.ndarray, "budgets"], areas: Float[np.ndarray, "samples budgets"], wanted: Samples
 ) -> Bounds:
-    """Return the labels at which areas under the curve, nondecreasing in the budget, first reach what is wanted.
+    """Return the labels at which areas under the curve, nondecreasing in the budget, first reach what is needed.
 
     Areas lie on straight lines over the logarithm of the labels between two budgets. Beyond the budgets only a bound is
     known: more than the largest budget, or no more than the smallest.
@@ -132,8 +132,8 @@ def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_bett
         for variant in variants:
             if variant.run == run and variant.labels:
                 asking.setdefault(variant.guidance, []).append(every[id(variant)])
-        named: Row = {"run": run} if run else {}
-        equal += [named | row for row in _equal_area(asking, question.reference, sign)]
+        head: Row = {"run": run} if run else {}
+        equal += [head | row for row in _equal_area(asking, question.reference, sign)]
     return Efficiency(level, origin, {"efficiency": rows} | ({"equal_area": equal} if equal else {}))
 
 
@@ -203,14 +203,14 @@ def cell(row: Row, name: str, form: str) -> str:
         return ""
     if name.endswith("_ratio") and upper == np.inf and float(lower or 0) <= 1:
         return "not told apart"
-    shown = lambda number: form.format(number) if number != np.inf else "no bound"  # noqa: E731
+    text_of = lambda number: form.format(number) if number != np.inf else "no bound"  # noqa: E731
     if value is not None:
-        text = shown(value)
+        text = text_of(value)
     elif high == np.inf:
-        text = f"above {shown(low)}" if low else "not known"
+        text = f"above {text_of(low)}" if low else "not known"
     else:
-        text = f"{shown(low)} to {shown(high)}" if low else f"below {shown(high)}"
-    return text if lower is None else f"{text} [{shown(lower)}, {shown(upper)}]"
+        text = f"{text_of(low)} to {text_of(high)}" if low else f"below {text_of(high)}"
+    return text if lower is None else f"{text} [{text_of(lower)}, {text_of(upper)}]"
 
 
 def section(efficiency: Efficiency) -> list[str]:

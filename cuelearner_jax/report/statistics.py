@@ -88,9 +88,9 @@ def curve(steps: Int[np.ndarray, "steps"], values: np.ndarray, each: np.ndarray 
     return Curve(np.asarray(steps), *interval(values, each))
 
 
-def stretches(steps: Int[np.ndarray, "steps"], chosen: Bool[np.ndarray, "steps"]) -> list[tuple[int, int]]:
-    """Return each unbroken stretch of chosen steps as (first step, last step)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int)))
+def stretches(steps: Int[np.ndarray, "steps"], marks: Bool[np.ndarray, "steps"]) -> list[tuple[int, int]]:
+    """Return each unbroken stretch of marked steps as (first step, last step)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], marks, [False]]).astype(int)))
     return [(int(steps[start]), int(steps[end - 1])) for start, end in edges.reshape(-1, 2)]
 
 

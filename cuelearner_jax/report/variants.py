@@ -89,11 +89,11 @@ class Group(NamedTuple):
 
 
 def read_groups(
-    folders: Sequence[PathLike], metric: str, split: str, by_run: bool, **chosen: Sequence[str | int]
+    folders: Sequence[PathLike], metric: str, split: str, by_run: bool, **choice: Sequence[str | int]
 ) -> list[Group]:
     """Read the results of folders, together or (`by_run`) each folder by itself under its name.
 
-    `chosen`: kinds of `guidance` and budgets (`labels`) to report, where not all; 0 labels are always reported.
+    `choice`: kinds of `guidance` and budgets (`labels`) to report, where not all; 0 labels are always reported.
     """
     folders_of = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
     if by_run and len(folders_of) < len(folders):
@@ -104,7 +104,7 @@ def read_groups(
         guides = None if guides is None else guides.filter(pc.field("split") == split)
         groups.append(Group(name, *_select(results.read(own), metric, split), guides))
     tasks = sorted({group.table["task"][0].as_py() for group in groups})
-    for column, values in chosen.items():
+    for column, values in choice.items():
         there = {value for group in groups for value in group.every[column].to_pylist()}
         if absent := [str(value) for value in values if value not in there]:
             names = ", ".join(map(str, sorted(there)))

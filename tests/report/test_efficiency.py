@@ -78,12 +78,8 @@ def test_a_curve_that_never_gets_there_is_a_bound_and_no_number():
     assert cell(row | {"steps_ratio_lower": 0.9}, "steps_ratio", "{:.1f}") == "not told apart"
     # Unguided agents that never get there: the others need less than their share of all steps.
     variants = [same("none", 0, 0.3), same("relative", 100, 1.0)]
-    assert known(efficiency_of(variants, Question(level=0.5)).tables["efficiency"][1], "steps_ratio") == [
-        0,
-        0.5,
-        0,
-        0.5,
-    ]
+    row = efficiency_of(variants, Question(level=0.5)).tables["efficiency"][1]
+    assert known(row, "steps_ratio") == [0, 0.5, 0, 0.5]
 
 
 def test_labels_for_equal_areas():
