@@ -14,7 +14,6 @@ from cuelearner_jax.cli.options import Flag, out, parse, unprefixed
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report.document import contents_of, report
 from cuelearner_jax.report.efficiency import Question
-from cuelearner_jax.report.tables import Row
 from cuelearner_jax.storage.table import plain
 
 
@@ -60,16 +59,11 @@ def run(arguments: list[str]) -> None:
     how |= {"split": options.split, "guidance": options.guidance, "labels": options.labels}
     if options.out is not None:
         command = shlex.join(["cuelearner", "report", *arguments])
-        more: dict[str, Any] = {"overwrite": options.overwrite, "command": command}
-        out.print(f"wrote {report(options.folders, options.out, options.metric, **how, **more)}")
+        how |= {"overwrite": options.overwrite, "command": command}
+        out.print(f"wrote {report(options.folders, options.out, options.metric, **how)}")
         return
     contents = contents_of(options.folders, options.metric, **how)
-    answers = {"metric": options.metric, "split": options.split, "rows": plain_rows(contents.rows)}
-    if (answer := contents.efficiency) is not None:
-        answers |= {"level": answer.level, **{name: plain_rows(table) for name, table in answer.tables.items()}}
-    print(json.dumps(answers | {"missing": contents.missing}, indent=1))
-
-
-def plain_rows(rows: list[Row]) -> list[Row]:
-    """Return rows of a table for JSON."""
-    return [{name: plain(value) for name, value in row.items()} for row in rows]
+    tables = {"metric": options.metric, "split": options.split, "rows": contents.rows, "missing": contents.missing}
+    if contents.efficiency:
+        tables |= {"level": contents.efficiency.level, **contents.efficiency.tables}
+    print(json.dumps(plain(tables), indent=1))

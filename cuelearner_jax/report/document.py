@@ -20,9 +20,8 @@ from cuelearner_jax.report.tables import code, markdown
 from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
 
-FIGURES = ("curves", "label_efficiency")
-PERMISSIVE: dict[str, Any] = {"promote_options": "permissive"}  # runs may differ in their metrics
-TABLES = ("summary", "curves", "efficiency", "equal_area")
+FILES = [f"{name}.{suffix}" for name in ("curves", "label_efficiency") for suffix in ("png", "svg")]
+FILES += [f"{name}.csv" for name in ("summary", "curves", "efficiency", "equal_area")]
 ORIGINS = {"command": "runs made by", "config_hash": "configuration", "commit": "commit"}
 ORIGINS |= {"versions": "versions", "hardware": "hardware"}
 NOTE = (
@@ -42,11 +41,7 @@ class Contents(NamedTuple):
     rows: list[tables.Row]  # the summary
     missing: list[str]  # a line for each thing that was planned and has no results, or that the figures leave out
     efficiency: Efficiency | None
-
-    @property
-    def every(self) -> pa.Table:
-        """All recorded rows of the split."""
-        return pa.concat_tables([group.every for group in self.groups], **PERMISSIVE)
+    every: pa.Table  # all recorded rows of the split
 
 
 def contents_of(
@@ -74,9 +69,9 @@ def contents_of(
     groups = read_groups(folders, metric, split, by_run, guidance=guidance, labels=labels)
     variants = variants_of(groups, metric)
     answer = efficiency_of(variants, question, lower_is_better) if question else None
-    contents = Contents(groups, variants, tables.summary(variants, lower_is_better), [], answer)
-    missing = extent.missing(folders, contents.every) + extent.gaps(groups, variants, metric, split)
-    return contents._replace(missing=missing)
+    every = pa.concat_tables([group.every for group in groups], promote_options="permissive")  # of other metrics
+    missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
+    return Contents(groups, variants, tables.summary(variants, lower_is_better), missing, answer, every)
 
 
 def report(
@@ -114,9 +109,8 @@ def report(
     lines += ["", "## Missing", "", *(f"- {markdown(line)}" for line in missing)]
     lines += ["", "## Where the numbers come from", "", *_origins(contents.every, command), ""]
     out.mkdir(parents=True, exist_ok=True)
-    figure_files = [f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")]
-    for stale in (*figure_files, *(f"{name}.csv" for name in TABLES)):
-        (out / stale).unlink(missing_ok=True)
+    for name in FILES:  # also those of an earlier report
+        (out / name).unlink(missing_ok=True)
     for name, figure in figures.items():
         save_figure(figure, out / name)
     own = {"summary": contents.rows, "curves": tables.curve_rows(variants)}

@@ -30,13 +30,9 @@ class Question:
     level: float | None = None
     """Value of the metric to be reached (default: see --level-at)."""
     level_at: int | None = None
-    """Step of the unguided agents whose value is the level (default: the last step that all curves have)."""
+    """Without --level: step of the unguided agents whose value is the level (default: the last one of all curves)."""
     reference: str | None = None
     """Kind of guidance with whose labels those of others are compared (default: each)."""
-
-    def __post_init__(self) -> None:
-        if self.level is not None and self.level_at is not None:
-            raise UserError("--level is a value, --level-at a step of the unguided agents: give one of them")
 
 
 class Efficiency(NamedTuple):

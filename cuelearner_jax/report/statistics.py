@@ -97,10 +97,7 @@ def stretches(steps: Int[np.ndarray, "steps"], marks: Bool[np.ndarray, "steps"])
 def improvement(
     values: Float[np.ndarray, "draws seeds"], others: Float[np.ndarray, "draws others"]
 ) -> Float[np.ndarray, "draws"]:
-    """Return the share of pairs, in each draw, in which a value exceeds one of the others; a tie counts half.
-
-    This is the probability of improvement of Agarwal et al. (arXiv 2108.13264).
-    """
+    """Return each draw's probability of improvement (arXiv 2108.13264): the share of pairs won, a tie by half."""
     pairs = zip(values, np.sort(others, axis=1), strict=True)
     places = [[np.searchsorted(its, mine, side).mean() for side in ("left", "right")] for mine, its in pairs]
     return np.mean(places, axis=1) / others.shape[1]

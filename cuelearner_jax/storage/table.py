@@ -229,6 +229,8 @@ def plain(value: Any) -> Any:
     """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
     if isinstance(value, list):
         return [plain(entry) for entry in value]
+    if isinstance(value, dict):
+        return {name: plain(entry) for name, entry in value.items()}
     value = float(value) if isinstance(value, bool) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 

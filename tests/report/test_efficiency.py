@@ -102,9 +102,6 @@ def test_labels_for_equal_areas():
         efficiency_of(variants, Question(level=0.1, reference="dcoach"))
 
 
-# --- the command -----------------------------------------------------------------------------------------------------
-
-
 def write(folder, guidance, labels, slope, *, seeds: Sequence[int] = range(4), guide=0.1):
     known = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": folder.parent.name}
     with TableWriter(folder, results.SCHEMA, known) as writer:
@@ -165,4 +162,3 @@ def test_the_command_writes_tables_and_a_section(runs, tmp_path):
     left = {path.name for path in out.iterdir()}
     assert not left & {"efficiency.csv", "equal_area.csv"}
     assert "Label efficiency" not in (out / "report.md").read_text()
-    assert "run" not in rows(out / "summary.csv")[0]
