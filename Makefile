@@ -50,7 +50,10 @@ $(VENV)/.foreign: $(VENV)/.tested
 setup: $(VENV)/.tested
 
 quickstart: $(VENV)/.installed
-	$(BIN)/python experiments/quickstart.py
+	$(BIN)/cuelearner sweep billiards --preset quickstart --out runs/quickstart
+	$(BIN)/cuelearner report runs/quickstart --out runs/quickstart/report --overwrite
+	$(BIN)/cuelearner render runs/quickstart --guidance relative --out runs/quickstart/pictures --overwrite
+	@grep '^|' runs/quickstart/report/report.md
 
 gallery: $(VENV)/.tested
 	$(BIN)/python experiments/gallery.py

@@ -10,9 +10,11 @@
     better.save("policies/better")                          # a folder that load_policy and every command take
     cl.export_policy(better, "walker", world, "numpy")      # a file that runs without JAX, and its contract
     run = cl.train(world, teacher, "quickstart", seeds=8)   # what `cuelearner sweep` does, results in memory
+    table = cl.read_run("runs/study")                       # recorded results as one table (Arrow)
     arm = cl.from_gymnasium("FetchReach-v4")                # a world as well: any Gymnasium environment
 
-Arguments and results are described in each function's docstring. All other modules are internal.
+Arguments and results are described in each function's docstring. Parts of your own import from the public modules,
+which docs/reference/interfaces.md lists. All other modules are internal.
 """
 
 import os
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
         load_policy,
         measure,
     )
-    from cuelearner_jax.api.training import Run, train
+    from cuelearner_jax.api.training import Run, read_run, train
     from cuelearner_jax.api.worlds import World, from_gymnasium, make, teacher_of
     from cuelearner_jax.errors import UserError
     from cuelearner_jax.reading import Distortion, Unknown
@@ -41,31 +43,19 @@ if TYPE_CHECKING:
 
 __version__ = "1.0.0"
 
-# The module of each name, loaded at first use: tasks import only the lowest modules of this package, and each command
+# The names of each module, loaded at first use: tasks import only the lowest modules of this package, and each command
 # needs few modules.
-_PLACES = {
-    "AdaptedPolicy": "api.adaptation",
-    "CallablePolicy": "api.policies",
-    "Distortion": "reading",
-    "Labels": "api.labels",
-    "Run": "api.training",
-    "UNSAID": "spaces",
-    "Unknown": "reading",
-    "UserError": "errors",
-    "World": "api.worlds",
-    "adapt": "api.adaptation",
-    "agreement": "api.adaptation",
-    "correct": "api.adaptation",
-    "export_correction": "api.policies",
-    "export_policy": "api.policies",
-    "from_gymnasium": "api.worlds",
-    "load_exported": "api.policies",
-    "load_policy": "api.policies",
-    "make": "api.worlds",
-    "measure": "api.policies",
-    "teacher_of": "api.worlds",
-    "train": "api.training",
+_NAMES = {
+    "api.adaptation": ("AdaptedPolicy", "adapt", "agreement", "correct"),
+    "api.labels": ("Labels",),
+    "api.policies": ("CallablePolicy", "load_policy", "measure", "load_exported", "export_policy", "export_correction"),
+    "api.training": ("Run", "read_run", "train"),
+    "api.worlds": ("World", "from_gymnasium", "make", "teacher_of"),
+    "errors": ("UserError",),
+    "reading": ("Distortion", "Unknown"),
+    "spaces": ("UNSAID",),
 }
+_PLACES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "UNSAID",
@@ -87,6 +77,7 @@ __all__ = [
     "load_policy",
     "make",
     "measure",
+    "read_run",
     "teacher_of",
     "train",
 ]

@@ -9,8 +9,8 @@ over validation episodes. A few minutes on 2 cores.
 import numpy as np
 
 import cuelearner_jax as cl
-from cuelearner_jax.api.policies import as_policy
 from cuelearner_jax.evaluate import episodes, rollout_with_progress
+from cuelearner_jax.policies import policy_of
 
 ANGLE = np.radians(40.0)
 TURN = np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
@@ -37,7 +37,7 @@ def main(worlds=64, labels=200, episodes_judged=100, episodes_measured=100):
     )
     env, key = world.environment("validation"), episodes()
     rates = []
-    for name, policy in (("compass", as_policy(compass)), ("refined", better.policy)):
+    for name, policy in (("compass", policy_of(compass)), ("refined", better.policy)):
         found = rollout_with_progress(env, policy, key, episodes_measured, 200 * episodes_measured).means
         rates.append(float(found["success"]))
         print(f"{name}: success {rates[-1]:.2f}, collision {float(found['collision']):.2f}")

@@ -14,7 +14,6 @@ import gymnasium
 import numpy as np
 
 import cuelearner_jax as cl
-from cuelearner_jax.adaptation.by_model import plain_scalars
 
 WRONG = np.array([0.4, -0.3, 0.35])  # of actions between -1 and 1
 
@@ -61,7 +60,7 @@ def main(labels=200, guidance="reading", seed=0):
     world = cl.from_gymnasium(
         Table, max_steps=20, cues="right,left;up,down;ahead,back", observation=slices, processes=1
     )
-    plain = plain_scalars(world.actions)
+    plain = world.task.start().scalars  # of the space's unit
     found = {"as it was": error(wrong)}
     for name, answer in (("corrected", "best"), ("answers shuffled", "shuffled")):
         scalars = dataclasses.replace(plain, answer=answer)

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import label_efficiency
-
 from cuelearner_jax.cli import main as cuelearner
 
 FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
@@ -88,7 +86,7 @@ class Experiment(NamedTuple):
     task: str
     pieces: tuple[Piece, ...]
     scales: Mapping[str, Scale]
-    # Options of label_efficiency.py at the scale `paper`, by world; None: there is no report.
+    # Options of `cuelearner report --efficiency` at the scale `paper`, by world; None: there is no report.
     report: Mapping[str, Sequence[str]] | None = None
     metric: Sequence[str] = ()  # options of it at every scale
     # (task, piece, folder of all pieces, go on?) -> command lines of the piece
@@ -108,7 +106,7 @@ def scaled(piece: Piece, scale: Scale) -> Piece | None:
 
 
 def report_command(experiment: Experiment, world: str, out: Path, scale: str) -> list[str] | None:
-    """Return the arguments of label_efficiency.py for the runs of a world, or None where no unguided run has begun."""
+    """Return the command line of the report on the runs of a world, or None where no unguided run has begun."""
     own = [piece for piece in experiment.pieces if piece.world == world]
     begun = [piece for piece in own if (out / piece.path / "config.json").exists()]
     kinds = {kind for piece in begun for kind in piece.kinds}
@@ -118,7 +116,8 @@ def report_command(experiment: Experiment, world: str, out: Path, scale: str) ->
     if "--reference" in more and more[(at := more.index("--reference")) + 1] not in kinds:
         del more[at : at + 2]
     folders = dict.fromkeys(str(out / world / piece.run) for piece in begun)
-    return [*folders, "--by-run", *experiment.metric, *more, "--out", str(out / world / "report"), "--overwrite"]
+    how = ["--by-run", "--efficiency", *experiment.metric, *more]
+    return ["report", *folders, *how, "--out", str(out / world / "report"), "--overwrite"]
 
 
 def pieces_below(pieces: Sequence[Piece], names: Sequence[str]) -> list[Piece]:
@@ -164,4 +163,4 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
                 return status
     worlds = dict.fromkeys(piece.world for piece in pieces if experiment.report is not None)
     reports = [report_command(experiment, world, out, options.scale) for world in worlds]
-    return next((status for command in reports if command and (status := label_efficiency.main(command))), 0)
+    return next((status for command in reports if command and (status := cuelearner(command))), 0)

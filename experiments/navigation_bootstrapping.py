@@ -103,8 +103,8 @@ EXPERIMENT = Experiment(
     PIECES,
     SCALES,
     report={
-        "clutter": ("--level", "0.9", "--within", "1", "--reference", "relative"),
-        "long": ("--level", "0.9", "--within", "1"),
+        "clutter": ("--level", "0.9", "--reference", "relative"),
+        "long": ("--level", "0.9"),
     },
     metric=("--metric", "success"),
 )

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from cuelearner_jax import terminal
 from cuelearner_jax.cli.options import out
-from cuelearner_jax.terminal import console, progress_bars
+from cuelearner_jax.terminal import TimedProgress, console, progress_bars
 
 TEXT = "runs/br[/x]/[red]r:smile:"
 
@@ -56,3 +56,13 @@ def test_progress_that_is_piped_is_lines_few_and_without_carriage_returns(capsys
     with progress_bars(visible=False) as bars:
         bars.add_task("work", total=1, note="")
     assert capsys.readouterr().err == ""
+
+
+def test_the_time_left_is_a_bound_until_a_second_stretch_and_counts_the_kinds_to_come():
+    clock, left, bars = [0], [], TimedProgress(disable=True)
+    bars.get_time = lambda: clock[0]
+    work = bars.add_task("relative", total=100, ahead=2)
+    for clock[0], steps in ((3600, 10), (4600, 20)):
+        bars.update(work, completed=steps)
+        left.append(bars.tasks[0].fields["left"])
+    assert left == ["at most 9 h left, 29 h with the kinds to come", "about 2 h left, 8 h with the kinds to come"]

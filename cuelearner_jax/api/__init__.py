@@ -1,1 +1,1 @@
-"""The public Python API: what `import cuelearner_jax as cl` offers. All other modules are internal."""
+"""The public Python API: what `import cuelearner_jax as cl` offers."""

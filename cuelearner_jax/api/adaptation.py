@@ -45,7 +45,7 @@ from cuelearner_jax.tasks.logs import LogsConfig
 from cuelearner_jax.types import Teacher
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class AdaptedPolicy(CallablePolicy):
     """A corrected policy: its base under a feedback model within a bound, or corrected for estimated changes.
 

@@ -35,7 +35,7 @@ def _act(policy: Policy, key: PRNGKeyArray, obs: Float[Array, "n obs"], space: S
     return call_policy(policy, key, None, obs, space)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class CallablePolicy:
     """A policy that can be called: `policy(obs)` on an observation (obs,), or on a batch (n, obs).
 
@@ -53,6 +53,14 @@ class CallablePolicy:
     def __post_init__(self) -> None:
         """Make a policy of an object that acts. Raises UserError for any other."""
         object.__setattr__(self, "policy", policy_of(self.policy, self.actions))
+
+    def __repr__(self) -> str:
+        """Return one line: the policy's name, the sizes of observation and action, its world and its lane."""
+        sizes = f"obs ({sum(quantity.size for quantity in self.observation) or '?'},) -> action ({self.actions.size},)"
+        where = [self.world.task.name] if self.world else []
+        where += [f"{name}={value!r}" for name, value in self.lane.items()]
+        words = ", ".join([policy_name(self.policy).removeprefix("policy "), sizes, *where])
+        return f"{type(self).__name__}({words})"
 
     @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:

@@ -27,6 +27,7 @@ from cuelearner_jax.runs.order import TrainRequest
 from cuelearner_jax.runs.policy_sources import best_lane
 from cuelearner_jax.runs.training import Training
 from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage import results as stored
 from cuelearner_jax.studies import train as study
 from cuelearner_jax.types import Teacher
 
@@ -107,6 +108,22 @@ def train(
     if failed:
         warnings.warn(f"{failed}: leave out the rows with failed = 1", stacklevel=2)
     return Run(world, request.config, results, trainings)
+
+
+@user_code.report_user_errors
+def read_run(folder: str | os.PathLike[str]) -> pa.Table:
+    """Return recorded results as one table, with a row a lane and evaluation.
+
+    `run.to_pandas()` is a data frame, where pandas is installed. Each column's field holds its meaning, as
+    `run.field("reward").metadata[b"description"]`.
+
+    Args:
+        folder: folder of a run, finished or not, of a sweep in pieces, or of several runs of one task.
+
+    Raises:
+        UserError: there are no results at or below the folder, or they are of several tasks.
+    """
+    return stored.read(folder)
 
 
 def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequest:

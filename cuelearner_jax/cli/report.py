@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
-from cuelearner_jax.cli.options import Flag, out, parse
+from cuelearner_jax.cli.options import Flag, out, parse, unprefixed
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.report import tables
-from cuelearner_jax.report.variants import read_groups, variants_of
+from cuelearner_jax.report.document import contents_of, report
+from cuelearner_jax.report.efficiency import Question
 from cuelearner_jax.storage.table import plain
 
 
@@ -26,7 +26,14 @@ class Report:
     out: Path | None = None
     """Folder for the report."""
     json: Flag[bool] = False
-    """Print the table of final values and means, with intervals, as JSON on standard output in place of a report."""
+    """Print the tables, with intervals and what is missing, as JSON on standard output in place of a report."""
+    guidance: tuple[str, ...] = ()
+    """Kinds of guidance to report (default: all)."""
+    labels: tuple[int, ...] = ()
+    """Label budgets to report, beside agents without labels (default: all)."""
+    efficiency: Flag[bool] = False
+    """Add label efficiency: steps to a level, and how many labels of one kind equal those of another."""
+    question: Annotated[Question, unprefixed] = field(default_factory=Question)
     metric: str = "reward"
     """Column of the results to report."""
     split: str = "validation"
@@ -47,17 +54,16 @@ def run(arguments: list[str]) -> None:
         raise UserError("no folder to report on: cuelearner report RUN_FOLDER ... --out FOLDER")
     if (options.out is None) != options.json:
         raise UserError("report writes a folder or prints JSON: give one of --out FOLDER and --json")
-    read: dict[str, Any] = {"metric": options.metric, "split": options.split, "by_run": options.by_run}
-    if options.out is None:
-        variants = variants_of(read_groups(options.folders, **read), options.metric)
-        table = tables.summary(variants, options.lower_is_better)
-        rows = [{name: plain(value) for name, value in row.items()} for row in table]
-        print(json.dumps({"metric": options.metric, "split": options.split, "rows": rows}, indent=1))
+    question = options.question if options.efficiency or options.question != Question() else None
+    how: dict[str, Any] = {"lower_is_better": options.lower_is_better, "by_run": options.by_run, "question": question}
+    how |= {"split": options.split, "guidance": options.guidance, "labels": options.labels}
+    if options.out is not None:
+        command = shlex.join(["cuelearner", "report", *arguments])
+        how |= {"overwrite": options.overwrite, "command": command}
+        out.print(f"wrote {report(options.folders, options.out, options.metric, **how)}")
         return
-    # The import loads Matplotlib, which no other command needs.
-    from cuelearner_jax.report.document import report
-
-    how: dict[str, Any] = {"lower_is_better": options.lower_is_better, "overwrite": options.overwrite}
-    command = shlex.join(["cuelearner", "report", *arguments])
-    page = report(options.folders, options.out, **read, **how, command=command)
-    out.print(f"wrote {page}")
+    contents = contents_of(options.folders, options.metric, **how)
+    tables = {"metric": options.metric, "split": options.split, "rows": contents.rows, "missing": contents.missing}
+    if contents.efficiency:
+        tables |= {"level": contents.efficiency.level, **contents.efficiency.tables}
+    print(json.dumps(plain(tables), indent=1))

@@ -1,13 +1,13 @@
 """Write the folder of `cuelearner report`: figures and tables of recorded results. Equal results give equal bytes.
 
-`report.md` has the figures, the table, what is missing, and the provenance. Beside it are `summary.csv`, `curves.csv`
-and the figures. A study may add tables and a section (`experiments/label_efficiency.py`).
+`report.md` has the figures, the tables, what is missing, and the provenance. Beside it are `summary.csv`, `curves.csv`,
+the figures, and the tables of a question about label efficiency.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,29 +15,63 @@ import pyarrow as pa
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import extent, tables
-from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, save_figure
+from cuelearner_jax.report.efficiency import Efficiency, Question, efficiency_of, section
 from cuelearner_jax.report.tables import code, markdown
-from cuelearner_jax.report.variants import PathLike, Variant, read_groups, variants_of
+from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
 
-FIGURES = ("curves", "label_efficiency")
-PERMISSIVE: dict[str, Any] = {"promote_options": "permissive"}  # runs may differ in their metrics
-TABLES = ("summary", "curves", "efficiency", "labels_to_level", "equal_area")
+FILES = [f"{name}.{suffix}" for name in ("curves", "label_efficiency") for suffix in ("png", "svg")]
+FILES += [f"{name}.csv" for name in ("summary", "curves", "efficiency", "equal_area")]
 ORIGINS = {"command": "runs made by", "config_hash": "configuration", "commit": "commit"}
 ORIGINS |= {"versions": "versions", "hardware": "hardware"}
 NOTE = (
     "Interquartile means over seeds with their 95% percentile bootstrap intervals in brackets, over seeds and the "
     "evaluation's episodes; with fewer than 10 seeds such intervals are too narrow. [no spread]: all draws are equal, "
-    "which does not make the value certain; evaluate more episodes. Steps are environment steps of one seed. Intervals "
-    "are compared at each evaluation by itself, so a short stretch may be chance."
+    "which does not make the value certain; evaluate more episodes. Steps are environment steps of one seed. "
+    "Comparisons draw equal seeds together. Each evaluation is compared by itself, so a short stretch may be chance. "
+    "The probability of improvement is that of a seed's mean over the curve against an unguided seed's."
 )
 
 
-class Study(NamedTuple):
-    """A study's additions to a report."""
+class Contents(NamedTuple):
+    """Contents of a report."""
 
-    lines: Sequence[str]  # of Markdown, below the summary
-    tables: dict[str, list[tables.Row]]  # by the name of the file
+    groups: list[Group]
+    variants: list[Variant]
+    rows: list[tables.Row]  # the summary
+    missing: list[str]  # a line for each thing that was planned and has no results, or that the figures leave out
+    efficiency: Efficiency | None
+    every: pa.Table  # all recorded rows of the split
+
+
+def contents_of(
+    folders: Sequence[PathLike],
+    metric: str = "reward",
+    *,
+    split: str = "validation",
+    lower_is_better: bool = False,
+    by_run: bool = False,
+    guidance: Sequence[str] = (),
+    labels: Sequence[int] = (),
+    question: Question | None = None,
+) -> Contents:
+    """Read the results of folders and compute what a report shows.
+
+    Args:
+        folders: run folders, or folders above them.
+        metric: column of the results.
+        split: "validation" or "tuning".
+        lower_is_better: small values of the metric are good ones.
+        by_run: report each folder under its own name, as needed where the runs' configurations differ.
+        guidance, labels: kinds and label budgets to report (default: all). Unguided agents have 0 labels.
+        question: question about label efficiency (default: none).
+    """
+    groups = read_groups(folders, metric, split, by_run, guidance=guidance, labels=labels)
+    variants = variants_of(groups, metric)
+    answer = efficiency_of(variants, question, lower_is_better) if question else None
+    every = pa.concat_tables([group.every for group in groups], promote_options="permissive")  # of other metrics
+    missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
+    return Contents(groups, variants, tables.summary(variants, lower_is_better), missing, answer, every)
 
 
 def report(
@@ -46,46 +80,41 @@ def report(
     metric: str = "reward",
     *,
     split: str = "validation",
-    lower_is_better: bool = False,
-    by_run: bool = False,
-    study: Callable[[Sequence[Variant]], Study] | None = None,
     overwrite: bool = False,
     command: str = "",
+    **how: Any,
 ) -> Path:
     """Write the report of run folders, or of folders above them, into `out`; return the path of `report.md`.
 
-    `folders` are run folders, or folders above them; `by_run` reports each under its own name, as needed where the
-    runs' configurations differ. `split`: "validation" or "training". `study` makes additions of the variants. `command`
-    is the command line to record in the report.
+    `command` is the command line to record in the report. `how`: other arguments of `contents_of`.
     """
+    from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, save_figure  # loads Matplotlib
+
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
     if in_use(out) and not overwrite:
         raise UserError(f"{out} exists already: give another --out, or --overwrite to replace it")
-    groups = read_groups(folders, metric, split, by_run)
-    variants = variants_of(groups, metric)
-    rows = tables.summary(variants, lower_is_better)
+    contents = contents_of(folders, metric, split=split, **how)
+    variants, efficiency = contents.variants, contents.efficiency
     seeds = _range("seed", [len(variant.seeds) for variant in variants])
     if episodes := [variant.episodes for variant in variants if variant.episodes]:
         seeds += f" x {_range('episode', episodes)}"
-    title = f"{groups[0].table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {seeds}"
+    title = f"{contents.groups[0].table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {seeds}"
     figures = {"curves": draw_curves(variants, title, metric)}
     if len({variant.labels for variant in variants if variant.labels}) > 1:
         figures["label_efficiency"] = draw_label_efficiency(variants, title, metric)
-    added = study(variants) if study else Study((), {})
-    every = pa.concat_tables([group.all_rows for group in groups], **PERMISSIVE)
-    missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
     lines = [f"# {markdown(title)}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
-    lines += [*tables.summary_lines(rows), "", NOTE, *added.lines]
-    lines += ["", "## Missing", "", *(f"- {markdown(line)}" for line in missing or ["nothing: all runs are complete"])]
-    lines += ["", "## Where the numbers come from", "", *_origins(every, command), ""]
+    lines += [*tables.summary_lines(contents.rows), "", NOTE, *(section(efficiency) if efficiency else [])]
+    missing = contents.missing or ["nothing: all runs are complete"]
+    lines += ["", "## Missing", "", *(f"- {markdown(line)}" for line in missing)]
+    lines += ["", "## Where the numbers come from", "", *_origins(contents.every, command), ""]
     out.mkdir(parents=True, exist_ok=True)
-    figure_files = [f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")]
-    for stale in (*figure_files, *(f"{name}.csv" for name in TABLES)):
-        (out / stale).unlink(missing_ok=True)
+    for name in FILES:  # also those of an earlier report
+        (out / name).unlink(missing_ok=True)
     for name, figure in figures.items():
         save_figure(figure, out / name)
-    for name, each in ({"summary": rows, "curves": tables.curve_rows(variants)} | added.tables).items():
+    own = {"summary": contents.rows, "curves": tables.curve_rows(variants)}
+    for name, each in (own | (efficiency.tables if efficiency else {})).items():
         tables.write_csv(out / f"{name}.csv", each)
     (out / "report.md").write_text("\n".join(lines), encoding="utf-8")
     return out / "report.md"

@@ -79,7 +79,7 @@ def gaps(groups: Sequence[Group], variants: Sequence[Variant], metric: str, spli
         for key, seeds in failures.describe_failed(group.failed).items():
             rest = f"curve and means are over the other {counts[key]}" if key in counts else "no lane is left"
             lines.append(f"{failures.variant_name(*key)}: {seeds} failed, no longer finite: {rest}")
-        omissions += _short(group.all_rows, own)
+        omissions += _short(group.every, own)
         if group.invalid:
             omissions.append(f"{group.invalid:,} {split} rows have no finite {metric}; their steps are left out")
     ends = {int(variant.curve.steps[-1]) for variant in variants}

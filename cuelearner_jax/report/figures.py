@@ -14,10 +14,13 @@ from matplotlib.figure import Figure
 
 from cuelearner_jax.errors import one_line
 from cuelearner_jax.guides import registry
+from cuelearner_jax.report.tables import unguided_of
 from cuelearner_jax.report.variants import Variant, guidance_name
 
 # Palette of Okabe and Ito, distinguishable with any colour vision, without the colours of the package's kinds.
 OTHER_COLOURS = ("#E69F00", "#56B4E9", "#B8A600", "#000000")
+DASHES = ("-", (0, (5, 1.5)), (0, (2, 1.5)), (0, (6, 1.5, 1, 1.5)))  # by which equal lines are told apart
+FAILED = "a failed seed, left out"
 AXIS_NAMES = {"reward": "reward a step", "success": "success rate", "collision": "collision rate"}
 STYLE: dict[Any, Any] = {
     "svg.hashsalt": "cuelearner",  # with no date, so that equal figures give equal bytes
@@ -34,30 +37,60 @@ STYLE: dict[Any, Any] = {
 
 
 def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
-    """Draw learning curves: interquartile means with interval bands, named in the order of their ends."""
+    """Draw learning curves: interquartile means over interval bands, named in the order of their ends.
+
+    More than four variants have a panel for each kind of guidance, beside the unguided agents.
+    """
+    groups = _panels(variants) if len(variants) > 4 else [list(variants)]
+    rows, columns = -(-len(groups) // 3), min(3, len(groups))
+    colours = {id(variant): colour for variant, colour in zip(variants, colours_of(variants), strict=True)}
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(8, 4.5), layout="constrained")
-        axes = figure.add_subplot()
-        pairs = zip(variants, colours_of(variants), strict=True)
-        for variant, colour in sorted(pairs, key=lambda pair: -pair[0].curve.estimate[-1]):
-            steps, estimate, lower, upper = variant.curve
-            axes.fill_between(steps, lower, upper, color=colour, alpha=0.18 if len(variants) < 6 else 0.12, linewidth=0)
-            marker = "o" if len(steps) == 1 else ""
-            axes.plot(steps, estimate, color=colour, linewidth=1.8, marker=marker, label=variant.name)
-            at = np.minimum(variant.failed, steps[-1])
-            axes.plot(at, np.interp(at, steps, estimate), "x", color=colour, markersize=8, clip_on=False)
-        if any(len(variant.failed) for variant in variants):
-            axes.plot([], [], "x", color="#595959", label="a failed seed, left out")
-        axes.set_xlim(0, max(1, *(int(variant.curve.steps[-1]) for variant in variants)))
-        axes.set_xlabel("environment steps of a seed")
-        axes.set_ylabel(axis_name(metric))
-        axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
-        axes.set_title(one_line(title), fontweight="bold", fontsize=11, pad=20)
+        figure = Figure(figsize=(8, 4.5) if len(groups) == 1 else (4 * columns, 1 + 2.8 * rows), layout="constrained")
+        panels = [*figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat]
+        for axes, group in zip(panels, groups, strict=False):
+            for place, variant in enumerate(group):
+                _draw_curve(axes, variant, colours[id(variant)], DASHES[place % len(DASHES)], 3 + 0.01 * place)
+            axes.set_xlim(0, max(1, *(int(variant.curve.steps[-1]) for variant in variants)))
+            axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
+            axes.tick_params(labelbottom=True)  # also above an empty place
+            names = [variant.name for variant in sorted(group, key=lambda variant: -variant.curve.estimate[-1])]
+            lines = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+            names += [FAILED] * (FAILED in lines)
+            if len(groups) == 1:
+                figure.legend([lines[name] for name in names], names, loc="outside right upper", fontsize=9)
+            else:
+                axes.legend([lines[name] for name in names], names, fontsize=7, frameon=True, edgecolor="none")
+        for axes in panels[len(groups) :]:
+            axes.remove()
         note = "interquartile mean over seeds, band: its 95% bootstrap interval over seeds"
         note += " and episodes" if all(variant.episodes for variant in variants) else ""
-        axes.text(0, 1.025, note, transform=axes.transAxes, color="#595959", fontsize=9)
-        figure.legend(loc="outside right upper", fontsize=9 if len(variants) < 20 else 6)
+        figure.supxlabel(f"environment steps of a seed\n{note}", fontsize=9)
+        figure.supylabel(axis_name(metric), fontsize=10)
+        figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
+
+
+def _panels(variants: Sequence[Variant]) -> list[list[Variant]]:
+    """Return the variants of each kind and run, after the unguided ones that they are compared with."""
+    kinds: dict[tuple[str, str], list[Variant]] = {}
+    for variant in variants:
+        before = unguided_of(variant, variants)
+        first = [] if before is None or before is variant else [before]
+        kinds.setdefault((variant.run, variant.guidance), first).append(variant)
+    others = {id(group[0]) for group in kinds.values() if len(group) > 1}
+    return [group for group in kinds.values() if len(group) > 1 or id(group[0]) not in others]
+
+
+def _draw_curve(axes: Any, variant: Variant, colour: Any, dashes: Any, height: float) -> None:
+    """Draw a curve over all bands. Dashes show an equal line below; a cross marks where a failed seed ended."""
+    steps, estimate, lower, upper = variant.curve
+    axes.fill_between(steps, lower, upper, color=colour, alpha=0.15, linewidth=0, zorder=2)
+    look: dict[str, Any] = {"color": colour, "zorder": height}
+    marker = "o" if len(steps) == 1 else ""
+    axes.plot(steps, estimate, linewidth=1.8, linestyle=dashes, marker=marker, label=variant.name, **look)
+    if len(at := np.minimum(variant.failed, steps[-1])):
+        axes.plot(at, np.interp(at, steps, estimate), "x", markersize=8, clip_on=False, **look)
+        axes.plot([], [], "x", color="#595959", label=FAILED)
 
 
 def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) -> Figure:
@@ -70,11 +103,12 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
             points = np.array([(one.labels, *one.mean) for one in variants if one.guidance == kind], float)
             for _, estimate, lower, upper in points[points[:, 0] == 0]:
                 axes.axhspan(lower, upper, color=look["color"], alpha=0.12, linewidth=0)
-                axes.axhline(estimate, linewidth=1.5, linestyle="--", **look)
+                axes.axhline(estimate, linewidth=1.5, linestyle=(3 * place, (3, 6)), **look)
             if len(points := points[points[:, 0] > 0]):
                 labels, estimate, lower, upper = points.T
                 bars = np.nan_to_num([estimate - lower, upper - estimate])
-                # All points stand on their budget's tick; caps of different widths tell intervals at one budget apart.
+                # Points stand on their budget's tick; caps and dots of other sizes tell equal ones apart.
+                look |= {"markersize": max(3, 9 - place), "linewidth": max(1, 2.8 - 0.3 * place)}
                 axes.errorbar(labels, estimate, bars, marker="o", capsize=3 + 2 * place, **look)
         budgets = sorted({variant.labels for variant in variants if variant.labels})
         axes.set_xscale("log")
@@ -104,7 +138,7 @@ def colours_of(variants: Sequence[Variant]) -> list[tuple[float, float, float]]:
     """Return each variant's colour: that of its guidance, paler for smaller label budgets."""
     colours = []
     for variant in variants:
-        budgets = [other.labels for other in variants if other.guidance == variant.guidance]
+        budgets = sorted({other.labels for other in variants if other.guidance == variant.guidance})
         pale = 0.6 * (1 - (budgets.index(variant.labels) + 1) / len(budgets))
         red, green, blue = ((1 - pale) * channel + pale for channel in to_rgb(colour_of(variant.guidance)))
         colours.append((red, green, blue))

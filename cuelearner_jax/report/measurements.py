@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,6 +15,7 @@ from cuelearner_jax.evaluate import group_means, mean_interval
 from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
 from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.storage.table import plain
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured, amount
 
 
@@ -91,11 +91,6 @@ def _less(row: Measured, other: Measured, name: str) -> Interval:
     return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(draws, [0.025, 0.975]))
 
 
-def _plain(values: Sequence[Any] | np.ndarray | None) -> list[float | None] | None:
-    """Return numbers for JSON, those that are not finite as None."""
-    return None if values is None else [float(value) if math.isfinite(value) else None for value in values]
-
-
 def _row(row: Measured) -> dict[str, Any]:
     return {
         "guidance": row.guidance,
@@ -103,8 +98,11 @@ def _row(row: Measured) -> dict[str, Any]:
         **({} if row.bound_deg is None else {"bound_deg": float(f"{row.bound_deg:g}")}),
         "trained_steps": row.step,
         "seeds": row.seeds.tolist(),
-        **{metric: _plain(values) for metric, values in row.metrics.items()},
-        "intervals": {"over": over(row), **{metric: _plain(spread(row, metric)) for metric in row.metrics}},
+        **{metric: plain(values.tolist()) for metric, values in row.metrics.items()},
+        "intervals": {
+            "over": over(row),
+            **{metric: plain(np.asarray(spread(row, metric)).tolist()) for metric in row.metrics},
+        },
     }
 
 
@@ -135,7 +133,7 @@ def to_json(
         name, pairs = compared
         entries = [
             {"of": variant(one.row), "less": _row(one.other), "over": one.over}
-            | {"difference": {metric: _plain(value) for metric, value in one.metrics.items()}}
+            | {"difference": {metric: plain(np.asarray(value).tolist()) for metric, value in one.metrics.items()}}
             for one in pairs
         ]
         contents["compared"] = {"with": name, "differences": entries}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 RESAMPLES = 2000
@@ -88,16 +88,19 @@ def curve(steps: Int[np.ndarray, "steps"], values: np.ndarray, each: np.ndarray 
     return Curve(np.asarray(steps), *interval(values, each))
 
 
-def stretches_apart(curve_a: Curve, curve_b: Curve) -> list[tuple[int, int]]:
-    """Return where the interval of `curve_a` lies wholly above that of `curve_b`, among the steps that both have.
-
-    Each unbroken stretch is (first step, last step). Each evaluation is compared by itself, so a short stretch may be
-    chance.
-    """
-    steps, a, b = np.intersect1d(curve_a.steps, curve_b.steps, return_indices=True)
-    above = curve_a.lower[a] > curve_b.upper[b]  # False where a bound is NaN
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], above, [False]]).astype(int)))
+def stretches(steps: Int[np.ndarray, "steps"], marks: Bool[np.ndarray, "steps"]) -> list[tuple[int, int]]:
+    """Return each unbroken stretch of marked steps as (first step, last step)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], marks, [False]]).astype(int)))
     return [(int(steps[start]), int(steps[end - 1])) for start, end in edges.reshape(-1, 2)]
+
+
+def improvement(
+    values: Float[np.ndarray, "draws seeds"], others: Float[np.ndarray, "draws others"]
+) -> Float[np.ndarray, "draws"]:
+    """Return each draw's probability of improvement (arXiv 2108.13264): the share of pairs won, a tie by half."""
+    pairs = zip(values, np.sort(others, axis=1), strict=True)
+    places = [[np.searchsorted(its, mine, side).mean() for side in ("left", "right")] for mine, its in pairs]
+    return np.mean(places, axis=1) / others.shape[1]
 
 
 def mean_over_curve(
@@ -149,12 +152,13 @@ def resampled(
     resamples: int = RESAMPLES,
     seed: int = 0,
     of: Callable[[np.ndarray], np.ndarray] = lambda curves: curves,
+    mean: Callable[..., np.ndarray] = interquartile_mean,
 ) -> Float[np.ndarray, "resamples *rest"]:
     """Return interquartile means over seeds drawn with replacement, each measured on groups of episodes drawn so too.
 
-    Whole curves are drawn. `of` makes a seed's number or numbers of its curve before the mean is taken. Seeds of
-    several variants are drawn independently, each with its own `seed`; the drawn episodes are those of all seeds and
-    variants, as in the evaluation. A single seed or a single group gives no spread.
+    Whole curves are drawn. `of` makes a seed's number or numbers of its curve before the `mean` is taken. Variants
+    with the same `seed` and number of seeds draw the same places, with another `seed` independent ones. The drawn
+    episodes are those of all seeds and variants, as in the evaluation. A single seed or group gives no spread.
     """
     each, streams = np.asarray(each, dtype=float), (seed, _EPISODES)
     draws = zip(streams, each.shape[:2], strict=True)
@@ -166,5 +170,5 @@ def resampled(
         rows = slice(at, at + batch)
         curves = np.tensordot(weights[rows], each, axes=(1, 1)) if each.shape[1] > 1 else each[None, :, 0]
         sample = curves[np.arange(len(curves))[:, None], seeds[rows]]
-        parts.append(interquartile_mean(of(sample), axis=1))
+        parts.append(mean(of(sample), axis=1))
     return np.concatenate(parts)

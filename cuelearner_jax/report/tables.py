@@ -6,6 +6,7 @@ import csv
 import html
 import re
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from cuelearner_jax.report.variants import Variant
 
 Row = dict[str, str | int | float]  # of a table
 REACHES = ("reaches_unguided_final", "reaches_unguided_final_lower", "reaches_unguided_final_upper")
+APART, IMPROVES = ("above_unguided", "below_unguided"), ("improvement", "improvement_lower", "improvement_upper")
 
 
 def markdown(text: object) -> str:
@@ -34,8 +36,9 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
 
     `reaches_unguided_final` is the interquartile mean over seeds of the step from which a seed stays as good as the
     final value without guidance; "never" if too many seeds end below that for a mean. `above_unguided` and
-    `below_unguided` are stretches of `stretches_apart`. With several runs, a variant is compared with the unguided
-    variant of `unguided_of`.
+    `below_unguided` are the stretches of steps at which the interval of the difference excludes zero. `improvement` is
+    the probability that a seed's mean over the curve is better than that of an unguided seed. Equal seeds are drawn
+    together. With several runs, a variant is compared with the unguided variant of `unguided_of`.
     """
     sign = -1.0 if lower_is_better else 1.0
     rows = []
@@ -49,22 +52,34 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
         row |= {"last_step": steps[-1], "final": estimate[-1], "final_lower": lower[-1], "final_upper": upper[-1]}
         row |= dict(zip(("mean", "mean_lower", "mean_upper"), map(float, variant.mean), strict=True))
         row |= {"best_step": steps[best], "best": estimate[best]}
-        row |= dict.fromkeys((*REACHES, "above_unguided", "below_unguided"), "")
+        row |= dict.fromkeys((*REACHES, *APART, *IMPROVES), "")
         if unguided is not None and variant is not unguided:
             row |= _steps_to(variant, sign, sign * unguided.curve.estimate[-1])
-            for column, pair in (("above", (variant, unguided)), ("below", (unguided, variant))):
-                apart = statistics.stretches_apart(*(each.curve for each in pair))
-                row[f"{column}_unguided"] = "; ".join(f"{start}-{end}" for start, end in apart)
+            row |= _against(variant, unguided, sign)
         rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
     return rows
+
+
+def _against(variant: Variant, unguided: Variant, sign: float) -> Row:
+    """Return the columns that compare a variant with the unguided one, without intervals for a single seed."""
+    pair = variant, unguided
+    better = statistics.improvement(*(sign * each.samples(each.area, lambda values, axis: values) for each in pair))
+    if min(len(each.seeds) for each in pair) == 1:
+        return {IMPROVES[0]: better[0]}
+    row: Row = dict(zip(IMPROVES, (better[0], *np.quantile(better[1:], [0.025, 0.975])), strict=True))
+    steps, *places = np.intersect1d(variant.curve.steps, unguided.curve.steps, return_indices=True)
+    own, its = (each.samples()[1:, at] for each, at in zip(pair, places, strict=True))
+    lower, upper = np.quantile(own - its, [0.025, 0.975], axis=0)
+    for column, apart in zip(APART, (lower > 0, upper < 0), strict=True):
+        row[column] = "; ".join(f"{start}-{end}" for start, end in statistics.stretches(steps, apart))
+    return row
 
 
 def _steps_to(variant: Variant, sign: float, level: float) -> Row:
     """Return the columns of the step from which a variant's seeds stay at a level; an interval for several seeds."""
     bounds = lambda curves: statistics.steps_to_level(variant.curve.steps, sign * curves, level)  # noqa: E731
-    draws = statistics.resampled(variant.groups, of=bounds)
-    ends = statistics.censored_interval(draws) if len(variant.seeds) > 1 else ()
-    numbers = (statistics.interquartile_mean(bounds(variant.values))[1], *ends)
+    own, *draws = variant.samples(bounds)
+    numbers = (own[1], *(statistics.censored_interval(np.array(draws)) if len(variant.seeds) > 1 else ()))
     return dict(zip(REACHES, (round(float(step)) if np.isfinite(step) else "never" for step in numbers), strict=False))
 
 
@@ -91,9 +106,9 @@ def curve_rows(variants: Sequence[Variant]) -> list[Row]:
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Write a CSV table with the columns of the first row."""
+    """Write a CSV table with the columns of all rows; a row without a column leaves it empty."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer = csv.DictWriter(file, list(dict.fromkeys(chain(*rows))), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
@@ -107,7 +122,8 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> l
 def summary_lines(rows: Sequence[Row]) -> list[str]:
     """Return the summary as a table in Markdown."""
     header = ["guidance", "labels", "seeds", "episodes", "last step", "final", "mean over the curve", "best (at step)"]
-    header += ["stays at the unguided final from step", "interval above the unguided", "interval below the unguided"]
+    header += ["stays at the unguided final from step", "above the unguided", "below the unguided"]
+    header += ["probability of improvement"]
     return markdown_table(["run"] * ("run" in rows[0]) + header, [_summary_cells(row) for row in rows])
 
 
@@ -123,8 +139,9 @@ def _summary_cells(row: Row) -> list[object]:
     cells += [f"{row['labels']:,}", seeds, _step(row["episodes"]), f"{row['last_step']:,}"]
     cells += [str(Interval(*(row[key + end] for end in ("", "_lower", "_upper")))) for key in ("final", "mean")]  # pyright: ignore[reportArgumentType]
     cells += [f"{row['best']:.3f} ({row['best_step']:,})", f"{reached} [{', '.join(ends)}]" if any(ends) else reached]
-    for column in ("above_unguided", "below_unguided"):
+    for column in APART:
         apart = [stretch.split("-") for stretch in str(row[column]).split("; ") if stretch]
         spans = [f"{int(start):,} to {int(end):,}" if start != end else f"{int(start):,}" for start, end in apart]
         cells.append("; ".join(spans))
-    return cells
+    better = [f"{row[name]:.2f}" for name in IMPROVES if row[name] != ""]
+    return [*cells, f"{better[0]} [{', '.join(better[1:])}]" if better[1:] else "".join(better)]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import zlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,8 @@ from jaxtyping import Float, Int
 
 from cuelearner_jax.errors import UserError, one_line
 from cuelearner_jax.guides import registry
-from cuelearner_jax.report.statistics import Curve, Interval, curve, interval, mean_over_curve
+from cuelearner_jax.report import statistics
+from cuelearner_jax.report.statistics import Curve, Interval, curve, interquartile_mean, interval, mean_over_curve
 from cuelearner_jax.runs import failures
 from cuelearner_jax.storage import results
 
@@ -37,11 +39,29 @@ class Variant(NamedTuple):
     guide: Float[np.ndarray, "guides"] | None = None  # metric of each seed's guide alone, where it was measured
     episodes: int = 0  # of an evaluation, at least; 0: the runs, of an earlier version, keep none
     each: Float[np.ndarray, "seeds groups steps"] | None = None  # values of groups of episodes; None: of one group
+    until: int | None = None  # number of steps up to the last one that all variants share; None: all steps
 
     @property
     def groups(self) -> Float[np.ndarray, "seeds groups steps"]:
         """The values of groups of episodes, of a single group where none are kept."""
         return self.values[:, None] if self.each is None else self.each
+
+    def area(self, curves: Float[np.ndarray, "*seeds steps"]) -> Float[np.ndarray, "*seeds"]:
+        """Return the mean of each curve up to the last step that all variants share."""
+        return mean_over_curve(self.curve.steps[: self.until], curves[..., : self.until])
+
+    def samples(
+        self,
+        of: Callable[[np.ndarray], np.ndarray] = lambda curves: curves,
+        mean: Callable[..., np.ndarray] = interquartile_mean,
+    ) -> Float[np.ndarray, "samples *rest"]:
+        """Return a quantity of the real seeds, and then of the draws of its bootstrap, see `statistics.resampled`.
+
+        Variants of equal seeds draw them together: their lanes start alike, so comparisons are paired by seed.
+        """
+        stream = zlib.crc32(np.asarray(self.seeds, np.int64).tobytes())
+        own = mean(of(self.values), axis=0)
+        return np.concatenate([own[None], statistics.resampled(self.groups, seed=stream, of=of, mean=mean)])
 
     @property
     def name(self) -> str:
@@ -64,16 +84,17 @@ class Group(NamedTuple):
     table: pa.Table  # the rows to report
     failed: pa.Table  # all rows of failed lanes
     invalid: int  # number of rows left out since the metric is not finite
+    every: pa.Table  # all rows of the split, also of kinds and budgets that are not reported
     guides: pa.Table | None  # evaluations of the guides alone, see `storage.results`; None: there are none
 
-    @property
-    def all_rows(self) -> pa.Table:
-        """The rows to report and those of failed lanes."""
-        return pa.concat_tables([self.table, self.failed])
 
+def read_groups(
+    folders: Sequence[PathLike], metric: str, split: str, by_run: bool, **choice: Sequence[str | int]
+) -> list[Group]:
+    """Read the results of folders, together or (`by_run`) each folder by itself under its name.
 
-def read_groups(folders: Sequence[PathLike], metric: str, split: str, by_run: bool) -> list[Group]:
-    """Read the results of folders, together or (`by_run`) each folder by itself under its name."""
+    `choice`: kinds of `guidance` and budgets (`labels`) to report, where not all; 0 labels are always reported.
+    """
     folders_of = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
     if by_run and len(folders_of) < len(folders):
         raise UserError("--by-run: several folders have the same name: give them different names")
@@ -83,19 +104,29 @@ def read_groups(folders: Sequence[PathLike], metric: str, split: str, by_run: bo
         guides = None if guides is None else guides.filter(pc.field("split") == split)
         groups.append(Group(name, *_select(results.read(own), metric, split), guides))
     tasks = sorted({group.table["task"][0].as_py() for group in groups})
+    for column, values in choice.items():
+        there = {value for group in groups for value in group.every[column].to_pylist()}
+        if absent := [str(value) for value in values if value not in there]:
+            names = ", ".join(map(str, sorted(there)))
+            raise UserError(f"--{column} {' '.join(absent)}: no such results; there are {names}")
+        if values:
+            fits = pc.field(column).isin([*values, *([0] if column == "labels" else [])])
+            groups = [one._replace(table=one.table.filter(fits), failed=one.failed.filter(fits)) for one in groups]
+    if not (groups := [group for group in groups if group.table.num_rows]):
+        raise UserError("no results of these kinds have one of these label budgets: give other --guidance or --labels")
     if len(tasks) > 1:
         raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: give folders of one of them")
     return groups
 
 
-def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int]:
-    """Return the rows to report, all rows of failed lanes, and the number of rows whose metric is not finite."""
-    if metric not in results.metrics(table):
-        raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(table))}")
-    splits = sorted(set(table["split"].to_pylist()))
+def _select(every: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int, pa.Table]:
+    """Return rows to report, all of failed lanes, the number whose metric is not finite, and all of the split."""
+    if metric not in results.metrics(every):
+        raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(every))}")
+    splits = sorted(set(every["split"].to_pylist()))
     if split not in splits:
         raise UserError(f"no {split} rows in the results: there are {', '.join(splits)} rows")
-    rows = table.filter(pc.field("split") == split)
+    every = rows = every.filter(pc.field("split") == split)
     marked, lanes = results.failures(rows), zip(*(rows[name].to_pylist() for name in results.LANE), strict=True)
     of_failed = np.array([lane in marked for lane in lanes], bool)
     rows, failed = rows.filter(pa.array(~of_failed)), rows.filter(pa.array(of_failed))
@@ -104,7 +135,7 @@ def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Tabl
     table = rows.filter(pc.field(metric).is_valid())
     if table.num_rows == 0:
         raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
-    return table, failed, rows.num_rows - table.num_rows
+    return table, failed, rows.num_rows - table.num_rows, every
 
 
 def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
@@ -128,7 +159,8 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
         until = max(1, int(np.searchsorted(steps, shared, side="right")))
         areas, parts = (mean_over_curve(steps[:until], of[..., :until]) for of in (values, each))
         mean_curve = curve(steps, values, each)
-        variants.append(Variant(kind, labels, seeds, values, mean_curve, interval(areas, parts), *others, each=each))
+        mean = interval(areas, parts)
+        variants.append(Variant(kind, labels, seeds, values, mean_curve, mean, *others, each=each, until=until))
     return variants
 
 

@@ -1,35 +1,10 @@
 """A run's tables: its results, and each guide's own performance while labels are collected.
 
 `results.jsonl` grows during a run; `results.parquet` replaces it at the end. One row holds one evaluation of one
-seed:
+seed. `MEANINGS` describes the columns, as does the `description` in each column's metadata in Arrow and Parquet.
 
-| column       | type  | meaning                                                          |
-|--------------|-------|------------------------------------------------------------------|
-| run          | str   | name of the run                                                  |
-| task         | str   | name of the task                                                 |
-| guidance     | str   | "none", "relative", "heuristic", ...                             |
-| labels       | int   | label budget, 0 where the guidance takes no labels               |
-| seed         | int   | seed of the lane                                                 |
-| step         | int   | environment steps taken by this seed so far                       |
-| split        | str   | "validation" or "training"                                       |
-| config_hash  | str   | hash of the configuration of the run                             |
-| wall_s       | float | seconds since the run started                                    |
-| commit, versions, hardware, command | str | the row's provenance (see `provenance`)     |
-| failed       | float | 1 once the lane stopped being finite: its metrics are null then  |
-| episodes     | int   | episodes of the evaluation, or environments where steps count    |
-| ..._each     | list  | means of a metric over up to 20 equal groups of these episodes   |
-| all others   | float | metrics, for instance `reward`; a value that is not finite is null |
-
-`guide.jsonl` and `guide.parquet` beside them evaluate uniform actions refined by a lane's guide, in the same columns
-and these:
-
-| column     | type  | meaning                                                                             |
-|------------|-------|-------------------------------------------------------------------------------------|
-| asked      | int   | labels asked for so far, answered or not: at most the budget                        |
-| round      | int   | label rounds of the lanes trained with it so far: what a resumed run goes back by   |
-| guide_...  | float | metrics, for instance `guide_reward`                                                |
-
-A lane's guide has a row at every multiple of `--schedule.guide-eval-every` labels of its own, and at its last label.
+`guide.jsonl` and `guide.parquet` beside them evaluate uniform actions refined by a lane's guide. A lane's guide has a
+row at every multiple of `--schedule.guide-eval-every` labels of its own, and at its last label.
 
 A run appends the rows of a step, or of a round, before it saves that checkpoint; then no row is lost.
 """
@@ -47,12 +22,37 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.table import PathLike
 
+MEANINGS = {  # of columns, by name or pattern; the first that fits
+    "run": "name of the run",
+    "task": "name of the task",
+    "guidance": 'kind of guidance: "none", "relative", ...',
+    "labels": "label budget; 0 where the guidance takes no labels",
+    "seed": "seed of the lane",
+    "step": "environment steps taken by this seed so far",
+    "split": 'episodes of the evaluation: "validation", "tuning" or "training"',
+    "config_hash": "hash of the run's configuration",
+    "wall_s": "seconds since the run started",
+    "commit": "commit of this package that wrote the row",
+    "versions": "versions of the libraries",
+    "hardware": "devices of the run",
+    "command": "command line of the run",
+    "failed": "1 once the lane is no longer finite: its metrics are null from then on",
+    "episodes": "episodes of the evaluation, or environments where steps count",
+    "folder": "folder of the row's table; only in tables that were read",
+    "asked": "labels asked for so far, answered or not: at most the budget",
+    "round": "label rounds of the lanes trained with this lane so far",
+    "*_each": "means of a metric over up to 20 equal groups of the evaluation's episodes",
+    "guide_*": "a metric of the guide alone, without the agent; null where the guide was not measured",
+    "train_*": "mean over training since the last evaluation: of the loss, of the reward, ...",
+    "*": "a metric: mean over the evaluation's episodes, or steps; null where the value is not finite",
+}
 SCHEMA = tables.Schema(
     stem="results",
     required=("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash"),
-    strings=("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command"),
+    strings=("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command", "folder"),
     integers=("labels", "seed", "step", "episodes"),
     lists=("_each",),
+    meanings=MEANINGS,
     remedy="is damaged: restore it, or move its folder away and give --resume, which trains these lanes anew",
 )
 GUIDES = tables.Schema(
@@ -60,6 +60,7 @@ GUIDES = tables.Schema(
     required=(*SCHEMA.required, "asked", "round"),
     strings=SCHEMA.strings,
     integers=("labels", "seed", "step", "asked", "round"),
+    meanings=MEANINGS,
     remedy=SCHEMA.remedy,
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
@@ -107,15 +108,15 @@ def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
 def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> pa.Table:
     """Read the results of any number of runs of one task, finished or not, into one table.
 
-    `paths`: results files, run folders, or folders at any height above them. The table has the columns listed at the
-    top of this module and `folder`, the folder of the row's run. A column that a run lacks is null for that run.
+    `paths`: results files, run folders, or folders at any height above them. The table has the columns of `MEANINGS`.
+    A column that a run lacks is null for that run.
     """
     files = find(paths, schema)
     parts = []
     for file in files:
         part = tables.read(file, schema)
         folder = pa.repeat(pa.scalar(file.parent.as_posix()), part.num_rows)
-        parts.append(part.append_column("folder", folder))
+        parts.append(part.append_column(schema.arrow_field("folder"), folder))
     table = pa.concat_tables(parts, promote_options="permissive")
     if table.num_rows == 0:
         raise UserError(f"no rows yet in {', '.join(map(str, files))}: wait for the first evaluation")
@@ -133,7 +134,7 @@ def read_guides(paths: Sequence[PathLike]) -> pa.Table | None:
 
 def metrics(table: pa.Table) -> list[str]:
     """Return the names of a results table's metric columns."""
-    others = (*SCHEMA.strings, *SCHEMA.integers, "wall_s", FAILED, "folder")
+    others = (*SCHEMA.strings, *SCHEMA.integers, "wall_s", FAILED)
     return [name for name in table.column_names if name not in others and not SCHEMA.is_list(name)]
 
 

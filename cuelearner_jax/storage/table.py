@@ -17,8 +17,9 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ class Schema:
     strings: tuple[str, ...] = ()
     integers: tuple[str, ...] = ()
     lists: tuple[str, ...] = ()  # of 32-bit floats: names, or endings of names
+    meanings: Mapping[str, str] = field(default_factory=dict)  # of columns, by name or pattern: the first that fits
     remedy: str = "is damaged: restore it"  # the remedy in the message about a damaged file, after its path
 
     @property
@@ -74,9 +76,14 @@ class Schema:
         """Whether a column holds lists."""
         return name.endswith(self.lists)
 
+    def arrow_field(self, name: str) -> pa.Field:
+        """Return the Arrow field of a column; its metadata has the column's meaning as `description`."""
+        meaning = next((text for key, text in self.meanings.items() if fnmatchcase(name, key)), None)
+        return pa.field(name, self.type(name), metadata=meaning and {"description": meaning})
+
     def cast(self, table: pa.Table, metadata: dict[bytes, bytes] | None = None) -> pa.Table:
         """Return a table with the columns' types and other metadata."""
-        return table.cast(pa.schema([(name, self.type(name)) for name in table.column_names], metadata))
+        return table.cast(pa.schema([self.arrow_field(name) for name in table.column_names], metadata))
 
 
 class TableWriter(contextlib.AbstractContextManager):
@@ -222,6 +229,8 @@ def plain(value: Any) -> Any:
     """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
     if isinstance(value, list):
         return [plain(entry) for entry in value]
+    if isinstance(value, dict):
+        return {name: plain(entry) for name, entry in value.items()}
     value = float(value) if isinstance(value, bool) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 

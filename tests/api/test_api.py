@@ -93,6 +93,7 @@ def folder(tmp_path_factory):
 
 def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(folder):
     loaded = cl.load_policy(folder, seed=5, task=TASK)
+    assert repr(loaded).startswith("CallablePolicy(Agent, obs (2,) -> action (2,), window, guidance='relative', ")
     many = loaded(SEEN)
     np.testing.assert_allclose(np.linalg.norm(many, axis=-1), 1, atol=1e-6)
     np.testing.assert_array_equal(loaded(SEEN[0]), many[0])
@@ -174,6 +175,7 @@ def test_training_from_python_gives_what_the_command_gives(folder):
     run = cl.train(WORLD, TEACHER, probes.CONFIG, **how)
     assert rows_of(run.results.to_pylist(), COLUMNS) == rows_of(results.read(folder).to_pylist(), COLUMNS)
     assert run.policy(guidance="relative", seed=5)(SEEN).shape == (200, 2)
+    assert cl.read_run(folder).equals(results.read(folder))
     last = {row["seed"]: row["reward"] for row in run.results.sort_by("step").to_pylist()}
     assert run.policy().lane == {"guidance": "relative", "labels": 10, "seed": max(last, key=last.get)}
     with pytest.raises(cl.UserError, match="no lane with seed 9"):

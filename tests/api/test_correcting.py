@@ -67,6 +67,7 @@ def better():
 
 def test_a_corrected_policy_is_nearer_to_what_people_have_in_mind(better):
     assert better.used
+    assert [line[:14] for line in repr(better).splitlines()] == ["AdaptedPolicy("]
     assert error(off) == pytest.approx(ERROR, rel=0.02)
     assert error(better) < 0.5 * ERROR
     assert better.actions.cues[1].words == ("up", "down")

@@ -279,7 +279,7 @@ def test_the_parts_keep_the_laws(tmp_path):
 def test_any_function_is_corrected(capsys):
     from examples.correct_a_policy import main as correct
 
-    rates = correct(worlds=4, labels=10, episodes_judged=4, episodes_measured=4)
+    rates = correct(worlds=4, labels=20, episodes_judged=4, episodes_measured=4)
     assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == ["compass", "refined"]
     assert all(rate in (0.0, 0.25, 0.5, 0.75, 1.0) for rate in rates)
 

@@ -30,6 +30,16 @@ def test_points_stand_on_their_ticks():
             np.testing.assert_array_equal(labels, ticks)
 
 
+def test_more_than_four_variants_have_a_panel_a_kind_where_equal_curves_have_other_dashes():
+    variants = [variant(kind, labels, 0.3) for kind in ("relative", "scalar") for labels in (100, 500)]
+    figure = draw_curves([variant("none", 0, 0.3), *variants], "title", "reward")
+    kinds = [[text.get_text().split(",")[0] for text in axes.get_legend().get_texts()] for axes in figure.axes]
+    assert kinds == [["no guidance", "relative", "relative"], ["no guidance", "scalar", "scalar"]]
+    for axes in figure.axes:
+        assert len({str(line._dash_pattern) for line in axes.lines}) == 3
+        assert min(line.zorder for line in axes.lines) > max(band.zorder for band in axes.collections)
+
+
 def test_curves_are_named_in_the_order_of_their_ends_whatever_their_names_hold():
     assert matplotlib.rcParams["text.parse_math"]  # what others draw is left as it is
     variants = [variant("$\\broken{$", 0, 0.1), variant("relative", 100, 0.3), variant("relative", 500, 0.2)]

@@ -59,6 +59,7 @@ def test_a_known_difference_is_found(runs, tmp_path):
     assert float(best["mean"]) == pytest.approx(0.6 * 0.65, abs=0.01)
     assert best["above_unguided"] == "40-100"
     assert best["below_unguided"] == ""
+    assert [float(best[f"improvement{end}"]) for end in ("", "_lower", "_upper")] == [1.0] * 3
     # A third of the way from 30 to 40: the unguided agents' last value is a third of 0.6.
     reached = [int(best[f"reaches_unguided_final{end}"]) for end in ("_lower", "", "_upper")]
     assert reached == sorted(reached)

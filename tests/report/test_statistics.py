@@ -5,12 +5,7 @@ import pytest
 
 from cuelearner_jax.evaluate import group_means
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.statistics import Curve, Interval
-
-
-def flat(steps, lower, upper):
-    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
-    return Curve(np.asarray(steps), (lower + upper) / 2, lower, upper)
+from cuelearner_jax.report.statistics import Interval
 
 
 @pytest.mark.parametrize(
@@ -57,14 +52,11 @@ def test_missing_values_are_refused():
         statistics.interval(np.empty((0, 3)))
 
 
-def test_stretches_apart_are_the_unbroken_ones_on_common_steps():
-    a = flat([0, 10, 20, 30, 40, 50], [0, 2, 2, 0, 2, np.nan], [9, 9, 9, 9, 9, np.nan])
-    b = flat([0, 10, 20, 30, 40, 50, 60], [0] * 7, [1] * 7)
-    assert statistics.stretches_apart(a, b) == [(10, 20), (40, 40)]
-    assert statistics.stretches_apart(b, a) == []
-    # Step 20 is unknown for this one: 10 and 30 are neighbours among the steps that both have.
-    assert statistics.stretches_apart(a, flat([0, 10, 30], [0, 0, -2], [1, 1, -1])) == [(10, 30)]
-    assert statistics.stretches_apart(flat([0], [1], [1]), flat([0], [1], [1])) == []
+def test_stretches_are_unbroken_and_the_probability_of_improvement_counts_pairs():
+    steps = np.array([0, 10, 20, 30, 40])
+    assert statistics.stretches(steps, np.array([False, True, True, False, True])) == [(10, 20), (40, 40)]
+    values, others = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), np.array([[2.0, 0.0], [0.0, 1.0]])
+    np.testing.assert_allclose(statistics.improvement(values, others), [4.5 / 6, 1.5 / 6])
 
 
 def test_the_mean_over_uneven_steps_by_hand():

@@ -1,7 +1,10 @@
 """The results of several runs as one table: what is found where, and what is refused in one line."""
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
@@ -42,6 +45,17 @@ def test_reads_runs_at_any_depth_done_or_not_with_their_own_metrics(tmp_path):
     assert results.metrics(table) == ["reward", "success"]
     # The same run given twice, once through the folder above it, counts once.
     assert results.read([tmp_path, tmp_path / "going" / results.JSONL]).num_rows == 13
+
+
+def test_every_column_has_its_meaning_in_the_file_and_on_the_page(tmp_path):
+    write(tmp_path)
+    with pq.ParquetFile(finish(tmp_path, results.SCHEMA)) as file:
+        meanings = {field.name: field.metadata[b"description"].decode() for field in file.schema_arrow}
+    assert meanings["seed"] == results.MEANINGS["seed"]
+    assert meanings["reward"] == results.MEANINGS["*"]
+    page = (Path(__file__).parents[2] / "docs/reference/columns.md").read_text(encoding="utf-8")
+    rows = (line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| `"))
+    assert {name.strip("`"): meaning for name, meaning in rows} == results.MEANINGS
 
 
 def test_errors_are_one_clear_line(tmp_path):

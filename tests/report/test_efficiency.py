@@ -4,16 +4,15 @@ import csv
 import json
 from collections.abc import Sequence
 
-import label_efficiency
 import numpy as np
 import pytest
-from _efficiency import Question, efficiency_of
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.report.efficiency import Question, cell, efficiency_of
 from cuelearner_jax.report.statistics import curve, interval, mean_over_curve
 from cuelearner_jax.report.variants import Variant
-from cuelearner_jax.storage import results
+from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.table import TableWriter
 
 STEPS = np.arange(0, 101, 10)
@@ -39,8 +38,8 @@ def same(guidance, labels, slope, **more):
 
 def known(row, name):
     """Bounds of an estimate and its interval."""
-    value = row[name]
-    bounds = (row[f"{name}_above"], row[f"{name}_below"]) if value == "" else (value, value)
+    value = row.get(name)
+    bounds = (row[f"{name}_above"], row[f"{name}_below"]) if value is None else (value, value)
     return [*bounds, row[f"{name}_lower"], row[f"{name}_upper"]]
 
 
@@ -50,10 +49,13 @@ def test_known_curves_give_known_steps_ratios_and_areas():
     assert known(plain, "steps_to_level") == pytest.approx([60.0] * 4)
     assert known(steered, "steps_to_level") == pytest.approx([30.0] * 4)
     assert known(steered, "steps_ratio") == pytest.approx([0.5] * 4)
-    assert (plain["reached"], steered["reached"], plain["steps_ratio"]) == (1.0, 1.0, "")
-    # Areas: a half of a triangle; a triangle to the middle and a rectangle after it.
+    assert (plain["reached"], steered["reached"], "steps_ratio" in plain) == (1.0, 1.0, False)
     for name, value in (("mean", 0.75), ("mean_difference", 0.25), ("mean_ratio", 1.5), ("guide", 0.1)):
         assert [steered[name + end] for end in ("", "_lower", "_upper")] == pytest.approx([value] * 3)
+    shared = np.arange(5)[:, None] / 10  # by equal seeds, which are drawn together
+    pair = [variant("none", 0, ramp(1.0) + shared), variant("relative", 100, ramp(1.0) + shared + 0.2)]
+    row = efficiency_of(pair, Question(level=0.9)).tables["efficiency"][1]
+    assert [row[f"mean_difference{end}"] for end in ("_lower", "_upper")] == pytest.approx([0.2] * 2)
 
 
 def test_the_level_is_the_unguided_agents_at_a_step():
@@ -75,23 +77,12 @@ def test_a_curve_that_never_gets_there_is_a_bound_and_no_number():
     assert known(row, "steps_to_level") == [100.0, np.inf, 100.0, np.inf]
     assert known(row, "steps_ratio") == [2.0, np.inf, 2.0, np.inf]  # more than 100 steps over 50
     assert row["reached"] == 0.0
+    assert cell(row, "steps_ratio", "{:.1f}") == "above 2.0 [2.0, no bound]"
+    assert cell(row | {"steps_ratio_lower": 0.9}, "steps_ratio", "{:.1f}") == "not told apart"
     # Unguided agents that never get there: the others need less than their share of all steps.
     variants = [same("none", 0, 0.3), same("relative", 100, 1.0)]
-    assert known(efficiency_of(variants, Question(level=0.5)).tables["efficiency"][1], "steps_ratio") == [
-        0,
-        0.5,
-        0,
-        0.5,
-    ]
-
-
-def test_the_smallest_budget_in_time():
-    variants = [same("none", 0, 0.5)]  # 0.4 at step 80: in time is by step 40, of slope 1
-    variants += [same("relative", budget, slope) for budget, slope in ((50, 0.7), (100, 1.1), (500, 2.0))]
-    variants += [same("scalar", budget, 0.6) for budget in (50, 500)]
-    relative, scalar = efficiency_of(variants, Question(level=0.4, within=0.5)).tables["labels_to_level"]
-    assert (known(relative, "labels"), relative["reached"]) == ([100.0] * 4, 1.0)
-    assert (known(scalar, "labels"), scalar["reached"]) == ([500.0, np.inf, 500.0, np.inf], 0.0)
+    row = efficiency_of(variants, Question(level=0.5)).tables["efficiency"][1]
+    assert known(row, "steps_ratio") == [0, 0.5, 0, 0.5]
 
 
 def test_labels_for_equal_areas():
@@ -112,9 +103,6 @@ def test_labels_for_equal_areas():
     assert known(found[2], "labels") == [10000.0, np.inf, 10000.0, np.inf]
     with pytest.raises(UserError, match="--reference dcoach: no results with its labels; there are relative, scalar"):
         efficiency_of(variants, Question(level=0.1, reference="dcoach"))
-
-
-# --- the command -----------------------------------------------------------------------------------------------------
 
 
 def write(folder, guidance, labels, slope, *, seeds: Sequence[int] = range(4), guide=0.1):
@@ -142,32 +130,36 @@ def rows(file):
         return list(csv.DictReader(opened))
 
 
+def test_kinds_and_budgets_are_chosen_and_json_tells_what_is_missing(runs, capsys):
+    formats.write("config", runs / "raw" / "config.json", {"grid": {"guidance": ["clic"]}})
+    command = ["report", str(runs / "raw"), "--json"]
+    assert main([*command, "--guidance", "none", "scalar", "--labels", "500", "--level", "0.4"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert [(row["guidance"], row["labels"]) for row in shown["rows"]] == [("none", 0), ("scalar", 500)]
+    assert [row["steps_ratio"] for row in shown["efficiency"][1:]] == [pytest.approx(1 / 1.7, abs=0.01)]
+    assert any("no results of clic guidance" in line for line in shown["missing"])
+    assert main([*command, "--labels", "7"]) == 2
+    assert "--labels 7: no such results; there are 0, 100, 500" in capsys.readouterr().err
+
+
 def test_the_command_writes_tables_and_a_section(runs, tmp_path):
     out = tmp_path / "report"
     command = [str(runs / "raw"), str(runs / "frame"), "--by-run", "--level", "0.4"]
-    assert label_efficiency.main([*command, "--reference", "relative", "--out", str(out)]) == 0
+    assert main(["report", *command, "--reference", "relative", "--out", str(out)]) == 0
     text = (out / "report.md").read_text()
     section = text.split("## Label efficiency")[1].split("## Missing")[0]
     assert "The level is 0.400: given." in section
     table = {(row["run"], row["guidance"], int(row["labels"])): row for row in rows(out / "efficiency.csv")}
-    assert len(table) == 2 * 5
     own = table["frame", "relative", 500]
     assert float(own["steps_ratio"]) == pytest.approx(1 / 2.1, abs=0.01)
-    assert float(own["guide"]) == pytest.approx(0.1615)
     assert own["against"] == "frame: no guidance"
-    (shown,) = (row for row in section.splitlines() if row.startswith("| frame | relative | 500 | "))
+    shown, *_ = (row for row in section.splitlines() if row.startswith("| frame | relative | 500 | "))
     assert f"| {float(own['steps_ratio']):.2f} [" in shown
-    needed = rows(out / "labels_to_level.csv")
-    # In time, in two thirds of the unguided agents' steps, are slopes of one and a half times theirs.
-    assert {(row["run"], row["guidance"]): float(row["labels"]) for row in needed} == {
-        (run, kind): labels for run in ("raw", "frame") for kind, labels in (("relative", 100), ("scalar", 500))
-    }
     assert {row["reference"] for row in rows(out / "equal_area.csv")} == {"relative"}
     summary = rows(out / "summary.csv")
     assert [float(row["mean"]) for row in summary] == [float(row["mean"]) for row in table.values()]
     assert "differ in more than" not in text  # each run has one configuration
     assert main(["report", str(runs / "raw"), "--out", str(out), "--overwrite"]) == 0
     left = {path.name for path in out.iterdir()}
-    assert not left & {"efficiency.csv", "labels_to_level.csv", "equal_area.csv"}
+    assert not left & {"efficiency.csv", "equal_area.csv"}
     assert "Label efficiency" not in (out / "report.md").read_text()
-    assert "run" not in rows(out / "summary.csv")[0]
