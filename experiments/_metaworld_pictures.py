@@ -13,7 +13,7 @@ import multiprocessing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import metaworld
@@ -147,7 +147,16 @@ class PicturesConfig(EnvConfig):
 
 
 Plan = Callable[[np.ndarray, np.ndarray], np.ndarray]  # pictures (n, h, w, 3), states (n, 4) -> chunks (n, T, 4)
-Correct = Callable[[np.ndarray], np.ndarray]  # inputs (n, 9), as in `Episode` -> actions (n, 4)
+
+
+class Corrected(Protocol):
+    """A correction beside a policy."""
+
+    shift: np.ndarray  # (4,): added to the state that the policy sees
+
+    def correct(self, inputs: np.ndarray) -> np.ndarray:
+        """Return actions (n, 4) of inputs (n, 25), as in `Episode`."""
+        ...
 
 
 class Demonstration(NamedTuple):
@@ -162,7 +171,7 @@ class Episode(NamedTuple):
     """An episode of a policy."""
 
     success: bool
-    inputs: np.ndarray  # (steps, 9): state, proposed action, phase in the chunk
+    inputs: np.ndarray  # (steps, 25): state, phase in the chunk, effects of the state, proposed action
     intended: np.ndarray  # (steps, 4): the script's actions in these situations
 
 
@@ -194,31 +203,45 @@ class Robots:
             first_seed += len(self.pipes)
         return episodes[:count]
 
-    def play(self, change: str, seeds: Sequence[int], plan: Plan, correct: Correct | None, every: int) -> list[Episode]:
-        """Return an episode a seed; `plan` gives a chunk every `every` steps, `correct` the action of inputs."""
+    def play(
+        self,
+        change: str,
+        seeds: Sequence[int],
+        plan: Plan,
+        corrected: Corrected | None,
+        every: int,
+        widths: Sequence[float] = (),
+    ) -> list[Episode]:
+        """Return an episode a seed; `plan` gives a chunk every `every` steps, `corrected` corrects its actions.
+
+        Where `widths` (4,) are given, the policy is asked as far to both sides of each entry of the state, and inputs
+        hold how its action changes with the state; else zeros.
+        """
         episodes: list[Episode] = []
         for start in range(0, len(seeds), len(self.pipes)):
-            episodes += self._wave(change, seeds[start : start + len(self.pipes)], plan, correct, every)
+            part = seeds[start : start + len(self.pipes)]
+            episodes += self._wave(change, part, partial(_with_effects, plan, every, np.array(widths)), corrected)
         return episodes
 
     def _wave(
-        self, change: str, seeds: Sequence[int], plan: Plan, correct: Correct | None, every: int
+        self, change: str, seeds: Sequence[int], plan: Callable[..., np.ndarray], corrected: Corrected | None
     ) -> list[Episode]:
         replies = self.call({number: ("start", change, seed) for number, seed in enumerate(seeds)})
         inputs: list[list[np.ndarray]] = [[] for _ in seeds]
         intended: list[list[np.ndarray]] = [[] for _ in seeds]
-        success, chunks = np.zeros(len(seeds), bool), np.zeros((len(seeds), every, 4), np.float32)
+        success, chunks = np.zeros(len(seeds), bool), np.zeros((0, 0, 0))
         for step in range(STEPS):
-            active, phase = list(replies), step % every
-            if phase == 0:
-                pictures, states = (
-                    np.stack([replies[number][name] for number in active]) for name in ("picture", "state")
-                )
-                chunks[active] = plan(pictures, states)[:, :every]
-            proposed = np.clip(chunks[active, phase], -1, 1)
+            active = list(replies)
+            phase = step % chunks.shape[1] if step else 0
             states = np.stack([replies[number]["state"] for number in active])
-            rows = np.concatenate([states, proposed, np.full((len(active), 1), phase / every)], 1).astype(np.float32)
-            actions = proposed if correct is None else correct(rows)
+            if phase == 0:
+                pictures = np.stack([replies[number]["picture"] for number in active])
+                planned = plan(pictures, states, 0 if corrected is None else corrected.shift)
+                chunks = np.zeros((len(seeds), *planned.shape[1:]), np.float32)
+                chunks[active] = planned
+            every, own = chunks.shape[1], chunks[active, phase]
+            rows = np.concatenate([states, np.full((len(active), 1), phase / every), own], 1).astype(np.float32)
+            actions = rows[:, -4:] if corrected is None else corrected.correct(rows)
             for number, row in zip(active, rows, strict=True):
                 inputs[number].append(row)
                 intended[number].append(replies[number]["intended"])
@@ -229,6 +252,20 @@ class Robots:
             if not replies:
                 break
         return [Episode(bool(success[n]), np.stack(inputs[n]), np.stack(intended[n])) for n in range(len(seeds))]
+
+
+def _with_effects(
+    plan: Plan, every: int, widths: np.ndarray, pictures: np.ndarray, states: np.ndarray, shift: np.ndarray | int
+) -> np.ndarray:
+    """Return, for each step of a chunk, the effects of the state and the proposed action (n, every, 20)."""
+    ways = np.concatenate([np.diag(widths), -np.diag(widths)]) if len(widths) else np.zeros((0, 4))
+    asked = (np.concatenate([np.zeros((1, 4)), ways])[:, None] + states + shift).astype(np.float32)
+    chunks = plan(np.tile(pictures, (len(asked), 1, 1, 1)), asked.reshape(-1, 4))[:, :every]
+    chunks = np.clip(chunks, -1, 1).reshape(len(asked), len(states), every, 4)
+    effects = np.zeros((len(states), every, 4, 4))
+    for entry, width in enumerate(widths):
+        effects[:, :, entry] = (chunks[1 + entry] - chunks[1 + len(widths) + entry]) / (2 * width)
+    return np.concatenate([effects.reshape(len(states), every, 16), chunks[0]], 2)
 
 
 def _serve(task: str, pipe: Any) -> None:

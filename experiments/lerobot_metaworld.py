@@ -8,8 +8,9 @@
 `all` does the first three. 50 episodes of the script with pictures become a LeRobot dataset (v3.0), which
 `lerobot-train` reads. The camera is moved, or the motion is changed. 100 situations, of failed episodes where there are
 any, are labelled in four rounds by a program that knows the script, with a person's slips. The correction acts beside
-the policy, on the hand's state, the proposed action and the phase in the chunk. Labels alone decide whether it is used.
-A control has answers drawn by chance about the same actions. Each task has a file, which grows with each cell.
+the policy, on the hand's state, the proposed action and the phase in the chunk; with the effects of the state, also on
+the state that the policy sees. Labels alone decide whether it is used. A control has answers drawn by chance about the
+same actions. Each task has a file, which grows with each cell.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ CHUNK, EXECUTED = 20, 10  # steps that ACT proposes at once, and those that are 
 LABELS, ROUNDS, SITUATIONS = 100, 4, 6  # situations met for each question
 MISTAKEN, SILENT = 0.05, 0.1  # shares of the answers about a cue
 TRAIN_SEED, LABEL_SEED, REPORT_SEED = 0, 100_000, 200_000  # of episodes
-CUES = "right,left;forward,back;up,down;close,open"
+CUES = ("right,left", "forward,back", "up,down", "close,open")
+SIDES = 0.05  # by which a state is shifted to see its effect, as a share of its range
 ACT = {
     "type": "act", "push_to_hub": "false", "pretrained_backbone_weights": "null", "chunk_size": CHUNK,
     "n_action_steps": EXECUTED, "dim_model": 256, "dim_feedforward": 1024, "optimizer_lr": 1e-4,
@@ -112,24 +114,35 @@ def planner(place: Path, device: str) -> Callable[[np.ndarray, np.ndarray], np.n
 class Labeller:
     """Labels about a policy in a changed world, and the correction that they give."""
 
-    def __init__(self, seed: int, eps: float) -> None:
+    def __init__(self, seed: int, eps: float, effects: bool) -> None:
         import jax
 
         import cuelearner_jax as cl  # noqa: F401
-        from cuelearner_jax.reading import Reading
+        from cuelearner_jax.environment import BASE, EFFECT
+        from cuelearner_jax.policies import Heuristic
+        from cuelearner_jax.reading import Reading, declared_distortions
         from cuelearner_jax.reading.families import ACTIONS_ALONE
-        from cuelearner_jax.spaces import Box, cues_from
+        from cuelearner_jax.tasks import logs
 
-        space = Box((-1.0,) * 4, (1.0,) * 4, cues_from(CUES, ("x", "y", "z", "grip"), "shares"))
-        proposed = jax.jit(lambda obs: obs[:, 4:8])
-        self.space, self.random, self.key = space, np.random.default_rng(seed), jax.random.key(seed)
-        self.make = lambda: Reading(proposed, ACTIONS_ALONE, space, eps, LABELS)
-        self.eps = eps
+        names = {"names": ("x", "y", "z", "opening", "phase", EFFECT, BASE), "entries": (1, 1, 1, 1, 1, 16, 4)}
+        env = logs.filled(logs.LogsConfig(**names, low=(-1.0,) * 4, high=(1.0,) * 4, cues=CUES))
+        family = declared_distortions(env) if effects else ACTIONS_ALONE
+        self.space, self.random, self.key = env.actions, np.random.default_rng(seed), jax.random.key(seed)
+        self.make = lambda: Reading(Heuristic(env.view()), family, env.actions, eps, LABELS, env.observation)
+        self.eps, self.effects = eps, effects
         self.reading = self.make()
 
+    @property
+    def shift(self) -> np.ndarray:
+        """What is added to the state that the policy sees (4,)."""
+        if not self.effects or self.reading.fit is None:
+            return np.zeros(4, np.float32)
+        return -np.asarray(self.reading.policy().correction.change.theta, np.float32)
+
     def correct(self, inputs: np.ndarray) -> np.ndarray:
-        """Return corrected actions; rows are filled up, so that one program serves."""
+        """Return corrected actions of a policy that sees the shifted state; rows are filled up for one program."""
         rows = np.concatenate([inputs, np.repeat(inputs[-1:], -len(inputs) % 32, 0)])
+        rows[:, 5:21] = 0
         return np.asarray(self.reading.act(rows))[: len(inputs)]
 
     def ask(self, episodes: Sequence[Episode], count: int) -> None:
@@ -167,15 +180,16 @@ class Labeller:
 class Cells:
     """The measurements of a task; those that its file has are not repeated."""
 
-    def __init__(self, task: str, robots: Robots, plan: Any, folder: Path, episodes: int, eps: float) -> None:
-        self.task, self.robots, self.plan, self.episodes, self.eps = task, robots, plan, episodes, eps
-        self.file = folder / "cells.parquet"
+    def __init__(self, robots: Robots, plan: Any, folder: Path, options: argparse.Namespace) -> None:
+        self.robots, self.plan, self.options, self.file = robots, plan, options, folder / "cells.parquet"
+        states = pq.read_table(sorted((folder / "dataset" / "data").rglob("*.parquet"))[0])["observation.state"]
+        self.widths = SIDES * np.ptp(np.stack(states.to_numpy()), 0) if options.effects else ()
         self.rows: list[dict[str, Any]] = pq.read_table(self.file).to_pylist() if self.file.exists() else []
 
-    def played(self, change: str, correct: Any = None, first: int = REPORT_SEED, count: int = 0) -> list[Episode]:
-        """Return episodes by the policy, or by the corrected policy."""
-        seeds = range(first, first + (count or self.episodes))
-        return self.robots.play(change, seeds, self.plan, correct, EXECUTED)
+    def played(self, change: str, corrected: Any = None, first: int = REPORT_SEED, count: int = 0) -> list[Episode]:
+        """Return episodes by the policy, or by the corrected policy; `count` of them are asked about."""
+        seeds = range(first, first + (count or self.options.episodes))
+        return self.robots.play(change, seeds, self.plan, corrected, EXECUTED, self.widths if count else ())
 
     def measure(self, seeds: int, until: float) -> None:
         """Measure all cells, those of one seed of labels after those of another, while there is time."""
@@ -187,17 +201,17 @@ class Cells:
                 for name in {"nothing": 0, change: 0}:
                     bases.setdefault(name, np.array([one.success for one in self.played(name)], float))
                 for row in self.cell(change, seed, bases[change]):
-                    self.rows.append({"task": self.task, "unchanged": bases["nothing"].mean(), **row})
+                    self.rows.append({"task": self.options.task, "unchanged": bases["nothing"].mean(), **row})
                     print({**self.rows[-1], "words": "; ".join(row["words"])[:300]}, flush=True)
                 pq.write_table(pa.Table.from_pylist(self.rows), self.file, compression="zstd")
 
     def cell(self, change: str, seed: int, before: np.ndarray) -> Iterator[dict[str, Any]]:
         """Yield the row of a change, and of its control."""
-        began, labeller, count = time.time(), Labeller(seed, self.eps), LABELS // ROUNDS
+        began, count = time.time(), LABELS // ROUNDS
+        labeller = Labeller(seed, self.options.eps, self.options.effects)
         for round_ in range(ROUNDS):
             first = LABEL_SEED + 1000 * seed + 100 * round_
-            correct = labeller.correct if round_ else None
-            labeller.ask(self.played(change, correct, first, len(self.robots.pipes)), count)
+            labeller.ask(self.played(change, labeller if round_ else None, first, len(self.robots.pipes)), count)
         yield self.row(change, seed, "labels", before, labeller, began)
         if seed == 0:
             yield self.row(change, seed, "random", before, labeller.shuffled(), time.time())
@@ -209,7 +223,7 @@ class Cells:
         from cuelearner_jax.adaptation.judging import PairedTest
 
         result, seconds = labeller.reading.result(), time.time() - began
-        after = np.array([one.success for one in self.played(change, labeller.correct)], float)
+        after = np.array([one.success for one in self.played(change, labeller)], float)
         test = PairedTest(1)
         test.add((after - before)[None])
         verdict = "better" if test.better[0] else "worse" if test.worse[0] else "open"
@@ -282,7 +296,7 @@ def run(options: argparse.Namespace) -> None:
         print(f"{options.task}: {checkpoint(folder / 'act').resolve()} after {time.time() - began:.0f} s", flush=True)
     if doing in ("evaluate", "all"):
         plan = planner(checkpoint(folder / "act"), options.device)
-        cells = Cells(options.task, robots, plan, folder, options.episodes, options.eps)
+        cells = Cells(robots, plan, folder, options)
         cells.measure(options.seeds, options.until)
         if options.tune:
             fine_tune(cells, folder, options, sizes)
@@ -305,6 +319,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--tune", type=float, default=0.0, help="seconds of fine-tuning by five demonstrations; 0: none"
     )
     parser.add_argument("--eps", type=float, default=0.05, help="strength of an answer, as a share of the range")
+    parser.add_argument("--effects", action=argparse.BooleanOptionalAction, default=True, help="of the state")
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--save", type=int, default=500, help="steps between checkpoints")
     parser.add_argument("--workers", type=int, default=12, help="that read the dataset")

@@ -34,6 +34,7 @@ from cuelearner_jax.types import Label, Teacher
 SIZES = GuideSizes(feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)
 REACH_QUANTILE = 0.95  # quantile of the distances between labelled actions and the policy's own: how far labels reach
 BOUND = 1 / 4  # default bound, as a share of the space's reach (45 deg)
+MOST_NATS = 13.8  # log of a million: evidence above is not told in numbers
 PASSES = 20  # threshold tau as a share of eps: a pass that turns an action by less has settled
 
 
@@ -87,8 +88,8 @@ class AdaptationResult:
             spent = f"difference {difference}; {judgement.rewarded_steps[lane]:,} rewarded steps"
             why = f"{judgement.by} on tuning episodes {before:.4g} before, {after:.4g} after ({spent})"
         elif self.results:
-            factor = np.exp(min(after, 50.0))
-            why = f"answers predicted before they were read: {factor:.3g} times as likely as without a change"
+            factor = f"{np.exp(after):.3g}" if after < MOST_NATS else "more than a million"
+            why = f"answers predicted before they were read: {factor} times as likely as without a change"
         else:
             why = f"predicts {after:.4g} of held-out answers, always 'already right' {before:.4g}"
         if not judgement.in_use[lane]:

@@ -15,11 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.adaptation.by_model import AdaptationResult, result_of
 from cuelearner_jax.adaptation.judging import Judge, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
+from cuelearner_jax.asking import fitted_labels
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import Tell, ignore_progress
@@ -93,7 +95,7 @@ def adapt(
             own = _ask(of, reading, seed, budget, teacher, progress)
         else:
             own = jax.tree.map(lambda leaf: np.asarray(leaf)[len(rows)], labels)
-            reading.read_in_batches(*(part[own.valid] for part in (own.obs, own.action, own.answer)))
+            reading.read_in_batches(*_valid(jax.random.key(seed), own, of.scalars))
         rows.append(own)
         results.append(reading.result())
         total_before += budget
@@ -128,10 +130,17 @@ def _ask(
         answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
         rows.append((np.asarray(obs), action, answer))
         there = np.isfinite(answer).any(-1)
-        reading.learn(np.asarray(obs)[there], action[there], answer[there])
+        batch = Label(np.asarray(obs), action, answer, there)  # pyright: ignore[reportArgumentType]
+        reading.learn(*_valid(k_answer, batch, of.scalars))
     obs, action, answer = (np.concatenate(column) for column in zip(*rows, strict=True))
     valid = np.asarray(np.isfinite(answer).any(-1))
     return Label(obs, action, np.where(valid[:, None], answer, 0), valid)  # pyright: ignore[reportArgumentType]
+
+
+def _valid(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> list[np.ndarray]:
+    """Return situations, actions and answers of the valid labels, in the control with exchanged answers."""
+    labels = fitted_labels(key, jax.tree.map(jnp.asarray, labels), scalars)
+    return [np.asarray(part)[labels.valid] for part in (labels.obs, labels.action, labels.answer)]
 
 
 def _side_by_side(trees: list[Any]) -> Any:

@@ -57,6 +57,8 @@ def run(arguments: list[str]) -> None:
     if options.out and options.out.exists():
         raise UserError(f"{options.out} exists: give another --out")
     requests: list[tuple[PolicySource, Evaluate]] = [(source, options)]
+    if "--compare" in arguments and not options.compare:
+        raise UserError("--compare names nothing: give a run folder, a policy folder or a policy")
     if options.compare:
         other, policy = _other(source, options)
         requests.append((other, replace(options, policy=policy, guidance=(), labels=(), seed=())))

@@ -94,8 +94,8 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
             raise UserError(f"{word!r} is no run folder of the task {task.name}: give one, or code as module:NAME")
         elif ":" not in word and word not in registry.names():
             raise UserError(
-                f"{word!r} is neither a run folder nor a task ({', '.join(registry.names())}) "
-                f"nor a shipped agent ({', '.join(shipped.names())})"
+                f"{word!r} is no run or policy folder, no task ({', '.join(registry.names())}) "
+                f"and no shipped agent ({', '.join(shipped.names())})"
             )
     task = task or registry.resolve(str(word))
     if base is not None:

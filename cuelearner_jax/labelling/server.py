@@ -35,7 +35,7 @@ pre {{ background: #80808022; padding: 0.8rem; white-space: pre-wrap; overflow-w
 form {{ display: flex; gap: 1rem; margin-top: 1rem; }} button {{ flex: 1; font: inherit; padding: 0.6rem; }}
 </style></head><body>{body}</body></html>"""
 HEADERS = (
-    (b"referrer-policy", b"no-referrer"),  # the address contains the token
+    (b"referrer-policy", b"same-origin"),  # the address contains the token; without any, forms have no origin
     (b"x-frame-options", b"DENY"),
     (b"x-content-type-options", b"nosniff"),
 )
@@ -62,7 +62,7 @@ class Ending(NamedTuple):
         body = f"""<h1>Finished. Thank you.</h1><p class="saved">{line}</p>
 <h2>What to type next</h2><pre id="next">{following}</pre>
 <h2>To add labels later</h2><pre>{again}</pre>
-<p>The command in the terminal has ended by itself. You may close this tab.</p>"""
+<p>The command in the terminal ends by itself once the last fit is done. You may close this tab.</p>"""
         return PAGE.format(title="finished", head="", body=body)
 
 

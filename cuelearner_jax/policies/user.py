@@ -347,6 +347,8 @@ def _onnx(path: Path) -> Foreign:
         import onnxruntime
     except ImportError as error:
         raise UserError(f"{path} needs onnxruntime: pip install 'cuelearner-jax[onnx]'") from error
+    if not path.exists():
+        raise UserError(f"{path} does not exist: give the path of a file in ONNX")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3

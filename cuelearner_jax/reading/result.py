@@ -142,7 +142,7 @@ def _changes_of_observation(
         value, deviation = share @ mean[members], float(np.linalg.norm(share @ root[members]))
         if not _matters(value, deviation, length[first] / math.sqrt(max(len(effect), 1))):
             continue
-        parts = [("" if not k else " and " if share[k] > 0 else " less ") + names[m][0] for k, m in enumerate(members)]
+        parts = [("" if not k else " + " if share[k] > 0 else " - ") + names[m][0] for k, m in enumerate(members)]
         name, unit = "".join(parts), names[first][1]
         ends = sorted(step[first] * np.array([value - NORMAL * deviation, value + NORMAL * deviation]))
         estimates.append(

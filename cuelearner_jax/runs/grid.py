@@ -130,7 +130,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     if not path.is_file():
         raise UserError(
             f"{folder} is not a run folder (it has no config.json): give the --out of a train or sweep, or code as "
-            "module:NAME"
+            "module:NAME, which may load a model file"
         )
     values = formats.read("config", path)
     task, world = world_of(values["task"], find, path)

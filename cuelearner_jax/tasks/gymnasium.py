@@ -210,8 +210,8 @@ def task_from(
     actions, slices, limit, succeeds, ends = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
     if not max_steps and not limit and not ends:
         console.print(
-            f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,} (give "
-            "--task.max-steps, or max_steps in Python, for another limit)"
+            f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,}, or after "
+            "--task.max-steps (in Python max_steps)"
         )
     slices = _with_names(name, slices, observation or fetch, units or {})
     pairs = cues.split(";") if isinstance(cues, str) else cues

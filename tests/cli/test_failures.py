@@ -20,7 +20,7 @@ ARGUMENTS = [
     ([*QUICK, "--schedule.total-steps", "1.5e0"], "1.5e0 is not a whole number"),
     ([*QUICK, "--agent", "sax"], "unknown agent 'sax', did you mean 'sac'"),
     (["train", "billiards", "--preset", "quickstart", "--agent", "sac"], "acts in boxes, not in directions: give"),
-    (["evaluate", "nowhere"], "neither a run folder nor a task"),
+    (["evaluate", "nowhere"], "no run or policy folder, no task"),
     (["evaluate", "shipped:golf"], "no shipped agent 'shipped:golf': give one of shipped:arm, "),
     (["evaluate", "billiards", "--policy", "agent"], "needs a trained run"),
     (["evaluate", "billiards", "--compare", "nowhere"], "--compare is 'nowhere': give a run folder, a policy folder"),

@@ -291,7 +291,7 @@ def test_a_constant_error_in_a_gymnasium_class_of_ones_own_falls_to_a_fifth():
 
     found = correct()
     assert found["corrected"] < 0.2 * found["as it was"]
-    assert found["answers shuffled"] > 0.5 * found["as it was"]
+    assert found["answers by chance"] > 0.5 * found["as it was"]
 
 
 def test_the_shots_that_the_page_on_billiards_shows_are_won(capsys):

@@ -39,7 +39,7 @@ def test_the_token_of_the_address_lets_in_and_a_cookie_carries_it_on():
     headers = dict(first[0]["headers"])
     assert first[0]["status"] == 200
     assert headers[b"set-cookie"] == f"{COOKIE}; HttpOnly; SameSite=Strict; Path=/".encode()
-    assert (headers[b"referrer-policy"], headers[b"x-frame-options"]) == (b"no-referrer", b"DENY")
+    assert (headers[b"referrer-policy"], headers[b"x-frame-options"]) == (b"same-origin", b"DENY")
     later = talk(host=HOST, cookie=f"other=1; {COOKIE}")
     assert later[0]["status"] == 200
     assert b"set-cookie" not in dict(later[0]["headers"])

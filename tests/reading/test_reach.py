@@ -69,7 +69,7 @@ def error(act, right, **how):
         ),
         (  # so far from the goal that actions are at their bounds: there a shift of the action is something else
             lambda obs: moved(obs - ASIDE),
-            {"obs[0] less obs[3] seen aside": 0.25, "obs[1] less obs[4] seen aside": 0.15},
+            {"obs[0] - obs[3] seen aside": 0.25, "obs[1] - obs[4] seen aside": 0.15},
             0.6,
         ),
     ],

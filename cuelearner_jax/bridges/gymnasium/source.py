@@ -138,7 +138,13 @@ def register_robotics() -> None:
     import gymnasium
 
     with contextlib.redirect_stderr(io.StringIO()):  # importing prints a notice about other environments
-        import gymnasium_robotics
+        try:
+            import gymnasium_robotics
+        except AttributeError as error:  # of PyOpenGL, which finds no library
+            library = os.environ.get("MUJOCO_GL")
+            raise UserError(
+                f"MUJOCO_GL={library} finds no library ({error}): install libosmesa6 or libegl1, or give another"
+            ) from error
 
     gymnasium.register_envs(gymnasium_robotics)
     _supply_joint_types()
