@@ -29,11 +29,8 @@ def direction(degrees):
         (30, 0, -1),
         (0, 4.9, 0),
         (0, 5.1, 1),
-        (0, -5.1, -1),
         (175, -178, 1),  # 7 deg counterclockwise, over the wrap
         (-178, 175, -1),
-        (179, -178, 0),
-        (0, 179, 1),
         (0, -179, -1),
     ],
 )
@@ -56,7 +53,7 @@ def test_indifference_widens_what_is_right_and_never_narrows_it():
     assert float(told(direction(4), indifference=1 * DEG)[0]) == 0
 
 
-@pytest.mark.parametrize("eps_deg", [0.1, 5.0, 20.0, 90.0, 179.0])
+@pytest.mark.parametrize("eps_deg", [0.1, 20.0, 179.0])
 def test_feedback_is_the_turn_that_comes_nearest(eps_deg):
     rng = np.random.default_rng(int(eps_deg * 10))
     action, best = rng.uniform(-math.pi, math.pi, (2, 2000))
