@@ -88,7 +88,9 @@ def test_a_reading_is_exported_whole_and_alone_unless_its_base_sees_something_el
     correction = policy.correction.replace(
         change=policy.correction.change.replace(action=0.1 * jnp.ones_like(policy.correction.change.action)),
         alpha=0.01 * jnp.ones_like(policy.correction.alpha),
+        scale=jnp.float32(0.1),
     )
+    policy = policy.replace(bound=jnp.float32(0.2))
     read = dataclasses.replace(better, policy=policy.replace(correction=correction))
     assert np.abs(read(OTHERS) - own(OTHERS)).max() > 0.01
     cl.export_policy(read, tmp_path / "numpy", format="numpy")
