@@ -58,8 +58,8 @@ def test_a_frame_holds_what_was_seen_and_chosen_at_its_pose_and_where_the_episod
     assert last.seconds == pytest.approx(7.1, abs=0.21)  # 7 m at 1 m/s and the lag
 
 
-@pytest.mark.parametrize("name", ["success", "collision"])
-def test_still_shows_solids_way_end_and_goal(records, tmp_path, name):
+def test_still_shows_solids_way_end_and_goal(records, tmp_path):
+    name = "collision"
     frames = [frame for frame in records[name] if frame.episode == 0]
     drawing.still(Robot(), frames, tmp_path / "episode.png")
     image = imageio.imread(tmp_path / "episode.png")[..., :3] / 255
