@@ -63,20 +63,6 @@ def grips(obs):
     return low + shares * (high - low)
 
 
-def person(space, eps, meant, wrong=0.0):
-    """Someone who answers about actions by what is meant in a situation: function (observations) -> actions."""
-
-    @jax.jit
-    def told_of(key, actions, best):
-        away = space.log(actions, best)
-        told = jnp.where(jnp.abs(away) <= eps / 2, 0.0, jnp.sign(away))
-        k_wrong, k_which = jax.random.split(key)
-        other = jax.random.randint(k_which, told.shape, -1, 2).astype(told.dtype)
-        return jnp.where(jax.random.bernoulli(k_wrong, wrong, told.shape), other, told)
-
-    return lambda key, states, obs, actions: told_of(key, actions, meant(obs))
-
-
 def changed(obs, shift=(0.0, 0.0), lidar_deg=0.0, wind_deg=0.0):
     """Observations as they were before a change of the sensors, written without the package's own undoing."""
     obs = np.array(obs)

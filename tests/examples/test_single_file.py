@@ -11,13 +11,11 @@ import pytest
 
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.table import Table
-from cuelearner_envs.billiards.teacher import SearchTeacher
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.replay import Memory, RingBuffer, StoredStep
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.environment import spaces_of
-from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guides
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import results
@@ -68,26 +66,6 @@ def test_fitted_targets_and_the_network_that_is_fitted():
     single = jax.jit(lambda key: single_file.fit(SINGLE, key, given, 15))(jax.random.key(3))
     chex.assert_trees_all_close(single, package, atol=1e-4)
     chex.assert_trees_all_equal_shapes_and_dtypes(single, package)
-
-
-def test_answers_of_the_teacher():
-    _, actions, _ = situations(200)
-    best = jax.vmap(single_file.turned)(actions, jnp.linspace(-math.pi, math.pi, 200))
-    single = jax.vmap(lambda action, best: single_file.answer(SINGLE, action, best))(actions, best)
-    package = jax.vmap(lambda action, best: relative_feedback(DIRECTIONS, action, best, SINGLE.eps))(actions, best)
-    np.testing.assert_array_equal(single, package[:, 0])
-    assert set(np.unique(single)) == {-1.0, 0.0, 1.0}
-
-
-def test_the_best_action_of_the_teacher():
-    @jax.jit
-    def both(key):
-        state, obs = ENV.reset(key)
-        teacher = SearchTeacher(ENV, SINGLE.aim_error, SINGLE.habit, SINGLE.search_directions)
-        return single_file.best_action(SINGLE, ENV, state), teacher.best_action(state, obs)
-
-    for seed in range(3):
-        np.testing.assert_allclose(*both(jax.random.key(seed)), atol=1e-6)
 
 
 def test_one_update_of_double_dqn():

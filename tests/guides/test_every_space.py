@@ -157,7 +157,7 @@ def test_a_label_that_says_nothing_of_any_cue_is_none():
     assert not bool(jax.jit(guide.fit)(KEY, None, silent, guide.init(KEY), scalars_of(space)).fitted)
 
 
-@pytest.mark.parametrize("kind", ["relative", "dcoach", "bdcoach", "clic", "clic_shown", "reading"])
+@pytest.mark.parametrize("kind", ["relative", "clic", "reading"])
 def test_a_kind_of_cues_refuses_choices_without_an_order_in_one_line(kind):
     with pytest.raises(UserError, match="have no order: give them one") as refusal:
         registry.make(kind, SIZES, Anywhere(FRUIT))
