@@ -11,7 +11,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.agents.networks import as_function, q_network
+from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import Aims
@@ -67,22 +67,6 @@ def test_actions_near_aims_are_near_each_of_them_and_anywhere_where_there_is_non
     assert 1.0 < beside.max() <= np.degrees(0.1) + 1e-3
     assert {*np.sign(turns[here])} == {-1.0, 1.0}
     assert np.abs(np.abs(turns[~here]) - 90.0).max() > 30.0
-
-
-def test_the_agent_takes_the_direction_of_the_largest_value():
-    expected = probes.greedy_actions(as_function(Q), AGENT.params, OBS)
-    np.testing.assert_array_equal(act(AGENT), expected)
-    assert len(np.unique(expected, axis=0)) > 2
-    np.testing.assert_array_equal(act(AGENT, jax.random.key(6)), expected)  # whatever the key
-
-
-def test_uniform_actions_are_drawn_anew_with_each_key():
-    many = act(Uniform(), obs=jnp.tile(OBS, (50, 1)))
-    np.testing.assert_allclose(np.linalg.norm(many, axis=-1), 1, atol=1e-6)
-    counts = np.histogram(np.arctan2(many[:, 1], many[:, 0]), 8, (-np.pi, np.pi))[0]
-    assert counts.min() > 180  # 250 each, standard deviation 15
-    np.testing.assert_array_equal(act(Uniform()), act(Uniform()))
-    assert np.abs(act(Uniform()) - act(Uniform(), jax.random.key(6))).max() > 0.1
 
 
 def test_under_relative_guidance_every_action_is_refined_once_the_model_is_fitted():

@@ -2,7 +2,6 @@
 
 WORLDS = ["--task.worlds", "8", "--task.max-steps"]
 EVALUATE = ["evaluate", "navigation", "--policy", "uniform", *WORLDS, "20"]
-OUTCOMES = ("success", "collision", "timeout")
 
 
 def test_an_evaluation_of_the_short_episodes_alone_is_refused(refused, tmp_path):

@@ -45,6 +45,8 @@ def test_beside_its_base_it_does_what_the_policy_does(format, better, tmp_path):
     written = cl.export_correction(better, tmp_path / "out", format=format)
     assert written["difference"] <= written["golden"]["tolerance"]
     assert written["base"]["size"] == 2
+    assert [cue["words"] for cue in written["action"]["space"]["cues"]] == [["left", "right"], ["open", "close"]]
+    assert (written["action"]["clip_radius"], written["action"]["clip_radius_unit"]) == (pytest.approx(0.2), "shares")
     assert format != "onnx" or (written["artefact"]["input"], written["artefact"]["base_input"]) == (
         "obs",
         "base_action",

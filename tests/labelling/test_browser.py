@@ -74,34 +74,6 @@ def test_every_key_is_in_the_file_once(browser, tmp_path):
     assert all(0 <= row["seconds"] < 60 for row in rows)
 
 
-def test_a_picture_its_arrows_and_its_film_fit_a_phone(browser, tmp_path):
-    folder = tmp_path / "labels"
-    with served(folder, task="photo_task:TASK") as (_, address):
-        page = entered(browser, address, 390, 844, has_touch=True)
-        assert page.evaluate("() => document.documentElement.scrollWidth") == 390
-        sizes = "one => [one.offsetWidth, one.offsetHeight]"
-        sizes = f"() => [...document.querySelectorAll('.answers button')].flatMap({sizes})"
-        assert min(page.evaluate(sizes)) >= 44
-        assert page.evaluate("() => document.querySelector('.photo').decode().then(() => true)")
-        page.locator(".said[data-name='pick-0-more'] .touched").tap(force=True)  # the arrow to the left
-        page.wait_for_function("() => document.querySelector('.said.picked')?.dataset.name === 'pick-0-more'")
-        page.keyboard.press("c")
-        page.wait_for_function("() => document.querySelectorAll('.answers .picked').length === 3")
-        page.keyboard.press("v")
-        page.wait_for_function("() => document.querySelectorAll('image.frame').length === 6")
-        page.wait_for_function("() => document.querySelector('.film-words').textContent.includes('from the best')")
-        page.wait_for_function(
-            "() => [...document.querySelectorAll('image.frame')].every(one => one.style.visibility === 'hidden')"
-        )
-        page.keyboard.press("Enter")
-        moved(page, 0)
-        page.keyboard.press("ArrowLeft")
-        page.keyboard.press(" ")
-        moved(page, 1)
-    rows = label_files.history(folder / label_files.JSONL)
-    assert [row["answer"] for row in rows] == [[1.0, 2.0, -1.0], [1.0, 0.0, 0.0]]
-
-
 def test_pointing_shows_what_to_do_instead(browser, tmp_path):
     folder = tmp_path / "labels"
     with served(folder, "--guidance", "demonstration") as (process, address):
