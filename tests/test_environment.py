@@ -87,13 +87,6 @@ def test_a_member_that_is_none_is_not_offered():
     assert symmetries_of(Silent(mirrors=True)) == 1  # of four announced
 
 
-def test_shapes_in_place_of_arrays_offer_the_same():
-    shapes = jax.eval_shape(lambda: probes.Window(mirrors=True))
-    assert offers(shapes, "heuristic")
-    assert symmetries_of(shapes) == 4
-    assert spaces_of(shapes) == spaces_of(probes.Window())
-
-
 # Symmetries.
 
 

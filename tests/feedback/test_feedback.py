@@ -116,16 +116,6 @@ def test_what_stands_in_rows_that_are_not_valid_changes_nothing(garbage_values):
     assert_same(fit(jax.random.key(0), labels), fit(jax.random.key(0), garbage))
 
 
-def test_validation_keeps_the_best_parameters_when_the_last_ones_overfit():
-    labels = label_set(2, noise=0.5, valid=40)
-    validation = HELD_OUT & labels.valid
-    kept = fit(jax.random.key(0), labels)
-    # The same steps without anything to validate: the last parameters are kept.
-    last = fit(jax.random.key(0), labels.replace(valid=labels.valid & ~HELD_OUT))
-    assert mean_error(kept, labels, validation) < 0.9 * mean_error(last, labels, validation)
-    assert mean_error(last, labels, labels.valid & ~HELD_OUT) < 0.9 * mean_error(kept, labels, labels.valid & ~HELD_OUT)
-
-
 def test_of_all_looks_the_one_nearest_to_the_validation_labels_is_kept():
     # A model of one vector, which walks from 0 by 0.01 a step toward (1, 0): 0.2, 0.4, 0.6, 0.8 at the looks.
     labels = label_set(0).replace(target=np.stack([np.where(HELD_OUT, 0.45, 1.0), np.zeros(ROWS)], -1))

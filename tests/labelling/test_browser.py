@@ -1,6 +1,5 @@
 """The page in headless Chromium, with real keys; left out where there is none."""
 
-import math
 import shutil
 
 import numpy as np
@@ -72,19 +71,3 @@ def test_every_key_is_in_the_file_once(browser, tmp_path):
     found = {row["item"]: None if row["answer"] is None else row["answer"][0] for row in rows}
     assert found == {number: values[key] for number, key in enumerate(pressed)}
     assert all(0 <= row["seconds"] < 60 for row in rows)
-
-
-def test_pointing_shows_what_to_do_instead(browser, tmp_path):
-    folder = tmp_path / "labels"
-    with served(folder, "--guidance", "demonstration") as (process, address):
-        page = entered(browser, address)
-        box = page.locator("svg.scene").bounding_box()
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        page.mouse.move(x + 60, y - 104)
-        page.mouse.click(x + 60, y - 104)
-        moved(page, 0)
-        process.kill()
-        page.get_by_text("The command behind this page has stopped").wait_for()
-        assert f"--out {folder}" in page.locator("#popup code").inner_text()
-    (row,) = label_files.history(folder / label_files.JSONL)
-    np.testing.assert_allclose(row["answer"], [0.5, math.sqrt(0.75)], atol=0.02)

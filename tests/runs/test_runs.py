@@ -131,12 +131,6 @@ def test_seeds_are_a_number_or_a_range(words, seeds):
         runs.parse_seeds(words, first=7)
 
 
-def test_grids_that_make_sense():
-    runs.check_grid(GRID)
-    runs.check_grid(Grid(("none", "heuristic"), (0, runs.LARGEST_SEED - 1), ()))
-    runs.check_grid(Grid(("none",), (0,), (10, 10)))  # budgets that nobody uses
-
-
 def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
     relative, none = (guidances.make(kind, probes.SIZES, probes.Window()) for kind in ("relative", "none"))
     seeds, budgets = GRID.lanes(relative)
