@@ -17,7 +17,7 @@ PACKAGES = ["cuelearner_envs", "cuelearner_jax"]  # packages whose functions and
 DOORS = "cuelearner_jax.api."  # public functions check their arguments themselves, with better messages
 # Folders and files of tests in which an operand of a lower rank is filled up by NumPy's rule,
 # which brax and MuJoCo's MJX rely on; elsewhere it is an error.
-LOOSE_RANKS = ("bridges", "experiments/test_train_walking.py", "cli/test_anymal.py", "envs/anymal", "examples")
+LOOSE_RANKS = ("bridges", "cli/test_anymal.py", "envs/anymal", "examples")
 
 # An int is a float, as pyright has it. What damaged files hold is a TypeError, as it is without checks.
 _conf = BeartypeConf(is_pep484_tower=True, violation_type=jaxtyping.TypeCheckError)

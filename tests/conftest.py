@@ -85,6 +85,18 @@ def pytest_terminal_summary(terminalreporter, exitstatus, config):
     path.write_text("\n".join([head, "# seconds tests file", *lines, ""]), encoding="utf-8")
 
 
+@cache
+def optimise_readings():
+    """Compile what a reading repeats hundreds of times with optimisation, which costs less than it saves."""
+    import jax
+
+    from cuelearner_jax.reading import fitting
+
+    options = {"xla_backend_optimization_level": 1}
+    update = jax.jit(fitting._update.__wrapped__, static_argnames="priors", compiler_options=options)
+    fitting._update = update
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Make implicit rank promotion an error, except in the tests of `LOOSE_RANKS`.
@@ -94,6 +106,8 @@ def pytest_runtest_setup(item):
     import jax  # reads the settings above
 
     jax.config.update("jax_numpy_rank_promotion", "allow" if lies_in(item.path, LOOSE_RANKS) else "raise")
+    if "cuelearner_jax.reading.fitting" in sys.modules:
+        optimise_readings()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -56,38 +56,11 @@ def scan(
 
 
 def poses(rng: np.random.Generator, world: NavigationWorld, count: int) -> np.ndarray:
-    """Random poses in the hall (count, 3) in single precision [m, rad], turned at random.
-
-    In turn: anywhere (which may be inside a solid), anywhere, inside a solid, and just outside one (within 0.3 m). The
-    outer walls are no such solid; a place beyond them is moved to the hall's edge.
-    """
-    boxes = np.array([row for row, _ in _used(world.boxes, world.box_heights)])[4:]
-    circles = np.array([row for row, _ in _used(world.circles, world.circle_heights)]).reshape(-1, 3)
-    half = np.asarray(world.extent, float) / 2
-    places = np.array([_place(rng, number % 4, boxes, circles, half) for number in range(count)])
-    yaws = rng.uniform(-np.pi, np.pi, (count, 1))
-    return np.concatenate([np.clip(places, -half + 1e-3, half - 1e-3), yaws], axis=-1).astype(np.float32)
+    """Random poses in the hall (count, 3) in single precision [m, rad], some of them inside solids."""
+    half = np.append(np.asarray(world.extent, float) / 2, np.pi)
+    return rng.uniform(-half, half, (count, 3)).astype(np.float32)
 
 
 def _used(rows, heights) -> list[tuple[list[float], float]]:
     pairs = zip(np.asarray(rows, float).tolist(), np.asarray(heights, float).tolist(), strict=True)
     return [(row, height) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
-
-
-def _place(rng: np.random.Generator, kind: int, boxes: np.ndarray, circles: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """0 and 1: anywhere; 2: inside a solid; 3: within 0.3 m of one."""
-    if kind < 2:
-        return rng.uniform(-half, half)
-    which = rng.integers(len(boxes) + len(circles))
-    if which >= len(boxes):
-        x, y, radius = circles[which - len(boxes)]
-        turn = rng.uniform(-np.pi, np.pi)
-        far = radius * np.sqrt(rng.uniform()) if kind == 2 else radius + rng.uniform(0.0, 0.3)
-        return np.array([x, y]) + far * np.array([np.cos(turn), np.sin(turn)])
-    x, y, yaw, *sides = boxes[which]
-    place = rng.uniform(-1.0, 1.0, 2) * sides
-    if kind == 3:  # pushed out through one of the four sides
-        axis = rng.integers(2)
-        place[axis] = rng.choice([-1.0, 1.0]) * (sides[axis] + rng.uniform(0.0, 0.3))
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.array([x, y]) + np.array([[cos, -sin], [sin, cos]]) @ place

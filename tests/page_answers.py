@@ -1,7 +1,6 @@
 """A script in the place of a person and a browser: it runs `cuelearner label` and presses the page's buttons."""
 
 import asyncio
-import inspect
 from unittest import mock
 
 import numpy as np
@@ -20,12 +19,11 @@ def labelled(arguments, ask):
 
     Args:
         arguments: of the command line, as a shell would give them.
-        ask: (observation (obs,), action (action,)) -> the answer (cues,): 1 more, 0 already right, -1 less, `UNSAID`;
-            it may take the `page` too.
+        ask: (observation (obs,), action (action,)) -> the answer (cues,): 1 more, 0 already right, -1 less, `UNSAID`.
 
     Returns the folder of the labels.
     """
-    places, looks = [], "page" in inspect.signature(ask).parameters
+    places = []
 
     def served(_, plan, asked, port, stopping, commands):
         with Session(plan, asked.out) as session:
@@ -33,8 +31,7 @@ def labelled(arguments, ask):
             async def acts(user, pages):
                 (page,) = pages
                 while (item := await drawn(page, session)) is not None:
-                    given = np.asarray(item.guide.obs), item.action, *([page] if looks else [])
-                    await answer(user, page, session, ask(*given))
+                    await answer(user, page, session, ask(np.asarray(item.guide.obs), item.action))
                 user.find(marker="finish").click()
 
             async def finish():

@@ -27,22 +27,16 @@ from cuelearner_jax.tasks import registry
 
 ROWS = 200
 PROBES = {"window": probes.Window(), "mirrored window": probes.Window(mirrors=True), "chain": probes.Chain()}
-SHAPES = {
-    **{
-        f"{task.name} {name}": shape_of(task, p.config.task)
-        for task in map(registry.find, registry.BUILT_IN)
-        for name, p in task.presets.items()
-    },
-    **PROBES,
-}
+PRESETS = [(task, name) for task in registry.BUILT_IN for name in registry.find(task).presets]
 
 
 # Slices of an observation.
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", [*PRESETS, *PROBES], ids=str)
 def test_an_observation_has_as_many_entries_as_its_slices_together(name):
-    env = SHAPES[name]
+    task = registry.find(name[0]) if isinstance(name, tuple) else None
+    env = PROBES[name] if task is None else shape_of(task, task.presets[name[1]].config.task)
     slices = env.observation
     assert env.obs_size == sum(quantity.size for quantity in slices) > 0
     _, obs = jax.eval_shape(lambda env, key: env.reset(key), env, jax.random.key(0))
@@ -91,13 +85,6 @@ def test_a_member_that_is_none_is_not_offered():
 
     assert not offers(Silent(mirrors=True), "heuristic")
     assert symmetries_of(Silent(mirrors=True)) == 1  # of four announced
-
-
-def test_shapes_in_place_of_arrays_offer_the_same():
-    shapes = jax.eval_shape(lambda: probes.Window(mirrors=True))
-    assert offers(shapes, "heuristic")
-    assert symmetries_of(shapes) == 4
-    assert spaces_of(shapes) == spaces_of(probes.Window())
 
 
 # Symmetries.

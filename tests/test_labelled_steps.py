@@ -105,6 +105,3 @@ def test_a_minibatch_has_its_share_of_labelled_steps(share, count):
 def test_without_a_share_every_step_is_as_likely():
     drawn = marks(memory(100, 50), 6_000) == 7.0
     assert abs(drawn.mean() - 1 / 3) < 4 * np.sqrt(2 / 9 / 6_000)  # four standard errors
-
-
-# What is refused.

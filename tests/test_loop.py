@@ -87,13 +87,13 @@ def chain_program():
     return make_program(CHAIN, guidances.make("heuristic", CHAIN.sizes, env), env, 0)
 
 
-def chain_values(truncates, polyak=CHAIN.agent.polyak):
+@cache
+def chain_values(truncates):
     """Learned values at both places of east, north, west and south; and the state."""
     env = probes.Chain(jnp.array(truncates))
     state = probes.start(chain_program(), [3], [0], env)
     assert state.agent.training.target_params is not None
-    settings = CHAIN.settings._replace(agent=dataclasses.replace(CHAIN.agent, polyak=polyak))
-    _, state, _ = chain_program().train(env, settings, loop.start_clock(), state, 1000)
+    _, state, _ = chain_program().train(env, CHAIN.settings, loop.start_clock(), state, 1000)
     params = probes.lane(state.agent.params, 0)
     values = [np.asarray(q(params, env.observe(place), directions.evenly_spaced(4)))[:, 0] for place in (0, 1)]
     return values, state
@@ -173,7 +173,7 @@ def test_an_episode_is_guided_as_a_whole():
     assert by_episode.mean() == pytest.approx(0.5, abs=0.08)
 
 
-@pytest.mark.parametrize(("learn_after", "updates"), [(49, 0), (48, 4), (45, 4), (44, 8), (0, 48)])
+@pytest.mark.parametrize(("learn_after", "updates"), [(49, 0), (48, 4), (44, 8)])
 def test_learning_begins_after_learn_after(learn_after, updates):
     program = probes.window_program("none")
     state = probes.start(program, [0], [0])

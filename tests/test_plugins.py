@@ -33,14 +33,6 @@ def test_an_object_of_a_module_in_the_current_folder_is_found(folder):
     assert load("furniture_of_mine:OAK", dict, "a table") is found
 
 
-def test_an_object_of_a_package_is_found(folder):
-    (folder / "house_of_mine").mkdir()
-    (folder / "house_of_mine" / "__init__.py").write_text("")
-    (folder / "house_of_mine" / "kitchen.py").write_text("PINE = {'legs': 3}\n")
-    assert load("house_of_mine.kitchen:PINE", dict, "a table") == {"legs": 3}
-    refused("house_of_mine.cellar:PINE", "no module 'house_of_mine.cellar'")
-
-
 @pytest.mark.parametrize("reference", ["module", ":NAME", "my-module:NAME", "a..b:NAME", "a:B.c", "./sub/mine.py:OAK"])
 def test_what_is_no_reference_is_told_its_form(folder, reference):
     refused(reference, "does not name a table: give package.module:NAME")

@@ -10,9 +10,6 @@ from flax import struct
 
 from cuelearner_jax.agents import sac
 from cuelearner_jax.environment import Quantity, WholeObservations
-from cuelearner_jax.guides import registry
-from cuelearner_jax.loop import start_clock
-from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Step
@@ -57,8 +54,6 @@ class WalkConfig:
     """By how much the heuristic errs."""
 
 
-__all__ = ["BOX", "SMALL", "TASK", "Walk", "WalkConfig", "config", "program", "start_clock"]
-
 TASK = Task("walk", "a walk", WalkConfig, (Body("point", "", lambda config, split: Walk(jnp.float32(config.wrong))),))
 
 
@@ -66,8 +61,3 @@ def config(agent=SMALL, arbiter=None, **groups):
     """A tiny run of the walk."""
     groups = {"scalars": {"discount": 0.9}, **groups}
     return dataclasses.replace(probes.config(arbiter, **groups), agent=agent, task=WalkConfig())
-
-
-def program(config, kind, env, mesh=None):
-    """The loop of a kind of guidance that never asks."""
-    return make_program(config, registry.make(kind, config.sizes, env), env, 0, mesh)

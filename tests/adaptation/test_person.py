@@ -6,6 +6,7 @@ from gymnasium_worlds import Adder
 from PIL import Image, ImageSequence
 
 import cuelearner_jax as cl
+from cuelearner_jax.config import GuideSizes
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*labels.*")
 
@@ -28,7 +29,8 @@ def seconds(file):
 
 
 def adapted(world, judge_by, **more):
-    return cl.adapt(slow, world, fast, labels=20, judge_by=judge_by, **more)
+    sizes = GuideSizes(feedback_layers=(8,), fit_steps=100, fit_batch_size=16)
+    return cl.adapt(slow, world, fast, labels=20, judge_by=judge_by, guidance="relative", sizes=sizes, **more)
 
 
 def test_seven_clear_preferences_decide_and_films_change_sides(world):

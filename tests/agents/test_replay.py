@@ -60,16 +60,14 @@ def test_samples_are_whole_steps():
     np.testing.assert_allclose(drawn.aftermath, number[:, None] + [0.8, 0.9, 1.0], rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("steps", "numbers"), [(1, {0}), (4, {0, 1, 2, 3}), (8, set(range(8))), (14, set(range(6, 14)))]
-)
+@pytest.mark.parametrize(("steps", "numbers"), [(4, {0, 1, 2, 3}), (14, set(range(6, 14)))])
 def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
     buffer = RingBuffer(EXAMPLE)
     drawn = drawn_from(buffer, filled(buffer, 8, 1, steps), 1, steps, 500)
     assert set((np.asarray(drawn.reward) - 0.5).tolist()) == numbers  # an empty row would be -0.5
 
 
-@pytest.mark.parametrize("steps", [10, 16, 24])
+@pytest.mark.parametrize("steps", [10, 24])
 def test_what_follows_a_step_is_its_own_environments(steps):
     """Two environments in turn, 12 rows: row n's followers are n + 2, n + 4, ... up to the newest, across the seam."""
     buffer = RingBuffer(EXAMPLE)
@@ -111,7 +109,7 @@ def test_guided_steps_are_counted_up_to_each_row():
     np.testing.assert_array_equal(counted(guided, 8, 2)[:, 0], [*total[8:], *total[2:8]])
 
 
-@pytest.mark.parametrize("steps", [5, 8, 12, 19])
+@pytest.mark.parametrize("steps", [5, 19])
 def test_rows_of_each_sort_are_drawn_alike_and_no_others(steps):
     """Once the ring of 8 has been round, its oldest row is of an unknown sort, and left out."""
     guided = np.isin(np.arange(steps) % 7, (1, 2, 5))

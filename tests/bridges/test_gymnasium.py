@@ -191,7 +191,6 @@ def test_wrong_calls_are_told_in_one_line(settings, told):
     ("fault", "told"),
     [
         ("raises", "raised RuntimeError: a joint is jammed: mend it first"),
-        ("nan", "gave an observation 'observation' that is not finite in step 3 of the episode with seed"),
         ("shape", r"gave an observation 'observation' of shape \(3,\), where its space has \(2,\) in step 3"),
     ],
 )
@@ -243,8 +242,6 @@ def measured(of, policy=lambda obs: 0 * obs):
     ("info", "length", "success"),
     [
         ({"is_success": True}, 150, 1),
-        ({"succeed": True}, 1, 1),
-        ({"success": np.array([True])}, 1, 1),
         ({"success": None}, 1, None),
     ],
 )

@@ -86,11 +86,6 @@ def test_what_is_no_run_is_refused(refused, copy, tmp_path, command):
     refused([command, copy, *out], "damaged", tmp_path)
 
 
-def test_a_lane_that_is_not_there_is_refused(refused, copy, tmp_path):
-    refused(["render", copy, "--seed", "7", "--out", tmp_path / "new"], "there are seeds 2000, 2001", tmp_path)
-    refused(["render", copy, "--labels", "7", "--guidance", "relative"], "labels 10, 20", tmp_path)
-
-
 def test_pictures_and_measurements_are_not_replaced_unasked(refused, copy, tmp_path):
     for name in ("copy-heuristic.gif", "measured.json"):
         (tmp_path / name).write_text("{}")

@@ -1,29 +1,7 @@
 """The second task through the same commands: measured by whole episodes, in worlds of any style."""
 
-import json
-
-import pytest
-
-from cuelearner_jax.cli import main
-
 WORLDS = ["--task.worlds", "8", "--task.max-steps"]
 EVALUATE = ["evaluate", "navigation", "--policy", "uniform", *WORLDS, "20"]
-OUTCOMES = ("success", "collision", "timeout")
-
-
-@pytest.mark.long
-def test_an_evaluation_is_of_whole_episodes(tmp_path, capsys):
-    """By default and by number."""
-    for asked, episodes in ([], 100), (["--episodes", "12"], 12):
-        out = tmp_path / f"{episodes}.json"
-        assert main([*EVALUATE, *asked, "--out", str(out)]) == 0
-        assert f"uniform, {episodes} episodes a lane" in capsys.readouterr().out
-        measured = json.loads(out.read_text())
-        assert (measured["envs"], measured["steps"]) == (episodes, 20 * episodes)
-        (row,) = measured["rows"]
-        assert row["finished"] == [1]
-        assert sum(row[name][0] for name in OUTCOMES) == pytest.approx(1)
-        assert row["timeout"][0] > 0.2  # chance gets nowhere in 4 s
 
 
 def test_an_evaluation_of_the_short_episodes_alone_is_refused(refused, tmp_path):

@@ -14,8 +14,6 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.util import spec_from_loader
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
@@ -23,7 +21,7 @@ from PIL import Image
 
 from cuelearner_jax import loop
 from cuelearner_jax.agents.protocol import AGENTS, AgentFunctions
-from cuelearner_jax.arbiters import ARBITERS, Arbiter, Outcome
+from cuelearner_jax.arbiters import ARBITERS
 from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -242,20 +240,6 @@ def test_the_soft_agent_learns_the_soft_values_of_a_chain():
     np.testing.assert_allclose(end, east, atol=0.1)
     np.testing.assert_allclose(start, np.roll(east, 1) / 2 + following, atol=0.1)
     assert following == pytest.approx(0.2, abs=0.05)  # a greedy target would have 0.5
-
-
-def test_the_late_arbiter_leaves_the_first_steps_to_the_agent():
-    late = importlib.import_module("examples.late_arbiter")
-    arbiter = late.Config(after=2, probability=1.0)
-    assert isinstance(arbiter, Arbiter)
-    state, guided = arbiter.init(2), []
-    for done in ([0, 1], [0, 0], [1, 0], [0, 0], [0, 0]):
-        outcome = Outcome(jnp.zeros(2), jnp.array(done, bool), jnp.array(True), False)
-        state = arbiter.follow(state, outcome, probes.SCALARS, jax.random.key(0))
-        guided.append(arbiter.guided(state).tolist())
-    assert guided == [[False, False], [False, False], [False, True], [False, True], [True, True]]
-    outcome = outcome._replace(done=jnp.ones(2, bool))
-    assert not late.Config(2, 0.0).follow(state, outcome, probes.SCALARS, jax.random.key(0)).chosen.any()
 
 
 @pytest.mark.long

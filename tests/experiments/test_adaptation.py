@@ -59,21 +59,3 @@ def test_every_correction_has_options_that_exist(study, scale, monkeypatch, tmp_
     for command in commands:
         main(command)
     assert len(worlds) == len(commands)
-
-
-def test_a_piece_that_was_measured_is_not_run_again(study, monkeypatch, tmp_path):
-    known = importlib.import_module("_pieces")
-    lines = []
-    bases(tmp_path, "navigation")
-    monkeypatch.setattr(known, "cuelearner", lambda command: lines.append(command) or 0)
-    arguments = ["--out", str(tmp_path), "--pieces", "navigation/rooms/intent", "navigation/rooms/none"]
-    assert study.main(arguments) == 0
-    assert [line[0] for line in lines] == ["evaluate", "adapt", "evaluate"]
-    assert lines[1][1:] == [
-        str(tmp_path / "navigation/bases/none"), "--base.seed", "5000", "5001", "--guidance", "intent",
-        "--labels", "100", "250", "1000", "--scenario", "rooms", "--out", str(tmp_path / "navigation/rooms/intent"),
-    ]  # fmt: skip
-    (tmp_path / "navigation/rooms").mkdir()
-    (tmp_path / "navigation/rooms/none.json").touch()
-    assert study.main([*arguments, "--resume"]) == 0
-    assert [line[0] for line in lines[3:]] == ["adapt", "evaluate"]

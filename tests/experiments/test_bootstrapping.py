@@ -5,7 +5,7 @@ import importlib
 from pathlib import Path
 
 import pytest
-from _pieces import report_command, scaled, sweep_command
+from _pieces import scaled, sweep_command
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.guides import registry
@@ -38,29 +38,6 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, monkeypatch,
         assert main(sweep_command(experiment.task, piece, tmp_path, resume=False)) == 0, piece.path
         assert orders[-1].grid.labels == piece.labels or not piece.labels
         assert orders[-1].out == tmp_path / piece.path
-
-
-def test_a_report_is_asked_what_its_runs_can_answer(experiment, tmp_path):
-    world = experiment.pieces[0].world
-    assert report_command(experiment, world, tmp_path, "paper") is None
-    for kind, reference in (("none", False), ("relative", True)):
-        piece = next(piece for piece in experiment.pieces if piece.world == world and piece.kinds == (kind,))
-        (tmp_path / piece.path).mkdir(parents=True)
-        (tmp_path / piece.path / "config.json").touch()
-        assert ("--reference" in report_command(experiment, world, tmp_path, "paper")) == reference
-
-
-@pytest.mark.long
-def test_a_smoke_runs_and_is_resumed(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
-    data = importlib.import_module("billiards_bootstrapping")
-    asked = ["--scale", "smoke", "--out", str(tmp_path), "--pieces", "easy/frame/none", "easy/frame/relative"]
-    assert data.main(asked) == 0
-    with (tmp_path / "smoke/easy/report/efficiency.csv").open() as file:
-        rows = [(row["run"], row["guidance"], row["labels"]) for row in csv.DictReader(file)]
-    assert rows == [("frame", "none", "0"), *(("frame", "relative", labels) for labels in ("5", "10", "15"))]
-    assert data.main([*asked, "--resume"]) == 0
-    assert data.main(asked) == 2  # begun already, and --resume was not given
 
 
 def test_labels_for_an_equal_mean_are_what_the_recorded_runs_give():

@@ -42,35 +42,6 @@ def test_the_scripts_do_what_they_say():
     np.testing.assert_allclose(push(observed(**at, gripper=(0.05, 0, 0.4))), [[0, 0, 1, 0]])  # rises before the object
 
 
-def test_what_a_camera_and_a_motor_change_is_undone(study):
-    robot = study.robot_of("FetchPush")
-    obs = np.random.default_rng(0).uniform(0.5, 1.5, (4, 31)).astype(np.float32)
-    obs[:, 12:15] = obs[:, 9:12] - obs[:, 6:9]
-    for change in robot.changes.values():
-        changed = study.seen(robot, change, obs)
-        np.testing.assert_array_equal(changed[:, 6:9], obs[:, 6:9])  # the gripper's own place is told by its joints
-        np.testing.assert_allclose(study.seen(robot, change, changed, back=True), obs, atol=1e-6)
-    aside = study.seen(robot, robot.changes["camera 3 cm aside"], obs) - obs
-    assert np.flatnonzero(np.abs(aside).max(0) > 1e-6).tolist() == [1, 4, 10, 13]
-    np.testing.assert_allclose(aside[:, [1, 4, 10, 13]], 0.03, atol=1e-6)
-    turned = study.seen(robot, robot.changes["camera turned by 25 degrees"], np.tile([1.4, 0.75, 0.4], (1, 5))[:, :15])
-    np.testing.assert_allclose(turned[0, :2], (1.3 + 0.1 * np.cos(0.43633), 0.75 + 0.1 * np.sin(0.43633)), atol=1e-5)
-    for change in study.META_WORLD.values():
-        action = np.array([[0.3, -0.2, 0.5, 1.0]], np.float32)
-        np.testing.assert_allclose(study.motion(change, study.motion(change, action), back=True), action, atol=1e-6)
-
-
-@pytest.mark.long
-def test_an_arm_is_corrected_and_its_file_kept(study, tmp_path, capsys):
-    command = ["--robots", "FetchReach", "--changes", "camera 3 cm aside", "--seeds", "1", "--labels", "50"]
-    for _ in range(2):
-        study.main([*command, "--out", str(tmp_path)])
-    rows = pq.read_table(tmp_path / "FetchReach.parquet").to_pylist()
-    assert [row["labels"] for row in rows] == ["labels", "random"]
-    assert rows[0]["after"] > rows[0]["before"] + 0.5
-    assert capsys.readouterr().out.count("seed 0, labels") == 1
-
-
 def test_the_page_tells_what_was_recorded(study):
     rows = pq.read_table(ROOT / "docs" / "data" / "scripted_arms.parquet").to_pylist()
     page = (ROOT / "docs" / "results" / "scripted_arms.md").read_text(encoding="utf-8")

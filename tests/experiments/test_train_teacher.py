@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -11,11 +10,11 @@ import numpy as np
 import probes
 import pytest
 import train_teacher
-from _teacher_program import TeacherConfig, Trainer
+from _teacher_program import TeacherConfig
 
 from cuelearner_jax import teachers
 from cuelearner_jax.config import to_json
-from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.terminal import Interrupted
 
 TASK, WORLD = probes.make_task(), probes.WindowConfig()
@@ -86,17 +85,3 @@ def test_a_stopped_training_goes_on_to_the_same_teacher_and_mixes_with_nothing(b
     assert [row[0] for row in told["history"]["rows"]] == [100, 200]
     assert told["config"] == to_json(CONFIG)
     refused(begun, "holds a finished teacher", resume=True)
-
-
-def test_a_training_that_diverges_stops_and_keeps_what_was_finite(begun, monkeypatch):
-    newest = begun / "training" / "100"
-    before = probes.files_of(newest)
-
-    def poisoned(self, env, state, rounds, train=Trainer.train):
-        return train(self, env, state.replace(params=jax.tree.map(lambda leaf: leaf * math.inf, state.params)), rounds)
-
-    monkeypatch.setattr(Trainer, "train", poisoned)
-    with pytest.raises(NotFinite, match=r"by round 200, and was not written; .* holds the checkpoint of round 100"):
-        train(begun, resume=True)
-    assert probes.files_of(newest) == before
-    assert not (begun / "teacher.json").exists()

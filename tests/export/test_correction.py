@@ -10,6 +10,8 @@ import pytest
 import cuelearner_jax as cl
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.export.runner import ContractError
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.reading.policy import unread
 
 LOW, HIGH = (-0.1, -1.0), (0.1, 1.0)
 EPS = 0.05
@@ -43,6 +45,8 @@ def test_beside_its_base_it_does_what_the_policy_does(format, better, tmp_path):
     written = cl.export_correction(better, tmp_path / "out", format=format)
     assert written["difference"] <= written["golden"]["tolerance"]
     assert written["base"]["size"] == 2
+    assert [cue["words"] for cue in written["action"]["space"]["cues"]] == [["left", "right"], ["open", "close"]]
+    assert (written["action"]["clip_radius"], written["action"]["clip_radius_unit"]) == (pytest.approx(0.2), "shares")
     assert format != "onnx" or (written["artefact"]["input"], written["artefact"]["base_input"]) == (
         "obs",
         "base_action",
@@ -82,15 +86,19 @@ def test_a_whole_policy_takes_no_base_action_and_code_can_be_in_no_file(better, 
 
 def test_a_reading_is_exported_whole_and_alone_unless_its_base_sees_something_else(better, tmp_path):
     own = jax.jit(lambda obs: jnp.stack([0.05 * obs[:, 0], jnp.tanh(obs[:, 1])], -1))
-    read = cl.correct(own, labels(20), low=LOW, high=HIGH, eps=EPS)
-    correction = read.policy.correction
-    correction = correction.replace(alpha=0.01 * jnp.ones_like(correction.alpha))  # so few labels leave no remainder
-    read = dataclasses.replace(read, policy=read.policy.replace(correction=correction))
+    policy = unread(policy_of(own, better.actions), better.actions, (), OBS.shape[1], labels=6)
+    correction = policy.correction.replace(
+        change=policy.correction.change.replace(action=0.1 * jnp.ones_like(policy.correction.change.action)),
+        alpha=0.01 * jnp.ones_like(policy.correction.alpha),
+        scale=jnp.float32(0.1),
+    )
+    policy = policy.replace(bound=jnp.float32(0.2))
+    read = dataclasses.replace(better, policy=policy.replace(correction=correction))
+    assert np.abs(read(OTHERS) - own(OTHERS)).max() > 0.01
     cl.export_policy(read, tmp_path / "numpy", format="numpy")
     np.testing.assert_allclose(cl.load_exported(tmp_path / "numpy")(OTHERS), read(OTHERS), atol=1e-5)
     with pytest.raises(ContractError, match="holds a whole policy: leave out"):
         cl.load_exported(tmp_path / "numpy")(OTHERS, base(OTHERS))
     aside = correction.replace(change=correction.change.replace(theta=correction.change.theta + 0.1))
-    policy = read.policy.replace(correction=aside)
     with pytest.raises(cl.UserError, match="asks its base about other observations"):
-        cl.export_correction(dataclasses.replace(read, policy=policy), tmp_path / "out")
+        cl.export_correction(dataclasses.replace(read, policy=policy.replace(correction=aside)), tmp_path / "out")

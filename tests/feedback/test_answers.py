@@ -156,22 +156,3 @@ def test_a_teacher_of_one_cue_speaks_of_each_as_often_and_rightly():
     np.testing.assert_allclose(told.mean(0), 1 / 3, atol=0.07)  # standard deviation 0.016
     for cue, h in enumerate((1, -1, 0)):
         np.testing.assert_array_equal(np.asarray(answers)[told[:, cue], cue], h)
-
-
-def test_faults_come_upon_the_cue_that_is_spoken_of():
-    action = jnp.array([0.0, 2.0, -1.0])
-    best = SMALL.exp(action, jnp.array([0.2, -0.3, 0.0]))
-    keys = jax.random.split(jax.random.key(0), 600)
-
-    def said(**faults):
-        scalars = dataclasses.replace(SCALARS, eps_deg=0.1, says="worst", **faults)
-        return map(np.asarray, jax.vmap(lambda key: human_answer(key, SMALL, action, best, scalars))(keys))
-
-    answers, answered = said(mistake_probability=0.3)
-    assert answered.all()
-    assert (answers[:, 1] == 1).mean() == pytest.approx(0.3, abs=0.08)  # standard deviation 0.019
-    answers, answered = said(silence_probability=0.3)
-    assert answered.mean() == pytest.approx(0.7, abs=0.08)
-    np.testing.assert_array_equal((answers == UNSAID).all(1), ~answered)
-    answers, _ = said(teacher_bias_deg=0.3)  # differences are then 0.5, 0 and 0.3
-    np.testing.assert_array_equal(answers[0], [1, UNSAID, UNSAID])

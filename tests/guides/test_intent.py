@@ -17,16 +17,7 @@ from cuelearner_jax.guides import intent, registry
 from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
-
-class Shuffled(probes.Aimed):
-    order = (3, 1, 0, 2)
-
-
-class Aimless(probes.Aimed):
-    possible = (False, False, False, False)
-
-
-ENV, SHUFFLED, AIMLESS = probes.Aimed(), Shuffled(), Aimless()
+ENV = probes.Aimed()
 SIZES, OPTIONS = probes.SIZES, intent.IntentConfig(aim_layers=(8,))
 OBS = directions.evenly_spaced(16)
 BASE = jax.jit(lambda: directions.rotate(OBS, jnp.linspace(-3.0, 3.0, 16)))()
@@ -128,11 +119,6 @@ def test_a_pass_goes_by_at_most_eps(fitted):
     assert away.max() == pytest.approx(20.0, abs=1e-3)
 
 
-def test_in_which_order_aims_are_told_changes_nothing(fitted):
-    one, other = acted(fitted, ENV), acted(fitted, SHUFFLED)
-    np.testing.assert_allclose(one.actions, other.actions, atol=1e-6)
-
-
 def test_in_a_box_answers_lead_to_the_aim_that_is_meant():
     class Boxed(box_task.Reach):
         """Three aims, of which the second is the goal; the features tell which they are."""
@@ -150,10 +136,6 @@ def test_in_a_box_answers_lead_to_the_aim_that_is_meant():
         np.median(jax.jit(jax.vmap(lambda obs, one: env.actions.distance(env.best(obs), one)))(labels.obs, found))
         < 0.06
     )
-
-
-def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
-    np.testing.assert_array_equal(acted(fitted, AIMLESS).actions, BASE)
 
 
 def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():

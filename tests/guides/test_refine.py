@@ -79,8 +79,8 @@ def test_agrees_with_a_float64_loop(scale, tau_deg, tau_max_deg, k_max):
     assert np.abs(turn(expected, np.asarray(result.actions)))[clear].max() < 1e-4
 
 
-@pytest.mark.parametrize("k_max", [4, 50])
-def test_passes_between_two_looks_change_nothing(monkeypatch, k_max):
+def test_passes_between_two_looks_change_nothing(monkeypatch):
+    k_max = 50
     weights, first, some = network(20, 0.2), starts(1), np.arange(ROWS) % 3 > 0
     given = (weights, first, some, 0.5 * DEG, math.pi, k_max)
     each = refined_by_network(*given)
@@ -96,11 +96,10 @@ def test_passes_between_two_looks_change_nothing(monkeypatch, k_max):
     assert asked
     np.testing.assert_array_equal(several.passes, each.passes)
     np.testing.assert_allclose(several.actions, each.actions, atol=1e-6)
-    assert k_max <= 7 or each.passes.max() > 7
+    assert each.passes.max() > 7
 
 
-@pytest.mark.parametrize("scale", [0.1, 30.0])
-@pytest.mark.parametrize("radius", [0.0, 1 * DEG, 90 * DEG, 179 * DEG])
+@pytest.mark.parametrize(("scale", "radius"), [(0.1, DEG), (30.0, 0.0), (30.0, DEG), (30.0, 179 * DEG)])
 def test_no_iterate_leaves_the_ball(scale, radius):
     weights, first = network(int(scale), scale), starts(2)
     farthest = 0.0

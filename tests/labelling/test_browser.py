@@ -1,6 +1,5 @@
 """The page in headless Chromium, with real keys; left out where there is none."""
 
-import math
 import shutil
 
 import numpy as np
@@ -72,47 +71,3 @@ def test_every_key_is_in_the_file_once(browser, tmp_path):
     found = {row["item"]: None if row["answer"] is None else row["answer"][0] for row in rows}
     assert found == {number: values[key] for number, key in enumerate(pressed)}
     assert all(0 <= row["seconds"] < 60 for row in rows)
-
-
-def test_a_picture_its_arrows_and_its_film_fit_a_phone(browser, tmp_path):
-    folder = tmp_path / "labels"
-    with served(folder, task="photo_task:TASK") as (_, address):
-        page = entered(browser, address, 390, 844, has_touch=True)
-        assert page.evaluate("() => document.documentElement.scrollWidth") == 390
-        sizes = "one => [one.offsetWidth, one.offsetHeight]"
-        sizes = f"() => [...document.querySelectorAll('.answers button')].flatMap({sizes})"
-        assert min(page.evaluate(sizes)) >= 44
-        assert page.evaluate("() => document.querySelector('.photo').decode().then(() => true)")
-        page.locator(".said[data-name='pick-0-more'] .touched").tap(force=True)  # the arrow to the left
-        page.wait_for_function("() => document.querySelector('.said.picked')?.dataset.name === 'pick-0-more'")
-        page.keyboard.press("c")
-        page.wait_for_function("() => document.querySelectorAll('.answers .picked').length === 3")
-        page.keyboard.press("v")
-        page.wait_for_function("() => document.querySelectorAll('image.frame').length === 6")
-        page.wait_for_function("() => document.querySelector('.film-words').textContent.includes('from the best')")
-        page.wait_for_function(
-            "() => [...document.querySelectorAll('image.frame')].every(one => one.style.visibility === 'hidden')"
-        )
-        page.keyboard.press("Enter")
-        moved(page, 0)
-        page.keyboard.press("ArrowLeft")
-        page.keyboard.press(" ")
-        moved(page, 1)
-    rows = label_files.history(folder / label_files.JSONL)
-    assert [row["answer"] for row in rows] == [[1.0, 2.0, -1.0], [1.0, 0.0, 0.0]]
-
-
-def test_pointing_shows_what_to_do_instead(browser, tmp_path):
-    folder = tmp_path / "labels"
-    with served(folder, "--guidance", "demonstration") as (process, address):
-        page = entered(browser, address)
-        box = page.locator("svg.scene").bounding_box()
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        page.mouse.move(x + 60, y - 104)
-        page.mouse.click(x + 60, y - 104)
-        moved(page, 0)
-        process.kill()
-        page.get_by_text("The command behind this page has stopped").wait_for()
-        assert f"--out {folder}" in page.locator("#popup code").inner_text()
-    (row,) = label_files.history(folder / label_files.JSONL)
-    np.testing.assert_allclose(row["answer"], [0.5, math.sqrt(0.75)], atol=0.02)

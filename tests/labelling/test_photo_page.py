@@ -120,20 +120,3 @@ def test_a_script_labels_a_folder_by_the_command_and_labels_of_others_are_refuse
     cues = [folder, "--cues", "right,left;up,down;open,close", *command[3:]]
     with pytest.raises(UserError, match=r"another task\.cues"):
         label.run([*map(str, cues)])
-
-
-def test_the_page_shows_what_gymnasium_renders_and_films_where_an_action_leads(tmp_path, capsys):
-    pytest.importorskip("gymnasium")
-    seen = []
-
-    def ask(obs, action, page):
-        seen.append(page._scene.content)
-        return np.array([1.0 if action < 0.5 else 0.0])
-
-    command = ["gymnasium:gymnasium_worlds:limited", "--cues", "right,left", *SMALL, "--labels", "3"]
-    found = labelled([*command, "--task.processes", "1", "--out", tmp_path / "mine"], ask)
-    assert "cuelearner train gymnasium:gymnasium_worlds:limited" in capsys.readouterr().out
-    assert label_files.read(found).space.cues[0].words == ("right", "left")
-    photos = [re.search(r'class="photo" href="([^"]+)"', svg)[1] for svg in seen]
-    assert len(set(photos)) == len(photos)  # a picture of each step
-    assert arrows(seen[0]) == {"+1": (0, "→", "right"), "-1": (180, "←", "left")}

@@ -227,16 +227,6 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
         comparing.merge([file, narrower])
 
 
-def test_labels_are_compared_with_the_teacher_in_the_situations_they_were_given_in(opened, tmp_path):
-    session = opened()
-    give(session, 5)
-    session.answer(5, 1 - np.abs(expert(session.item)))  # wrong
-    rows = label_files.history(tmp_path / "labels" / JSONL)
-    file = label_files.read(tmp_path / "labels")
-    found = comparing.with_teacher(page_task.TASK, file, rows, probes.SCALARS, print)
-    assert (found.count, found.value) == (6, pytest.approx(5 / 6))
-
-
 def test_a_policy_that_gives_no_actions_is_named_before_a_question_is_asked(opened, tmp_path):
     nothing = Opaque(lambda obs: obs * np.where(obs.any(), np.nan, 1.0), on_host=True)
     with pytest.raises(UserError, match=r"policy .*lambda.* gave zero or not finite numbers"):

@@ -7,7 +7,7 @@ import numpy as np
 from cuelearner_jax.reading import Reading
 from cuelearner_jax.spaces import DIRECTIONS
 
-LABELS, EPS_DEG = 50, 9.0
+LABELS, BATCHES, EPS_DEG = 48, 3, 9.0
 ASIDE = np.array([1.2, -0.9, 0, 0, 0, 0], np.float32)  # farther than goals are away
 
 
@@ -27,9 +27,9 @@ def met(random):
 def read(right, aside):
     """Return the reading of labels, and its mean error in other situations [deg]."""
     reading, random = Reading(policy, (), DIRECTIONS, EPS_DEG, LABELS), np.random.default_rng(1)
-    for batch in range(5):
+    for batch in range(BATCHES):
         obs = met(random) + aside
-        index, action = reading.questions(obs, LABELS // 5, jax.random.key(batch))
+        index, action = reading.questions(obs, LABELS // BATCHES, jax.random.key(batch))
         turn = np.asarray(DIRECTIONS.log(action, right(obs[index])))
         reading.learn(obs[index], action, np.where(np.abs(turn) <= reading.eps / 2, 0, np.sign(turn)))
     obs = jnp.asarray(met(random) + aside)

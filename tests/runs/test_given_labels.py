@@ -8,10 +8,9 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.order import Order, read_labels
+from cuelearner_jax.runs.order import read_labels
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.studies import train
 
 TASK = {"name": "window", "half_width_deg": 28.0}
 EPS = probes.CONFIG.scalars.eps_deg
@@ -71,19 +70,3 @@ def test_labels_that_do_not_fit_a_run_are_refused(path, given, grid, says):
     written(path, **given)
     with pytest.raises(UserError, match=says):
         read_for(path, grid)
-
-
-SMALL = {"feedback_layers": (4,), "fit_steps": 20, "lanes_per_block": 1}
-RUN = probes.config(sizes=SMALL, schedule={"total_steps": 16, "guidance_until": 16}, agent={"q_layers": (4,)})
-
-
-def test_demonstrations_are_written_and_taken_again_by_their_own_kind_alone(tmp_path):
-    grid, task = Grid(("demonstration",), (4,), (10,)), probes.make_task()
-    train.run(Order(task, RUN, grid, tmp_path / "asked"))
-    path = tmp_path / "asked" / "demonstration" / "labels.parquet"
-    file = label_files.read(path)
-    assert (file.answers, file.eps, file.labels.answer.shape) == ("demonstration", None, (10, 2))
-    np.testing.assert_array_equal(read_for(path, grid).labels.answer, file.labels.answer)
-    for other in ("relative", "scalar", "dcoach"):
-        with pytest.raises(UserError, match=f"holds demonstration answers, but guidance {other} needs"):
-            read_for(path, Grid((other,), (4,), (10,)))

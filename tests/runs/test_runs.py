@@ -87,30 +87,6 @@ def test_the_hash_of_a_configuration_depends_on_what_a_lane_learns_from_alone():
     assert runs.config_hash({**values, "agent": {**values["agent"], "polyak": 0.5}}) != found
 
 
-def not_loaded(folder, message):
-    before = probes.files_of(folder)
-    with pytest.raises(UserError, match=message) as refusal:
-        runs.load(folder, find)
-    assert "\n" not in str(refusal.value)
-    assert probes.files_of(folder) == before
-
-
-def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
-    not_loaded(tmp_path / "missing", "not a run folder")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda values: values["task"].update(name="tennis"), "unknown task 'tennis'"),
-        (lambda values: values["scalars"].update(colour=1), "colour is 1 in a file of another version"),
-    ],
-)
-def test_the_description_of_another_program_is_not_loaded(out, change, message):
-    probes.edit_json(out / "config.json", change)
-    not_loaded(out, message)
-
-
 # Grids.
 
 
@@ -155,12 +131,6 @@ def test_seeds_are_a_number_or_a_range(words, seeds):
         runs.parse_seeds(words, first=7)
 
 
-def test_grids_that_make_sense():
-    runs.check_grid(GRID)
-    runs.check_grid(Grid(("none", "heuristic"), (0, runs.LARGEST_SEED - 1), ()))
-    runs.check_grid(Grid(("none",), (0,), (10, 10)))  # budgets that nobody uses
-
-
 def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
     relative, none = (guidances.make(kind, probes.SIZES, probes.Window()) for kind in ("relative", "none"))
     seeds, budgets = GRID.lanes(relative)
@@ -168,21 +138,3 @@ def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
     seeds, budgets = GRID.lanes(none)
     assert list(zip(seeds.tolist(), budgets.tolist(), strict=True)) == [(4, 0), (9, 0)]
     assert seeds.dtype == budgets.dtype == np.int32
-
-
-# The same through `studies.train.run`: nothing is changed on disk by what is refused.
-
-
-@pytest.mark.parametrize(
-    ("config", "grid", "options", "message"),
-    [
-        (probes.config(scalars={"k_max": 3}), GRID, {"resume": True}, r"other values of scalars\.k_max"),
-        (probes.config(agent={"batch_size": 0}), GRID, {"overwrite": True}, r"agent\.batch_size is 0"),
-        (probes.CONFIG, Grid(("none",), (), ()), {"overwrite": True}, "seeds must be"),
-    ],
-)
-def test_a_refused_run_changes_nothing(out, config, grid, options, message):
-    before = probes.files_of(out.parent)
-    with pytest.raises(UserError, match=message):
-        train.run(Order(TASK, config, grid, out, split="tuning", **options))
-    assert probes.files_of(out.parent) == before

@@ -35,13 +35,6 @@ def refused(folder, message, now=DESCRIBED, resume=False, overwrite=False):
     assert probes.files_of(looked_at) == before
 
 
-def test_a_missing_or_empty_folder_may_be_used(tmp_path):
-    folders.check_folder(tmp_path, DESCRIBED, resume=False, overwrite=False)
-    for overwrite in (False, True):
-        folders.check_folder(tmp_path / "new", DESCRIBED, resume=False, overwrite=overwrite)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_run_may_be_resumed_or_overwritten_and_nothing_else(out):
     refused(out, "not empty: give --resume to go on, --overwrite to delete it")
     folders.check_folder(out, DESCRIBED, resume=True, overwrite=False)

@@ -158,18 +158,6 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
     assert not (tmp_path / files.PARQUET).exists()
 
 
-@pytest.mark.parametrize(
-    ("other", "named"), [({"answers": "scalar", "eps_deg": None}, "answers"), ({"eps_deg": 5.0}, "eps")]
-)
-def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named):
-    said(tmp_path, range(3))
-    files.finish(tmp_path)
-    before = probes.files_of(tmp_path)
-    with pytest.raises(UserError, match=f"holds labels of another {named}: give the same, or another --out"):
-        said(tmp_path, [3], **other)
-    assert probes.files_of(tmp_path) == before
-
-
 def test_a_label_that_could_not_be_read_is_not_written(tmp_path):
     labels = said(tmp_path, range(2))
     row = {name: getattr(labels, name)[0, 2] for name in NAMES}

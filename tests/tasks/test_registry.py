@@ -62,15 +62,6 @@ def test_the_packages_own_tasks_can_be_had(name):
     assert all(isinstance(preset.config, RunConfig) for preset in task.presets.values())
 
 
-def test_a_task_from_outside_is_known_once_it_is_named(tmp_path):
-    (tmp_path / "own_one.py").write_text(OWN.format(name="mine"))
-    task = registry.resolve("own_one:TASK")
-    assert (task.name, task.origin) == ("mine", "own_one:TASK")
-    assert registry.find("mine") is task
-    assert registry.names() == (*registry.BUILT_IN, "mine")
-    assert registry.resolve("own_one:TASK") == task  # named again
-
-
 REFUSED = [
     ("own_here:NUMBER", "own_here:NUMBER is of type int: a task is a cuelearner_jax.task.Task"),
     ("own_taken:TASK", "there is a task 'billiards' already: give this one another name"),

@@ -1,7 +1,5 @@
 """Walking in MJX: steps of control against C MuJoCo, rewards and ends by hand. One compile serves the whole file."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.anymal.locomotion import Locomotion, Trial, random_command
+from cuelearner_envs.anymal.locomotion import Locomotion, Trial
 from cuelearner_envs.anymal.physics import AnymalGround
 from cuelearner_envs.anymal.policy import OBS
 
@@ -76,12 +74,6 @@ def test_falls_end_the_episode(stepped):
     assert {name for name, value in done.items() if value} == {"on its side", "low", "blown up"}
 
 
-def test_rewards_are_never_negative_and_calm_standing_earns_the_most(stepped):
-    reward = np.asarray(stepped.reward)
-    assert (reward >= 0).all()
-    assert reward[0] == reward[:3].max() > 0
-
-
 def test_observations_are_what_the_policy_is_told_in_order(stepped):
     walk = stepped.pipeline_state
     obs = np.asarray(stepped.obs)[0]
@@ -91,14 +83,3 @@ def test_observations_are_what_the_policy_is_told_in_order(stepped):
     np.testing.assert_allclose(obs[12:24], walk.body.qpos[0, 7:] - robot.HOME, atol=1e-6)
     np.testing.assert_allclose(obs[24:36], walk.body.qvel[0, 6:], atol=1e-6)
     np.testing.assert_allclose(obs[36:], walk.last_action[0])
-
-
-def test_commands_fill_the_trials_bounds():
-    trial = Trial(speed=1.2, turning=1.6, rest=0.1)
-    draw = jax.jit(jax.vmap(partial(random_command, trial=trial)))
-    commands = np.asarray(draw(jax.random.split(jax.random.key(0), 4000)))
-    speed = np.linalg.norm(commands[:, :2], axis=-1)
-    assert 1.19 < speed.max() <= 1.2
-    assert 1.59 < np.abs(commands[:, 2]).max() <= 1.6
-    assert (speed == 0).mean() == pytest.approx(0.1, abs=0.02)  # 4000 draws: standard deviation 0.005
-    assert np.abs(commands.mean(0)).max() < 0.06

@@ -122,16 +122,6 @@ def test_an_episode_is_truncated_after_its_last_shot():
     assert ends == [(False, number == 9) for number in range(11)]
 
 
-def test_a_turned_strike_is_the_turned_action():
-    turned = make_environment(BilliardsConfig("easy", action_turn_deg=0.8))
-    for degrees in (17.0, -100.0, 179.8):
-        after, _ = step(turned, KEY, SCENE, toward(degrees))
-        same, _ = step(EASY, KEY, SCENE, toward(degrees + 0.8))
-        other, _ = step(EASY, KEY, SCENE, toward(degrees))
-        np.testing.assert_allclose(after.positions, same.positions, atol=1e-4)
-        assert float(jnp.abs(after.positions - other.positions).max()) > 1e-3
-
-
 def test_records_hold_the_path_of_every_shot_and_what_the_environment_paid():
     paths, rewards = record(EASY, Heuristic(EASY), jax.random.key(2), 12)
     assert len(paths) == len(rewards) == 12

@@ -65,24 +65,6 @@ def test_the_way_to_a_doorway_leads_on_and_the_wall_does_not():
     assert left[inner].min() > left[to_gap] + 1.0
 
 
-# A passage ahead, 1.5 m wide, that turns left at its end 5 m away; the goal lies round the corner.
-PASSAGE = [[2.0, 0.85, 0, 2.0, 0.1], [3.0, -0.85, 0, 4.0, 0.1], [5.6, 1.5, 0, 0.1, 2.25], [3.9, 3.0, 0, 0.1, 2.0]]
-
-
-def test_an_l_shaped_passage_is_walked_in_two_legs():
-    goal = (4.75, 3.0)
-    obs = among(PASSAGE, goal)
-    left, detour, leg = ahead(obs)
-    along = -round(math.degrees(math.atan2(goal[1], goal[0])) / 5)  # ahead, counted from the goal
-    near = left[[along - 1, along, along + 1]]
-    assert near.min() < 0.1
-    best = along - 1 + int(near.argmin())
-    np.testing.assert_allclose(leg[best], goal[0], atol=0.7)
-    # Two sides of a right angle less the third: 4.75 + 3 - 5.6 m.
-    np.testing.assert_allclose(detour[best], sum(goal) - math.hypot(*goal), atol=0.4)
-    assert left[0] > 2.0  # straight at the goal: the passage's wall
-
-
 def test_what_is_seen_of_a_wall_stops_a_second_leg_and_what_is_not_seen_does_not():
     """Behind a screen the free-space assumption holds: the hidden wall counts only for who sees it."""
     goal, screen, hidden = (6.5, 0.0), [3.0, 0.0, 0, 0.1, 1.0], [5.0, 0.0, 0, 0.1, 1.6]

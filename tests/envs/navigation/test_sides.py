@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import rooms
 
-from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.geometry import line_clearance
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
@@ -54,25 +53,6 @@ def test_a_closed_side_lets_nothing_through_and_the_other_stays_open():
 # The corridor twice, walked through in either direction.
 BACK = WORLD.replace(starts=WORLD.goals, goals=WORLD.starts)
 TWO = Navigation(jax.tree.map(lambda *leaves: jnp.stack(leaves), WORLD, BACK), max_steps=jnp.int32(120), sides=True)
-
-
-def test_they_are_counted_for_a_quadruped_too():
-    """One step past the box, a little below its middle."""
-    legged = LeggedNavigation(TWO.worlds, max_steps=TWO.max_steps, sides=True, walking=None)
-    zero = jnp.zeros((), jnp.int32)
-
-    @jax.jit
-    def counted(env):
-        there = [env.at_rest(jnp.array([x, 0.05, 0.0])) for x in (-1.0, 1.0)]
-        states = [env.placed(place, jnp.array([8.0, 0.0]), jnp.zeros((3, 2)), zero, zero) for place in there]
-        states = [state.replace(passed=jnp.array([0.0, 2.0])) for state in states]
-        after = env.counted(*states)
-        return after.passed, env.sides_of(after)
-
-    for env in (TWO, legged):
-        passed, sides = counted(env)
-        np.testing.assert_array_equal(passed, [0, 3])
-        assert [name for name, value in sides.items() if value] == ["passed_right"]
 
 
 walked = jax.jit(lambda teacher, env: rollout(Taught(teacher), env, episodes("tuning"), 20, 20 * 120))

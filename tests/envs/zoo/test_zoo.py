@@ -1,6 +1,6 @@
 """The zoo: what robots observe, what is wrong in their worlds, what teachers answer, and the laws of an environment."""
 
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +20,11 @@ ERRORS = jnp.arange(len(zoo.ERRORS))
 KEY = jax.random.key(3)
 
 
-@partial(jax.jit, static_argnames="cues")
-def situations(cues):
-    """A robot, its worlds of all errors, and a state amid an episode in each."""
-    robot = draw(jax.random.key(cues), cues)
+@cache
+@jax.jit
+def situations():
+    """A robot of three cues, its worlds of all errors, and a state amid an episode in each."""
+    robot = draw(jax.random.key(3), 3)
     worlds = jax.vmap(lambda error: zoo.change(KEY, robot, error))(ERRORS)
     states = jax.vmap(lambda world: zoo.reset(KEY, world))(worlds)
     states, _ = jax.vmap(zoo.step)(worlds, states, jax.vmap(zoo.right)(worlds, states))
@@ -31,35 +32,40 @@ def situations(cues):
 
 
 def test_observations_hold_all_quantities():
-    robot, worlds, states = situations(3)
+    robot, worlds, states = situations()
+    sights = jax.jit(jax.vmap(sight_of))(worlds, states)
+    both = jax.jit(lambda robot, sights: jax.vmap(lambda sight: decode(robot, encode(robot, sight)))(sights))
     for true in (False, True):
-        robot = robot.replace(relative=jnp.array(true))
-        sights = jax.vmap(sight_of)(worlds, states)
-        again = jax.vmap(lambda sight, robot=robot: decode(robot, encode(robot, sight)))(sights)
+        again = both(robot.replace(relative=jnp.array(true)), sights)
         jax.tree.map(partial(np.testing.assert_allclose, atol=1e-4), again, sights)
 
 
-@pytest.mark.parametrize("cues", [1, 3])
-def test_the_right_action_has_the_effect_that_the_unchanged_policys_has(cues):
-    robot, worlds, states = situations(cues)
-    effects = jax.vmap(execute)(worlds, states.position, jax.vmap(zoo.right)(worlds, states))
-    wanted = zoo.policy(robot, encode(robot, sight_of(*jax.tree.map(lambda leaf: leaf[0], (worlds, states)))))
+def test_the_right_action_has_the_effect_that_the_unchanged_policys_has():
+    robot, worlds, states = situations()
+
+    @jax.jit
+    def found():
+        effects = jax.vmap(execute)(worlds, states.position, jax.vmap(zoo.right)(worlds, states))
+        return effects, zoo.policy(
+            robot, encode(robot, sight_of(*jax.tree.map(lambda leaf: leaf[0], (worlds, states))))
+        )
+
+    effects, wanted = found()
     for name, effect, other in zip(zoo.ERRORS, effects, worlds.other, strict=True):
         assert other == name.startswith("other")
         if not other:
             np.testing.assert_allclose(effect, wanted, atol=1e-4 * float(robot.half.max()), err_msg=name)
 
 
-@pytest.mark.parametrize("cues", [1, 3])
-def test_each_error_changes_what_is_executed_or_what_is_observed(cues):
-    robot, worlds, states = situations(cues)
+def test_each_error_changes_what_is_executed_or_what_is_observed():
+    robot, worlds, states = situations()
     action = robot.retract(0.3 * robot.high)
 
     def differences(world, state):
         seen = (zoo.observe(world, state) - encode(robot, sight_of(world, state))) / robot.unit[robot.order]
         return jnp.abs(execute(world, state.position, action) - action).max(), jnp.abs(seen).max()
 
-    executes, observes = (np.asarray(size) > 1e-3 for size in jax.vmap(differences)(worlds, states))
+    executes, observes = (np.asarray(size) > 1e-3 for size in jax.jit(jax.vmap(differences))(worlds, states))
     changes = {name for name, at in zip(zoo.ERRORS, executes, strict=True) if at} | {"region"}  # where that is reached
     assert changes == {"constant", "gain", "mixing", "region", "waves", "two"}
     assert {name for name, at in zip(zoo.ERRORS, observes, strict=True) if at} == {
@@ -68,7 +74,7 @@ def test_each_error_changes_what_is_executed_or_what_is_observed(cues):
 
 
 def test_answers_say_where_the_right_action_lies_and_teachers_err_as_they_are_told_to():
-    _, worlds, states = situations(3)
+    _, worlds, states = situations()
     world, state = jax.tree.map(lambda leaf: leaf[1], (worlds, states))
     right, half, eps = zoo.right(world, state), world.robot.half, 0.1
     action = right + 2 * half * jnp.array([-0.2, 0.3, 0.04])
@@ -78,9 +84,8 @@ def test_answers_say_where_the_right_action_lies_and_teachers_err_as_they_are_to
     np.testing.assert_array_equal(answer(one_cue=True), [UNSAID, -1, UNSAID])
 
 
-@pytest.mark.parametrize("cues", [1, 3])
-def test_a_world_keeps_the_laws_of_an_environment(cues):
-    _, worlds, _ = situations(cues)
+def test_a_world_keeps_the_laws_of_an_environment():
+    _, worlds, _ = situations()
     env = ZooEnvironment.of(jax.tree.map(lambda leaf: leaf[4], worlds))
     check_environment(env, zoo.STEPS + 2, tolerance=1e-4)
     state, obs = env.reset(KEY)
@@ -90,9 +95,9 @@ def test_a_world_keeps_the_laws_of_an_environment(cues):
 
 def test_a_world_is_found_by_its_name():
     task = registry.resolve("zoo:2")
-    env = task.environment(task.configure(number=4, error="gain"))
+    asked = [task.configure(number=4, error="gain", **more) for more in ({}, {"split": "held_out"})]
+    env, other = jax.jit(lambda: [task.environment(config) for config in asked])()
     assert (env.actions.size, env.world.error) == (2, zoo.ERRORS.index("gain"))
-    other = task.environment(task.configure(number=4, error="gain", split="held_out"))
     assert not np.array_equal(env.world.robot.unit, other.world.robot.unit)
     with pytest.raises(UserError, match="unknown robots 'zoo:9': give zoo:1"):
         registry.resolve("zoo:9")
