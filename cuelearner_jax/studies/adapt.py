@@ -107,8 +107,8 @@ class AdaptRequest:
     labels_from: Path | None = None
     """Label file to use instead of asking the teacher."""
     judge_by: str = "reward"
-    """What decides whether the correction is used: a metric on tuning episodes, held-out answers (labels), or you, by
-    films of both policies side by side (person). A model that is not shown to make the policy better is not used."""
+    """What decides whether the correction is used: labels (default of `reading`), a metric such as success on tuning
+    episodes, or person: you, by films of both policies side by side. What is not shown to be better is not used."""
     judge_episodes: int = 50
     """Largest number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
     judge_bounds: tuple[float, ...] = ()
