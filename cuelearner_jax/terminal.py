@@ -76,7 +76,7 @@ class TimedProgress(Progress):
             return
         now = (task.elapsed or 0.0, task.completed)
         first = task.fields.setdefault("first", now)  # stretch, which compiles: without it the rest is faster
-        word, since = ("about", first) if now > first else ("at most", (0.0, begun))
+        word, since = ("about", first) if now[1] > first[1] else ("at most", (0.0, begun))
         pace, ahead = (now[0] - since[0]) / (now[1] - since[1]), task.fields.get("ahead", 0) * task.total
         left = [duration(pace * steps) for steps in (task.total - task.completed, task.total - task.completed + ahead)]
         more = f", {left[1]} with the kinds to come" if ahead else ""

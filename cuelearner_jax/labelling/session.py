@@ -98,8 +98,10 @@ class Record:
             raise UserError(f"not finished ({error.strerror or error}): make room, then finish again") from error
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, and delete one without a response."""
         self._writer.close()
+        if not self.rows:
+            self.path.unlink(missing_ok=True)
 
 
 class Status(NamedTuple):
@@ -139,12 +141,16 @@ class Session:
         self._items: dict[int, Item] = {}
         self._file: Path | None = None
         self.number = 0  # of the current question
-        self._replay(tell)
-        tell("preparing questions")
-        self._prepare(self.number)
-        self._prepare(self.number + 1)
-        # whether the task films situations
-        self.films = self.questions.film(self._items[self.number], self._items[self.number].action) is not None
+        try:
+            self._replay(tell)
+            tell("preparing questions")
+            self._prepare(self.number)
+            self._prepare(self.number + 1)
+            # whether the task films situations
+            self.films = self.questions.film(self._items[self.number], self._items[self.number].action) is not None
+        except BaseException:
+            self.record.close()
+            raise
         self._next: Future[None] = self._ahead.submit(self._prepare, self.number + 1)
         self._since = time.monotonic()
 

@@ -167,7 +167,7 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
         is_sound or pair == UNASKED for is_sound, pair in zip(sound, pairs, strict=True)
     ):
         raise UserError(f'cues is {format_value(words)}: give two words an entry of an action, as "left,right;up,down"')
-    if len({*filter(any, pairs)}) < len([*filter(any, pairs)]):
+    if not names and len({*filter(any, pairs)}) < len([*filter(any, pairs)]):
         raise UserError(f"cues is {format_value(words)}, the same words twice: give each entry its own")
     if names and len(names) != len(pairs):
         raise UserError(

@@ -109,12 +109,9 @@ class LabelWriter(tables.TableWriter):
         `more`: further entries of a new file's head, such as the versions that wrote it.
         """
         about = _about(task, answers, space, eps, meaning, session)
-        if there := found_in(folder):
-            table, before = _table_and_head(there)
-            old, new = ({name: head.get(name) for name in SHARED} for head in (before or about, about))
-            if (differing := next(differences(old, new), None)) is not None and not len(table):
-                there.unlink()  # a session that ended before its first answer
-            elif differing is not None:
+        if (there := found_in(folder)) and (before := _table_and_head(there)[1]):
+            old, new = ({name: head.get(name) for name in SHARED} for head in (before, about))
+            if (differing := next(differences(old, new), None)) is not None:
                 raise UserError(f"{there} holds labels of another {differing}: give the same, or another --out")
         self._widths: dict[str, int] = {}
         super().__init__(folder, SCHEMA, about={**about, **more})
