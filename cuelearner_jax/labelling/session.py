@@ -98,10 +98,8 @@ class Record:
             raise UserError(f"not finished ({error.strerror or error}): make room, then finish again") from error
 
     def close(self) -> None:
-        """Close the file, and delete one without a response."""
+        """Close the file."""
         self._writer.close()
-        if not self.rows:
-            self.path.unlink(missing_ok=True)
 
 
 class Status(NamedTuple):
@@ -150,6 +148,8 @@ class Session:
             self.films = self.questions.film(self._items[self.number], self._items[self.number].action) is not None
         except BaseException:
             self.record.close()
+            if not self.record.rows:
+                self.record.path.unlink()
             raise
         self._next: Future[None] = self._ahead.submit(self._prepare, self.number + 1)
         self._since = time.monotonic()

@@ -231,3 +231,10 @@ def test_a_policy_that_gives_no_actions_is_named_before_a_question_is_asked(open
     nothing = Opaque(lambda obs: obs * np.where(obs.any(), np.nan, 1.0), on_host=True)
     with pytest.raises(UserError, match=r"policy .*lambda.* gave zero or not finite numbers"):
         opened(base=Base(nothing, "mine"))
+
+
+def test_a_session_that_cannot_begin_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(Session, "_prepare", lambda self, number: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        Session(plan(), tmp_path / "labels")
+    assert not (tmp_path / "labels" / JSONL).exists()
