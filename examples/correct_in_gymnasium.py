@@ -62,10 +62,10 @@ def main(labels=200, guidance="reading", seed=0):
     better = cl.adapt(wrong, world, right, labels=labels, **how)
     answer = np.random.default_rng(seed).integers(-1, 2, better.labels.answer.shape).astype(np.float32)
     control = cl.adapt(wrong, world, labels=better.labels._replace(answer=answer), **how)
-    found = {"as it was": error(wrong), "corrected": error(better), "answers by chance": error(control)}
-    for name, value in found.items():
+    errors = {"as it was": error(wrong), "corrected": error(better), "answers by chance": error(control)}
+    for name, value in errors.items():
         print(f"{name}: mean error {value:.3f}")
-    return found
+    return errors
 
 
 if __name__ == "__main__":

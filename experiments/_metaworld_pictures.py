@@ -149,7 +149,7 @@ class PicturesConfig(EnvConfig):
 Plan = Callable[[np.ndarray, np.ndarray], np.ndarray]  # pictures (n, h, w, 3), states (n, 4) -> chunks (n, T, 4)
 
 
-class Corrected(Protocol):
+class Correction(Protocol):
     """A correction beside a policy."""
 
     shift: np.ndarray  # (4,): added to the state that the policy sees
@@ -208,11 +208,11 @@ class Robots:
         change: str,
         seeds: Sequence[int],
         plan: Plan,
-        corrected: Corrected | None,
+        correction: Correction | None,
         every: int,
         widths: Sequence[float] = (),
     ) -> list[Episode]:
-        """Return an episode a seed; `plan` gives a chunk every `every` steps, `corrected` corrects its actions.
+        """Return an episode a seed; `plan` gives a chunk every `every` steps, `correction` corrects its actions.
 
         Where `widths` (4,) are given, the policy is asked as far to both sides of each entry of the state, and inputs
         hold how its action changes with the state; else zeros.
@@ -220,11 +220,11 @@ class Robots:
         episodes: list[Episode] = []
         for start in range(0, len(seeds), len(self.pipes)):
             part = seeds[start : start + len(self.pipes)]
-            episodes += self._wave(change, part, partial(_with_effects, plan, every, np.array(widths)), corrected)
+            episodes += self._wave(change, part, partial(_with_effects, plan, every, np.array(widths)), correction)
         return episodes
 
     def _wave(
-        self, change: str, seeds: Sequence[int], plan: Callable[..., np.ndarray], corrected: Corrected | None
+        self, change: str, seeds: Sequence[int], plan: Callable[..., np.ndarray], correction: Correction | None
     ) -> list[Episode]:
         replies = self.call({number: ("start", change, seed) for number, seed in enumerate(seeds)})
         inputs: list[list[np.ndarray]] = [[] for _ in seeds]
@@ -236,12 +236,12 @@ class Robots:
             states = np.stack([replies[number]["state"] for number in active])
             if phase == 0:
                 pictures = np.stack([replies[number]["picture"] for number in active])
-                planned = plan(pictures, states, 0 if corrected is None else corrected.shift)
+                planned = plan(pictures, states, 0 if correction is None else correction.shift)
                 chunks = np.zeros((len(seeds), *planned.shape[1:]), np.float32)
                 chunks[active] = planned
             every, own = chunks.shape[1], chunks[active, phase]
             rows = np.concatenate([states, np.full((len(active), 1), phase / every), own], 1).astype(np.float32)
-            actions = rows[:, -4:] if corrected is None else corrected.correct(rows)
+            actions = rows[:, -4:] if correction is None else correction.correct(rows)
             for number, row in zip(active, rows, strict=True):
                 inputs[number].append(row)
                 intended[number].append(replies[number]["intended"])
@@ -259,9 +259,9 @@ def _with_effects(
 ) -> np.ndarray:
     """Return, for each step of a chunk, the effects of the state and the proposed action (n, every, 20)."""
     ways = np.concatenate([np.diag(widths), -np.diag(widths)]) if len(widths) else np.zeros((0, 4))
-    asked = (np.concatenate([np.zeros((1, 4)), ways])[:, None] + states + shift).astype(np.float32)
-    chunks = plan(np.tile(pictures, (len(asked), 1, 1, 1)), asked.reshape(-1, 4))[:, :every]
-    chunks = np.clip(chunks, -1, 1).reshape(len(asked), len(states), every, 4)
+    probes = (np.concatenate([np.zeros((1, 4)), ways])[:, None] + states + shift).astype(np.float32)
+    chunks = plan(np.tile(pictures, (len(probes), 1, 1, 1)), probes.reshape(-1, 4))[:, :every]
+    chunks = np.clip(chunks, -1, 1).reshape(len(probes), len(states), every, 4)
     effects = np.zeros((len(states), every, 4, 4))
     for entry, width in enumerate(widths):
         effects[:, :, entry] = (chunks[1 + entry] - chunks[1 + len(widths) + entry]) / (2 * width)

@@ -134,7 +134,7 @@ class Labeller:
 
     @property
     def shift(self) -> np.ndarray:
-        """What is added to the state that the policy sees (4,)."""
+        """The shift of the state that the policy sees (4,), in the state's units."""
         if not self.effects or self.reading.fit is None:
             return np.zeros(4, np.float32)
         return -np.asarray(self.reading.policy().correction.change.theta, np.float32)
@@ -186,10 +186,10 @@ class Cells:
         self.widths = SIDES * np.ptp(np.stack(states.to_numpy()), 0) if options.effects else ()
         self.rows: list[dict[str, Any]] = pq.read_table(self.file).to_pylist() if self.file.exists() else []
 
-    def played(self, change: str, corrected: Any = None, first: int = REPORT_SEED, count: int = 0) -> list[Episode]:
+    def played(self, change: str, correction: Any = None, first: int = REPORT_SEED, count: int = 0) -> list[Episode]:
         """Return episodes by the policy, or by the corrected policy; `count` of them are asked about."""
         seeds = range(first, first + (count or self.options.episodes))
-        return self.robots.play(change, seeds, self.plan, corrected, EXECUTED, self.widths if count else ())
+        return self.robots.play(change, seeds, self.plan, correction, EXECUTED, self.widths if count else ())
 
     def measure(self, seeds: int, until: float) -> None:
         """Measure all cells, those of one seed of labels after those of another, while there is time."""

@@ -11,6 +11,7 @@ import probes
 import pytest
 
 from cuelearner_jax import asking
+from cuelearner_jax.adaptation import by_reading
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Heuristic, Uniform
@@ -136,6 +137,7 @@ def test_shuffled_answers_are_those_given_each_with_another_label():
     chex.assert_trees_all_equal(given.replace(answer=labels.answer), labels)
     np.testing.assert_array_equal(np.sort(found[valid], 0), answer[valid])
     assert (found[valid] != answer[valid]).all()
+    np.testing.assert_array_equal(by_reading._valid(LANE_KEY, labels, scalars)[2], found[valid])  # as readings get them
     np.testing.assert_array_equal(found[~valid], answer[~valid])
     other = asking.fitted_labels(jax.random.key(12), labels, scalars)
     assert (np.asarray(other.answer) != found).any()

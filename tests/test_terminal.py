@@ -24,7 +24,8 @@ def test_what_looks_like_markup_is_printed_as_it_is(capsys, monkeypatch):
     out.print(table)
     assert capsys.readouterr().out.count(TEXT) == 3
     with progress_bars() as bars:
-        bars.update(bars.add_task(TEXT, total=1, note="[/bold]"), completed=1)
+        bars.update(work := bars.add_task(TEXT, total=1, note="[/bold]"), completed=1)
+        bars.update(work, completed=1)  # no step since
     told = capsys.readouterr().err
     assert told.startswith(f"{TEXT}, 1 of 1, [/bold]; after 0 s")
 

@@ -386,6 +386,3 @@ def _together(first: Fit, second: Fit) -> Fit:
     hypothesis = hypothesis.replace(parts=ModelParts(hypothesis.parts.weights, True), hyper=never(hypothesis.hyper))
     first = first.replace(hypothesis=hypothesis, posterior=posteriors.replace(hyper=never(posteriors.hyper)))
     return jax.tree.map(lambda one, other: jnp.concatenate([one, other]), first, second)
-
-
-# --- steps of unknowns: so large that a change moves a policy's actions by a usual correction ---

@@ -79,15 +79,15 @@ def ratio_bounds(above: Bounds, below: Bounds) -> Bounds:
 
 
 def labels_for(
-    budgets: Int[np.ndarray, "budgets"], areas: Float[np.ndarray, "samples budgets"], wanted: Samples
+    budgets: Int[np.ndarray, "budgets"], areas: Float[np.ndarray, "samples budgets"], target: Samples
 ) -> Bounds:
-    """Return the labels at which areas under the curve, nondecreasing in the budget, first reach what is needed.
+    """Return the labels at which areas under the curve, nondecreasing in the budget, first reach the target.
 
     Areas lie on straight lines over the logarithm of the labels between two budgets. Beyond the budgets only a bound is
     known: more than the largest budget, or no more than the smallest.
     """
-    first = areas[:, 0] >= wanted
-    exact = np.where(first, float(budgets[0]), np.exp(statistics.step_at_level(np.log(budgets), areas, wanted)))
+    first = areas[:, 0] >= target
+    exact = np.where(first, float(budgets[0]), np.exp(statistics.step_at_level(np.log(budgets), areas, target)))
     return Bounds(np.where(first, 0.0, np.minimum(exact, float(budgets[-1]))), exact)
 
 

@@ -167,7 +167,8 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
         is_sound or pair == UNASKED for is_sound, pair in zip(sound, pairs, strict=True)
     ):
         raise UserError(f'cues is {format_value(words)}: give two words an entry of an action, as "left,right;up,down"')
-    if not names and len({*filter(any, pairs)}) < len([*filter(any, pairs)]):
+    in_words = [pair for pair in pairs if pair != UNASKED]
+    if not names and len({*in_words}) < len(in_words):
         raise UserError(f"cues is {format_value(words)}, the same words twice: give each entry its own")
     if names and len(names) != len(pairs):
         raise UserError(

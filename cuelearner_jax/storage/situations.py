@@ -59,7 +59,6 @@ class Situations(NamedTuple):
     slices: tuple[Quantity, ...]  # of an observation
     entries: tuple[str, ...]  # names of an action's entries; empty: the recording names none
     digest: str  # of these situations
-    has_pictures: bool
     # row -> its picture; None: that row has none. Raises UserError for a picture that cannot be read.
     picture: Callable[[int], Picture | None]
     text: Callable[[int], str] = lambda row: ""  # row -> what the robot was told to do
@@ -141,7 +140,7 @@ def _situations_of(
     contents.update("\n".join([quantity.name for quantity in slices] + ["", *entries]).encode())
     digest = contents.hexdigest()[:12]
     none: Callable[[int], Picture | None] = lambda row: None  # noqa: E731
-    return Situations(observations, actions, slices, entries, digest, picture is not None, picture or none)
+    return Situations(observations, actions, slices, entries, digest, picture or none)
 
 
 def _about(table: Path, size: int) -> dict[str, Any]:

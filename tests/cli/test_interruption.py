@@ -26,7 +26,7 @@ def interrupt_after(folder, step):
 def test_ctrl_c_saves_and_resume_goes_on(tmp_path, capsys):
     """To the bits of a run that was never stopped: tests/runs/test_resume.py and tests/test_frozen.py."""
     folder = tmp_path / "run"
-    thread = threading.Thread(target=interrupt_after, args=(folder, 200))
+    thread = threading.Thread(target=interrupt_after, args=(folder, 200), daemon=True)
     thread.start()
     assert main([*COMMAND, "--out", str(folder)]) == 128 + signal.SIGINT
     thread.join()

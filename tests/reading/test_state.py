@@ -39,8 +39,8 @@ def read(aside, seed, family):
     rows = np.concatenate([place, 0 * place[:, :1], effect, action], 1)
     reading = Reading(Heuristic(ENV.view()), family, ENV.actions, 1 / 36, LABELS, ENV.observation)
     for key in jax.random.split(jax.random.key(seed), 3):
-        at, asked = reading.questions(rows, LABELS // 3, key)
-        reading.learn(rows[at], asked, np.sign(np.trunc((right[at] - asked) / (2 * MOST) * 72)))
+        at, action_there = reading.questions(rows, LABELS // 3, key)
+        reading.learn(rows[at], action_there, np.sign(np.trunc((right[at] - action_there) / (2 * MOST) * 72)))
     return reading
 
 

@@ -83,6 +83,12 @@ def test_mistakes_and_silence_come_upon_each_entry_by_itself():
     np.testing.assert_array_equal(unsaid, action)
 
 
+def test_equal_words_of_two_entries_are_refused():
+    with pytest.raises(UserError, match="the same words twice: give each entry its own"):
+        cues_from("left,right;left,right")
+    assert len(cues_from("left,right;,;,")) == 3  # nothing is asked about the others
+
+
 @pytest.mark.parametrize("size", [28])
 def test_boxes_of_bimanual_arms_and_hands_need_no_cues_and_no_keys(size):
     plain = Box((-1.0,) * size, (1.0,) * size)

@@ -141,7 +141,7 @@ def register_robotics() -> None:
         try:
             import gymnasium_robotics
         except AttributeError as error:  # of PyOpenGL, which finds no library
-            library = os.environ.get("MUJOCO_GL")
+            library = os.environ.get("MUJOCO_GL", "")
             raise UserError(
                 f"MUJOCO_GL={library} finds no library ({error}): install libosmesa6 or libegl1, or give another"
             ) from error

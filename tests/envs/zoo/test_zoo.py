@@ -95,8 +95,8 @@ def test_a_world_keeps_the_laws_of_an_environment():
 
 def test_a_world_is_found_by_its_name():
     task = registry.resolve("zoo:2")
-    asked = [task.configure(number=4, error="gain", **more) for more in ({}, {"split": "held_out"})]
-    env, other = jax.jit(lambda: [task.environment(config) for config in asked])()
+    configs = [task.configure(number=4, error="gain", **more) for more in ({}, {"split": "held_out"})]
+    env, other = jax.jit(lambda: [task.environment(config) for config in configs])()
     assert (env.actions.size, env.world.error) == (2, zoo.ERRORS.index("gain"))
     assert not np.array_equal(env.world.robot.unit, other.world.robot.unit)
     with pytest.raises(UserError, match="unknown robots 'zoo:9': give zoo:1"):
