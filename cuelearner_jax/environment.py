@@ -12,6 +12,7 @@ has is in `Environment`. It may also have these members; no module asks for the 
 | mirror(which, obs, v)  | images of an observation and an action-like vector under symmetry `which`; 0: itself     |
 | features(obs, actions) | `Features`: a network's inputs for one observation and each of the actions               |
 | aims(obs)              | `Aims`: one for each thing that an action may be about, in a fixed order                 |
+| plays_once             | True: an evaluation plays one episode in each, since steps are slow; NaN is no action    |
 """
 
 from __future__ import annotations
@@ -274,6 +275,11 @@ def _traced(classes: tuple[Any, ...]) -> tuple[Callable[..., Features], Callable
 def symmetries_of(env: Any) -> int:
     """Return the number of symmetries of an environment (1: only the identity)."""
     return int(getattr(env, "symmetries", 1)) if offers(env, "mirror") else 1
+
+
+def plays_once(env: Any) -> bool:
+    """Return whether an evaluation plays one episode in each environment, and no step after it."""
+    return bool(getattr(env, "plays_once", False))
 
 
 Image = Callable[[Array, Array], tuple[Array, Array]]  # observations (n, obs), vectors (n, action) -> their images

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
 from cuelearner_jax.devices import BY_LANE, SHARED, commit_arrays, over_lanes, portions
-from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.environment import Environment, actions_of, plays_once
 from cuelearner_jax.policies import Policy, PolicyNode, call_policy, lanes_in, policy_name
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
@@ -46,14 +46,15 @@ class Rollout(NamedTuple):
     """The results of a roll-out: means over all environments, and each environment's values, which are independent."""
 
     means: dict[str, Any]  # (*lanes,) over the environments, as `rollout` gives them
-    # (*lanes, envs) means over an environment's own steps; outcomes are of its first episode, nan until that has ended
+    # (*lanes, envs) means over an environment's own steps (those of its first episode, where the environment
+    # `plays_once`); outcomes are of its first episode, nan until that has ended
     each: dict[str, Any]
     episode_steps: Any  # (*lanes, envs) int: of each environment's first episode, as far as it went
 
 
 def _rolled(policy: Policy, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int) -> Rollout:
     walk = _walked(policy, env, key, _begun(env, key, num_envs), jnp.arange(steps // num_envs))
-    return _summed(walk, steps // num_envs)
+    return _summed(walk, None if plays_once(env) else steps // num_envs)
 
 
 class _Walk(NamedTuple):
@@ -86,26 +87,30 @@ _begin = jax.jit(_begun, static_argnames="num_envs")
 def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, indices: Array) -> _Walk:
     """Return the roll-out after the steps of these numbers."""
     _, k_run = jax.random.split(key)
-    num_envs = walk.first.shape[0]
+    num_envs, once = walk.first.shape[0], plays_once(env)
 
     def one_step(walk: _Walk, index: jax.Array) -> tuple[_Walk, None]:
         k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
         action = call_policy(policy, k_act, walk.state, walk.obs, actions_of(env))
-        acts = walk.acts & jnp.isfinite(action).all(-1)
+        acts = walk.acts & (jnp.isfinite(action).all(-1) | (once & ~walk.first))
+        action = jnp.where(walk.first[:, None], action, jnp.nan) if once else action
         state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), walk.state, action)
         done = step.terminated | step.truncated
-        values = {"reward": step.reward, **step.metrics}
+        values, obs = {"reward": step.reward, **step.metrics}, step.obs
+        if once:
+            values = {name: jnp.where(walk.first, value, 0.0) for name, value in values.items()}
+            obs = jnp.where(walk.first[:, None], obs, walk.obs)
         sums = {name: total + values[name] for name, total in walk.sums.items()}
         ends = walk.first & done
         outcomes = {name: jnp.where(ends, step.outcome[name], before) for name, before in walk.outcomes.items()}
-        return _Walk(state, step.obs, walk.first & ~done, walk.episode_steps + walk.first, sums, outcomes, acts), None
+        return _Walk(state, obs, walk.first & ~done, walk.episode_steps + walk.first, sums, outcomes, acts), None
 
     return jax.lax.scan(one_step, walk, indices)[0]
 
 
-def _summed(walk: _Walk, steps: int) -> Rollout:
-    """Return the results of a roll-out of so many steps an environment."""
-    each = {name: total / steps for name, total in walk.sums.items()} | walk.outcomes
+def _summed(walk: _Walk, steps: int | None) -> Rollout:
+    """Return the results of a roll-out of so many steps an environment; None: of one episode each."""
+    each = {name: total / (steps or walk.episode_steps) for name, total in walk.sums.items()} | walk.outcomes
     # Results after an invalid action are meaningless.
     each = {name: jnp.where(walk.acts, values, jnp.nan) for name, values in each.items()}
     if walk.outcomes:
@@ -237,6 +242,7 @@ def _in_stretches(
 ) -> Rollout:
     """Roll out one policy (`each` is None), or the lanes of `each` side by side; a lane that fails is NaN."""
     count, lanes = _stretches(steps // num_envs), 0 if each is None else len(jax.tree.leaves(each)[0])
+    once = plays_once(env)
     env, each, shared, key = commit_arrays((env, each, shared, key))
     walk = _begin(env, key, num_envs=num_envs)
     walk = _repeat(walk, lanes=lanes) if lanes else walk
@@ -244,8 +250,10 @@ def _in_stretches(
         tell(number, count)
         walk = jax.block_until_ready(_walk(env, each, shared, key, walk, jnp.asarray(indices)))
         user_code.check_actions(True if lanes else walk.acts, whose)
+        if once and not walk.first.any():
+            break
     tell(count, count)
-    return jax.device_get(_sum_up(walk, steps=steps // num_envs, lanes=bool(lanes)))
+    return jax.device_get(_sum_up(walk, steps=None if once else steps // num_envs, lanes=bool(lanes)))
 
 
 def _stretches(steps: int) -> int:
@@ -271,6 +279,6 @@ def _walk(env: Any, each: Any, shared: Any, key: PRNGKeyArray, walk: _Walk, indi
 
 
 @partial(jax.jit, static_argnames=("steps", "lanes"))
-def _sum_up(walk: _Walk, *, steps: int, lanes: bool) -> Rollout:
+def _sum_up(walk: _Walk, *, steps: int | None, lanes: bool) -> Rollout:
     summed = partial(_summed, steps=steps)
     return jax.vmap(summed)(walk) if lanes else summed(walk)

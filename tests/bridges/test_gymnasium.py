@@ -132,6 +132,22 @@ def test_lanes_that_share_a_state_each_get_an_instance():
     assert len(found.running) <= 8
 
 
+class Counted(Adder):
+    played = 0
+
+    def step(self, action):
+        Counted.played += 1
+        return super().step(action)
+
+
+def test_an_evaluation_plays_one_episode_in_each_environment():
+    here = world(Counted, max_steps=20)
+    Counted.played = 0
+    found = cl.measure(lambda obs: np.full((len(obs), 1), PAID), here, episodes=8).metrics
+    assert found["reward"][0] == PAID  # a step of these episodes
+    assert Counted.played == found["return"][0] * 8 / PAID  # a return is that of so many steps
+
+
 def test_an_environment_that_does_not_repeat_itself_is_told():
     here = world(Forgetful)
     states, _ = walk(here, [[0.1]] * 3)
@@ -170,10 +186,7 @@ BOX = spaces.Box(-1, 1, (1,), np.float32)
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        (
-            {"env": "CartPol-v1"},
-            "no environment 'CartPol-v1', did you mean 'CartPole-v1'.*; of an id that your own code",
-        ),
+        ({"env": "CartPol-v1"}, "no environment 'CartPol-v1', did you mean 'CartPole-v1'.*; of an id that your own"),
         ({"env": "os:system"}, "would import code"),
         ({"env": Adder, "max_steps": 0}, "max_steps is 0: give a whole number"),
         ({"env": Adder, "cues": "left,right;up,down"}, "cues are 2 pairs of words, and an action has 1 entries"),
@@ -238,13 +251,7 @@ def measured(of, policy=lambda obs: 0 * obs):
     return {name: float(value[0]) for name, value in cl.measure(policy, of, episodes=1).metrics.items()}
 
 
-@pytest.mark.parametrize(
-    ("info", "length", "success"),
-    [
-        ({"is_success": True}, 150, 1),
-        ({"success": None}, 1, None),
-    ],
-)
+@pytest.mark.parametrize(("info", "length", "success"), [({"is_success": True}, 150, 1), ({"success": None}, 1, None)])
 def test_success_is_read_whenever_and_however_it_is_told(info, length, success):
     assert measured(short(info=info, length=length)).get("success") == success
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,7 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
     succeeds: bool = struct.field(pytree_node=False, default=False)  # True if it reports success
+    plays_once: ClassVar[bool] = True
 
     def reset(self, key: PRNGKeyArray) -> tuple[Episode, Float[Array, " obs"]]:
         """Begin an episode with a seed drawn from the key."""
