@@ -40,7 +40,7 @@ CHUNK, EXECUTED = 20, 10  # steps that ACT proposes at once, and those that are 
 LABELS, ROUNDS, SITUATIONS = 100, 4, 6  # situations met for each question
 MISTAKEN, SILENT = 0.05, 0.1  # shares of the answers about a cue
 TRAIN_SEED, LABEL_SEED, REPORT_SEED = 0, 100_000, 200_000  # of episodes
-CUES = ("right,left", "forward,back", "up,down", "close,open")
+CUES = ("right,left", "forward,back", "up,down", "")  # of the gripper nothing is said
 SIDES = 0.05  # by which a state is shifted to see its effect, as a share of its range
 ACT = {
     "type": "act", "push_to_hub": "false", "pretrained_backbone_weights": "null", "chunk_size": CHUNK,
@@ -114,7 +114,7 @@ def planner(place: Path, device: str) -> Callable[[np.ndarray, np.ndarray], np.n
 class Labeller:
     """Labels about a policy in a changed world, and the correction that they give."""
 
-    def __init__(self, seed: int, eps: float, effects: bool) -> None:
+    def __init__(self, seed: int, options: argparse.Namespace) -> None:
         import jax
 
         import cuelearner_jax as cl  # noqa: F401
@@ -126,16 +126,16 @@ class Labeller:
 
         names = {"names": ("x", "y", "z", "opening", "phase", EFFECT, BASE), "entries": (1, 1, 1, 1, 1, 16, 4)}
         env = logs.filled(logs.LogsConfig(**names, low=(-1.0,) * 4, high=(1.0,) * 4, cues=CUES))
-        family = declared_distortions(env) if effects else ACTIONS_ALONE
+        family = declared_distortions(env) if options.effects else ACTIONS_ALONE
         self.space, self.random, self.key = env.actions, np.random.default_rng(seed), jax.random.key(seed)
-        self.make = lambda: Reading(Heuristic(env.view()), family, env.actions, eps, LABELS, env.observation)
-        self.eps, self.effects = eps, effects
-        self.reading = self.make()
+        rest = (env.actions, options.eps, LABELS, env.observation, options.process)
+        self.make = lambda: Reading(Heuristic(env.view()), family, *rest)
+        self.options, self.reading = options, self.make()
 
     @property
     def shift(self) -> np.ndarray:
         """The shift of the state that the policy sees (4,), in the state's units."""
-        if not self.effects or self.reading.fit is None:
+        if not self.options.effects or self.reading.fit is None:
             return np.zeros(4, np.float32)
         return -np.asarray(self.reading.policy().correction.change.theta, np.float32)
 
@@ -153,6 +153,8 @@ class Labeller:
         inputs, intended = (
             np.concatenate(part) for part in zip(*((one.inputs, one.intended) for one in failed), strict=True)
         )
+        if self.options.answers == "way":
+            intended = as_fast(intended, inputs[:, -4:])
         some = self.random.choice(len(inputs), min(SITUATIONS * count, len(inputs)), replace=False)
         self.key, key = jax.random.split(self.key)
         index, action = self.reading.questions(inputs[some], count, key)
@@ -163,18 +165,25 @@ class Labeller:
         from cuelearner_jax.spaces import UNSAID
 
         off = np.asarray(self.space.log(action, intended))
-        answer = np.where(np.abs(off) <= self.eps / 2, 0.0, np.sign(off))
+        answer = np.where(np.abs(off) <= self.options.eps / 2, 0.0, np.sign(off))
         chance = self.random.random(off.shape)
         answer = np.where(chance < MISTAKEN, self.random.integers(-1, 2, off.shape), answer)
-        return np.where(chance > 1 - SILENT, UNSAID, answer).astype(np.float32)
+        asked = [cue.is_asked for cue in self.space.cues]
+        return np.where(asked & (chance <= 1 - SILENT), answer, UNSAID).astype(np.float32)
 
     def shuffled(self) -> Labeller:
         """Return what answers drawn by chance about the same actions give."""
         rows, self.reading = self.reading.rows, self.make()
         assert rows is not None
-        answer = self.random.integers(-1, 2, np.shape(rows.answer)).astype(np.float32)
-        self.reading.read_in_batches(np.asarray(rows.obs), np.asarray(rows.action), answer)
+        answer = np.where(np.isnan(rows.answer), np.nan, self.random.integers(-1, 2, np.shape(rows.answer)))
+        self.reading.read_in_batches(np.asarray(rows.obs), np.asarray(rows.action), answer.astype(np.float32))
         return self
+
+
+def as_fast(intended: np.ndarray, proposed: np.ndarray) -> np.ndarray:
+    """Return actions (n, 4) that lead where the intended ones lead, as fast as proposed: a person sees that."""
+    lengths = [np.linalg.norm(one[:, :3], axis=1, keepdims=True) for one in (proposed, intended)]
+    return np.concatenate([intended[:, :3] * lengths[0] / np.maximum(lengths[1], 1e-6), intended[:, 3:]], 1).clip(-1, 1)
 
 
 class Cells:
@@ -208,7 +217,7 @@ class Cells:
     def cell(self, change: str, seed: int, before: np.ndarray) -> Iterator[dict[str, Any]]:
         """Yield the row of a change, and of its control."""
         began, count = time.time(), LABELS // ROUNDS
-        labeller = Labeller(seed, self.options.eps, self.options.effects)
+        labeller = Labeller(seed, self.options)
         for round_ in range(ROUNDS):
             first = LABEL_SEED + 1000 * seed + 100 * round_
             labeller.ask(self.played(change, labeller if round_ else None, first, len(self.robots.pipes)), count)
@@ -320,6 +329,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--eps", type=float, default=0.05, help="strength of an answer, as a share of the range")
     parser.add_argument("--effects", action=argparse.BooleanOptionalAction, default=True, help="of the state")
+    parser.add_argument("--answers", choices=("way", "script"), default="way", help="about the way alone, or speed too")
+    parser.add_argument("--process", action=argparse.BooleanOptionalAction, default=False)
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--save", type=int, default=500, help="steps between checkpoints")
     parser.add_argument("--workers", type=int, default=12, help="that read the dataset")

@@ -99,6 +99,7 @@ class Reader:
         acts: the policy: observations (n, obs) -> actions (n, action).
         eps: strength of an answer, in the unit of `space.log`.
         step: size of each unknown of the family that changes actions by a usual correction; None without a family.
+        process: whether corrections may depend on the situation in ways that no parameter describes.
     """
 
     def __init__(
@@ -109,8 +110,10 @@ class Reader:
         eps: Float[Array, ""] | float,
         step: Float[Array, " unknowns"] | None = None,
         priors: Priors = PRIORS,
+        process: bool = True,
     ) -> None:
         self.space, self.family, self.acts, self.eps, self.step, self.priors = space, family, acts, eps, step, priors
+        self.process = process
 
     def read(self, labels: RelativeLabels, plain: Hypothesis, smooth: Hypothesis) -> Fit:
         """Return all hypotheses fitted to labels, stacked in the order of `HYPOTHESES`, those with the process last."""
@@ -118,7 +121,7 @@ class Reader:
         plain = self._start(frame, labels, plain)
         labels = labels._replace(valid=labels.valid & steady)
         first = self._fit(frame, labels, plain)
-        second = self._fit(frame, labels, _first_and_best(first, smooth))
+        second = self._fit(frame, labels, _first_and_best(first, smooth)) if self.process else None
         return _together(first, second)
 
     def _ask(self, obs: Float[Array, "*k n obs"]) -> Float[Array, "*k n action"]:
@@ -379,10 +382,12 @@ def _first_and_best(first: Fit, smooth: Hypothesis) -> Hypothesis:
 
 
 @jax.jit
-def _together(first: Fit, second: Fit) -> Fit:
+def _together(first: Fit, second: Fit | None) -> Fit:
     """Return all fits, stacked; those without the process have one of no amplitude."""
     never = lambda hyper: hyper.replace(amplitudes=jnp.full_like(hyper.amplitudes, _NEVER))  # noqa: E731
     hypothesis, posteriors = first.hypothesis, first.posterior
     hypothesis = hypothesis.replace(parts=ModelParts(hypothesis.parts.weights, True), hyper=never(hypothesis.hyper))
     first = first.replace(hypothesis=hypothesis, posterior=posteriors.replace(hyper=never(posteriors.hyper)))
+    if second is None:
+        return first
     return jax.tree.map(lambda one, other: jnp.concatenate([one, other]), first, second)

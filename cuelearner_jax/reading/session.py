@@ -52,6 +52,7 @@ class Reading:
         eps_deg: strength of an answer, in the space's unit.
         labels: expected number of labels, for which programs are compiled.
         observation: slices of the observation, for words.
+        process: whether corrections may depend on the situation in ways that no parameter describes.
     """
 
     def __init__(
@@ -62,11 +63,12 @@ class Reading:
         eps_deg: float,
         labels: int,
         observation: Sequence[Quantity] = (),
+        process: bool = True,
     ) -> None:
         if not space.cues:
             raise UserError(f"actions of {space.name} have no order, so no answer says more or less: give them cues")
         self.base, self.family, self.space = policy_of(policy, space), family, space
-        self.eps, self.observation = float(space.from_unit(eps_deg)), tuple(observation)
+        self.eps, self.observation, self.process = float(space.from_unit(eps_deg)), tuple(observation), process
         self.slots = labels
         self.rows: RelativeLabels | None = None  # all answers so far
         self.fits: Fit | None = None  # all hypotheses
@@ -172,7 +174,8 @@ class Reading:
             step = None
             if self.family:
                 step = steps_of(self.space, self.family, self._acts, jnp.asarray(obs), self.eps)
-            self._reader = Reader(self.space, self.family, self._acts, jnp.float32(self.eps), step)
+            rest = (jnp.float32(self.eps), step)
+            self._reader = Reader(self.space, self.family, self._acts, *rest, process=self.process)
         return self._reader
 
 
