@@ -25,7 +25,12 @@ from lerobot.envs.configs import EnvConfig
 from metaworld.sawyer_xyz_env import SawyerMocapBase
 
 TASKS = ("reach-v3", "button-press-v3", "drawer-open-v3", "door-open-v3")  # reported
-TUNING = ("door-close-v3", "drawer-close-v3", "handle-press-v3", "window-open-v3")  # on which settings are chosen
+TUNING = (
+    "coffee-button-v3",
+    "button-press-topdown-v3",
+    "faucet-open-v3",
+    "window-open-v3",
+)  # on which settings are chosen
 SIZE = 128  # of a picture [pixels]
 STEPS = 200  # of an episode at most
 CAMERA, PLACE = 2, (0.75, 0.075, 0.7)  # `corner2`, where LeRobot has it [m]
