@@ -269,7 +269,7 @@ def _with_effects(
     chunks = np.clip(chunks, -1, 1).reshape(len(probes), len(states), every, 4)
     effects = np.zeros((len(states), every, 4, 4))
     for entry, width in enumerate(widths):
-        effects[:, :, entry] = (chunks[1 + entry] - chunks[1 + len(widths) + entry]) / (2 * width)
+        effects[:, :, entry] = (chunks[1 + entry] - chunks[1 + len(widths) + entry]) / max(2 * width, 1e-6)
     return np.concatenate([effects.reshape(len(states), every, 16), chunks[0]], 2)
 
 

@@ -176,9 +176,11 @@ class Labeller:
 
     def shuffled(self) -> Labeller:
         """Return what answers drawn by chance about the same actions give."""
+        from cuelearner_jax.spaces import UNSAID
+
         rows, self.reading = self.reading.rows, self.make()
         assert rows is not None
-        answer = np.where(np.isnan(rows.answer), np.nan, self.random.integers(-1, 2, np.shape(rows.answer)))
+        answer = np.where(rows.answer == UNSAID, UNSAID, self.random.integers(-1, 2, np.shape(rows.answer)))
         self.reading.read_in_batches(np.asarray(rows.obs), np.asarray(rows.action), answer.astype(np.float32))
         return self
 
