@@ -41,6 +41,7 @@ LABELS, ROUNDS, SITUATIONS = 100, 4, 6  # situations met for each question
 MISTAKEN, SILENT = 0.05, 0.1  # shares of the answers about a cue
 TRAIN_SEED, LABEL_SEED, REPORT_SEED = 0, 100_000, 200_000  # of episodes
 CUES = ("right,left", "forward,back", "up,down", ",")  # of the gripper nothing is said
+TUNED = "camera 10 cm aside"  # the change in which fine-tuning is measured
 SIDES = 0.05  # by which a state is shifted to see its effect, as a share of its range
 ACT = {
     "type": "act", "push_to_hub": "false", "pretrained_backbone_weights": "null", "chunk_size": CHUNK,
@@ -117,7 +118,8 @@ def planner(place: Path, device: str) -> Callable[[np.ndarray, np.ndarray], np.n
 class Labeller:
     """Labels about a policy in a changed world, and the correction that they give."""
 
-    def __init__(self, seed: int, options: argparse.Namespace) -> None:
+    def __init__(self, seed: int, early: int | None, options: argparse.Namespace) -> None:
+        """`early`: number of steps of an episode that are asked about; None: all."""
         import jax
 
         import cuelearner_jax as cl  # noqa: F401
@@ -133,7 +135,7 @@ class Labeller:
         self.space, self.random, self.key = env.actions, np.random.default_rng(seed), jax.random.key(seed)
         rest = (env.actions, options.eps, LABELS, env.observation, options.process)
         self.make = lambda: Reading(Heuristic(env.view()), family, *rest)
-        self.options, self.reading = options, self.make()
+        self.early, self.options, self.reading = early, options, self.make()
 
     @property
     def shift(self) -> np.ndarray:
@@ -149,13 +151,15 @@ class Labeller:
         return np.asarray(self.reading.act(rows))[: len(inputs)]
 
     def ask(self, episodes: Sequence[Episode], count: int) -> None:
-        """Ask about situations of failed episodes, or of all where none failed."""
+        """Ask about early situations of failed episodes, or of all where none failed.
+
+        Later ones are those of a robot that has gone wrong already: what the script does there is no correction.
+        """
         import jax
 
-        failed = [one for one in episodes if not one.success] or list(episodes)
-        inputs, intended = (
-            np.concatenate(part) for part in zip(*((one.inputs, one.intended) for one in failed), strict=True)
-        )
+        failed, early = [one for one in episodes if not one.success] or episodes, slice(self.early)
+        inputs = np.concatenate([one.inputs[early] for one in failed])
+        intended = np.concatenate([one.intended[early] for one in failed])
         if self.options.answers == "way":
             intended = as_fast(intended, inputs[:, -4:])
         some = self.random.choice(len(inputs), min(SITUATIONS * count, len(inputs)), replace=False)
@@ -196,8 +200,11 @@ class Cells:
 
     def __init__(self, robots: Robots, plan: Any, folder: Path, options: argparse.Namespace) -> None:
         self.robots, self.plan, self.options, self.file = robots, plan, options, folder / "cells.parquet"
-        states = pq.read_table(sorted((folder / "dataset" / "data").rglob("*.parquet"))[0])["observation.state"]
-        self.widths = SIDES * np.ptp(np.stack(states.to_numpy()), 0) if options.effects else ()
+        rows = pq.read_table(folder / "dataset" / "data", columns=["observation.state", "frame_index"])
+        states = np.stack(rows["observation.state"].to_numpy())
+        self.widths = SIDES * np.ptp(states, 0) if options.effects else ()
+        usual = len(states) / np.sum(rows["frame_index"].to_numpy() == 0)  # length of a demonstration [steps]
+        self.early = round(options.early * usual) or None
         self.rows: list[dict[str, Any]] = pq.read_table(self.file).to_pylist() if self.file.exists() else []
 
     def played(self, change: str, correction: Any = None, first: int = REPORT_SEED, count: int = 0) -> list[Episode]:
@@ -222,7 +229,7 @@ class Cells:
     def cell(self, change: str, seed: int, before: np.ndarray) -> Iterator[dict[str, Any]]:
         """Yield the row of a change, and of its control."""
         began, count = time.time(), LABELS // ROUNDS
-        labeller = Labeller(seed, self.options)
+        labeller = Labeller(seed, self.early, self.options)
         for round_ in range(ROUNDS):
             first = LABEL_SEED + 1000 * seed + 100 * round_
             labeller.ask(self.played(change, labeller if round_ else None, first, len(self.robots.pipes)), count)
@@ -247,22 +254,19 @@ class Cells:
 
 
 def fine_tune(cells: Cells, folder: Path, options: argparse.Namespace, sizes: dict[str, Any]) -> None:
-    """Measure fine-tuning by five new demonstrations in each changed world of the camera, for a wall time."""
-    for change in [name for name in CHANGES if name.startswith("camera")]:
-        if any(row["change"] == change and row["labels"] == "demonstrations" for row in cells.rows):
-            continue
-        if time.time() + options.tune + 30 > options.until:
-            return
-        place = folder / change.replace(" ", "_")
-        collect(cells.robots, emptied(place / "dataset"), change, 500_000, 5)
-        train(place / "dataset", place / "act", options.tune, sizes | {"save": 50}, checkpoint(folder / "act"))
-        cells.plan = planner(checkpoint(place / "act"), options.device)
-        after = float(np.mean([one.success for one in cells.played(change)]))
-        like = next(row for row in cells.rows if row["change"] == change)
-        row = {"corrected": after, "after": after, "labels": "demonstrations", "used": True, "paired": "open"}
-        cells.rows.append(like | row | {"evidence": 0.0, "seconds": options.tune, "words": []})
-        print(cells.rows[-1], flush=True)
-        pq.write_table(pa.Table.from_pylist(cells.rows), cells.file, compression="zstd")
+    """Measure fine-tuning by five new demonstrations in a changed world, for a wall time."""
+    own = [row for row in cells.rows if row["change"] == TUNED]
+    if not own or any(row["labels"] == "demonstrations" for row in own):
+        return
+    place = folder / "tuned"
+    collect(cells.robots, emptied(place / "dataset"), TUNED, 500_000, 5)
+    train(place / "dataset", place / "act", options.tune, sizes | {"save": 50}, checkpoint(folder / "act"))
+    cells.plan = planner(checkpoint(place / "act"), options.device)
+    after = float(np.mean([one.success for one in cells.played(TUNED)]))
+    row = {"corrected": after, "after": after, "labels": "demonstrations", "used": True, "paired": "open"}
+    cells.rows.append(own[0] | row | {"evidence": 0.0, "seconds": options.tune, "words": []})
+    print(cells.rows[-1], flush=True)
+    pq.write_table(pa.Table.from_pylist(cells.rows), cells.file, compression="zstd")
 
 
 def emptied(folder: Path) -> Path:
@@ -335,6 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--eps", type=float, default=0.05, help="strength of an answer, as a share of the range")
     parser.add_argument("--effects", action=argparse.BooleanOptionalAction, default=True, help="of the state")
+    parser.add_argument("--early", type=float, default=1.0, help="asked about, in lengths of a demonstration; 0: all")
     parser.add_argument("--answers", choices=("way", "script"), default="way", help="about the way alone, or speed too")
     parser.add_argument("--process", action=argparse.BooleanOptionalAction, default=False)
     parser.add_argument("--batch", type=int, default=64)
