@@ -1,6 +1,4 @@
-"""Meta-World with pictures in changed worlds, in processes of its own, and as an environment of LeRobot.
-
-    lerobot-eval --env.discover_packages_path=_metaworld_pictures --env.type=metaworld_pictures --env.task=reach-v3 ...
+"""Meta-World with pictures in changed worlds, in processes of its own.
 
 Needs lerobot 0.6.1 and `pip install --no-deps metaworld`. A policy sees one picture of the camera `corner2`, and the
 hand's place and opening. Its reset of the gripper's weld writes 11 numbers where MuJoCo 3.17 has 12 columns: the first
@@ -11,26 +9,18 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
-import gymnasium
 import metaworld
 import mujoco
 import numpy as np
-from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs import metaworld as of_lerobot
-from lerobot.envs.configs import EnvConfig
 from metaworld.sawyer_xyz_env import SawyerMocapBase
 
 TASKS = ("reach-v3", "button-press-v3", "drawer-open-v3", "door-open-v3")  # reported
-TUNING = (
-    "coffee-button-v3",
-    "button-press-topdown-v3",
-    "faucet-open-v3",
-    "window-open-v3",
-)  # on which settings are chosen
+# on which settings are chosen
+TUNING = ("coffee-button-v3", "button-press-topdown-v3", "faucet-open-v3", "window-open-v3")
 SIZE = 128  # of a picture [pixels]
 STEPS = 200  # of an episode at most
 CAMERA, PLACE = 2, (0.75, 0.075, 0.7)  # `corner2`, where LeRobot has it [m]
@@ -69,10 +59,10 @@ def motion(change: Change, action: np.ndarray, back: bool = False) -> np.ndarray
 class ChangedMetaworld(of_lerobot.MetaworldEnv):
     """LeRobot's environment of a task, with smaller pictures and a change."""
 
-    def __init__(self, task: str, change: str = "nothing") -> None:
+    def __init__(self, task: str) -> None:
         size = {"observation_width": SIZE, "observation_height": SIZE}
         super().__init__(task, obs_type="pixels_agent_pos", **size)
-        self.change, self._max_episode_steps = CHANGES[change], STEPS
+        self.change = CHANGES["nothing"]
 
     def _ensure_env(self) -> None:
         if self._env is not None:
@@ -106,10 +96,6 @@ class ChangedMetaworld(of_lerobot.MetaworldEnv):
         self._env.seed(seed)
         return self._env.reset(seed=seed)[0]
 
-    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Execute the changed action."""
-        return super().step(motion(self.change, action))
-
     def intended(self, obs: np.ndarray) -> np.ndarray:
         """Return the script's action, for the world as it is."""
         return motion(self.change, np.clip(self.expert_policy.get_action(obs), -1, 1), back=True)
@@ -118,37 +104,6 @@ class ChangedMetaworld(of_lerobot.MetaworldEnv):
 def _reset_welds(env: Any) -> None:
     for number in np.flatnonzero(env.model.eq_type == mujoco.mjtEq.mjEQ_WELD):
         env.model.eq_data[number][:11] = [0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5]
-
-
-@EnvConfig.register_subclass("metaworld_pictures")
-@dataclass
-class PicturesConfig(EnvConfig):
-    """Options of the environment in LeRobot's commands: `--env.task`, `--env.change`."""
-
-    task: str = TASKS[0]
-    change: str = "nothing"
-    fps: int = 80
-    features: dict[str, PolicyFeature] = field(
-        default_factory=lambda: {
-            "action": PolicyFeature(type=FeatureType.ACTION, shape=(4,)),
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(4,)),
-            "pixels": PolicyFeature(type=FeatureType.VISUAL, shape=(SIZE, SIZE, 3)),
-        }
-    )
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {"action": "action", "agent_pos": "observation.state", "pixels": "observation.image"}
-    )
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of an environment."""
-        return {"change": self.change}
-
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> Any:
-        """Return the environments of the only task."""
-        kind = gymnasium.vector.AsyncVectorEnv if use_async_envs and n_envs > 1 else gymnasium.vector.SyncVectorEnv
-        make = partial(ChangedMetaworld, self.task, self.change)
-        return {self.task: {0: kind([make] * n_envs)}}
 
 
 Plan = Callable[[np.ndarray, np.ndarray], np.ndarray]  # pictures (n, h, w, 3), states (n, 4) -> chunks (n, T, 4)
@@ -307,6 +262,3 @@ def _record(world: ChangedMetaworld, change: str, seed: int) -> Demonstration | 
         if info["success"]:
             return Demonstration(*(np.stack(column) for column in zip(*rows, strict=True)))
     return None
-
-
-__path__: list[str] = []  # LeRobot looks for more modules of a plugin here

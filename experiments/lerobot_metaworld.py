@@ -7,7 +7,8 @@
 
 `all` does the first three. 50 episodes of the script with pictures become a LeRobot dataset (v3.0), which
 `lerobot-train` reads. The camera is moved, or the motion is changed. 100 situations, of failed episodes where there are
-any, are labelled in four rounds by a program that knows the script, with a person's slips. The correction acts beside
+any, up to the usual length of a demonstration, are labelled in four rounds by a program that knows the script, with a
+person's slips. The answers are about the way of the hand, not about its speed. The correction acts beside
 the policy, on the hand's state, the proposed action and the phase in the chunk; with the effects of the state, also on
 the state that the policy sees. Labels alone decide whether it is used. A control has answers drawn by chance about the
 same actions. Each task has a file, which grows with each cell.
@@ -118,29 +119,28 @@ def planner(place: Path, device: str) -> Callable[[np.ndarray, np.ndarray], np.n
 class Labeller:
     """Labels about a policy in a changed world, and the correction that they give."""
 
-    def __init__(self, seed: int, early: int | None, options: argparse.Namespace) -> None:
-        """`early`: number of steps of an episode that are asked about; None: all."""
+    def __init__(self, seed: int, early: int, eps: float) -> None:
+        """`early`: number of first steps of an episode that are asked about; `eps`: strength of an answer."""
         import jax
 
         import cuelearner_jax as cl  # noqa: F401
         from cuelearner_jax.environment import BASE, EFFECT
         from cuelearner_jax.policies import Heuristic
         from cuelearner_jax.reading import Reading, declared_distortions
-        from cuelearner_jax.reading.families import ACTIONS_ALONE
         from cuelearner_jax.tasks import logs
 
         names = {"names": ("x", "y", "z", "opening", "phase", EFFECT, BASE), "entries": (1, 1, 1, 1, 1, 16, 4)}
         env = logs.filled(logs.LogsConfig(**names, low=(-1.0,) * 4, high=(1.0,) * 4, cues=CUES))
-        family = declared_distortions(env) if options.effects else ACTIONS_ALONE
+        family = declared_distortions(env)
         self.space, self.random, self.key = env.actions, np.random.default_rng(seed), jax.random.key(seed)
-        rest = (env.actions, options.eps, LABELS, env.observation, options.process)
+        rest = (env.actions, eps, LABELS, env.observation)
         self.make = lambda: Reading(Heuristic(env.view()), family, *rest)
-        self.early, self.options, self.reading = early, options, self.make()
+        self.early, self.eps, self.reading = early, eps, self.make()
 
     @property
     def shift(self) -> np.ndarray:
         """The shift of the state that the policy sees (4,), in the state's units."""
-        if not self.options.effects or self.reading.fit is None:
+        if self.reading.fit is None:
             return np.zeros(4, np.float32)
         return -np.asarray(self.reading.policy().correction.change.theta, np.float32)
 
@@ -160,8 +160,7 @@ class Labeller:
         failed, early = [one for one in episodes if not one.success] or episodes, slice(self.early)
         inputs = np.concatenate([one.inputs[early] for one in failed])
         intended = np.concatenate([one.intended[early] for one in failed])
-        if self.options.answers == "way":
-            intended = as_fast(intended, inputs[:, -4:])
+        intended = as_fast(intended, inputs[:, -4:])
         some = self.random.choice(len(inputs), min(SITUATIONS * count, len(inputs)), replace=False)
         self.key, key = jax.random.split(self.key)
         index, action = self.reading.questions(inputs[some], count, key)
@@ -172,7 +171,7 @@ class Labeller:
         from cuelearner_jax.spaces import UNSAID
 
         off = np.asarray(self.space.log(action, intended))
-        answer = np.where(np.abs(off) <= self.options.eps / 2, 0.0, np.sign(off))
+        answer = np.where(np.abs(off) <= self.eps / 2, 0.0, np.sign(off))
         chance = self.random.random(off.shape)
         answer = np.where(chance < MISTAKEN, self.random.integers(-1, 2, off.shape), answer)
         asked = [cue.is_asked for cue in self.space.cues]
@@ -202,9 +201,8 @@ class Cells:
         self.robots, self.plan, self.options, self.file = robots, plan, options, folder / "cells.parquet"
         rows = pq.read_table(folder / "dataset" / "data", columns=["observation.state", "frame_index"])
         states = np.stack(rows["observation.state"].to_numpy())
-        self.widths = SIDES * np.ptp(states, 0) if options.effects else ()
-        usual = len(states) / np.sum(rows["frame_index"].to_numpy() == 0)  # length of a demonstration [steps]
-        self.early = round(options.early * usual) or None
+        self.widths = SIDES * np.ptp(states, 0)
+        self.early = round(len(states) / np.sum(rows["frame_index"].to_numpy() == 0))  # length of a demonstration
         self.rows: list[dict[str, Any]] = pq.read_table(self.file).to_pylist() if self.file.exists() else []
 
     def played(self, change: str, correction: Any = None, first: int = REPORT_SEED, count: int = 0) -> list[Episode]:
@@ -229,7 +227,7 @@ class Cells:
     def cell(self, change: str, seed: int, before: np.ndarray) -> Iterator[dict[str, Any]]:
         """Yield the row of a change, and of its control."""
         began, count = time.time(), LABELS // ROUNDS
-        labeller = Labeller(seed, self.early, self.options)
+        labeller = Labeller(seed, self.early, self.options.eps)
         for round_ in range(ROUNDS):
             first = LABEL_SEED + 1000 * seed + 100 * round_
             labeller.ask(self.played(change, labeller if round_ else None, first, len(self.robots.pipes)), count)
@@ -338,10 +336,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--tune", type=float, default=0.0, help="seconds of fine-tuning by five demonstrations; 0: none"
     )
     parser.add_argument("--eps", type=float, default=0.05, help="strength of an answer, as a share of the range")
-    parser.add_argument("--effects", action=argparse.BooleanOptionalAction, default=True, help="of the state")
-    parser.add_argument("--early", type=float, default=1.0, help="asked about, in lengths of a demonstration; 0: all")
-    parser.add_argument("--answers", choices=("way", "script"), default="way", help="about the way alone, or speed too")
-    parser.add_argument("--process", action=argparse.BooleanOptionalAction, default=False)
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--save", type=int, default=500, help="steps between checkpoints")
     parser.add_argument("--workers", type=int, default=12, help="that read the dataset")

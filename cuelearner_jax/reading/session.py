@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.environment import Quantity
+from cuelearner_jax.environment import PROPOSED, Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_name, policy_of
 from cuelearner_jax.reading import fitting, linear
@@ -51,8 +51,8 @@ class Reading:
         space: space of the actions, with cues.
         eps_deg: strength of an answer, in the space's unit.
         labels: expected number of labels, for which programs are compiled.
-        observation: slices of the observation, for words.
-        process: whether corrections may depend on the situation in ways that no parameter describes.
+        observation: slices of the observation, for words. Where one is an action that is proposed elsewhere, corrections
+            depend on the situation by parameters alone: what the proposal depends on, such as pictures, is not seen.
     """
 
     def __init__(
@@ -63,12 +63,11 @@ class Reading:
         eps_deg: float,
         labels: int,
         observation: Sequence[Quantity] = (),
-        process: bool = True,
     ) -> None:
         if not space.cues:
             raise UserError(f"actions of {space.name} have no order, so no answer says more or less: give them cues")
         self.base, self.family, self.space = policy_of(policy, space), family, space
-        self.eps, self.observation, self.process = float(space.from_unit(eps_deg)), tuple(observation), process
+        self.eps, self.observation = float(space.from_unit(eps_deg)), tuple(observation)
         self.slots = labels
         self.rows: RelativeLabels | None = None  # all answers so far
         self.fits: Fit | None = None  # all hypotheses
@@ -174,8 +173,8 @@ class Reading:
             step = None
             if self.family:
                 step = steps_of(self.space, self.family, self._acts, jnp.asarray(obs), self.eps)
-            rest = (jnp.float32(self.eps), step)
-            self._reader = Reader(self.space, self.family, self._acts, *rest, process=self.process)
+            rest, process = (jnp.float32(self.eps), step), all(part.kind != PROPOSED for part in self.observation)
+            self._reader = Reader(self.space, self.family, self._acts, *rest, process=process)
         return self._reader
 
 

@@ -23,6 +23,7 @@ def main() -> None:
     situations.add_argument("--dataset", type=Path, required=True, help="folder of a LeRobot dataset, format v3.0")
     situations.add_argument("--out", type=Path, required=True, help="folder for the situations, new or empty")
     situations.add_argument("--count", type=int, default=200, help="number of situations (default: 200)")
+    situations.add_argument("--first", type=int, default=0, help="of each episode's first frames alone (default: all)")
     situations.add_argument("--seed", type=int, default=0, help="seed of the chosen frames")
     situations.add_argument("--mjcf", type=Path, help="the robot's MJCF: actions are then the positions of its hand")
     situations.add_argument("--site", help="site of the MJCF at the hand")
@@ -55,6 +56,7 @@ def main() -> None:
         hand,
         matrices,
         not options.no_effects,
+        options.first,
     )
     cues = "forward,back;left,right;up,down" if hand else "left,right;up,down"
     print(f'wrote {count} situations; next: cuelearner label {options.out} --cues "{cues}"')

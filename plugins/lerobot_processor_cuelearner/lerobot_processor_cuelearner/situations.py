@@ -39,8 +39,9 @@ def write(
     hand_of: Callable[[Sequence[str]], Hand] | None = None,
     matrices: Mapping[str, Path] | None = None,
     effects: bool = True,
+    first: int = 0,
 ) -> int:
-    """Write situations at random frames of a dataset; return their number.
+    """Write situations at random frames of a dataset, or of the `first` of each episode; return their number.
 
     A situation holds the state at its frame, and the action that the policy proposes there, in the robot's own units:
     the first action of a new chunk, or a later one of a chunk that was predicted some frames before. `phase` is the
@@ -60,7 +61,8 @@ def write(
     projections = _projections(matrices or {}, data)
     policy, config, pre, post = _load(checkpoint, data)
     chunk, steps = int(getattr(config, "n_action_steps", 1)), _steps(data) if effects else None
-    frames = np.random.default_rng(seed).permutation(len(data))[:count]
+    number = data.hf_dataset.data.column("frame_index").to_numpy()  # of a frame in its episode
+    frames = np.random.default_rng(seed).permutation(np.flatnonzero(number < (first or np.inf)))[:count]
     where = np.random.default_rng(seed + 1).uniform(size=len(frames))
     (out / "pictures").mkdir(parents=True)
     rows: list[dict[str, Any]] = []
