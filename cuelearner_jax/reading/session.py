@@ -51,8 +51,8 @@ class Reading:
         space: space of the actions, with cues.
         eps_deg: strength of an answer, in the space's unit.
         labels: expected number of labels, for which programs are compiled.
-        observation: slices of the observation, for words. Where one is an action that is proposed elsewhere, corrections
-            depend on the situation by parameters alone: what the proposal depends on, such as pictures, is not seen.
+        observation: slices of the observation, for words. Where one is an action proposed elsewhere, there is no
+            process, since what the proposal depends on, such as pictures, is not seen.
     """
 
     def __init__(
