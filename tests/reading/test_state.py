@@ -9,7 +9,7 @@ import pytest
 
 from cuelearner_jax.environment import BASE, EFFECT
 from cuelearner_jax.policies import Heuristic
-from cuelearner_jax.reading import Reading, declared_distortions, families
+from cuelearner_jax.reading import Reading, declared_distortions, families, fitting
 from cuelearner_jax.tasks import logs
 
 MOST, LABELS, STEP, SEEN = 0.05, 60, 0.05, np.array([0.08, -0.05])
@@ -60,7 +60,9 @@ def test_a_shift_of_the_state_is_found_and_only_where_there_is_one():
     corrected, (state,) = read(SEEN, 2, STATE).policy(), STATE
     np.testing.assert_allclose(corrected.correction.change.theta, -SEEN, atol=0.02)
     assert play(corrected)[0] < 0.02  # 0.27 before
-    assert not read(0 * SEEN, 0, STATE).result().used
+    nothing = read(0 * SEEN, 0, STATE)
+    assert not nothing.result().used
+    assert len(nothing.fits.score) == len(fitting.HYPOTHESES)  # none with a process: the policy cannot be asked
     obs = jnp.array([0.3, 0.4, 0.0, -0.5, 0.0, 0.0, -0.25, 0.02, 0.01])
     np.testing.assert_allclose(state.plans(jnp.array([0.04, -0.02]), obs, obs[-2:]), [0.04, 0.005], atol=1e-7)
 
