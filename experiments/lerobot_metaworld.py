@@ -75,7 +75,7 @@ def train(dataset: Path, out: Path, seconds: float, sizes: dict[str, Any], base:
     words |= {"dataset.repo_id": "local/metaworld", "dataset.root": dataset, "output_dir": out, "steps": 10**6}
     words |= {"batch_size": sizes["batch"], "save_freq": sizes["save"], "num_workers": sizes["workers"]}
     words |= {"env_eval_freq": 0, "log_freq": sizes["save"], "dataloader_multiprocessing_context": "fork"}
-    words |= {"dataset.discover_packages_path": "_lerobot_reading"}  # or else 12 workers feed 4 steps a second
+    words |= {"dataset.discover_packages_path": "_lerobot_columns"}  # or else 12 workers feed 4 steps a second
     path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-m", "lerobot.scripts.lerobot_train", *(f"--{n}={v}" for n, v in words.items())]
     with (out.parent / f"{out.name}.log").open("w") as log:
@@ -131,10 +131,9 @@ class Labeller:
 
         names = {"names": ("x", "y", "z", "opening", "phase", EFFECT, BASE), "entries": (1, 1, 1, 1, 1, 16, 4)}
         env = logs.filled(logs.LogsConfig(**names, low=(-1.0,) * 4, high=(1.0,) * 4, cues=CUES))
-        family = declared_distortions(env)
         self.space, self.random, self.key = env.actions, np.random.default_rng(seed), jax.random.key(seed)
-        rest = (env.actions, eps, LABELS, env.observation)
-        self.make = lambda: Reading(Heuristic(env.view()), family, *rest)
+        about = (declared_distortions(env), env.actions, eps, LABELS, env.observation)
+        self.make = lambda: Reading(Heuristic(env.view()), *about)
         self.early, self.eps, self.reading = early, eps, self.make()
 
     @property
@@ -174,8 +173,8 @@ class Labeller:
         answer = np.where(np.abs(off) <= self.eps / 2, 0.0, np.sign(off))
         chance = self.random.random(off.shape)
         answer = np.where(chance < MISTAKEN, self.random.integers(-1, 2, off.shape), answer)
-        asked = [cue.is_asked for cue in self.space.cues]
-        return np.where(asked & (chance <= 1 - SILENT), answer, UNSAID).astype(np.float32)
+        is_asked = [cue.is_asked for cue in self.space.cues]
+        return np.where(is_asked & (chance <= 1 - SILENT), answer, UNSAID).astype(np.float32)
 
     def shuffled(self) -> Labeller:
         """Return what answers drawn by chance about the same actions give."""
@@ -214,7 +213,7 @@ class Cells:
         """Measure all cells, those of one seed of labels after those of another, while there is time."""
         bases: dict[str, np.ndarray] = {}
         for seed in range(seeds):
-            for change in self.options.changes:
+            for change in CHANGES:
                 if any((row["change"], row["seed"]) == (change, seed) for row in self.rows) or time.time() > until:
                     continue
                 for name in {"nothing": 0, change: 0}:
@@ -329,7 +328,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--demonstrations", type=int, default=DEMONSTRATIONS)
     parser.add_argument("--episodes", type=int, default=REPORTED, help="of each measurement")
     parser.add_argument("--seeds", type=int, default=3, help="of labels")
-    parser.add_argument("--changes", nargs="+", choices=tuple(CHANGES), default=tuple(CHANGES))
     parser.add_argument("--minutes", type=float, default=4.5, help="of training")
     parser.add_argument("--total", type=float, default=9.0, help="minutes after which no cell is begun")
     parser.add_argument(

@@ -157,7 +157,8 @@ def robot_of(name: str) -> Robot:
     names = {"peg-insert-side": "PegInsertionSide"}
     title = names.get(name, "".join(word.capitalize() for word in name.split("-")))
     policy = getattr(policies, f"Sawyer{title}V3Policy")()
-    act = lru_cache(1 << 17)(lambda row: policy.get_action(np.frombuffer(row).copy()))  # a reading asks again
+    # A reading asks about many rows again.
+    act = lru_cache(1 << 17)(lambda row: policy.get_action(np.frombuffer(row).copy()))  # scripts write into it
     with_each = lambda obs: np.stack([act(one.tobytes()) for one in np.asarray(obs, float)])  # noqa: E731
     script = lambda obs: np.clip(with_each(obs), -1, 1).astype(np.float32)  # noqa: E731
     return Robot(partial(MetaWorld, name), script, None, (4, 11, 22, 29, 36), META_WORLD)

@@ -26,7 +26,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
-from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.environment import Environment, actions_of, plays_once
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
 from cuelearner_jax.policies import Policy, PolicyNode
@@ -179,9 +179,10 @@ class Judge:
         return rollout_lanes(how.env, policy, key, envs, envs * how.steps, self.watch(what), mesh)
 
     def _counted_steps(self, rolled: Rollout, num_envs: int) -> np.ndarray:
-        """Return the environment steps (lanes,) that count: where a metric is an outcome, those of first episodes."""
+        """Return the steps (lanes,) that count: for an outcome, or where no others are played, of first episodes."""
         first, whole = np.asarray(rolled.episode_steps), num_envs * self.how.steps
-        return first.sum(-1) if self.how.by in _step_of(self.how.env).outcome else np.full(len(first), whole)
+        is_of_first = plays_once(self.how.env) or self.how.by in _step_of(self.how.env).outcome
+        return first.sum(-1) if is_of_first else np.full(len(first), whole)
 
 
 class PairedTest:

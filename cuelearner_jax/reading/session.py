@@ -173,8 +173,8 @@ class Reading:
             step = None
             if self.family:
                 step = steps_of(self.space, self.family, self._acts, jnp.asarray(obs), self.eps)
-            rest, process = (jnp.float32(self.eps), step), all(part.kind != PROPOSED for part in self.observation)
-            self._reader = Reader(self.space, self.family, self._acts, *rest, process=process)
+            process = all(part.kind != PROPOSED for part in self.observation)
+            self._reader = Reader(self.space, self.family, self._acts, jnp.float32(self.eps), step, process=process)
         return self._reader
 
 

@@ -143,9 +143,9 @@ class Counted(Adder):
 def test_an_evaluation_plays_one_episode_in_each_environment():
     here = world(Counted, max_steps=20)
     Counted.played = 0
-    found = cl.measure(lambda obs: np.full((len(obs), 1), PAID), here, episodes=8).metrics
-    assert found["reward"][0] == PAID  # a step of these episodes
-    assert Counted.played == found["return"][0] * 8 / PAID  # a return is that of so many steps
+    metrics = cl.measure(lambda obs: np.full((len(obs), 1), PAID), here, episodes=8).metrics
+    assert metrics["reward"][0] == PAID  # a step of these episodes
+    assert Counted.played == metrics["return"][0] * 8 / PAID  # a return is that of so many steps
 
 
 def test_an_environment_that_does_not_repeat_itself_is_told():

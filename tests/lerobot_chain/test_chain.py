@@ -66,8 +66,8 @@ def checkpoint_of(folder: Path, *arguments: str) -> str:
 def test_a_checkpoint_is_corrected_by_labels_and_evaluated_by_lerobot(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     checkpoint = checkpoint_of(tmp_path)
-    write = ["--policy", checkpoint, "--dataset", "data", "--out", "situations", "--count", "60", "--first", "20"]
-    run(tmp_path, "-m", "lerobot_processor_cuelearner", "situations", *write)
+    write = ["--policy", checkpoint, "--dataset", "data", "--out", "situations", "--count", "200", "--first", "15"]
+    assert "wrote 60 situations" in run(tmp_path, "-m", "lerobot_processor_cuelearner", "situations", *write)
     answer_all(["situations", "--cues", "left,right;up,down", "--labels", "60", "--out", "labels"], Path("labels"))
     assert main(["adapt", "--labels-from", "labels", "--out", "corrected"]) == 0
     export = ["export", "corrected", "--format", "lerobot", "--policy", checkpoint]
@@ -86,7 +86,7 @@ def test_a_checkpoint_is_corrected_by_labels_and_evaluated_by_lerobot(tmp_path, 
 def test_the_hand_of_an_arm_is_corrected_where_people_think(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     checkpoint = checkpoint_of(tmp_path, str(MJCF))
-    write = ["--policy", checkpoint, "--dataset", "data", "--out", "situations", "--count", "60", "--first", "20"]
+    write = ["--policy", checkpoint, "--dataset", "data", "--out", "situations", "--count", "60"]
     arm = ["--mjcf", str(MJCF), "--site", "grip", "--joints", "pan,lift,elbow,turn,flex,roll"]
     write += [*arm, "--joint-unit", "degrees", "--projection", "image=camera.json"]
     run(tmp_path, "-m", "lerobot_processor_cuelearner", "situations", *write)

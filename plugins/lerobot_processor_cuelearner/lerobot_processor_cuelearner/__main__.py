@@ -23,7 +23,9 @@ def main() -> None:
     situations.add_argument("--dataset", type=Path, required=True, help="folder of a LeRobot dataset, format v3.0")
     situations.add_argument("--out", type=Path, required=True, help="folder for the situations, new or empty")
     situations.add_argument("--count", type=int, default=200, help="number of situations (default: 200)")
-    situations.add_argument("--first", type=int, default=0, help="of each episode's first frames alone (default: all)")
+    situations.add_argument(
+        "--first", type=int, default=0, help="take only the first frames of episodes (default: all)"
+    )
     situations.add_argument("--seed", type=int, default=0, help="seed of the chosen frames")
     situations.add_argument("--mjcf", type=Path, help="the robot's MJCF: actions are then the positions of its hand")
     situations.add_argument("--site", help="site of the MJCF at the hand")
@@ -41,6 +43,8 @@ def main() -> None:
     if options.command == "judge":
         print(judge(options.before, options.after))
         return
+    if options.first < 0 or options.count < 1:
+        parser.error("give --first 0 or more and --count 1 or more")
     if (options.mjcf is None) != (options.site is None):
         parser.error("give --mjcf and --site together")
     if wrong := [text for text in options.projection if "=" not in text]:

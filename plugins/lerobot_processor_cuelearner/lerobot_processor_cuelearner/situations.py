@@ -61,8 +61,8 @@ def write(
     projections = _projections(matrices or {}, data)
     policy, config, pre, post = _load(checkpoint, data)
     chunk, steps = int(getattr(config, "n_action_steps", 1)), _steps(data) if effects else None
-    since = data.hf_dataset.data.column("frame_index").to_numpy()  # of each frame in its episode
-    frames = np.random.default_rng(seed).permutation(np.flatnonzero(since < (first or np.inf)))[:count]
+    frame_index = data.hf_dataset.data.column("frame_index").to_numpy()
+    frames = np.random.default_rng(seed).permutation(np.flatnonzero(frame_index < (first or np.inf)))[:count]
     where = np.random.default_rng(seed + 1).uniform(size=len(frames))
     (out / "pictures").mkdir(parents=True)
     rows: list[dict[str, Any]] = []
