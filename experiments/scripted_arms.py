@@ -7,8 +7,9 @@
 Needs the extra `gymnasium`, and for Meta-World `pip install --no-deps metaworld`. The policy is a script that knows
 nothing of the change; the teacher is the same script on what is true, except in the worlds named "other way". Labels
 are asked for, fitted and judged by the defaults of `cl.adapt`; `REPORTED` validation episodes measure. Where a camera
-stands aside, a control has answers drawn by chance about the same actions. Each robot has a file, which grows with each
-cell; what is there is kept.
+stands aside, a control has answers drawn by chance about the same actions. With `--judge-by success` the sequential
+test decides whether a correction is used, with the same labels. Each robot has a file, which grows with each cell; what
+is there is kept.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from cuelearner_jax.tasks import fetch_layout
 REPORTED = 50  # episodes of each measurement
 EPS = 0.05  # strength of an answer, as a share of the range
 WORSE = 0.15  # difference of success that is more than the noise of `REPORTED` episodes
+TESTED = "labels, tested"  # kind of the rows where the sequential test decided
 WITHIN = 0.02  # distance of a reach that counts as success [m]: 5 cm, as Fetch has it, forgive a camera aside
 CENTRE = (1.3, 0.75)  # about which a camera over Fetch's table turns [m]
 TASKS = (
@@ -214,8 +216,8 @@ def success(policy: Any, world: cl.World) -> tuple[float, float]:
     return float(found["success"][0]), float(found["return"][0])
 
 
-def measure(name: str, change: str, seed: int, labels: int) -> Iterator[dict[str, Any]]:
-    """Yield the row of a cell, and of its control where a camera stands aside."""
+def measure(name: str, change: str, seed: int, labels: int, judge_by: str) -> Iterator[dict[str, Any]]:
+    """Yield the row of a cell, and of its control where a camera stands aside and labels judge."""
     robot, world = robot_of(name), world_of(name, change)
     altered = robot.changes[change]
     way = robot.other if altered.other_way and robot.other else robot.script
@@ -223,9 +225,9 @@ def measure(name: str, change: str, seed: int, labels: int) -> Iterator[dict[str
     base = {"robot": name, "change": change, "seed": seed}
     base |= dict(zip(("unchanged", "unchanged return"), reference(name, "nothing"), strict=True))
     base |= dict(zip(("before", "before return"), reference(name, change), strict=True))
-    found = cl.adapt(robot.script, world, teacher, labels=labels, seed=seed, eps_deg=EPS)
-    yield base | _row("labels", found, world)
-    if not any(altered.aside) or altered.other_way:
+    found = cl.adapt(robot.script, world, teacher, labels=labels, seed=seed, eps_deg=EPS, judge_by=judge_by)
+    yield base | _row(TESTED if judge_by == "success" else "labels", found, world)
+    if judge_by == "success" or not any(altered.aside) or altered.other_way:
         return
     shape = np.asarray(found.labels.answer).shape
     given = found.labels._replace(answer=np.random.default_rng(seed).integers(-1, 2, shape).astype(np.float32))
@@ -246,17 +248,18 @@ def reference(name: str, change: str) -> tuple[float, float]:
     return success(robot_of(name).script, world_of(name, change))
 
 
-def run(name: str, changes: Sequence[str], seeds: Sequence[int], labels: int, out: Path) -> None:
+def run(options: argparse.Namespace, name: str) -> None:
     """Measure a robot's cells that its file has not, and write after each."""
+    out, seeds = options.out, range(options.first_seed, options.first_seed + options.seeds)
     file = out / f"{name}.parquet"
     rows = pq.read_table(file).to_pylist() if file.exists() else []
     done = {(row["change"], row["seed"]) for row in rows}
     out.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
-        for change in changes or robot_of(name).changes:
+        for change in options.changes or robot_of(name).changes:
             if (change, seed) in done:
                 continue
-            for row in measure(name, change, seed, labels):
+            for row in measure(name, change, seed, options.labels, options.judge_by):
                 row["after"] = row["before"] if row["after"] is None else row["after"]
                 row["after return"] = row["before return"] if row["after return"] is None else row["after return"]
                 rows.append(row)
@@ -316,6 +319,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=4, help="of labels")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--labels", type=int, default=100)
+    parser.add_argument("--judge-by", choices=("labels", "success"), default="labels")
     parser.add_argument("--out", type=Path, default=Path("runs/scripted_arms"), help="folder for a file a robot")
     parser.add_argument("--table", type=Path, help="print the table of this file or folder, and measure nothing")
     parser.add_argument("--record", action="store_true", help="with --table: write the figure's numbers")
@@ -327,9 +331,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             results_figures.write("scripted_arms", success_of(rows))
         return
     warnings.simplefilter("ignore")  # that a correction is not used is a row
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
     for name in options.robots:
-        run(name, options.changes, seeds, options.labels, options.out)
+        run(options, name)
 
 
 if __name__ == "__main__":
