@@ -20,14 +20,13 @@ import numpy as np
 
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.labelling.learner import Fitted, step_back
+from cuelearner_jax.labelling.learner import Fitted, Row, step_back
 from cuelearner_jax.labelling.plan import SessionPlan, begin, replay
 from cuelearner_jax.labelling.questions import Item, Questions
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import shape_of
-from cuelearner_jax.types import Label
 
 PICTURES = 20  # number of past questions whose pictures are kept; undo redraws earlier ones
 RECENT = 50  # number of answers from which the pace is computed
@@ -77,6 +76,10 @@ class Record:
         """Return the responses by the numbers of their items; may be called from any thread."""
         rows = self.rows.copy()
         return [rows[number] for number in sorted(rows)]
+
+    def labels(self) -> list[Row]:
+        """Return the answered items' observations, actions and answers, in order."""
+        return [(row.obs, row.action, row.answer) for row in self.in_order() if row.answer is not None]
 
     def count(self, said: str) -> int:
         """Return the number of items with this response."""
@@ -167,7 +170,7 @@ class Session:
             pairs = enumerate(zip(situations, rows, strict=False))
             self._items = {n: Item(n, at, row.action) for n, (at, row) in pairs}
         self.number = min((number for number in self._items if rows[number].said == UNDONE), default=count)
-        self._learner.fit(self._labels())
+        self._learner.fit(self.record.labels())
         self._items[count] = questions.ask(count, situations[-1])
 
     def _prepare(self, number: int) -> None:
@@ -187,14 +190,14 @@ class Session:
 
     def _fit(self) -> None:
         """Fit the model to the answers so far, if that is still due."""
-        labels = self._labels()
-        if not self._learner.is_due(count := int(labels.valid.sum())):
+        labels = self.record.labels()
+        if not self._learner.is_due(len(labels)):
             return
         try:
             self._learner.fit(labels)
         except Exception as error:  # labels are still saved, whatever happens to the model
             problem = f"the last fit failed ({type(error).__name__}: {error})"
-            self._learner.newest = self._learner.newest._replace(labels=count, problem=problem)
+            self._learner.newest = self._learner.newest._replace(labels=len(labels), problem=problem)
         self._ahead.submit(self._use_fit)
 
     def _use_fit(self) -> None:
@@ -240,11 +243,6 @@ class Session:
 
     def _save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
         self.record.save(item.number, Response(said, np.asarray(item.guide.obs), item.action, answer, seconds))
-
-    def _labels(self) -> Label:
-        """Return the answers in the order of their items, as a padded `Label`."""
-        rows = [(row.obs, row.action, row.answer) for row in self.record.in_order() if row.answer is not None]
-        return self._learner.pad(rows)
 
     def undo(self, number: int) -> bool:
         """Take back the answer before this question and ask it again.
