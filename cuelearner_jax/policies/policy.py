@@ -280,7 +280,7 @@ class Corrected(PolicyNode):
         """Return the base's actions, corrected by the teacher's answers until the teacher calls them right."""
         space, first = self.actions, self.base.act(key, states, obs)
         eps = space.from_unit(self.scalars.eps_deg)
-        intend = lambda row: intended_action(space, self.teacher, *row, self.scalars)  # noqa: E731
+        intend = lambda row: intended_action(space, self.teacher, row[0], row[1], row[2], self.scalars)  # noqa: E731
         best = jax.lax.map(intend, (states, obs, first), batch_size=min(len(obs), portions().states))
         step = lambda action, best: space.toward(action, relative_feedback(space, action, best, eps), eps) - action  # noqa: E731
         return refine(
