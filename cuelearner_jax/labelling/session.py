@@ -60,17 +60,18 @@ class Record:
         if set(self.rows) != set(range(len(self.rows))):
             raise UserError(f"{self.path} was not written by the labelling page: give another --out")
 
-    def save(self, number: int, response: Response) -> None:
+    def save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
         """Write a response to the disk, then use it. Raises UserError if the disk takes no more."""
+        response = Response(said, np.asarray(item.guide.obs), item.action, answer, seconds)
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        person = {"seconds": round(response.seconds, 3), "who": self._plan.who, "when": now}
+        person = {"seconds": round(seconds, 3), "who": self._plan.who, "when": now}
         try:
-            self._writer.append(seed=self._plan.seed, item=number, **{**response._asdict(), **person})
+            self._writer.append(seed=self._plan.seed, item=item.number, **{**response._asdict(), **person})
         except OSError as error:
             self.trouble = f"this answer is not saved ({error.strerror or error}): make room, then answer again"
             raise UserError(self.trouble) from error
         self.trouble = ""
-        self.rows[number] = response
+        self.rows[item.number] = response
 
     def in_order(self) -> list[Response]:
         """Return the responses by the numbers of their items; may be called from any thread."""
@@ -234,15 +235,12 @@ class Session:
                     return False
                 took = time.monotonic() - self._since
                 took = took if seconds is None or not 0 <= seconds <= took else seconds
-                self._save(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
+                self.record.save(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
             self._next.result()
             self._show(number + 1)
             if self._learner.is_due(self.record.count(ANSWERED)):
                 self._fits.submit(self._fit)
             return True
-
-    def _save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
-        self.record.save(item.number, Response(said, np.asarray(item.guide.obs), item.action, answer, seconds))
 
     def undo(self, number: int) -> bool:
         """Take back the answer before this question and ask it again.
@@ -254,7 +252,7 @@ class Session:
                 before = None if number == 0 or self._file else self._items.get(number - 1)
                 if number != self.number or before is None:
                     return False
-                self._save(before, UNDONE, None, time.monotonic() - self._since)
+                self.record.save(before, UNDONE, None, time.monotonic() - self._since)
             self._ahead.submit(self._prepare, number - 1).result()
             self._show(number - 1)
             return True
