@@ -68,7 +68,7 @@ def _person(judge_by: str) -> Any:
     """Return a context with the function by which a person judges, on a page; None where none does."""
     if judge_by != PERSON:
         return nullcontext()
-    return page_module("films").film_page(0, lambda address: out.print(f"open {address}", soft_wrap=True))
+    return page_module("films").film_page(lambda address: out.print(f"open {address}", soft_wrap=True))
 
 
 def _named_again(options: Adapt, task: Task, code: str | None) -> list[str]:

@@ -13,7 +13,6 @@ import io
 import itertools
 import json
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +48,11 @@ def check_request(format: str, out: Path) -> None:
     """Raise UserError unless a decision in that format can be written to a folder."""
     if format not in FORMATS:
         raise UserError(f"unknown format {format!r}{suggestion(format, FORMATS)}")
+    check_unused(out)
+
+
+def check_unused(out: Path) -> None:
+    """Raise UserError unless a folder is free to be written."""
     if is_occupied(out):
         raise UserError(f"{out} is not empty: give another --out")
 
@@ -68,7 +72,7 @@ def write(
 
     Returns the contract, with "difference": the largest difference among the golden cases in this replay.
     """
-    with place_of(out, partial(check_request, format)) as place:
+    with place_of(out, check_unused) as place:
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
         base = getattr(env, "base_size", 0)  # only for a correction alone
         traced = trace_policy(policy, env.obs_size)

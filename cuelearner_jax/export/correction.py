@@ -25,15 +25,13 @@ from cuelearner_jax.types import EnvState
 class FixedActions(PolicyNode):
     """Policy with fixed actions, supplied from elsewhere."""
 
+    KIND = "given"
+
     actions: Float[Array, "n action"]
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the supplied actions."""
         return self.actions
-
-    def describe(self) -> dict[str, Any]:
-        """Describe a policy that runs elsewhere."""
-        return {"policy": "given"}
 
 
 class CorrectionAlone(PolicyNode):

@@ -19,12 +19,13 @@ import numpy as np
 
 from cuelearner_jax.environment import BASE, EFFECT, actions_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.export.contract import check_unused
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.reading import ReadingPolicy
 from cuelearner_jax.reading.families import ACTIONS_ALONE, has_effects
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.storage.situations import PHASE
-from cuelearner_jax.storage.whole import is_occupied, place_of
+from cuelearner_jax.storage.whole import place_of
 
 NAME = "lerobot"
 ABOUT = "for LeRobot: the checkpoint of --policy with the correction in its processors"
@@ -38,19 +39,15 @@ Arrays = dict[str, np.ndarray]
 
 
 def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: Path, hand: dict[str, Any]) -> Path:
-    """Write a checkpoint with the correction; the folder appears completely or not at all. Return its path.
+    """Write a checkpoint with the correction of proposed actions; the folder appears completely or not at all.
+    Return its path.
 
-    Args:
-        policy: a corrected policy of proposed actions.
-        env: its situations.
-        names: names of the action's entries; empty: none are known.
-        checkpoint: the folder with the checkpoint's `config.json` and processors.
-        out: the folder to write.
-        hand: the robot's kinematics where actions are positions of its hand, as `storage.situations`; else empty.
+    `env`: the policy's situations. `names`: of the action's entries; empty: not known. `hand`: the robot's kinematics
+    where actions are positions of its hand, as `storage.situations`; else empty.
 
     Raises UserError for a policy without such a correction, a checkpoint of another robot, or of relative actions.
     """
-    with place_of(out, _check_unused) as place:
+    with place_of(out, check_unused) as place:
         space, arrays = actions_of(env), arrays_of(policy, env)
         size, names = (len(hand["joints"]), tuple(hand["entries"])) if hand else (space.size, names)
         arrays |= {f"hand_{name}": np.asarray(hand[name], np.float32) for name in hand if name != "entries"}
@@ -61,9 +58,9 @@ def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: 
         digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays.values())).hexdigest()[:16]
         more = {"chunk": int(config.get("n_action_steps") or 1), "version": VERSION}
         shift = {"state_shift": arrays.pop("state_shift").tolist()}
-        pre["steps"].insert(_place(pre, NORMALIZER), _step("StateStep", digest, shift))
-        post["steps"].insert(_place(post, UNNORMALIZER) + 1, _step("CorrectStep", digest, more))
-        post["steps"][_place(post, UNNORMALIZER) + 1]["state_file"] = STATE_FILE
+        last = _place(post, UNNORMALIZER) + 1
+        pre["steps"].insert(_place(pre, NORMALIZER), _step("StateStep", digest, **shift))
+        post["steps"].insert(last, _step("CorrectStep", digest, **more) | {"state_file": STATE_FILE})
         post["steps"].insert(0, _step("PlaceStep", digest))
         with place.writing() as folder:
             shutil.copytree(checkpoint, folder, dirs_exist_ok=True)
@@ -140,11 +137,6 @@ def safetensors(arrays: Arrays) -> bytes:
     return struct.pack("<Q", len(text)) + text + b"".join(array.tobytes() for array in arrays.values())
 
 
-def _check_unused(out: Path) -> None:
-    if is_occupied(out):
-        raise UserError(f"{out} is not empty: give another --out")
-
-
 def _read(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -190,5 +182,5 @@ def _place(pipeline: dict[str, Any], name: str) -> int:
     return [step.get("registry_name") for step in pipeline["steps"]].index(name)
 
 
-def _step(name: str, pair: str, more: dict[str, Any] | None = None) -> dict[str, Any]:
-    return {"class": f"{STEPS}.{name}", "config": {"pair": pair, **(more or {})}}
+def _step(name: str, pair: str, **more: Any) -> dict[str, Any]:
+    return {"class": f"{STEPS}.{name}", "config": {"pair": pair, **more}}

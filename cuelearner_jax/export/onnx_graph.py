@@ -216,15 +216,15 @@ def _atan2(w: _Writer, y: str, x: str) -> str:
     return w.node("Where", steep, straight, turned)
 
 
-def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[int]) -> str:
-    return w.node("Slice", x, w.whole(start), w.whole(stop), w.whole(range(len(start))), w.whole(step))
-
+# Operations that ONNX has too, by both names.
+ALIKE = {name.lower(): name for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin", "Cos")}
+ALIKE |= {name.lower(): name for name in ("Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul", "Div", "Pow")}
+ALIKE |= {name.lower(): name for name in ("Max", "Min", "And", "Or", "Xor", "MatMul")}
+ALIKE |= {"eq": "Equal", "lt": "Less", "le": "LessOrEqual", "gt": "Greater", "ge": "GreaterOrEqual", "select": "Where"}
 
 # By the names of `runner.OPERATIONS`: (writer, input names, attributes) -> output name.
 NODES: dict[str, Callable[..., str]] = {
-    **{name.lower(): _plain(name) for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin")},
-    **{name.lower(): _plain(name) for name in ("Cos", "Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul")},
-    **{name.lower(): _plain(name) for name in ("Div", "Pow", "Max", "Min", "And", "Or", "Xor")},
+    **{name: _plain(kind) for name, kind in ALIKE.items()},
     "log1p": _log1p,
     "expm1": _expm1,
     "rsqrt": lambda w, x: w.node("Reciprocal", w.node("Sqrt", x)),
@@ -234,22 +234,15 @@ NODES: dict[str, Callable[..., str]] = {
     "is_finite": lambda w, x: w.node("Not", w.node("Or", w.node("IsInf", x), w.node("IsNaN", x))),
     "rem": _plain("Mod", fmod=1),
     "atan2": _atan2,
-    "eq": _plain("Equal"),
     "ne": lambda w, x, y: w.node("Not", w.node("Equal", x, y)),
-    "lt": _plain("Less"),
-    "le": _plain("LessOrEqual"),
-    "gt": _plain("Greater"),
-    "ge": _plain("GreaterOrEqual"),
-    "select": _plain("Where"),
     "cast": lambda w, x, dtype: w.cast(x, dtype),
     "reshape": lambda w, x, shape: w.node("Reshape", x, w.whole(shape)),
     "transpose": lambda w, x, axes: w.node("Transpose", x, perm=axes),
     "broadcast": lambda w, x, shape: w.node("Expand", x, w.whole(shape)),
     "concatenate": lambda w, *parts, axis: w.node("Concat", *parts, axis=axis),
-    "slice": _sliced,
+    "slice": lambda w, x, start, stop, step: w.node("Slice", x, *map(w.whole, (start, stop, range(len(start)), step))),
     "pad": lambda w, x, value, low, high: w.node("Pad", x, w.whole([*low, *high]), value),
     "take": lambda w, x, places: w.node("Gather", x, places, axis=0),
-    "matmul": _plain("MatMul"),
     "sum": _sum,
     "largest": _extreme("ReduceMax"),
     "smallest": _extreme("ReduceMin"),

@@ -58,9 +58,8 @@ class Decision:
             raise ContractError(
                 f"{self.folder} holds {content if self._base else 'a whole policy: leave out base_action'}"
             )
-        sizes = self.contract["observation"]["size"] - self._base, self._base
-        parts = [_numbers(obs), *([_numbers(base_action)] if self._base else [])]
-        rows = parts[0].shape[:-1]
+        parts = [_numbers(part) for part in (obs, base_action) if part is not None]
+        rows, sizes = parts[0].shape[:-1], (self.contract["observation"]["size"] - self._base, self._base)
         for part, size in zip(parts, sizes, strict=False):
             if len(rows) > 1 or part.shape != (*rows, size):
                 raise ContractError(

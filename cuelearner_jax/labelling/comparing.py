@@ -63,9 +63,8 @@ def with_teacher(
         raise UserError("replaying gives other observations than the file: use the version of cuelearner that wrote it")
     scalars = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
     one = jax.jit(lambda env, teacher, *question: as_teacher(form, env, scalars, teacher, *question))
-    guides = [(situations[item], jnp.asarray(items[item][1])) for item in file.people.item]
-    questions = [(guide.env, guide.obs, action) for guide, action in guides]
-    theirs = np.stack([np.asarray(one(env, teacher, *question)) for question in questions])
+    guides = [(situations[item], items[item][1]) for item in file.people.item]
+    theirs = np.stack([one(env, teacher, guide.env, guide.obs, jnp.asarray(action)) for guide, action in guides])
     return agreement(form, env, np.asarray(file.labels.answer), theirs)
 
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import secrets
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-import uvicorn
 from fastapi import FastAPI
 from fastapi.requests import Request
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
 
-from cuelearner_jax.labelling.server import HOST, PAGE, bind, guard
+from cuelearner_jax.labelling.server import PAGE, bind, serving
 from cuelearner_jax.signals import Interrupted, interruptible
 
 # answers: what they say of the right film, and their buttons
@@ -33,6 +31,18 @@ class _Desk:
         self.number, self.films = -1, {}  # the films by their sides; empty between two pairs
         self.answers: queue.Queue[int] = queue.Queue()
         self.over, self.last_shown = False, threading.Event()
+
+    def ask(self, left: Path, right: Path) -> int:
+        """Return -1 where the left film is better, 0 where neither is, 1 where the right one is.
+
+        Raises Interrupted for Ctrl-C while it waits for the answer.
+        """
+        self.number, self.films = self.number + 1, {"left": left, "right": right}
+        with interruptible("the answer of the moment") as stopping:
+            while not stopping.is_set():
+                with contextlib.suppress(queue.Empty):
+                    return self.answers.get(timeout=0.2)
+            raise Interrupted("stopped before it was decided: nothing is written")
 
     def page(self, request: Request) -> Response:
         """Return the page of the moment."""
@@ -62,38 +72,18 @@ class _Desk:
 
 
 @contextlib.contextmanager
-def film_page(port: int, tell: Callable[[str], None]) -> Iterator[Callable[[Path, Path], int]]:
-    """Serve the page on this machine, and yield a function of two films that waits for an answer.
+def film_page(tell: Callable[[str], None]) -> Iterator[Callable[[Path, Path], int]]:
+    """Serve the page on this machine, and yield a function of two films that waits for an answer (`_Desk.ask`).
 
-    The function returns -1 where the left film is better, 0 where neither is, 1 where the right one is. `tell` gets the
-    page's address, which contains a secret token. Port 0 is any free one.
-
-    Raises UserError if the port is taken, and Interrupted for Ctrl-C while an answer is waited for.
+    `tell` gets the page's address, which contains a secret token.
     """
-    with bind(port) as listening:
-        token, desk = secrets.token_urlsafe(18), _Desk()
-        app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+    with bind(0) as listening:
+        desk, app = _Desk(), FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         app.add_route("/", desk.page)
         app.add_route("/film/{number:int}/{side}", desk.film)
         app.add_route("/answer/{number:int}/{word}", desk.answer, methods=["POST"])
-        gate = guard(app, listening.getsockname()[1], token)
-        server = uvicorn.Server(uvicorn.Config(gate, log_level="warning", timeout_graceful_shutdown=1))
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-        thread.start()
-        tell(f"http://{HOST}:{listening.getsockname()[1]}/?token={token}")
-
-        def ask(left: Path, right: Path) -> int:
-            desk.number, desk.films = desk.number + 1, {"left": left, "right": right}
-            with interruptible("the answer of the moment") as stopping:
-                while not stopping.is_set():
-                    with contextlib.suppress(queue.Empty):
-                        return desk.answers.get(timeout=0.2)
-                raise Interrupted("stopped before it was decided: nothing is written")
-
-        try:
-            yield ask
+        with serving(app, listening) as address:
+            tell(address)
+            yield desk.ask
             desk.over = True
             desk.last_shown.wait(SHOWN_WITHIN)
-        finally:
-            server.should_exit = True
-            thread.join()

@@ -8,13 +8,14 @@ import dataclasses
 import os
 import sys
 import threading
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from cuelearner_jax import asking
 from cuelearner_jax.agents.networks import all_finite
@@ -23,10 +24,12 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.fitting import held_out
-from cuelearner_jax.labelling.plan import SessionPlan
+from cuelearner_jax.labelling.plan import SessionKeys, SessionPlan
 from cuelearner_jax.reading import Reading
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.types import EnvState, Label, Teacher
+
+Row = tuple[np.ndarray, np.ndarray, np.ndarray]  # observation, action and answer of a label
 
 # A fit uses one thread, at low priority, so that the page stays responsive.
 ALONE = {"xla_cpu_multi_thread_eigen": False}
@@ -115,15 +118,17 @@ def step_back() -> None:
 class Learner:
     """The model of a session's answers: a guide fitted from scratch to all labels, or a reading of new ones."""
 
-    def __init__(self, plan: SessionPlan, env: Any, blank: GuideState, key: PRNGKeyArray) -> None:
-        """`blank`: a guide without labels; `key`: the session's."""
-        self._plan, self._blank, self._key = plan, blank, key
+    def __init__(self, plan: SessionPlan, env: Any, keys: SessionKeys) -> None:
+        """Begin without labels."""
+        slots = asking.label_slots(plan.labels, plan.config.sizes)
+        self._blank = asking.start(plan.guidance, env, slots, plan.labels, keys.model, keys.start)
+        self._plan, self._key = plan, keys.session
         space, bound = actions_of(env), plan.bound_deg
         within = None if bound is None else space.from_unit(bound)
         self._of = asking.Inquiry(plan.guidance, env, plan.config.scalars, plan.base.policy, within)
         self._reads = plan.guidance.by_evidence
         self._rows: list[np.ndarray] = []  # reading: observations, actions and answers that the newest model has read
-        self.newest = Fitted(self._unread() if self._reads else blank.model)
+        self.newest = Fitted(self._unread() if self._reads else self._blank.model)
         options: Any = ALONE if jax.default_backend() == "cpu" else None
         self._fit = jax.jit(asking.fit, static_argnums=0, compiler_options=options)
 
@@ -144,47 +149,41 @@ class Learner:
             return np.asarray(self.newest.model.act(jnp.asarray(obs)[None]))[0]
         return np.asarray(refine_action(self._of, self.newest.model, obs, jnp.asarray(action)))
 
-    def pad(self, rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Label:
-        """Put observations, actions and answers into a padded `Label` of the session's size."""
-        blank = jax.tree.map(np.array, self._blank.labels)
-        for slot, (obs, action, answer) in enumerate(rows[: len(blank.valid)]):
-            blank.obs[slot], blank.action[slot], blank.answer[slot], blank.valid[slot] = obs, action, answer, True
-        return blank
-
     def is_due(self, count: int) -> bool:
         """Return whether a full round of labels is new."""
         every = self._plan.config.sizes.labels_per_round
         return count // every > self.newest.labels // every
 
-    def fit(self, labels: Label) -> None:
-        """Fit to these labels."""
-        if (count := int(labels.valid.sum())) and self._reads:
-            rows = labels.obs, labels.action, labels.answer
-            self.newest = self._reading_of([np.asarray(part)[:count] for part in rows])
-        elif count:
-            self.newest = self._model_of(labels, count)
+    def fit(self, rows: Sequence[Row]) -> None:
+        """Fit to these labels, of which no more count than the session wants."""
+        rows = rows[: len(self._blank.labels.valid)]
+        if rows:
+            self.newest = self._reading_of(rows) if self._reads else self._model_of(rows)
 
-    def _model_of(self, labels: Label, count: int) -> Fitted:
-        of, plan = self._of, self._plan
+    def _model_of(self, rows: Sequence[Row]) -> Fitted:
+        of, plan, count = self._of, self._plan, len(rows)
+        labels = jax.tree.map(np.array, self._blank.labels)
+        for slot, (obs, action, answer) in enumerate(rows):
+            labels.obs[slot], labels.action[slot], labels.answer[slot], labels.valid[slot] = obs, action, answer, True
         guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels), model=self.newest.model)
         rounds = jnp.asarray(count // plan.config.sizes.labels_per_round, jnp.int32)
         model = jax.block_until_ready(self._fit(of.guidance, of.env, of.scalars, guide, self._key, rounds).model)
         if not all_finite(model):
             return self.newest._replace(labels=count, problem="the last fit diverged")
-        apart = np.asarray(labels.valid) & held_out(len(labels.valid))
-        predictions = np.asarray(answers(of, model, labels))[apart]
-        quality = agreement(plan.form, of.env, predictions, np.asarray(labels.answer)[apart])
+        apart = labels.valid & held_out(len(labels.valid))
+        quality = agreement(plan.form, of.env, np.asarray(answers(of, model, labels))[apart], labels.answer[apart])
         return Fitted(model, count, self.newest.number + 1, quality if quality.count else None)
 
-    def _reading_of(self, rows: list[np.ndarray]) -> Fitted:
+    def _reading_of(self, rows: Sequence[Row]) -> Fitted:
         """Read what is new in `rows`; all of it again if earlier answers were taken back."""
+        columns = [np.stack(part) for part in zip(*rows, strict=True)]
         count = len(self._rows[0]) if self._rows else 0
-        if count and all(np.array_equal(old, new[:count]) for old, new in zip(self._rows, rows, strict=True)):
+        if count and all(np.array_equal(old, new[:count]) for old, new in zip(self._rows, columns, strict=True)):
             # a copy learns, so that questions in the meantime are asked by what was known before
             reading = copy.copy(self.newest.model)
-            reading.learn(*(part[count:] for part in rows))
+            reading.learn(*(column[count:] for column in columns))
         else:
             reading = self._unread()
-            reading.read_in_batches(*rows)
-        self._rows = rows
-        return Fitted(reading, len(rows[0]), self.newest.number + 1, lines=tuple(reading.result().words()))
+            reading.read_in_batches(*columns)
+        self._rows = columns
+        return Fitted(reading, len(rows), self.newest.number + 1, lines=tuple(reading.result().words()))

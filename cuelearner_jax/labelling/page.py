@@ -131,34 +131,32 @@ class Page:
         control, angle = self.controls.get(name), data.get("angle")
         if name == "help":
             self._help.value = not self._help.value
-            return
-        if name.startswith("film"):
+        elif name.startswith("film"):
             await self._show_film(name.removeprefix("film-"), number)
-            return
-        if control is None and not (name == "point" and self.form.is_action and angle is not None):
-            return
-        is_accepted, why = False, LATE
+        elif control is not None or (name == "point" and self.form.is_action and angle is not None):
+            why = await self._taken(control, number, angle, data.get("seconds"))
+            if why:
+                self._script(f"cue.refused({json.dumps(why)})")
+            for page in list(self._pages):
+                page.refresh()
+
+    async def _taken(self, control: Control | None, number: int, angle: float | None, seconds: float | None) -> str:
+        """Take an answer, a part of one, or an answer back; return why not, empty if it was taken."""
         if self._help.value:  # the browser may not know yet that the window opened
-            why = "a window lies over the question: close it first"
-        elif control is not None and control.picks and control.answer and number == self.session.number:
-            self._parts_about(number)[control.cue or 0] = control.answer[0]  # stored until the answer is sent
-            self._mark()
-            return
-        elif control is None or not control.picks:
-            try:
-                if name == "undo":
-                    is_accepted = await run.io_bound(self.session.undo, number)
-                    why = "there is nothing to take back" if number == self.session.number else LATE
-                else:
-                    parts = self._parts if self._parts_of == number else {}
-                    answer = controls.answer_of(self.space, control, angle, parts)
-                    is_accepted = await run.io_bound(self.session.answer, number, answer, data.get("seconds"))
-            except UserError as error:
-                why = str(error)
-        if not is_accepted:
-            self._script(f"cue.refused({json.dumps(why)})")
-        for page in list(self._pages):
-            page.refresh()
+            return "a window lies over the question: close it first"
+        if control is not None and control.picks and control.answer:
+            if number == self.session.number:
+                self._parts_about(number)[control.cue or 0] = control.answer[0]  # stored until the answer is sent
+            return "" if number == self.session.number else LATE
+        try:
+            if control is not None and control.name == "undo":
+                if await run.io_bound(self.session.undo, number):
+                    return ""
+                return "there is nothing to take back" if number == self.session.number else LATE
+            answer = controls.answer_of(self.space, control, angle, self._parts if self._parts_of == number else {})
+            return "" if await run.io_bound(self.session.answer, number, answer, seconds) else LATE
+        except UserError as error:
+            return str(error)
 
     def _script(self, code: str) -> None:
         """Run a script in the browser."""

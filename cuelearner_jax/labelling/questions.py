@@ -37,9 +37,7 @@ class Questions:
         """Make the model that later items are asked by."""
         self.plan, self.env, self.pictures, self.space = plan, env, plan.task.pictures(), actions_of(env)
         self.keys = keys_of(plan.seed)
-        slots = asking.label_slots(plan.labels, plan.config.sizes)
-        blank = asking.start(plan.guidance, env, slots, plan.labels, self.keys.model, self.keys.start)
-        self.learner = Learner(plan, env, blank, self.keys.session)
+        self.learner = Learner(plan, env, self.keys)
 
     def after(self, item: Item) -> GuideState:
         """Return the situation that follows an item's action."""

@@ -8,7 +8,8 @@ import html
 import secrets
 import socket
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import uvicorn
@@ -127,21 +128,24 @@ def guard(app: Any, port: int, token: str) -> Any:
     return gate
 
 
-class _Server(uvicorn.Server):
-    """A server that stops when an event is set and leaves signals to the command."""
-
-    ends: threading.Event
-    after_startup: Callable[[], None]
-    capture_signals: Any = contextlib.nullcontext
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, then call `after_startup` in a thread of its own: what it opens may need an event loop too."""
-        await super().startup(sockets)
-        await asyncio.to_thread(self.after_startup)
-
-    async def on_tick(self, counter: int) -> bool:
-        """Return whether the server should stop."""
-        return await super().on_tick(counter) or self.ends.is_set()
+@contextlib.contextmanager
+def serving(app: Any, listening: socket.socket) -> Iterator[str]:
+    """Serve an application in a thread, and yield its address, which contains a secret token, once it has started."""
+    token, port = secrets.token_urlsafe(18), listening.getsockname()[1]
+    # uvloop would take over the signal wake-up that the thread of `signals` waits for.
+    how = {"log_level": "warning", "ws": "wsproto", "loop": "asyncio", "timeout_graceful_shutdown": 1}
+    server = uvicorn.Server(uvicorn.Config(guard(app, port, token), **how))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    thread.start()
+    while not server.started:
+        if not thread.is_alive():
+            raise RuntimeError("the page's server did not start")
+        time.sleep(0.01)
+    try:
+        yield f"http://{HOST}:{port}/?token={token}"
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 class Site:
@@ -199,20 +203,12 @@ def serve(
 
     Returns how a person finished the session; None if `stopping` was set before. Raises what `make` raises.
     """
-    token, port = secrets.token_urlsafe(18), listening.getsockname()[1]
     app, site = FastAPI(docs_url=None, redoc_url=None, openapi_url=None), Site(commands, stopping)
     app.add_route(FINISHED, site.last_page)
-    with contextlib.ExitStack() as end:
-
-        def opened() -> None:
-            site.session = end.enter_context(make())
-            tell(f"http://{HOST}:{port}/?token={token}")
-
-        look = {"title": title, "dark": None, "reconnect_timeout": RECONNECT, "show_welcome_message": False}
-        ui.run_with(app, root=site.show, **look)
-        # uvloop would take over the signal wake-up that the thread of `signals` waits for.
-        how = {"log_level": "warning", "ws": "wsproto", "loop": "asyncio", "timeout_graceful_shutdown": 1}
-        server = _Server(uvicorn.Config(guard(app, port, token), **how))
-        server.ends, server.after_startup = stopping, opened
-        server.run(sockets=[listening])
-        return site.ending
+    look = {"title": title, "dark": None, "reconnect_timeout": RECONNECT, "show_welcome_message": False}
+    ui.run_with(app, root=site.show, **look)
+    with contextlib.ExitStack() as end, serving(app, listening) as address:
+        site.session = end.enter_context(make())
+        tell(address)
+        stopping.wait()
+    return site.ending

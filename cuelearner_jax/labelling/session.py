@@ -20,14 +20,13 @@ import numpy as np
 
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.labelling.learner import Fitted, step_back
+from cuelearner_jax.labelling.learner import Fitted, Row, step_back
 from cuelearner_jax.labelling.plan import SessionPlan, begin, replay
 from cuelearner_jax.labelling.questions import Item, Questions
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import shape_of
-from cuelearner_jax.types import Label
 
 PICTURES = 20  # number of past questions whose pictures are kept; undo redraws earlier ones
 RECENT = 50  # number of answers from which the pace is computed
@@ -61,22 +60,27 @@ class Record:
         if set(self.rows) != set(range(len(self.rows))):
             raise UserError(f"{self.path} was not written by the labelling page: give another --out")
 
-    def save(self, number: int, response: Response) -> None:
+    def save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
         """Write a response to the disk, then use it. Raises UserError if the disk takes no more."""
+        response = Response(said, np.asarray(item.guide.obs), item.action, answer, seconds)
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        person = {"seconds": round(response.seconds, 3), "who": self._plan.who, "when": now}
+        person = {"seconds": round(seconds, 3), "who": self._plan.who, "when": now}
         try:
-            self._writer.append(seed=self._plan.seed, item=number, **{**response._asdict(), **person})
+            self._writer.append(seed=self._plan.seed, item=item.number, **{**response._asdict(), **person})
         except OSError as error:
             self.trouble = f"this answer is not saved ({error.strerror or error}): make room, then answer again"
             raise UserError(self.trouble) from error
         self.trouble = ""
-        self.rows[number] = response
+        self.rows[item.number] = response
 
     def in_order(self) -> list[Response]:
         """Return the responses by the numbers of their items; may be called from any thread."""
         rows = self.rows.copy()
         return [rows[number] for number in sorted(rows)]
+
+    def labels(self) -> list[Row]:
+        """Return the answered items' observations, actions and answers, in order."""
+        return [(row.obs, row.action, row.answer) for row in self.in_order() if row.answer is not None]
 
     def count(self, said: str) -> int:
         """Return the number of items with this response."""
@@ -167,7 +171,7 @@ class Session:
             pairs = enumerate(zip(situations, rows, strict=False))
             self._items = {n: Item(n, at, row.action) for n, (at, row) in pairs}
         self.number = min((number for number in self._items if rows[number].said == UNDONE), default=count)
-        self._learner.fit(self._labels())
+        self._learner.fit(self.record.labels())
         self._items[count] = questions.ask(count, situations[-1])
 
     def _prepare(self, number: int) -> None:
@@ -187,14 +191,14 @@ class Session:
 
     def _fit(self) -> None:
         """Fit the model to the answers so far, if that is still due."""
-        labels = self._labels()
-        if not self._learner.is_due(count := int(labels.valid.sum())):
+        labels = self.record.labels()
+        if not self._learner.is_due(len(labels)):
             return
         try:
             self._learner.fit(labels)
         except Exception as error:  # labels are still saved, whatever happens to the model
             problem = f"the last fit failed ({type(error).__name__}: {error})"
-            self._learner.newest = self._learner.newest._replace(labels=count, problem=problem)
+            self._learner.newest = self._learner.newest._replace(labels=len(labels), problem=problem)
         self._ahead.submit(self._use_fit)
 
     def _use_fit(self) -> None:
@@ -231,20 +235,12 @@ class Session:
                     return False
                 took = time.monotonic() - self._since
                 took = took if seconds is None or not 0 <= seconds <= took else seconds
-                self._save(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
+                self.record.save(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
             self._next.result()
             self._show(number + 1)
             if self._learner.is_due(self.record.count(ANSWERED)):
                 self._fits.submit(self._fit)
             return True
-
-    def _save(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
-        self.record.save(item.number, Response(said, np.asarray(item.guide.obs), item.action, answer, seconds))
-
-    def _labels(self) -> Label:
-        """Return the answers in the order of their items, as a padded `Label`."""
-        rows = [(row.obs, row.action, row.answer) for row in self.record.in_order() if row.answer is not None]
-        return self._learner.pad(rows)
 
     def undo(self, number: int) -> bool:
         """Take back the answer before this question and ask it again.
@@ -256,7 +252,7 @@ class Session:
                 before = None if number == 0 or self._file else self._items.get(number - 1)
                 if number != self.number or before is None:
                     return False
-                self._save(before, UNDONE, None, time.monotonic() - self._since)
+                self.record.save(before, UNDONE, None, time.monotonic() - self._since)
             self._ahead.submit(self._prepare, number - 1).result()
             self._show(number - 1)
             return True

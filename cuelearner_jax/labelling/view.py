@@ -50,7 +50,8 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
     Directions are drawn as arrows. For other actions the picture shows their outcomes, where the task draws them, and
     the cues that have a direction on the screen. `one_cue`: see `controls.answers`.
     """
-    sketch, planar = sketch_of(item), space == DIRECTIONS
+    sketch, planar = item.sketch, space == DIRECTIONS
+    assert sketch is not None
     parts = [f'<g class="still">{sketch.still}</g>']
     for name, trail in reversed((item.trails or {}).items()):
         parts += [f'<g class="trail halo">{trail}</g>', f'<g class="trail {name}">{trail}</g>']
@@ -58,7 +59,10 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
         x, y, turn = sketch.places[name]
         place = f"translate({x:.4f} {y:.4f}) rotate({turn:.2f})"
         parts.append(f'<g class="mover" data-mover="{html.escape(name)}" transform="{place}">{body}</g>')
-    parts += _arrows(item, form, eps_deg) if planar else _cues(item, space, controls.answers(form, space, one_cue))
+    if planar:
+        parts += _arrows(sketch, item, form, eps_deg)
+    else:
+        parts += _cues(sketch, item, space, controls.answers(form, space, one_cue))
     data = {
         "item": item.number,
         "foot": json.dumps(sketch.foot),
@@ -91,18 +95,13 @@ def note(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS
 
 def change_words(space: Space, change: np.ndarray) -> str:
     """Return a change (cues,), in the space's unit, in words, as "left by 12%, open by 30% of the range"."""
-    words, shares = [], space.unit == SHARE
-    for cue, part in zip(space.cues, np.asarray(change, float), strict=True):
-        if abs(part) >= 0.005 * space.reach:
-            amount = f"{100 * abs(part):.0f}%" if shares else f"{abs(part):.2g} {space.unit}"
-            words.append(f"{cue.words[0 if part > 0 else 1]} by {amount}")
+    shares = space.unit == SHARE
+    words = [
+        f"{cue.words[part < 0]} by " + (f"{100 * abs(part):.0f}%" if shares else f"{abs(part):.2g} {space.unit}")
+        for cue, part in zip(space.cues, change.tolist(), strict=True)
+        if abs(part) >= 0.005 * space.reach
+    ]
     return f"{', '.join(words)}{' of the range' * shares}" if words else "as it is"
-
-
-def sketch_of(item: Item) -> Sketch:
-    """Return the sketch of an item that the page shows."""
-    assert item.sketch is not None
-    return item.sketch
 
 
 def angle_of(action: np.ndarray) -> float:
@@ -117,23 +116,27 @@ def _farthest(item: Item) -> float:
 
 def magnification_of(item: Item, eps_deg: float) -> int:
     """Return the factor by which turns of an item's action are magnified, so that a turn by eps is visible."""
-    sketch = sketch_of(item)
+    sketch = item.sketch
+    assert sketch is not None
     _, far = _ends(sketch, angle_of(item.action), _farthest(item))
     visible = min(math.degrees(math.asin(min(TIPS * sketch.box[2] * HAIR / far, 1.0))), STEEPEST)
     return math.ceil(visible / eps_deg) if eps_deg < 0.75 * visible else 1
 
 
-def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
+def _arrows(sketch: Sketch, item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
     """Return the arrows of the asked direction, of the answers' outcomes, of the model's action, and the pointer."""
-    sketch, angle = sketch_of(item), angle_of(item.action)
-    parts, times = [], magnification_of(item, eps_deg) if form.by_eps else 1
+    parts, angle, times = [], angle_of(item.action), magnification_of(item, eps_deg) if form.by_eps else 1
     if form.by_eps:
         turn = times * eps_deg
         longer = min(max(APART / turn, TURNED_REACH[0]), _farthest(item))
         for one in controls.answers(form, DIRECTIONS):
             if one.answer and one.answer[0]:
                 parts.append(arrow(sketch, angle + one.answer[0] * turn, one.colour, longer, one.first_key))
-    parts += ["" if item.trails else _aim(sketch, angle), arrow(sketch, angle, "asked")]
+    if sketch.aim and not item.trails:
+        hair, tip = sketch.box[2] * HAIR, sketch.reach[1]
+        dashes = f' class="aim" stroke-dasharray="{4 * hair:.5f} {3 * hair:.5f}"'
+        parts.append(_line(_point(sketch, angle, tip), _point(sketch, angle, tip + sketch.aim), 0.8 * hair, dashes))
+    parts.append(arrow(sketch, angle, "asked"))
     if item.refined is not None:
         turn = (angle_of(item.refined) - angle + 180) % 360 - 180
         turn = math.copysign(min(times * abs(turn), max(WIDEST, abs(turn))), turn)
@@ -144,22 +147,21 @@ def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
 
 def by_words(cue: Cue) -> Direction | None:
     """Return the screen direction for "more" of a cue by its words; None: the words give none, or contradict."""
-    ways = [
-        (sign * way[0], sign * way[1])
+    ways = {
+        (sign * WORDS[word][0], sign * WORDS[word][1])
         for words, sign in zip(cue.words, (1.0, -1.0), strict=True)
         for word in words.lower().replace("-", " ").split()
-        if (way := WORDS.get(word))
-    ]
-    return ways[0] if len(set(ways)) == 1 else None
+        if word in WORDS
+    }
+    return ways.pop() if len(ways) == 1 else None
 
 
-def _cues(item: Item, space: Space, answers: Sequence[Control]) -> list[str]:
+def _cues(sketch: Sketch, item: Item, space: Space, answers: Sequence[Control]) -> list[str]:
     """Return the arrows of the cues' answers and of the actions, for cues with a screen direction.
 
     A direction that the task gives has its own length; a direction inferred from words has length 1 or less.
     """
-    sketch, middle = sketch_of(item), space.middle()
-    ways = tuple(sketch.points) or tuple(map(by_words, space.cues))
+    middle, ways = space.middle(), sketch.points or tuple(map(by_words, space.cues))
     parts, lanes = [], {}
     for control in answers:
         number = 0 if len(ways) == 1 else control.cue
@@ -203,8 +205,7 @@ def _from_foot(sketch: Sketch, ways: Sequence[Direction | None], shares: np.ndar
 
     `shares` (cues,) is the action's distance from the middle of each cue's range; 1 is the end of the range.
     """
-    moves = [(float(share) * way[0], float(share) * way[1]) for share, way in zip(shares, ways, strict=True) if way]
-    x, y = sum(move[0] for move in moves), sum(move[1] for move in moves)
+    x, y = shares @ np.array([way or (0.0, 0.0) for way in ways])
     if (far := math.hypot(x, y)) < LEAST:
         return ""
     first, last = sketch.reach
@@ -264,12 +265,3 @@ def arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0, key: str
         text = f'<text x="{x:.4f}" y="{y:.4f}" font-size="{1.6 * badge:.5f}">{key}</text>'
         parts.append(f'<g class="at-key">{disc}{text}</g>')
     return f'<g class="arrow {name}">{"".join(parts)}</g>'
-
-
-def _aim(sketch: Sketch, angle: float) -> str:
-    """Return the SVG of the thin line that continues an arrow; empty where the sketch has no aim line."""
-    if not sketch.aim:
-        return ""
-    hair, tip = sketch.box[2] * HAIR, sketch.reach[1]
-    one, other = (_point(sketch, angle, along) for along in (tip, tip + sketch.aim))
-    return _line(one, other, 0.8 * hair, f' class="aim" stroke-dasharray="{4 * hair:.5f} {3 * hair:.5f}"')

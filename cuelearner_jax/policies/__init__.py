@@ -26,7 +26,6 @@ from cuelearner_jax.policies.policy import (
     layers,
     policy_name,
     uniform_in,
-    wanted_actions,
 )
 from cuelearner_jax.policies.user import FILES, ONNX, Opaque, Teaching, policy_of, teaching
 from cuelearner_jax.types import Policy

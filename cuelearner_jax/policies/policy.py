@@ -49,7 +49,7 @@ class PolicyNode(struct.PyTreeNode):
         """Return JSON values: the policy's kind under `policy`, and under `base` the policy that it changes."""
         asks, base = {"asks": True} if self.ASKS else {}, getattr(self, "base", None)
         if not self.KIND:
-            return described_code(self) | asks
+            return {"policy": "code", "named": code_name(self), **asks}
         return {"policy": self.KIND, **asks, **({} if base is None else {"base": describe(base)})}
 
     def lane(self, index: int | ArrayLike) -> Any:
@@ -78,18 +78,14 @@ def lanes_in(policy: PolicyNode) -> int | None:
     return counts[0] if counts else None
 
 
-def described_code(policy: Any) -> dict[str, Any]:
-    """Return the description of a policy that is code."""
-    return {"policy": "code", "named": code_name(getattr(policy, "function", type(policy)))}
-
-
 def describe(policy: Any) -> dict[str, Any]:
     """Return a policy's description (`PolicyNode.describe`); a policy without one is described as code."""
-    return policy.describe() if hasattr(policy, "describe") else described_code(policy)
+    return policy.describe() if hasattr(policy, "describe") else {"policy": "code", "named": code_name(policy)}
 
 
 def code_name(code: Any) -> str:
-    """Return the qualified name of a function or class."""
+    """Return the qualified name of a function, of a policy's function, or of the class of any other policy."""
+    code = getattr(code, "function", code)
     return getattr(code, "__qualname__", type(code).__qualname__).replace("<locals>.", "")
 
 
@@ -97,7 +93,7 @@ def policy_name(policy: Any) -> str:
     """Return a policy's name for a message: that of the user's function or class below all layers."""
     while (below := getattr(policy, "base", None) or getattr(policy, "policy", None)) is not None:
         policy = below
-    return f"policy {code_name(getattr(policy, 'function', type(policy)))}"
+    return f"policy {code_name(policy)}"
 
 
 def call_policy(
@@ -277,14 +273,15 @@ class Corrected(PolicyNode):
 
     base: Any  # a policy
     teacher: Teacher
-    scalars: GuideScalars
+    scalars: Scalars
     actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return the base's actions, corrected by the teacher's answers until the teacher calls them right."""
         space, first = self.actions, self.base.act(key, states, obs)
         eps = space.from_unit(self.scalars.eps_deg)
-        best = wanted_actions(space, self.teacher, states, obs, first, self.scalars)
+        intend = lambda row: intended_action(space, self.teacher, row[0], row[1], row[2], self.scalars)  # noqa: E731
+        best = jax.lax.map(intend, (states, obs, first), batch_size=min(len(obs), portions().states))
         step = lambda action, best: space.toward(action, relative_feedback(space, action, best, eps), eps) - action  # noqa: E731
         return refine(
             lambda current: jax.vmap(step)(current, best),
@@ -309,24 +306,6 @@ def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"])
     """Return a teacher's actions in n situations, a few at a time: a searching teacher simulates hundreds for each."""
     ask = lambda pair: teacher.best_action(*pair)  # noqa: E731
     return jax.lax.map(ask, (states, obs), batch_size=min(len(obs), portions().states))
-
-
-def wanted_actions(
-    space: Space,
-    teacher: Teacher,
-    states: EnvState,
-    obs: Float[Array, "n obs"],
-    actions: Float[Array, "n action"],
-    scalars: Any,
-) -> Float[Array, "n action"]:
-    """Return the actions that a teacher intends: its best or, with `scalars.answer` "nearest", the nearest good ones.
-
-    `scalars` without that field (`GuideScalars`) select the best ones.
-    """
-    if getattr(scalars, "answer", "best") != "nearest":
-        return best_actions(teacher, states, obs)
-    ask = lambda row: intended_action(space, teacher, row[0], row[1], row[2], scalars)  # noqa: E731
-    return jax.lax.map(ask, (states, obs, actions), batch_size=min(len(obs), portions().states))
 
 
 def uniform_in(env: Any) -> Uniform:

@@ -66,16 +66,6 @@ class Opaque(PolicyNode):
         # called here: one that computes with JAX would wait for the program that waits for it
         return _valid(self.actions, jnp.asarray(self._called_back(np.asarray(obs))))
 
-    def _compare(self, actions: np.ndarray, others: np.ndarray, most: float, when: str) -> None:
-        """Raise UserError for actions (..., action) that differ by more than a share `most` of an entry's range."""
-        entries = np.subtract(self.actions.high, self.actions.low) if isinstance(self.actions, Box) else 1.0
-        apart = np.abs(np.asarray(self.actions.retract(actions)) - np.asarray(self.actions.retract(others)))
-        if (apart > most * entries).any():
-            raise UserError(
-                f"{policy_name(self)} does not repeat itself: the same observation gets another action {when}; give a "
-                "policy without memory and sampling, as model.predict(obs, deterministic=True)"
-            )
-
     def _called_back(self, obs: Any) -> np.ndarray:
         """Return the function's actions; NaN once it has failed, which `user_code` reports after the program."""
         nothing = np.full((*obs.shape[:-1], self.actions.size), np.nan, np.float32)
@@ -97,8 +87,9 @@ class Opaque(PolicyNode):
     def _called(self, rows: np.ndarray) -> np.ndarray:
         """Call the function with a batch of any leading axes. Raises UserError for any exception of the function."""
         flat = rows.reshape(-1, rows.shape[-1])
-        result = _call_user(self.function, self.function, flat)
-        return self._checked(result, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
+        return self._checked(_call_user(self.function, flat), len(flat), np.asarray).reshape(
+            *rows.shape[:-1], self.actions.size
+        )
 
     def _checked(self, result: Any, rows: int, as_array: Callable[..., Any]) -> Any:
         """Return the function's result as an array of real numbers.
@@ -141,12 +132,20 @@ def _try(policy: Opaque, size: int) -> None:
 
     Two observations are asked about in turn, each alone, and then among others: `TRIED` in all.
     """
-    rows = np.random.default_rng(0).random((TRIED, size), np.float32)
-    alone = np.concatenate([policy._called(rows[place : place + 1]) for place in (0, 1, 0, 1)])
-    policy._compare(alone[:2], alone[2:], REPEATED, "when it is asked again")
-    among = policy._called(rows)
-    policy._compare(among, policy._called(rows), REPEATED, "when it is asked again")
-    policy._compare(alone[:2], among[:2], BATCHED, f"in a batch of {TRIED}")
+    rows, space = np.random.default_rng(0).random((TRIED, size), np.float32), policy.actions
+    alone, again = (np.concatenate([policy._called(rows[:1]), policy._called(rows[1:2])]) for _ in range(2))
+    batch, repeated = (policy._called(rows) for _ in range(2))
+    entries = np.subtract(space.high, space.low) if isinstance(space, Box) else 1.0
+    for actions, others, most, when in (
+        (alone, again, REPEATED, "when it is asked again"),
+        (batch, repeated, REPEATED, "when it is asked again"),
+        (alone, batch[:2], BATCHED, f"in a batch of {TRIED}"),
+    ):
+        if (np.abs(np.asarray(space.retract(actions)) - np.asarray(space.retract(others))) > most * entries).any():
+            raise UserError(
+                f"{policy_name(policy)} does not repeat itself: the same observation gets another action {when}; give "
+                "a policy without memory and sampling, as model.predict(obs, deterministic=True)"
+            )
 
 
 @partial(jax.jit, static_argnums=0)
@@ -154,14 +153,14 @@ def _valid(actions: Space, vectors: Array) -> Array:
     return actions.retract(actions.only_actions(vectors))
 
 
-def _call_user(code: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function. Raises UserError for any exception; `code`: whose name is told."""
+def _call_user(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function. Raises UserError for any exception."""
     try:
         return function(*arguments)
     except UserError:
         raise
     except (Exception, SystemExit) as error:
-        raise user_code_error(f"policy {code_name(code)}", error) from error
+        raise user_code_error(f"policy {code_name(function)}", error) from error
 
 
 def policy_of(source: Any, space: Space | None = None) -> Any:
@@ -173,29 +172,24 @@ def policy_of(source: Any, space: Space | None = None) -> Any:
             `torch.nn.Module`; a model or policy of Stable-Baselines3, or its `predict`; or the path of a file in ONNX.
         space: the space of the actions of a function (None: not known yet).
     """
-    function = _foreign(source)
-    if function is None and not _acts(source) and _required(source) == []:
-        source = _call_user(source, source)
-        function = _foreign(source)
-    policy = source if function is None else Opaque(function, on_host=True)
-    if _acts(policy):
-        if any(leaf is policy for leaf in jax.tree.leaves(policy)):
-            kind = type(policy).__name__
-            raise UserError(
-                f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function"
-            )
-    elif callable(source) and not isinstance(source, type):
-        if len(more := _required(source) or ()) > 1:
-            raise UserError(
-                f"policy {code_name(source)} takes {', '.join(more)}: give a function of observations alone, for "
-                f"instance jax.jit(lambda obs: policy(obs, {', '.join(more[1:])})[0])"
-            )
-        policy = Opaque(source, on_host=not isinstance(source, jax.stages.Wrapped))
-    else:
+    policy = _foreign(source)
+    if not _acts(policy) and _required(policy) == []:
+        policy = _foreign(_call_user(policy))
+    if isinstance(policy, type) or not (_acts(policy) or callable(policy)):
         raise UserError(
-            f"{format_value(source)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
+            f"{format_value(policy)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
             "model of Stable-Baselines3 or a file in ONNX, or load one"
         )
+    if not _acts(policy):
+        if len(more := _required(policy) or ()) > 1:
+            raise UserError(
+                f"policy {code_name(policy)} takes {', '.join(more)}: give a function of observations alone, for "
+                f"instance jax.jit(lambda obs: policy(obs, {', '.join(more[1:])})[0])"
+            )
+        policy = Opaque(policy, on_host=not isinstance(policy, jax.stages.Wrapped))
+    elif jax.tree_util.all_leaves([policy]):
+        kind = type(policy).__name__
+        raise UserError(f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function")
     if space is None or not isinstance(policy, Opaque):
         return policy
     model = getattr(policy.function, "model", None)
@@ -251,22 +245,22 @@ class Foreign:
     """
 
     def __init__(self, model: Any, act: Callable[[Any, Any], Any], path: Path | None = None) -> None:
-        self.model, self.act, self.key = model, act, (act if path is None else path, id(model) if path is None else 0)
+        self.model, self._act, self._key = model, act, path or id(model)
         self.__qualname__ = str(path or type(model).__qualname__)
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
         """Return actions for observations."""
-        return self.act(self.model, obs)
+        return self._act(self.model, obs)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Foreign) and self.key == other.key
+        return isinstance(other, Foreign) and self._key == other._key
 
     def __hash__(self) -> int:
-        return hash(self.key)
+        return hash(self._key)
 
 
-def _foreign(source: Any) -> Foreign | None:
-    """Return another library's policy as a function; None if the object is none of these."""
+def _foreign(source: Any) -> Any:
+    """Return another library's policy as a function, and anything else as it is."""
     if isinstance(source, str | os.PathLike):
         path = Path(source)
         if path.suffix != ONNX and path.suffix in FILES:
@@ -274,7 +268,7 @@ def _foreign(source: Any) -> Foreign | None:
                 f"reading {source} may run code in it: write a module that loads it, as POLICY = PPO.load(...) or "
                 "torch.jit.load(...), and give my_policy:POLICY (module:NAME; in Python, the loaded policy)"
             )
-        return _onnx(path) if path.suffix == ONNX else None
+        return _onnx(path) if path.suffix == ONNX else source
     predicts = lambda one: callable(getattr(one, "predict", None)) and hasattr(one, "observation_space")  # noqa: E731
     owner = getattr(source, "__self__", None)
     source = owner if predicts(owner) and getattr(source, "__name__", "") == "predict" else source
@@ -282,7 +276,7 @@ def _foreign(source: Any) -> Foreign | None:
         return Foreign(source, _predicted)
     torch = sys.modules.get("torch")
     is_module = torch is not None and hasattr(torch, "nn") and isinstance(source, torch.nn.Module)
-    return Foreign(source, _forwarded) if is_module else None
+    return Foreign(source, _forwarded) if is_module else source
 
 
 _alone = threading.Lock()  # evaluation mode is a state of a module, so calls must not overlap
@@ -347,8 +341,6 @@ def _onnx(path: Path) -> Foreign:
         import onnxruntime
     except ImportError as error:
         raise UserError(f"{path} needs onnxruntime: pip install 'cuelearner-jax[onnx]'") from error
-    if not path.exists():
-        raise UserError(f"{path} does not exist: give the path of a file in ONNX")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3

@@ -20,7 +20,7 @@ def test_a_pair_is_shown_answered_once_and_only_to_who_knows_the_address(tmp_pat
     def get(path):
         return browser.open(told[0].split("?")[0] + path).read().decode()
 
-    with film_page(0, told.append) as ask:
+    with film_page(told.append) as ask:
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(told[0].split("?")[0])
         assert "being made" in browser.open(told[0]).read().decode()
