@@ -81,7 +81,6 @@ def test_a_name_that_is_none_is_refused_in_one_line(capsys):
     ("changes", "says"),
     [
         ({"max_steps": 0}, "task.max_steps is 0: give a whole number from 1"),
-        ({"backend": "bullet"}, "task.backend is 'bullet': choose one of generalized"),
         ({"slice_sizes": (1, 1)}, "name the task brax:ENVIRONMENT, which fills them"),
     ],
 )
