@@ -220,25 +220,24 @@ class Task:
         bodies = {one.name: one for one in self.bodies}
         if body not in bodies:
             raise UserError(f"unknown robot {body!r}{suggestion(body, bodies)}")
-        others, first = tuple(one for one in self.bodies if one.name != body), bodies[body]
-        if folder and first.made_of is None:
-            raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
-        first = first.made_of(Path(folder)) if folder and first.made_of else first
-        return dataclasses.replace(self, bodies=(first, *others), robot=robot)
+        first = bodies.pop(body)
+        if folder:
+            if first.made_of is None:
+                raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
+            first = first.made_of(Path(folder))
+        return dataclasses.replace(self, bodies=(first, *bodies.values()), robot=robot)
 
     def engine(self, name: str | None) -> Rollout | None:
         """Return the first body's roll-out in other physics (None: its own). Raises UserError for an unknown engine."""
-        if name is None:
-            return None
         engines = self.bodies[0].engines
-        if name not in engines and name in (body.name for body in self.bodies[1:]):
+        if name is None or name in engines:
+            return engines.get(name or "")
+        if name in (body.name for body in self.bodies):
             raise UserError(f"{name} is a robot of {self.name}, not an engine: give --robot {name}")
         if not engines:
             others = [body.name for body in self.bodies if body.engines]
             raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(others) or 'none'}")
-        if name not in engines:
-            raise UserError(f"unknown engine {name!r}{suggestion(name, engines)}")
-        return engines[name]
+        raise UserError(f"unknown engine {name!r}{suggestion(name, engines)}")
 
     def pictures(self, otherwise: str = "evaluate it instead") -> Pictures:
         """Return the first body's drawing functions. Raises UserError, with the remedy `otherwise`, if none are."""

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.bridges.brax import Interface, JaxEnvironment, layout_of
+from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity
 from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.task import QUICKSTART, Body, Task
 from cuelearner_jax.tasks.presets import quickstart
@@ -63,12 +64,10 @@ class Simulator(NamedTuple):
 
     def __call__(self) -> Any:
         """Return the simulator. Raises UserError if its library has none, or one of another layout."""
-        own, wanted = _layout(self.family, self.environment, self.backend), self.layout
-        if own != wanted:
+        if _layout(self.family, self.environment, self.backend) != self.layout:
             raise UserError(
-                f"{self.family}:{self.environment} has observations of {sum(own.sizes)} entries and actions of "
-                f"{len(own.entries)}, the configuration {sum(wanted.sizes)} and {len(wanted.entries)}, or other "
-                f"names: name the task {self.family}:{self.environment}, and install the {self.family} of the policy"
+                f"{self.family}:{self.environment} has other observations or actions than its configuration: name the "
+                f"task {self.family}:{self.environment}, and install the {self.family} of the policy"
             )
         return _simulator(self.family, self.environment, self.backend)
 
@@ -112,12 +111,13 @@ def _from_playground(name: str) -> Any:
 def make_environment(family: str, config: Any, split: str = "training") -> JaxEnvironment:
     """Return the environment of a configuration; the simulator is made at the first step or reset."""
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
-    layout = Interface(config.slices, config.slice_sizes, config.entries)
-    if not config.entries or len(layout.slices) != len(layout.sizes):
+    if not config.entries or len(config.slices) != len(config.slice_sizes):
         raise UserError(
             f"task.environment is {format_value(config.environment)}, and task.slices, slice_sizes or entries are of "
             f"another one: name the task {family}:ENVIRONMENT, which fills them"
         )
+    slices = zip(config.slices, config.slice_sizes, strict=True)
+    layout = Interface(tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in slices), config.entries)
     simulator = Simulator(family, config.environment, getattr(config, "backend", ""), layout)
     return JaxEnvironment(jnp.array(config.max_steps, jnp.int32), simulator, layout.observation, layout.box())
 
@@ -141,7 +141,8 @@ PLAYGROUND = _family(
 def _task_of(family: Task, name: str) -> Task:
     """Return the task of an environment with its whole box of actions. Raises UserError for an unknown name."""
     layout = _layout(family.name, name, getattr(family.config, "backend", ""))
-    config = family.config(name, slices=layout.slices, slice_sizes=layout.sizes, entries=layout.entries)
+    names, sizes, *_ = zip(*layout.observation, strict=True)
+    config = family.config(name, slices=names, slice_sizes=sizes, entries=layout.entries)
     preset = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
     about = f"{family.name}'s {name}"
     return dataclasses.replace(family, about=about, default=config, presets={QUICKSTART: preset})

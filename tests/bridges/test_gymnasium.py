@@ -273,7 +273,7 @@ def test_choices_count_from_the_start_of_the_space_and_integers_are_rounded():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: World(spaces.Box(np.array([-1, 0]), np.array([1, 0]), dtype=np.float64)), "entry 2 .* only be 0"),
+        (lambda: World(spaces.Box(np.array([-1, 0]), np.array([1, 0]), dtype=np.float64)), "each high above its low"),
         (lambda: World(spaces.Box(-3.4e38, 3.4e38, (1,), np.float32)), "entry 1 .* no bounds"),
         (lambda: gymnasium.make_vec("Pendulum-v1", num_envs=3), "a vector of 3"),
         (lambda: gymnasium.wrappers.NormalizeObservation(gymnasium.make("Pendulum-v1")), "does not repeat itself"),

@@ -100,8 +100,6 @@ def actions_of(whose: str, space: Any) -> Actions:
         raise UserError(f"{whose}: its actions are a {kind}: wrap the environment so that they are a Box or Discrete")
     low, high = (np.ravel(bound).astype(float).tolist() for bound in (space.low, space.high))
     for number, (least, most) in enumerate(zip(low, high, strict=True), 1):
-        if least == most:
-            raise UserError(f"{whose}: entry {number} of its actions can only be {least:g}: wrap it to leave it out")
         if not max(-least, most) < LARGEST:
             raise UserError(f"{whose}: entry {number} of its actions has no bounds: wrap it, as in RescaleAction")
     return Actions(tuple(low), tuple(high))
@@ -111,10 +109,10 @@ class Request(NamedTuple):
     """One row of a call."""
 
     seed: int  # seed of the episode
-    place: bytes = b""  # place before the action; empty: the episode begins
+    place: bytes = b""  # place before the action
     action: np.ndarray | None = None  # (action,); None: begin the episode
     next_seed: int = 0  # seed of the next episode, where this one ends
-    history: np.ndarray | None = None  # (steps, action) that lead to the place; None: not sent yet
+    history: Any = ()  # (steps, action) that lead to the place
 
 
 class Went(NamedTuple):
@@ -242,29 +240,27 @@ class Instances:
         self.running: list[Running] = []
         self.calls = self.replays = 0  # number of calls, and of replayed steps
 
-    def carry_out(self, requests: Sequence[Request]) -> list[Went | str | None]:
-        """Return the result of each request: the words of an error, or None where its history is needed.
+    def carry_out(self, requests: Sequence[Request]) -> list[Went | str]:
+        """Return the result of each request, or the words of an error.
 
         The instance for a request stands at the place, or is the least recently used one, or new.
         """
-        self.calls += all(row.history is None for row in requests)  # with histories, a call goes on
+        self.calls += 1
         standing: dict[bytes, list[Running]] = defaultdict(list)
         for one in self.running:
             standing[one.place].append(one)
-        instances = [standing[row.place].pop() if row.place and standing[row.place] else None for row in requests]
+        instances = [standing[row.place].pop() if standing[row.place] else None for row in requests]
         for one in filter(None, instances):
             one.last_use = self.calls
         free = iter(sorted((one for one in self.running if one.last_use < self.calls), key=lambda one: one.last_use))
         return [self._result(request, one, free) for request, one in zip(requests, instances, strict=True)]
 
-    def _result(self, request: Request, one: Running | None, free: Iterator[Running]) -> Went | str | None:
-        if one is None and request.place and request.history is None:
-            return None
+    def _result(self, request: Request, one: Running | None, free: Iterator[Running]) -> Went | str:
         try:
             if one is None:
-                one = self._vacated(free, request.history is not None and len(request.history) > 0)
-                if request.history is not None:
-                    self._replay(one, request, request.history)
+                one = self._vacated(free, len(request.history) > 0)
+                if request.action is not None:
+                    self._replay(one, request)
             if request.action is None:
                 obs = one.reset(request.seed)
                 return Went(obs, obs, 0.0, False, False, 0.0, 0.0, one.place)
@@ -297,17 +293,17 @@ class Instances:
         self.running.append(one)
         return one
 
-    def _replay(self, one: Running, request: Request, history: np.ndarray) -> None:
+    def _replay(self, one: Running, request: Request) -> None:
         """Bring an instance to a place. Raises UserError if the environment does not repeat itself."""
         one.reset(request.seed)
-        for action in history:
+        for action in request.history:
             one.step(action)
-        self.replays += len(history)
+        self.replays += len(request.history)
         if one.place != request.place:
             raise UserError(
-                f"{one.whose} does not repeat itself: with seed {request.seed} and the same {len(history)} actions it "
-                "came elsewhere than before: let it draw from its own np_random alone, and reset everything in "
-                "reset(seed=...)"
+                f"{one.whose} does not repeat itself: with seed {request.seed} and the same {len(request.history)} "
+                "actions it came elsewhere than before: let it draw from its own np_random alone, and reset everything "
+                "in reset(seed=...)"
             )
 
     def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray] | str:
