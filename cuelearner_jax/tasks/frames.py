@@ -15,6 +15,7 @@ from cuelearner_envs.playing import record_steps
 from cuelearner_jax import pictures, user_code
 from cuelearner_jax.bridges.brax import JaxEnvironment, SimulatorState, model_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.pictures import Picture
 from cuelearner_jax.task import Pictures
 from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.types import Reel, Sketch
@@ -23,13 +24,11 @@ HELD = 5  # steps for which a clip holds an action, since one step is hardly vis
 PERIOD = 0.1  # time between two frames of a clip [s]
 SIZE = (480, 360)  # width and height of a rendered model [pixels]
 
-Frame = pictures.Picture
-
 
 def pictures_of(
-    draw: Callable[[Any, Any, Any], list[Frame]],
+    draw: Callable[[Any, Any, Any], list[Picture]],
     drawable: Callable[[Any], Any],
-    film: Callable[[Any, Sequence[Any], Sequence[Any]], list[Frame]],
+    film: Callable[[Any, Sequence[Any], Sequence[Any]], list[Picture]],
     points: Callable[[Any], tuple[tuple[float, float] | None, ...]] = lambda env: (),
     check: Callable[[Any], Any] | None = None,
 ) -> Pictures:
@@ -47,7 +46,7 @@ def pictures_of(
         (frame,) = draw(env, state, np.zeros((0, env.actions.size), np.float32))
         return pictures.sketch(frame, f"step {int(state.steps) + 1}")._replace(points=points(env))
 
-    def clip(env: Any, state: Any, action: Any) -> list[Frame]:
+    def clip(env: Any, state: Any, action: Any) -> list[Picture]:
         return draw(env, state, np.repeat(np.asarray(action, np.float32)[None], HELD, 0))
 
     def reel(env: Any, state: Any, action: Any) -> Reel:
@@ -58,7 +57,7 @@ def pictures_of(
         frames = clip(env, state, action)
         pictures.still([frames[0], frames[-1]], file)
 
-    def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
+    def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Picture], list[float]]:
         see = lambda env, state, action, step: (drawable(state), action, step.reward)  # noqa: E731
         states, actions, rewards = zip(*record_steps(env, policy, key, steps, see), strict=True)
         user_code.tell()
@@ -78,7 +77,7 @@ def pictures_of(
 # --- Gymnasium: a spare instance replays an episode's actions --------------------------------------------------------
 
 
-def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Frame]:
+def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Picture]:
     """Return pictures of an episode after its first `first` actions. Raises UserError where there are none."""
     from cuelearner_jax.bridges.gymnasium.pool import pool_of
 
@@ -89,12 +88,12 @@ def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Frame]:
     return pool_of(dataclasses.replace(source, draws=True)).film(int(seed), rows, first)
 
 
-def _drawn_instance(env: Any, state: Any, actions: Any) -> list[Frame]:
+def _drawn_instance(env: Any, state: Any, actions: Any) -> list[Picture]:
     seed, steps, history = jax.device_get((state.seed, state.steps, state.actions))
     return _replayed(env, seed, np.concatenate([history[:steps], actions]), int(steps))
 
 
-def _filmed_episodes(env: Any, states: Sequence[Any], actions: Sequence[Any]) -> list[Frame]:
+def _filmed_episodes(env: Any, states: Sequence[Any], actions: Sequence[Any]) -> list[Picture]:
     begins = [number for number, (_, steps) in enumerate(states) if steps == 0]
     episodes = zip(begins, [*begins[1:], len(states)], strict=True)
     return [frame for first, end in episodes for frame in _replayed(env, states[first][0], actions[first:end], 0)]
@@ -129,7 +128,7 @@ def pose_of(state: SimulatorState) -> tuple[Any, Any]:
     return physics.q, None
 
 
-def draw_poses(env: JaxEnvironment, poses: Sequence[tuple[Any, Any]]) -> list[Frame]:
+def draw_poses(env: JaxEnvironment, poses: Sequence[tuple[Any, Any]]) -> list[Picture]:
     """Return a picture of each pose. Raises UserError for an environment without a MuJoCo model, or without OpenGL."""
     import mujoco
 
@@ -156,7 +155,7 @@ def draw_poses(env: JaxEnvironment, poses: Sequence[tuple[Any, Any]]) -> list[Fr
 _step = jax.jit(lambda env, key, state, action: env.step(key, state, action))
 
 
-def _drawn_model(env: JaxEnvironment, state: SimulatorState, actions: Any) -> list[Frame]:
+def _drawn_model(env: JaxEnvironment, state: SimulatorState, actions: Any) -> list[Picture]:
     poses = [pose_of(state)]
     for number, action in enumerate(actions):
         state, step = _step(env, jax.random.key(number), state, action)

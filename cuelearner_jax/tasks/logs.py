@@ -215,8 +215,9 @@ def task_of(
         spread=spread,
         hand=json.dumps(recording.about["hand"]) if "hand" in recording.about else "",
     )
-    space, largest = space_of(config), max(1.0, float(np.abs(recording.actions).max()))
-    if space.size != size or np.abs(space.retract(recording.actions) - recording.actions).max() > 1e-3 * largest:
+    space, near = space_of(config), 1e-3 * max(1.0, float(np.abs(recording.actions).max()))
+    # what `retract` makes NaN is not close either
+    if space.size != size or not np.allclose(space.retract(recording.actions), recording.actions, rtol=0, atol=near):
         remedy = "bounds that hold the recorded actions" if actions == "box" else "another kind of actions"
         raise UserError(
             f"{folder}: its actions are not all {space.about} ({space.name}, {space.size} entries): give {remedy}"

@@ -107,7 +107,10 @@ class Pool:
     """Instances of one source, in this process or in several."""
 
     def __init__(self, source: Source) -> None:
+        from cuelearner_jax.runs.lanes import CORES  # loads JAX, which the processes do not need
+
         self.source, self.lock = source, threading.RLock()
+        self.count = 1 if source.draws else source.processes or CORES
         self.hosts: dict[int, Process | Here] = {}
 
     def carry_out(self, requests: Mapping[int, Request]) -> list[Went]:
@@ -115,7 +118,7 @@ class Pool:
         with self.lock:
             rows: dict[int, list[int]] = {}
             for row in requests:
-                rows.setdefault(row % self.source.hosts, []).append(row)
+                rows.setdefault(row % self.count, []).append(row)
             for number, own in rows.items():
                 self._host(number).send("carry_out", [requests[row] for row in own])
             results: dict[int, Any] = dict.fromkeys(requests)
@@ -128,7 +131,8 @@ class Pool:
 
     def _host(self, number: int) -> Process | Here:
         if number not in self.hosts or self.hosts[number].is_gone:
-            self.hosts[number] = (Here if self.source.plays_here else Process)(self.source)
+            # Drawn instances need a process of their own: OpenGL does not work across threads.
+            self.hosts[number] = (Process if self.source.draws or self.count > 1 else Here)(self.source)
         return self.hosts[number]
 
     def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:

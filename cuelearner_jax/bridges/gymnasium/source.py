@@ -37,18 +37,6 @@ class Source:
     draws: bool = False  # True if its instances are drawn, which takes one process
 
     @property
-    def hosts(self) -> int:
-        """Number of processes that play."""
-        from cuelearner_jax.runs.lanes import CORES  # loads JAX, which the processes do not need
-
-        return 1 if self.draws else self.processes or CORES
-
-    @property
-    def plays_here(self) -> bool:
-        """Whether instances are played in this process. Drawn ones are not: OpenGL does not work across threads."""
-        return self.hosts == 1 and not self.draws
-
-    @property
     def make(self) -> Callable[[], Any]:
         """A function without arguments that makes one instance."""
         arguments = json.loads(self.arguments)
