@@ -81,7 +81,7 @@ def measured(name: str, num_envs: int, steps: int, turns: int) -> dict[str, Any]
     """Median seconds a step of each way, and ours over the faster of the plain ones."""
     ways = {f"plain {mode}": plain(name, num_envs, steps, mode) for mode in ("sync", "async")}
     for processes in WAYS[name]:
-        told = "in this process" if processes == 1 else f"in {source.cores()} processes"
+        told = "in this process" if processes == 1 else f"in {len(os.sched_getaffinity(0))} processes"
         ways[f"ours {told}"] = ours(name, num_envs, steps, processes)
     times: dict[str, list[float]] = {way: [] for way in ways}
     for number in range(turns):

@@ -74,10 +74,6 @@ def checked_quantities(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
     return slices
 
 
-# What `spaces.DIRECTIONS` are, where an environment does not say more by its own `action`.
-DIRECTION = Quantity("direction", 2, "1", "unit vector (x, y) in the frame of the observation")
-
-
 class Features(NamedTuple):
     """An observation as it looks from actions. Networks take the two parts where they take observation and action."""
 
@@ -86,11 +82,8 @@ class Features(NamedTuple):
 
 
 @runtime_checkable
-class View(Protocol):
-    """Parts that a policy reads: the observation and optional members (`features`, `aims`, `heuristic`, `mirror`).
-
-    Every environment is one; one whose episodes need more than that (generated worlds, say) offers `view()`.
-    """
+class Environment(Protocol):
+    """One task. Inherit `WholeObservations` (or `Described`) for the members that can be derived."""
 
     @property
     def observation(self) -> tuple[Quantity, ...]:
@@ -101,11 +94,6 @@ class View(Protocol):
     def obs_size(self) -> int:
         """Number of entries of an observation: the sum of its slices."""
         ...
-
-
-@runtime_checkable
-class Environment(View, Protocol):
-    """One task. Inherit `WholeObservations` (or `Described`) for the members that can be derived."""
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
         """Start an episode."""
@@ -191,10 +179,11 @@ def actions_of(env: Any) -> Space:
 
 def action_of(env: Any) -> Quantity:
     """Return the description of an action: an environment's own `action`, a direction, or what its space says."""
-    space = actions_of(env)
-    return getattr(
-        env, "action", DIRECTION if space == DIRECTIONS else Quantity("action", space.size, "1", space.about)
-    )
+    if (space := actions_of(env)) == DIRECTIONS:
+        words = Quantity("direction", 2, "1", "unit vector (x, y) in the frame of the observation")
+    else:
+        words = Quantity("action", space.size, "1", space.about)
+    return getattr(env, "action", words)
 
 
 def action_words(space: Any) -> str:
@@ -263,11 +252,10 @@ def _classes(structure: Any) -> tuple[Any, ...]:
 
 @lru_cache(maxsize=64)
 def _traced(classes: tuple[Any, ...]) -> tuple[Callable[..., Features], Callable[..., Aims]]:
-    """Return the functions that JAX traces for the shapes of `features` and of `aims`.
+    """Return the functions that JAX traces for the shapes of `features` and of `aims`: others for each classes.
 
-    JAX keeps traces by function and tree. There are functions for each tuple of classes, since JAX 0.10 and 0.12 take
-    dataclasses of different classes with equal fields for the same tree, and now and then give one class the trace of
-    another.
+    JAX keeps traces by function and tree. JAX 0.10 and 0.12 take dataclasses of different classes with equal fields for
+    the same tree, and now and then give one class the trace of another.
     """
     return lambda env, obs, action: env.features(obs, action), lambda env, obs: env.aims(obs)
 

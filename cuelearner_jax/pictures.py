@@ -19,7 +19,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Reel, Sketch
 
 Picture = UInt8[np.ndarray, "height width 3"]
-Source = np.ndarray | bytes  # a `Picture`, or the bytes of a PNG or JPEG file
+Source = np.ndarray | bytes  # a `Picture`, or the bytes of a PNG or JPEG file; UserError for anything else
 MEDIA_TYPES = {"PNG": "image/png", "JPEG": "image/jpeg"}  # readable file formats and their media types
 LARGEST = 1280  # longest side of a picture on the page, of a film there half of it [pixels]
 SHEET = 6  # frames of a film that its still shows
@@ -27,11 +27,7 @@ TURNED = 0x0112  # the EXIF tag that says how a camera was held
 
 
 def sketch(image: Source, words: str = "") -> Sketch:
-    """Return a picture as the sketch of a situation; its frame counts in pixels.
-
-    `image`: RGB uint8 (height, width, 3), or the bytes of a PNG or JPEG file; else UserError. `words`: about the
-    situation, in a few words.
-    """
+    """Return a picture as the sketch of a situation, in pixels; `words`: about the situation, in a few words."""
     uri, (width, height) = _uri(image, LARGEST)
     still = f'<image class="photo" href="{uri}" width="{width}" height="{height}"/>'
     foot, reach = (width / 2, height / 2), (0.0, min(width, height) / 4)
@@ -41,18 +37,14 @@ def sketch(image: Source, words: str = "") -> Sketch:
 def clip(frames: Sequence[Source], period: float, words: str = "") -> Reel:
     """Return a short film of pictures that replaces a sketch's picture while it plays.
 
-    `frames`: pictures as `sketch` takes them, all of one size; else UserError. `period`: between two of them [s].
-    `words`: for the film's end.
+    `period`: between two of them [s]. `words`: for the film's end.
     """
-    uris, sizes = zip(*(_uri(frame, LARGEST // 2) for frame in _some(frames)), strict=True)
-    if len(set(sizes)) > 1:
-        raise UserError(f"the frames of a clip differ in size ({sizes[0]} and others): give frames of one size")
-    return Reel(period, [], words, uris)
+    return Reel(period, [], words, [_uri(frame, LARGEST // 2)[0] for frame in frames])
 
 
 def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
     """Write up to six frames of a film, the first and the last among them, as one PNG."""
-    places = np.unique(np.linspace(0, len(_some(frames)) - 1, SHEET).round().astype(int))
+    places = np.unique(np.linspace(0, len(frames) - 1, SHEET).round().astype(int))
     pictures = [pixels(frames[number]) for number in places]
     height, width = pictures[0].shape[:2]
     columns = min(3, len(pictures))
@@ -64,21 +56,14 @@ def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
 
 def animate(frames: Sequence[Source], file: str | os.PathLike[str], fps: float = 25.0) -> None:
     """Write all frames as a film; raises UserError unless its name ends in .gif or .mp4."""
-    check_film(file, fps)
 
     def even(rate: float) -> Iterator[Picture]:
         for number in range(max(1, round(len(frames) * rate / fps))):
             frame = pixels(frames[min(int(number * fps / rate), len(frames) - 1)])
             yield frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2]  # even sides, as codecs need
 
-    specimen = np.concatenate([pixels(_some(frames)[number]) for number in (0, len(frames) // 2, -1)])
+    specimen = np.concatenate([pixels(frames[number]) for number in (0, len(frames) // 2, -1)])
     write_film(file, fps, even, palette_of(specimen, 256))
-
-
-def _some(frames: Sequence[Source]) -> Sequence[Source]:
-    if not len(frames):
-        raise UserError("there is no frame to draw: give at least one")
-    return frames
 
 
 def pixels(image: Source) -> Picture:
@@ -89,9 +74,8 @@ def pixels(image: Source) -> Picture:
 def _opened(image: Any) -> tuple[Image.Image, str]:
     """Return the image, rotated as its EXIF tag says, and the format of the file's bytes; empty: of other bytes."""
     if isinstance(image, np.ndarray):
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-            wanted = "give uint8 (height, width, 3), red, green and blue"
-            raise UserError(f"a picture is {image.dtype} {image.shape}: {wanted}")
+        if image.dtype != np.uint8 or image.shape[2:] != (3,):
+            raise UserError(f"a picture is {image.dtype} {image.shape}: give uint8 (height, width, 3), as RGB")
         return Image.fromarray(image), ""
     try:
         picture = Image.open(io.BytesIO(image), formats=tuple(MEDIA_TYPES))
@@ -120,26 +104,18 @@ def _uri(image: Source, largest: int) -> tuple[str, tuple[int, int]]:
 def write_film(
     file: str | os.PathLike[str], fps: float, pictures: Callable[[float], Iterator[Picture]], palette: Sequence[int]
 ) -> None:
-    """Write a film of pictures that are made one by one: GIF with one exact palette, or MP4.
+    """Write a film of pictures that are made one by one: GIF with one exact palette (see `palette_of`), or MP4.
 
-    Args:
-        file: a name that ends in .gif or .mp4; else UserError.
-        fps: pictures a second; a GIF counts in hundredths of a second and takes the nearest rate it can have.
-        pictures: makes them for the rate that it gets.
-        palette: a GIF's colours, see `palette_of`.
+    `pictures` makes them for a rate [1/s]: `fps`, but a GIF counts in hundredths of a second. Raises UserError for
+    another suffix.
     """
-    check_film(file, fps)
-    if Path(file).suffix.lower() == ".gif":
+    if (suffix := Path(file).suffix.lower()) not in (".gif", ".mp4"):
+        raise UserError(f"cannot animate to {file}: give a name in .gif or .mp4")
+    if suffix == ".gif":
         delay = max(2, round(100 / fps))  # [1/100 s]; viewers slow down what is faster
         _write_gif(file, pictures(100 / delay), 10 * delay, palette)
     else:
         _write_mp4(file, pictures(fps), fps)
-
-
-def check_film(file: str | os.PathLike[str], fps: float) -> None:
-    """Raise UserError if such a film cannot be written."""
-    if Path(file).suffix.lower() not in (".gif", ".mp4") or fps <= 0:
-        raise UserError(f"cannot animate to {file} at {fps:g}: give a name in .gif or .mp4, and a positive fps")
 
 
 def palette_of(specimen: Picture, colours: int, exactly: Sequence[str] = ()) -> list[int]:

@@ -12,7 +12,7 @@ import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideSizes, Scalars, check_types
-from cuelearner_jax.environment import Environment, View, offers, view_of
+from cuelearner_jax.environment import Environment, offers, view_of
 from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.types import EnvState, Policy, Reel, Sketch, Teacher
@@ -140,13 +140,13 @@ class Task:
     def __post_init__(self) -> None:
         """Raise ValueError for a part that cannot work."""
         fields = {entry.name for entry in dataclasses.fields(self.config)}
-        names = [body.name for body in self.bodies]
         if not self.name.isidentifier() or "name" in fields:
             raise ValueError(f"task {self.name!r}: its name must be an identifier, and no field of its configuration")
-        if not names or len(set(names)) < len(names):
-            raise ValueError(f"task {self.name}: it needs at least one body, each of another name, not {names}")
-        if unknown := sorted(set(self.labels_hold) - fields):
-            raise ValueError(f"task {self.name}: labels_hold names {unknown[0]!r}, no field of {self.config.__name__}")
+        names = [body.name for body in self.bodies]
+        if len(set(names)) < len(names):
+            raise ValueError(f"task {self.name}: each body needs another name, not {names}")
+        if unknown := set(self.labels_hold) - fields:
+            raise ValueError(f"task {self.name}: labels_hold names {unknown}, no fields of {self.config.__name__}")
         for name, scenario in self.scenarios.items():
             try:
                 dataclasses.replace(GuideSizes(), **scenario.sizes)
@@ -177,7 +177,7 @@ class Task:
         """Return the world of a configuration with the first body in it, for the episodes of a split."""
         return self.bodies[0].environment(config, split)
 
-    def view(self, config: Any) -> View:
+    def view(self, config: Any) -> Any:
         """Return what policies see in a configuration; worlds that no policy uses are not generated."""
         make = lambda: self.bodies[0].shape_environment(config)  # noqa: E731
         if not offers(jax.eval_shape(make), "view"):
@@ -220,25 +220,24 @@ class Task:
         bodies = {one.name: one for one in self.bodies}
         if body not in bodies:
             raise UserError(f"unknown robot {body!r}{suggestion(body, bodies)}")
-        others, first = tuple(one for one in self.bodies if one.name != body), bodies[body]
-        if folder and first.made_of is None:
-            raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
-        first = first.made_of(Path(folder)) if folder and first.made_of else first
-        return dataclasses.replace(self, bodies=(first, *others), robot=robot)
+        first = bodies.pop(body)
+        if folder:
+            if first.made_of is None:
+                raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
+            first = first.made_of(Path(folder))
+        return dataclasses.replace(self, bodies=(first, *bodies.values()), robot=robot)
 
     def engine(self, name: str | None) -> Rollout | None:
         """Return the first body's roll-out in other physics (None: its own). Raises UserError for an unknown engine."""
-        if name is None:
-            return None
         engines = self.bodies[0].engines
-        if name not in engines and name in (body.name for body in self.bodies[1:]):
+        if name is None or name in engines:
+            return engines.get(name or "")
+        if name in (body.name for body in self.bodies):
             raise UserError(f"{name} is a robot of {self.name}, not an engine: give --robot {name}")
         if not engines:
             others = [body.name for body in self.bodies if body.engines]
             raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(others) or 'none'}")
-        if name not in engines:
-            raise UserError(f"unknown engine {name!r}{suggestion(name, engines)}")
-        return engines[name]
+        raise UserError(f"unknown engine {name!r}{suggestion(name, engines)}")
 
     def pictures(self, otherwise: str = "evaluate it instead") -> Pictures:
         """Return the first body's drawing functions. Raises UserError, with the remedy `otherwise`, if none are."""

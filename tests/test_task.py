@@ -27,7 +27,7 @@ TWO = dataclasses.replace(TASK, bodies=(*TASK.bodies, WIDE))
 
 CANNOT_BE = [
     ({"name": "my task"}, "task 'my task': its name must be an identifier"),
-    ({"bodies": (WIDE, WIDE)}, "each of another name, not ['wide', 'wide']"),
+    ({"bodies": (WIDE, WIDE)}, "each body needs another name, not ['wide', 'wide']"),
     ({"scenarios": {"x": Scenario("", {"half_with_deg": 1.0})}}, "unexpected keyword argument 'half_with_deg'"),
     ({"scenarios": {"x": Scenario("", {}, sizes={"members": 5})}}, "unexpected keyword argument 'members'"),
 ]

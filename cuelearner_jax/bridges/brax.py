@@ -79,16 +79,10 @@ class FixedSimulator(NamedTuple):
 
 
 class Interface(NamedTuple):
-    """The sizes and names of a simulator's observations and actions, as policies need them."""
+    """The names and sizes of a simulator's observations and actions, as policies need them."""
 
-    slices: tuple[str, ...]  # names of an observation's slices, in their order
-    sizes: tuple[int, ...]  # entries of each slice
+    observation: tuple[Quantity, ...]
     entries: tuple[str, ...]  # names of an action's entries
-
-    @property
-    def observation(self) -> tuple[Quantity, ...]:
-        """The slices as an environment has them."""
-        return tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in zip(self.slices, self.sizes, strict=True))
 
     def box(self, cues: Sequence[Cue] = ()) -> Box:
         """Return the space [-1, 1]^n of the actions, with a cue an entry: `cues`, or the entry's name."""
@@ -108,8 +102,8 @@ def layout_of(simulator: Any, name: str) -> Interface:
     for part, shape in slices:
         if len(shape) > 1 or part.startswith("pixels"):
             raise UserError(f"{name}: the observation {part!r} is an image {shape}: give numbers (n,), as its state")
-    parts, sizes = tuple(part for part, _ in slices), tuple(math.prod(shape) for _, shape in slices)
-    return Interface(parts, sizes, _entries_of(simulator, int(simulator.action_size)))
+    observation = tuple(Quantity(part, math.prod(shape), UNKNOWN_UNIT) for part, shape in slices)
+    return Interface(observation, _entries_of(simulator, int(simulator.action_size)))
 
 
 def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, UInt8
+from jaxtyping import PRNGKeyArray
 
 from cuelearner_envs.playing import record_steps
 from cuelearner_jax import pictures, user_code
 from cuelearner_jax.bridges.brax import JaxEnvironment, SimulatorState, model_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.pictures import Picture
 from cuelearner_jax.task import Pictures
 from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.types import Reel, Sketch
@@ -23,13 +24,11 @@ HELD = 5  # steps for which a clip holds an action, since one step is hardly vis
 PERIOD = 0.1  # time between two frames of a clip [s]
 SIZE = (480, 360)  # width and height of a rendered model [pixels]
 
-Frame = UInt8[np.ndarray, "height width 3"]
-
 
 def pictures_of(
-    draw: Callable[[Any, Any, Any], list[Frame]],
+    draw: Callable[[Any, Any, Any], list[Picture]],
     drawable: Callable[[Any], Any],
-    film: Callable[[Any, Any, Any], list[Frame]],
+    film: Callable[[Any, Sequence[Any], Sequence[Any]], list[Picture]],
     points: Callable[[Any], tuple[tuple[float, float] | None, ...]] = lambda env: (),
     check: Callable[[Any], Any] | None = None,
 ) -> Pictures:
@@ -38,7 +37,7 @@ def pictures_of(
     Args:
         draw: (environment, state, actions (n, action)) -> a frame of the state and one after each of the actions.
         drawable: the part of a state that a film needs.
-        film: (environment, these parts (steps, ...), actions (steps, action)) -> frames of a roll-out.
+        film: (environment, this part of the state before each step, the actions) -> frames of a roll-out.
         points: see `Sketch.points`.
         check: see `Pictures.check`.
     """
@@ -47,10 +46,10 @@ def pictures_of(
         (frame,) = draw(env, state, np.zeros((0, env.actions.size), np.float32))
         return pictures.sketch(frame, f"step {int(state.steps) + 1}")._replace(points=points(env))
 
-    def clip(env: Any, state: Any, action: Any) -> list[Frame]:
+    def clip(env: Any, state: Any, action: Any) -> list[Picture]:
         return draw(env, state, np.repeat(np.asarray(action, np.float32)[None], HELD, 0))
 
-    def reel(env: Any, state: Any, action: Float[Array, " action"]) -> Reel:
+    def reel(env: Any, state: Any, action: Any) -> Reel:
         frames = clip(env, state, action)
         return pictures.clip(frames, PERIOD, f"held for {len(frames) - 1} steps")
 
@@ -58,12 +57,11 @@ def pictures_of(
         frames = clip(env, state, action)
         pictures.still([frames[0], frames[-1]], file)
 
-    def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
+    def record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Picture], list[float]]:
         see = lambda env, state, action, step: (drawable(state), action, step.reward)  # noqa: E731
-        rows = record_steps(env, policy, key, steps, see)
-        states, actions, rewards = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+        states, actions, rewards = zip(*record_steps(env, policy, key, steps, see), strict=True)
         user_code.tell()
-        return film(env, states, actions), rewards.tolist()
+        return film(env, states, actions), [float(reward) for reward in rewards]
 
     return Pictures(
         record=record,
@@ -79,7 +77,7 @@ def pictures_of(
 # --- Gymnasium: a spare instance replays an episode's actions --------------------------------------------------------
 
 
-def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Frame]:
+def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Picture]:
     """Return pictures of an episode after its first `first` actions. Raises UserError where there are none."""
     from cuelearner_jax.bridges.gymnasium.pool import pool_of
 
@@ -90,16 +88,15 @@ def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Frame]:
     return pool_of(dataclasses.replace(source, draws=True)).film(int(seed), rows, first)
 
 
-def _drawn_instance(env: Any, state: Any, actions: Any) -> list[Frame]:
+def _drawn_instance(env: Any, state: Any, actions: Any) -> list[Picture]:
     seed, steps, history = jax.device_get((state.seed, state.steps, state.actions))
     return _replayed(env, seed, np.concatenate([history[:steps], actions]), int(steps))
 
 
-def _filmed_episodes(env: Any, states: Any, actions: Any) -> list[Frame]:
-    seeds, steps = states
-    begins = np.flatnonzero(steps == 0).tolist()
-    episodes = zip(begins, [*begins[1:], len(steps)], strict=True)
-    return [frame for first, end in episodes for frame in _replayed(env, seeds[first], actions[first:end], 0)]
+def _filmed_episodes(env: Any, states: Sequence[Any], actions: Sequence[Any]) -> list[Picture]:
+    begins = [number for number, (_, steps) in enumerate(states) if steps == 0]
+    episodes = zip(begins, [*begins[1:], len(states)], strict=True)
+    return [frame for first, end in episodes for frame in _replayed(env, states[first][0], actions[first:end], 0)]
 
 
 def _points(env: Any) -> tuple[tuple[float, float] | None, ...]:
@@ -118,24 +115,20 @@ GYMNASIUM = pictures_of(
 # --- brax and Playground: the model of the simulator in the poses of its states --------------------------------------
 
 
-class Pose(NamedTuple):
-    """Positions of a model's bodies."""
+def pose_of(state: SimulatorState) -> tuple[Any, Any]:
+    """Return a state's joint positions and those of bodies without joints (None: the simulator has no such bodies).
 
-    qpos: Float[Array, "*steps qpos"]
-    mocap: Float[Array, "*steps bodies 3"] | None  # positions of bodies without joints; None: the simulator has none
-
-
-def pose_of(state: SimulatorState) -> Pose:
-    """Return the positions of a state's bodies. Raises UserError for a simulator unlike MuJoCo's."""
+    Raises UserError for a simulator unlike MuJoCo's.
+    """
     if hasattr(state.state, "data"):
-        return Pose(state.state.data.qpos, state.state.data.mocap_pos)
+        return state.state.data.qpos, state.state.data.mocap_pos
     physics: Any = getattr(state.state, "pipeline_state", None)
     if not hasattr(physics, "q"):
         raise UserError("this simulator has no bodies to draw: evaluate a policy in it instead")
-    return Pose(physics.q, None)
+    return physics.q, None
 
 
-def draw_poses(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
+def draw_poses(env: JaxEnvironment, poses: Sequence[tuple[Any, Any]]) -> list[Picture]:
     """Return a picture of each pose. Raises UserError for an environment without a MuJoCo model, or without OpenGL."""
     import mujoco
 
@@ -151,37 +144,25 @@ def draw_poses(env: JaxEnvironment, poses: Sequence[Pose]) -> list[Frame]:
         camera.type, camera.fixedcamid = library.mjtCamera.mjCAMERA_FIXED, 0
     frames = []
     with Studio(model, *SIZE) as studio:
-        for pose in poses:
-            if pose.mocap is not None and model.nmocap:
-                studio.data.mocap_pos[:] = pose.mocap
-            studio.pose(np.asarray(pose.qpos))
+        for joints, bodies in poses:
+            if bodies is not None and model.nmocap:
+                studio.data.mocap_pos[:] = bodies
+            studio.pose(np.asarray(joints))
             frames.append(np.ascontiguousarray(studio.picture(camera)))
     return frames
 
 
-@jax.jit
-def _poses_after(env: JaxEnvironment, state: SimulatorState, actions: Float[Array, "n action"]) -> tuple[Pose, Array]:
-    """Return the pose after each action, and whether that step ended the episode."""
-
-    def advance(state: SimulatorState, row: Any) -> Any:
-        number, action = row
-        after, step = env.step(jax.random.key(number), state, action)
-        return after, (pose_of(after), step.terminated | step.truncated)
-
-    return jax.lax.scan(advance, state, (jax.numpy.arange(len(actions)), actions))[1]
+_step = jax.jit(lambda env, key, state, action: env.step(key, state, action))
 
 
-def _drawn_model(env: JaxEnvironment, state: SimulatorState, actions: Any) -> list[Frame]:
-    poses = [jax.device_get(pose_of(state))]
-    if len(actions):
-        following, ended = jax.device_get(_poses_after(env, state, actions))
-        poses += _rows(following, int(np.flatnonzero(ended)[0]) if ended.any() else len(ended))
+def _drawn_model(env: JaxEnvironment, state: SimulatorState, actions: Any) -> list[Picture]:
+    poses = [pose_of(state)]
+    for number, action in enumerate(actions):
+        state, step = _step(env, jax.random.key(number), state, action)
+        if step.terminated | step.truncated:
+            break
+        poses.append(pose_of(state))
     return draw_poses(env, poses)
 
 
-def _rows(poses: Pose, count: int) -> list[Pose]:
-    """Return the first `count` poses, one by one."""
-    return [jax.tree.map(lambda leaf, number=number: leaf[number], poses) for number in range(count)]
-
-
-SIMULATOR = pictures_of(_drawn_model, pose_of, lambda env, poses, actions: draw_poses(env, _rows(poses, len(actions))))
+SIMULATOR = pictures_of(_drawn_model, pose_of, lambda env, poses, actions: draw_poses(env, poses))

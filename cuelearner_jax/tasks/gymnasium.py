@@ -14,6 +14,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -26,12 +27,13 @@ from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, reg
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, checked_quantities
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
-from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
+from cuelearner_jax.task import QUICKSTART, Body, Task
 from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.tasks.presets import quickstart
 from cuelearner_jax.terminal import console
 
 FAMILY = "gymnasium"
+FRAMES = "cuelearner_jax.tasks.frames"  # whose Pillow is not loaded for every command
 NUM_ENVS = 8
 UNLIMITED = 1_000  # steps of an episode, where neither environment nor caller gives a limit
 TRIED = 1_000  # most steps of an episode, to find out whether the environment reports success
@@ -77,17 +79,11 @@ class GymnasiumConfig:
 
     @property
     def observation(self) -> tuple[Quantity, ...]:
-        """The slices of an observation. Raises UserError where their columns do not fit together."""
-        rows = self.slices, self.slice_sizes, self.units, self.slice_kinds
-        if not self.slices or len({len(row) for row in rows}) > 1 or not all(size > 0 for size in self.slice_sizes):
-            raise UserError(
-                f"task.slices is {format_value(self.slices)} of task.slice_sizes {format_value(self.slice_sizes)}: "
-                f"give a name, a size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which "
-                "fills them"
-            )
+        """The slices of an observation. Raises UserError for an unknown unit or kind."""
+        rows = zip(self.slices, self.slice_sizes, self.units, self.slice_kinds, strict=True)
         texts = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
         return checked_quantities(
-            Quantity(name, size, unit, texts.get(name, ""), kind) for name, size, unit, kind in zip(*rows, strict=True)
+            Quantity(name, size, unit, texts.get(name, ""), kind) for name, size, unit, kind in rows
         )
 
     @property
@@ -95,13 +91,10 @@ class GymnasiumConfig:
         """The space of actions. Raises UserError for bounds or cues that fit none."""
         if self.choices and self.cues:
             raise UserError(
-                f"cues is {format_value(self.cues)}, but actions are choices without an order: leave it out, and "
-                "choose a guidance without relative answers"
+                f"cues is {format_value(self.cues)}, but actions are choices without an order: leave it out"
             )
         if self.choices:
             return Choices(self.choices)
-        if self.cues and len(self.cues) != len(self.low):
-            raise UserError(f"cues are {len(self.cues)} pairs of words, and an action has {len(self.low)} entries")
         return Box(self.low, self.high, cues_from(self.cues, self.cue_names) if self.cues else ())
 
 
@@ -114,7 +107,6 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
         raise UserError(f"task.environment is empty: name the task {FAMILY}:ENVIRONMENT, as {FAMILY}:FetchReach-v4")
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     check_number("processes", config.processes, 0, MOST_PROCESSES, whole=True)
-    check_number("choices", config.choices, 0, MOST_STEPS, whole=True)
     try:
         dict(**json.loads(config.arguments))
     except (ValueError, TypeError):
@@ -136,14 +128,9 @@ def _refuse(name: str, **arguments: Any) -> Any:
     )
 
 
-def _pictures() -> Pictures:
-    from cuelearner_jax.tasks import frames  # Pillow's loading is not for every command
-
-    return frames.GYMNASIUM
-
-
 def _body(factory: Callable[..., Any] | None = None) -> Body:
-    return Body(FAMILY, "Gymnasium's own simulation", partial(make_environment, factory), pictures=_pictures)
+    make = partial(make_environment, factory)
+    return Body(FAMILY, "Gymnasium's own simulation", make, pictures=partial(resolve_name, f"{FRAMES}:GYMNASIUM"))
 
 
 GYMNASIUM = Task(
@@ -200,13 +187,7 @@ def task_from(
             f"env is {format_value(source)}: give an id of Gymnasium's registry, or a class or function that "
             "gives environments"
         )
-    try:
-        text = json.dumps(dict(arguments or {}))
-    except (TypeError, ValueError) as error:
-        raise UserError(
-            f"the arguments of {name} cannot be kept in a file ({error}): give a function that makes the environment "
-            "with them"
-        ) from error
+    text = json.dumps(dict(arguments or {}))
     actions, slices, limit, succeeds, ends = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
     if not max_steps and not limit and not ends:
         console.print(
@@ -216,7 +197,7 @@ def task_from(
     slices = _with_names(name, slices, observation or fetch, units or {})
     pairs = cues.split(";") if isinstance(cues, str) else cues
     words = tuple(pair if isinstance(pair, str) else ",".join(pair) for pair in pairs if pair)
-    is_fetch = not words and fetch is not None and len(actions.low) == len(fetch_layout.CUES)
+    is_fetch = not words and fetch is not None
     names, sizes, slice_units, _, kinds, *_ = zip(*slices, strict=True)
     config = GymnasiumConfig(
         environment=name,
@@ -245,15 +226,15 @@ def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
     Return its actions, the slices of an observation, the limit of steps (0: none), whether it reports success, and
     whether the episode ended by itself.
     """
+    from gymnasium.spaces import flatten
+
     one, ended = Running(source.make, source.name, 0), False
     try:
         slices = [Quantity(leaf.name, leaf.size, UNKNOWN_UNIT) for leaf in one.leaves if leaf.size]
-        if not slices:
-            raise UserError(f"{one.whose}: an observation has no entries: give one with some")
-        limit, first, space = _limit(one.env), one.reset(0), one.env.action_space
-        space.seed(0)
+        limit, first = _limit(one.env), one.reset(0)
+        one.space.seed(0)
         while not ended and one.steps < min(limit or TRIED, TRIED):
-            _, _, terminated, truncated, _ = one.execute(space.sample())
+            _, _, terminated, truncated, _ = one.step(np.asarray(flatten(one.space, one.space.sample())))
             ended = terminated or truncated
         if not np.array_equal(first, one.reset(0)):
             raise UserError(
@@ -279,21 +260,14 @@ def _with_names(
     name: str, slices: Sequence[Quantity], names: Sequence[Any] | None, units: Mapping[str, str]
 ) -> tuple[Quantity, ...]:
     """Return the slices with names and units that the caller, or this package, knows."""
-    wanted = sum(quantity.size for quantity in slices)
-    try:
-        own = slices if names is None else names
-        own = [one if isinstance(one, Quantity) else Quantity(*one) for one in own]
-        total = sum(quantity.size for quantity in own)
-    except TypeError as error:
-        raise UserError(
-            f'observation is {format_value(names)}: give (name, entries, unit) for each slice, as ("goal", 3, "m") '
-            'or cuelearner_jax.environment.Quantity("goal", 3, "m", kind="own")'
-        ) from error
+    rows: Sequence[Any] = names or slices
+    own = [Quantity(*one) for one in rows]
+    total, wanted = (sum(quantity.size for quantity in row) for row in (own, slices))
     if total != wanted:
         raise UserError(f"observation names {total} entries, and {name} has {wanted}: name each entry once")
-    names_there = {quantity.name for quantity in own}
-    if unknown := sorted(set(units) - names_there):
+    if unknown := sorted(set(units) - {quantity.name for quantity in own}):
         raise UserError(
-            f"units names {unknown[0]!r}, the slices are {', '.join(sorted(names_there))}: name one of them"
+            f"units names {unknown[0]!r}, the slices are {', '.join(quantity.name for quantity in own)}: name one of "
+            "them"
         )
     return tuple(quantity._replace(unit=units.get(quantity.name, quantity.unit)) for quantity in own)

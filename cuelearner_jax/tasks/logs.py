@@ -90,8 +90,6 @@ def space_of(config: LogsConfig) -> Space:
     cues = cues_from(config.cues, config.cue_names, unit) if config.cues else ()
     if cues and config.keys:
         pairs = [tuple(filter(None, pair.split(","))) for pair in config.keys]
-        if len(pairs) != len(cues) or not {len(pair) for pair in pairs} <= {0, 2}:
-            raise UserError(f"task.keys is {config.keys}: give two keys for each cue, as q,a")
         cues = tuple(dataclasses.replace(cue, keys=pair) for cue, pair in zip(cues, pairs, strict=True))
     return Choices(len(config.low), *cues) if config.actions == "choices" else Box(config.low, config.high, cues)
 
@@ -217,18 +215,12 @@ def task_of(
         spread=spread,
         hand=json.dumps(recording.about["hand"]) if "hand" in recording.about else "",
     )
-    space = space_of(config)
-    remedy = "bounds that hold the recorded actions" if actions == "box" else "another kind of actions"
-    apart = np.full(len(recording.actions), np.inf)
-    if space.size == size:
-        apart = np.abs(np.asarray(space.retract(recording.actions)) - recording.actions).max(-1)
-    wrong = ~(apart <= 1e-3 * max(1.0, float(np.abs(recording.actions).max())))
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        action = ", ".join(f"{value:.3g}" for value in recording.actions[row])
+    space, near = space_of(config), 1e-3 * max(1.0, float(np.abs(recording.actions).max()))
+    # what `retract` makes NaN is not close either
+    if space.size != size or not np.allclose(space.retract(recording.actions), recording.actions, rtol=0, atol=near):
+        remedy = "bounds that hold the recorded actions" if actions == "box" else "another kind of actions"
         raise UserError(
-            f"{folder}: the action of row {row} ({action}) does not belong to {space.about} ({space.name}, "
-            f"{space.size} entries): give {remedy}"
+            f"{folder}: its actions are not all {space.about} ({space.name}, {space.size} entries): give {remedy}"
         )
     return configured(config)
 
@@ -273,11 +265,6 @@ def bounds_of(
 def filled(config: LogsConfig, observations: Any = None, actions: Any = None) -> Logs:
     """Return the environment of situations (n, obs) and (n, action) in their order; zeros where none are given."""
     space, size = space_of(config), sum(config.entries)
-    sound = len(config.names) == len(config.entries) and min((*config.entries, config.rows, *config.spread)) > 0
-    if not sound or not all(len(part) in (0, size) for part in (config.centre, config.spread)):
-        raise UserError(
-            "task.names, entries, rows, centre or spread are of no situations: give the folder by logs:FOLDER"
-        )
     slices = [Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True)]
     if slices[-1].name == BASE and slices[-1].size == space.size:
         slices[-1] = slices[-1]._replace(kind=PROPOSED)

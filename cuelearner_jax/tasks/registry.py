@@ -7,9 +7,9 @@ installed package names it, never because a file does.
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Any
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING
 
 from cuelearner_jax import plugins
 from cuelearner_jax.errors import UserError, suggestion
@@ -49,7 +49,7 @@ def names() -> tuple[str, ...]:
 def find(name: str) -> Task:
     """Return the task called `name`. Raises UserError if it is unknown, or an installed package's does not load."""
     if name in BUILT_IN:
-        return _built_in(BUILT_IN[name])
+        return resolve_name(BUILT_IN[name])
     if name in _registered:
         return _registered[name]
     if (entry := _installed().get(name)) is None:
@@ -75,16 +75,10 @@ def resolve(text: str) -> Task:
         return find(text)
     family, _, environment = text.partition(":")
     if family in FAMILIES:
-        return dataclasses.replace(_built_in(FAMILIES[family])(environment), command_name=text)
+        return dataclasses.replace(resolve_name(FAMILIES[family])(environment), command_name=text)
     task = dataclasses.replace(_loaded(text), origin=text)
     installed = _installed().get(task.name)
     return find(task.name) if installed and installed.value == text else register(task)
-
-
-def _built_in(reference: str) -> Any:
-    """Import what the package itself has under module:NAME."""
-    module, _, attribute = reference.partition(":")
-    return getattr(importlib.import_module(module), attribute)
 
 
 def _loaded(reference: str) -> Task:

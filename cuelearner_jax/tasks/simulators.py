@@ -10,15 +10,17 @@ import dataclasses
 import warnings
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, Literal, NamedTuple, get_args
+from pkgutil import resolve_name
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from cuelearner_envs.bounds import MOST_STEPS, check_number, check_word
+from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.bridges.brax import Interface, JaxEnvironment, layout_of
+from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity
 from cuelearner_jax.errors import UserError, format_value, suggestion
-from cuelearner_jax.task import QUICKSTART, Body, Pictures, Task
+from cuelearner_jax.task import QUICKSTART, Body, Task
 from cuelearner_jax.tasks.presets import quickstart
 
 Backend = Literal["generalized", "spring", "positional", "mjx"]
@@ -62,15 +64,17 @@ class Simulator(NamedTuple):
 
     def __call__(self) -> Any:
         """Return the simulator. Raises UserError if its library has none, or one of another layout."""
-        env = _simulator(self.family, self.environment, self.backend)
-        own, wanted = layout_of(env, self.environment), self.layout
-        if own != wanted:
+        if _layout(self.family, self.environment, self.backend) != self.layout:
             raise UserError(
-                f"{self.family}:{self.environment} has observations of {sum(own.sizes)} entries and actions of "
-                f"{len(own.entries)}, the configuration {sum(wanted.sizes)} and {len(wanted.entries)}, or other "
-                f"names: name the task {self.family}:{self.environment}, and install the {self.family} of the policy"
+                f"{self.family}:{self.environment} has other observations or actions than its configuration: name the "
+                f"task {self.family}:{self.environment}, and install the {self.family} of the policy"
             )
-        return env
+        return _simulator(self.family, self.environment, self.backend)
+
+
+@cache
+def _layout(family: str, name: str, backend: str) -> Interface:
+    return layout_of(_simulator(family, name, backend), name)
 
 
 @cache
@@ -93,15 +97,11 @@ def _from_brax(name: str, backend: str) -> Any:
 
 def _from_playground(name: str) -> Any:
     try:
-        from mujoco_playground import dm_control_suite, registry  # pyright: ignore[reportMissingImports]
+        from mujoco_playground import dm_control_suite  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         raise UserError("tasks of playground need an extra: pip install 'cuelearner-jax[playground]'") from None
     if name not in dm_control_suite.ALL_ENVS:
-        if name in registry.ALL_ENVS:
-            raise UserError(
-                f"playground:{name} downloads its robot: make that environment yourself, and pass it to from_brax"
-            )
-        raise UserError(f"playground has no task {name!r}{suggestion(name, dm_control_suite.ALL_ENVS)}")
+        raise UserError(f"playground has no dm_control task {name!r}{suggestion(name, dm_control_suite.ALL_ENVS)}")
     try:
         return dm_control_suite.load(name, config_overrides={"impl": "jax"})
     except AttributeError as error:  # MuJoCo's own interface has changed
@@ -111,27 +111,20 @@ def _from_playground(name: str) -> Any:
 def make_environment(family: str, config: Any, split: str = "training") -> JaxEnvironment:
     """Return the environment of a configuration; the simulator is made at the first step or reset."""
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
-    if backend := getattr(config, "backend", ""):
-        check_word("backend", backend, get_args(Backend))
-    layout = Interface(config.slices, config.slice_sizes, config.entries)
-    whole = config.environment and layout.entries and len(layout.slices) == len(layout.sizes)
-    if not whole or min(layout.sizes, default=0) < 1:
+    if not config.entries or len(config.slices) != len(config.slice_sizes):
         raise UserError(
             f"task.environment is {format_value(config.environment)}, and task.slices, slice_sizes or entries are of "
             f"another one: name the task {family}:ENVIRONMENT, which fills them"
         )
-    simulator = Simulator(family, config.environment, backend, layout)
+    slices = zip(config.slices, config.slice_sizes, strict=True)
+    layout = Interface(tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in slices), config.entries)
+    simulator = Simulator(family, config.environment, getattr(config, "backend", ""), layout)
     return JaxEnvironment(jnp.array(config.max_steps, jnp.int32), simulator, layout.observation, layout.box())
 
 
-def _pictures() -> Pictures:
-    from cuelearner_jax.tasks import frames  # takes seconds to load
-
-    return frames.SIMULATOR
-
-
 def _family(name: str, about: str, physics: str, config: type, *labels_hold: str) -> Task:
-    body = Body(name, physics, partial(make_environment, name), pictures=_pictures)
+    pictures = partial(resolve_name, "cuelearner_jax.tasks.frames:SIMULATOR")  # takes seconds to load
+    body = Body(name, physics, partial(make_environment, name), pictures=pictures)
     return Task(name, f"{about} for instance", config, (body,), labels_hold=("max_steps", *labels_hold))
 
 
@@ -145,20 +138,14 @@ PLAYGROUND = _family(
 )
 
 
-@cache
-def brax_task(name: str) -> Task:
-    """Return the task of a brax environment with its whole box of actions. Raises UserError for an unknown name."""
-    return _task_of(BRAX, f"brax's {name}", name)
-
-
-@cache
-def playground_task(name: str) -> Task:
-    """Return one of Playground's dm_control tasks with its whole box of actions. Raises UserError if unavailable."""
-    return _task_of(PLAYGROUND, f"Playground's {name}", name)
-
-
-def _task_of(family: Task, about: str, name: str) -> Task:
-    layout = layout_of(_simulator(family.name, name, getattr(family.config, "backend", "")), name)
-    config = family.config(name, slices=layout.slices, slice_sizes=layout.sizes, entries=layout.entries)
+def _task_of(family: Task, name: str) -> Task:
+    """Return the task of an environment with its whole box of actions. Raises UserError for an unknown name."""
+    layout = _layout(family.name, name, getattr(family.config, "backend", ""))
+    names, sizes, *_ = zip(*layout.observation, strict=True)
+    config = family.config(name, slices=names, slice_sizes=sizes, entries=layout.entries)
     preset = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
+    about = f"{family.name}'s {name}"
     return dataclasses.replace(family, about=about, default=config, presets={QUICKSTART: preset})
+
+
+brax_task, playground_task = partial(_task_of, BRAX), partial(_task_of, PLAYGROUND)

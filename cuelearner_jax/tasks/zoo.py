@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
 
 import jax
 from jaxtyping import Array, Int, PRNGKeyArray
@@ -66,23 +65,15 @@ def _draw(key: PRNGKeyArray, cues: int, split: str, odd: int, number: Index, err
     return change(jax.random.fold_in(jax.random.fold_in(key, cues), number), robot, error)
 
 
-def make_environment(config: ZooConfig, split: str = "training") -> ZooEnvironment:
-    """Return the world of a configuration; splits differ only in their episodes' keys."""
-    return ZooEnvironment.of(_world(config))
-
-
-def make_teacher(config: ZooConfig, env: Any) -> ZooTeacher:
-    """Return the teacher, who knows what is wrong."""
-    return ZooTeacher(env.world)
-
-
+# Splits differ only in their episodes' keys.
+ROBOT = Body("zoo", "velocity commands in a few dimensions", lambda config, split: ZooEnvironment.of(_world(config)))
 ZOO = Task(
     name="zoo",
     about="small robots drawn by chance, in changed worlds: zoo:3 has those with three cues",
     wants=lambda config: "The robot is to do its task.",
     config=ZooConfig,
-    bodies=(Body("zoo", "velocity commands in a few dimensions", make_environment),),
-    teacher=make_teacher,
+    bodies=(ROBOT,),
+    teacher=lambda config, env: ZooTeacher(env.world),
     proposed=Heuristic,
     longest=lambda config: STEPS,
     judge_by=lambda config: "success",

@@ -81,7 +81,6 @@ def test_a_name_that_is_none_is_refused_in_one_line(capsys):
     ("changes", "says"),
     [
         ({"max_steps": 0}, "task.max_steps is 0: give a whole number from 1"),
-        ({"backend": "bullet"}, "task.backend is 'bullet': choose one of generalized"),
         ({"slice_sizes": (1, 1)}, "name the task brax:ENVIRONMENT, which fills them"),
     ],
 )
@@ -92,7 +91,7 @@ def test_a_configuration_that_makes_no_environment_is_refused_in_one_line(change
 
 def test_a_simulator_of_another_layout_is_refused():
     world = cl.make("brax:fast", environment="inverted_pendulum")
-    says = "brax:inverted_pendulum has observations of 4 entries and actions of 1, the configuration 2 and 1"
+    says = "brax:inverted_pendulum has other observations or actions than its configuration"
     with pytest.raises(UserError, match=says):
         world.reset(jax.random.key(0))
 

@@ -92,10 +92,11 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         places = [row.tobytes() for row in np.ascontiguousarray(places).reshape(-1, 2)]
         # What is no action is not executed, and what comes of nothing stays nothing.
         rows = [row for row in np.flatnonzero(np.isfinite(actions).all(-1)).tolist() if places[row] != NOWHERE]
-        requests = {row: Request(seeds[row], places[row], actions[row], next_seeds[row]) for row in rows}
-        return self._carried(shape, requests, lambda row: history[row, : steps[row]])
+        past = lambda row: history[row, : steps[row]]  # noqa: E731
+        requests = {row: Request(seeds[row], places[row], actions[row], next_seeds[row], past(row)) for row in rows}
+        return self._carried(shape, requests)
 
-    def _carried(self, shape: tuple[int, ...], requests: dict[int, Request], history: Any = None) -> tuple[Any, ...]:
+    def _carried(self, shape: tuple[int, ...], requests: dict[int, Request]) -> tuple[Any, ...]:
         """Return the results of requests, column by column; NaN where there is none, and after a failure.
 
         `user_code` then reports the failure.
@@ -105,7 +106,7 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         columns = [np.full((rows, *one.shape), blank[one.dtype.type], one.dtype) for one in self._shapes]
         if requests and not user_code.is_waiting():
             try:
-                results = pool_of(self.source).carry_out(requests, history)
+                results = pool_of(self.source).carry_out(requests)
             except UserError as error:
                 user_code.leave(error)
             else:

@@ -1,7 +1,7 @@
 """Instances of one environment, which reset, step and replay: the work of one process of the pool.
 
-Observations become vectors, and vectors become actions. This module imports neither JAX nor Gymnasium, so that worker
-processes start quickly.
+Observations become vectors, and vectors become actions. This module imports neither JAX nor, by itself, Gymnasium, so
+that worker processes start quickly.
 
 Where an instance stands is named by a chain of hashes: of the seed and the first observation, then of each action with
 the observation, reward and end that followed. Equal places have equal names. An environment that does not repeat itself
@@ -13,20 +13,21 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
+import operator
 import struct
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.errors import UserError, format_value, user_code_error
+from cuelearner_jax.errors import UserError, first_line, format_value, user_code_error
 
 SUCCESS = ("success", "is_success", "succeed")  # names in `info`
 PLACE_BYTES = 8
 MOST_INSTANCES = 1024  # spare instances, beyond those that one call needs
 RECENT = 16  # an instance that was used within so many calls is kept
-LARGEST_FLOAT = np.finfo(np.float32).max
 LARGEST = 1e30  # a bound from here on is none: float32's own largest number, say
 
 
@@ -34,14 +35,14 @@ class Leaf(NamedTuple):
     """One entry of a (nested) space of observations."""
 
     path: tuple[Any, ...]  # keys and places that lead to it
-    shape: tuple[int, ...]  # shape of the environment's value
-    choices: tuple[int, ...] = ()  # number of values of each entry, which the vector holds one-hot; (): as they are
-    start: tuple[int, ...] = ()  # the first value of each entry with choices
+    space: Any  # Box, Discrete, MultiDiscrete or MultiBinary of Gymnasium
 
     @property
     def size(self) -> int:
         """Number of entries that the leaf fills in the vector."""
-        return sum(self.choices) or int(np.prod(self.shape, dtype=int))
+        from gymnasium.spaces import flatdim
+
+        return flatdim(self.space)
 
     @property
     def name(self) -> str:
@@ -49,25 +50,20 @@ class Leaf(NamedTuple):
         return ".".join(map(str, self.path)) or "observation"
 
     def vector(self, obs: Any) -> np.ndarray:
-        """Return the leaf of an observation as a vector. Raises ValueError, which says what is wrong with it."""
-        try:
-            for key in self.path:
-                obs = obs[key]
-            value = np.asarray(obs)
-        except (KeyError, IndexError, TypeError, ValueError):
-            raise ValueError(f"no numbers {self.name!r} in its observation, which its space has") from None
-        if value.shape != self.shape or value.dtype.kind not in "biuf":
-            raise ValueError(f"an observation {self.name!r} of shape {value.shape}, where its space has {self.shape}")
-        if not (np.abs(value) <= LARGEST_FLOAT).all():
-            raise ValueError(f"an observation {self.name!r} that is not finite")
-        if not self.choices:
-            return value.ravel()
-        places = value.ravel().astype(int) - np.array(self.start, int)
-        if ((places < 0) | (places >= self.choices)).any():
-            raise ValueError(f"an observation {self.name!r} of {value}, beyond {self.choices} values from {self.start}")
-        rows = np.zeros(self.size, np.float32)
-        rows[places + np.cumsum((0, *self.choices[:-1]), dtype=int)] = 1.0
-        return rows
+        """Return the leaf of an observation as a vector, choices one-hot. Raises ValueError for no value of its space.
+
+        Bounds of a Box are not checked, and its numbers are not cast to its type: many environments keep to neither.
+        """
+        value = reduce(operator.getitem, self.path, obs)
+        if type(self.space).__name__ == "Box":
+            value = np.asarray(value, np.float32)
+            if value.shape == self.space.shape and np.isfinite(value).all():
+                return value.ravel()
+        elif self.space.contains(value):
+            from gymnasium.spaces import flatten
+
+            return np.asarray(flatten(self.space, value), np.float32)
+        raise ValueError(f"{self.name!r} is {format_value(value)}, not finite or not of {self.space}")
 
 
 def leaves_of(whose: str, space: Any, path: tuple[Any, ...] = ()) -> tuple[Leaf, ...]:
@@ -76,26 +72,15 @@ def leaves_of(whose: str, space: Any, path: tuple[Any, ...] = ()) -> tuple[Leaf,
     if kind in ("Dict", "Tuple"):
         parts = space.spaces.items() if kind == "Dict" else enumerate(space.spaces)
         return tuple(leaf for key, inner in parts for leaf in leaves_of(whose, inner, (*path, key)))
-    leaf = Leaf(path, tuple(space.shape or ()))
-    if kind in ("Discrete", "MultiDiscrete"):
-        counts = getattr(space, "nvec", getattr(space, "n", 0))
-        return (leaf._replace(choices=tuple(np.ravel(counts).tolist()), start=tuple(np.ravel(space.start).tolist())),)
-    if kind not in ("Box", "MultiBinary"):
+    leaf, is_box = Leaf(path, space), kind == "Box"
+    is_image = is_box and len(space.shape) + (space.dtype == np.uint8) >= 3
+    if is_image or not (is_box or kind in ("Discrete", "MultiDiscrete", "MultiBinary")):
         raise UserError(
-            f"{whose}: observation {leaf.name!r} is a {kind}: give one of Box, Discrete, MultiDiscrete or MultiBinary, "
-            "or a Dict or Tuple of these"
-        )
-    if kind == "Box" and len(leaf.shape) + (space.dtype == np.uint8) >= 3:
-        raise UserError(
-            f"{whose}: observation {leaf.name!r} is an image of shape {leaf.shape}: give one with observations of "
-            "numbers (a vector, or a dictionary of vectors); pictures for people come from render_mode='rgb_array'"
+            f"{whose}: observation {leaf.name!r} is {'an image, ' * is_image}{space}: give numbers, as Box, Discrete, "
+            "MultiDiscrete or MultiBinary, or a Dict or Tuple of these; pictures for people come from "
+            "render_mode='rgb_array'"
         )
     return (leaf,)
-
-
-def flatten(leaves: tuple[Leaf, ...], obs: Any) -> np.ndarray:
-    """Return an observation as a vector (obs,) of float32. Raises ValueError for an observation outside its space."""
-    return np.concatenate([leaf.vector(obs) for leaf in leaves], dtype=np.float32, casting="unsafe")
 
 
 class Actions(NamedTuple):
@@ -110,38 +95,24 @@ def actions_of(whose: str, space: Any) -> Actions:
     """Return a space of actions as vectors. Raises UserError for one that is neither a bounded box nor choices."""
     kind = type(space).__name__
     if kind == "Discrete":
-        if int(space.n) < 2:
-            raise UserError(f"{whose}: there is only one action: give an environment with a choice")
         return Actions(choices=int(space.n))
     if kind != "Box":
         raise UserError(f"{whose}: its actions are a {kind}: wrap the environment so that they are a Box or Discrete")
-    low, high = np.ravel(space.low).astype(float), np.ravel(space.high).astype(float)
+    low, high = (np.ravel(bound).astype(float).tolist() for bound in (space.low, space.high))
     for number, (least, most) in enumerate(zip(low, high, strict=True), 1):
-        if least == most:
-            raise UserError(f"{whose}: entry {number} of its actions can only be {least:g}: wrap it to leave it out")
         if not max(-least, most) < LARGEST:
             raise UserError(f"{whose}: entry {number} of its actions has no bounds: wrap it, as in RescaleAction")
-    return Actions(tuple(low.tolist()), tuple(high.tolist()))
-
-
-def action_maker(space: Any) -> Callable[[np.ndarray], Any]:
-    """Return the function that makes an environment's action from a vector (action,)."""
-    if type(space).__name__ == "Discrete":
-        return lambda vector: int(vector.argmax()) + int(space.start)
-    shape, dtype = space.shape, space.dtype
-    if np.issubdtype(dtype, np.integer):
-        return lambda vector: np.round(vector).reshape(shape).astype(dtype)
-    return lambda vector: vector.reshape(shape).astype(dtype)
+    return Actions(tuple(low), tuple(high))
 
 
 class Request(NamedTuple):
     """One row of a call."""
 
     seed: int  # seed of the episode
-    place: bytes = b""  # place before the action; empty: the episode begins
+    place: bytes = b""  # place before the action
     action: np.ndarray | None = None  # (action,); None: begin the episode
     next_seed: int = 0  # seed of the next episode, where this one ends
-    history: np.ndarray | None = None  # (steps, action) that lead to the place; None: not sent yet
+    history: Any = ()  # (steps, action) that lead to the place
 
 
 class Went(NamedTuple):
@@ -169,16 +140,14 @@ class Running:
             raise
         except Exception as error:
             raise user_code_error(f"{self.whose}, while it was made,", error) from error
-        if hasattr(self.env, "num_envs"):
-            raise UserError(
-                f"{self.whose} is a vector of {self.env.num_envs} environments: give a function that makes a single one"
-            )
-        self.actions = actions_of(self.whose, self.env.action_space)
+        if (count := getattr(self.env, "num_envs", 0)) or not hasattr(self.env, "action_space"):
+            kind = f"vector of {count} environments" if count else type(self.env).__name__
+            raise UserError(f"{self.whose} is a {kind}: give a class or function that makes a single gymnasium.Env")
+        self.space = self.env.action_space
+        self.actions = actions_of(self.whose, self.space)
         self.leaves = leaves_of(self.whose, self.env.observation_space)
-        self.to_action = action_maker(self.env.action_space)
         self.seed, self.steps, self.total, self.place = -1, 0, 0.0, b""
         self.last_use = -RECENT  # number of the call that used it last
-        self.filmed = np.zeros((0, 0), np.float32)  # actions so far, where it is filmed
         self.reports_success = False
 
     def reset(self, seed: int) -> np.ndarray:
@@ -190,29 +159,18 @@ class Running:
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, float]:
         """Execute an action (action,). Return observation, reward, terminated, truncated, success."""
-        obs, reward, terminated, truncated, success = self.execute(self.to_action(action))
+        self.steps += 1
+        raw, reward, terminated, truncated, info = self._called(self.env.step, self._own_action(action))
+        obs, reward, terminated = self._vector(raw), self._number("a reward", reward), bool(terminated)
+        self.total += reward
+        truncated = (bool(truncated) or self.steps >= self.max_steps > 0) and not terminated
+        name = next((name for name in SUCCESS if info.get(name) is not None), None)
+        success = float(name is not None and self._number(f"info[{name!r}]", info[name]) != 0)
+        self.reports_success |= name is not None
         outcome = struct.pack("<d??d", reward, terminated, truncated, success)
         parts = self.place + action.tobytes() + obs.tobytes() + outcome
         self.place = hashlib.blake2b(parts, digest_size=PLACE_BYTES).digest()
         return obs, reward, terminated, truncated, success
-
-    def execute(self, action: Any) -> tuple[np.ndarray, float, bool, bool, float]:
-        """Like `step`, for an action as the environment takes it; `place` is not moved."""
-        self.steps += 1
-        raw, reward, terminated, truncated, info = self._called(self.env.step, action)
-        obs = self._vector(raw)
-        try:
-            number = float(reward)
-        except (TypeError, ValueError):
-            number = math.nan
-        if not math.isfinite(number):
-            raise UserError(
-                f"{self.whose} gave a reward of {format_value(reward)} in {self._when}: give a finite number"
-            )
-        self.total += number
-        terminated = bool(terminated)
-        truncated = (bool(truncated) or self.steps >= self.max_steps > 0) and not terminated
-        return obs, number, terminated, truncated, self._success(info)
 
     @property
     def _when(self) -> str:
@@ -225,40 +183,46 @@ class Running:
         except Exception as error:
             raise user_code_error(f"{self.whose}, in {self._when},", error) from error
 
-    def _success(self, info: dict[str, Any]) -> float:
-        """Return what `info` says of success; 0 where nothing. Raises UserError for neither true nor false."""
-        name = next((name for name in SUCCESS if info.get(name) is not None), None)
-        if name is None:
-            return 0.0
-        value = np.asarray(info[name])
-        if value.size != 1 or value.dtype.kind not in "biuf" or not np.isfinite(value).all():
-            raise UserError(f"{self.whose} says info[{name!r}] = {info[name]!r}: give True, False or None")
-        self.reports_success = True
-        return float(bool(value.ravel()[0]))
+    def _own_action(self, vector: np.ndarray) -> Any:
+        """Return the environment's own form of an action (action,)."""
+        if self.actions.choices:
+            return int(vector.argmax()) + int(self.space.start)
+        if np.issubdtype(self.space.dtype, np.integer):
+            vector = np.round(vector)
+        return vector.reshape(self.space.shape).astype(self.space.dtype)
+
+    def _number(self, called: str, value: Any) -> float:
+        """Return a number of the environment. Raises UserError for anything but one finite number."""
+        try:
+            number = float(np.asarray(value).item())
+        except (TypeError, ValueError):
+            number = math.nan
+        if not math.isfinite(number):
+            raise UserError(
+                f"{self.whose} gave {called} of {format_value(value)} in {self._when}: give a finite number, True or "
+                "False"
+            )
+        return number
 
     def _vector(self, obs: Any) -> np.ndarray:
+        """Return an observation as a vector (obs,) of float32."""
         try:
-            return flatten(self.leaves, obs)
-        except ValueError as error:
-            raise UserError(f"{self.whose} gave {error} in {self._when}: keep to its observation space") from None
+            return np.concatenate([leaf.vector(obs) for leaf in self.leaves])
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            words = first_line(error)
+            raise UserError(f"{self.whose} gave an observation outside its space in {self._when}: {words}") from None
 
     def picture(self) -> np.ndarray:
-        """Return what `render` gives, (height, width, 3) uint8. Raises UserError where that is no picture."""
+        """Return what `render` gives, (height, width, 3). Raises UserError where that is no picture."""
         try:
             frame = self.env.render()
         except Exception as error:
-            words = " ".join(str(error).split())[:160]
             raise UserError(
-                f"{self.whose} cannot be drawn ({type(error).__name__}: {words}): if that is of OpenGL, set MUJOCO_GL "
-                "to egl or osmesa"
+                f"{self.whose} cannot be drawn ({type(error).__name__}: {first_line(error)}): if that is of OpenGL, "
+                "set MUJOCO_GL to egl or osmesa"
             ) from error
-        if isinstance(frame, list) and frame:
-            frame = frame[-1]
-        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.shape[2:] != (3,) or not frame.size:
-            raise UserError(
-                f"{self.whose} gives no pictures: let it take render_mode='rgb_array', and render return uint8 "
-                "(height, width, 3)"
-            )
+        if not isinstance(frame, np.ndarray):
+            raise UserError(f"{self.whose} gives no pictures: let it take render_mode='rgb_array'")
         return np.ascontiguousarray(frame)
 
     def close(self) -> None:
@@ -274,32 +238,29 @@ class Instances:
         """`make` returns an environment; `size`: entries of an observation by the task."""
         self.make, self.whose, self.max_steps, self.size = make, whose, max_steps, size
         self.running: list[Running] = []
-        self.camera: Running | None = None  # the instance that is filmed
         self.calls = self.replays = 0  # number of calls, and of replayed steps
 
-    def carry_out(self, requests: Sequence[Request]) -> list[Went | str | None]:
-        """Return the result of each request: the words of an error, or None where its history is needed.
+    def carry_out(self, requests: Sequence[Request]) -> list[Went | str]:
+        """Return the result of each request, or the words of an error.
 
         The instance for a request stands at the place, or is the least recently used one, or new.
         """
-        self.calls += all(row.history is None for row in requests)  # with histories, a call goes on
+        self.calls += 1
         standing: dict[bytes, list[Running]] = defaultdict(list)
         for one in self.running:
             standing[one.place].append(one)
-        instances = [standing[row.place].pop() if row.place and standing[row.place] else None for row in requests]
+        instances = [standing[row.place].pop() if standing[row.place] else None for row in requests]
         for one in filter(None, instances):
             one.last_use = self.calls
         free = iter(sorted((one for one in self.running if one.last_use < self.calls), key=lambda one: one.last_use))
         return [self._result(request, one, free) for request, one in zip(requests, instances, strict=True)]
 
-    def _result(self, request: Request, one: Running | None, free: Iterator[Running]) -> Went | str | None:
-        if one is None and request.place and request.history is None:
-            return None
+    def _result(self, request: Request, one: Running | None, free: Iterator[Running]) -> Went | str:
         try:
             if one is None:
-                one = self._vacated(free, request.history is not None and len(request.history) > 0)
-                if request.history is not None:
-                    self._replay(one, request, request.history)
+                one = self._vacated(free, len(request.history) > 0)
+                if request.action is not None:
+                    self._replay(one, request)
             if request.action is None:
                 obs = one.reset(request.seed)
                 return Went(obs, obs, 0.0, False, False, 0.0, 0.0, one.place)
@@ -319,7 +280,6 @@ class Instances:
         wanted = one is not None and one.last_use > self.calls - RECENT
         if one is None or (wanted and replays and len(self.running) < MOST_INSTANCES):
             one = self._new()
-            self.running.append(one)
         one.last_use = self.calls
         return one
 
@@ -330,19 +290,20 @@ class Instances:
             raise UserError(
                 f"{one.whose} has observations of {size} entries, its task says {self.size}: name the environment anew"
             )
+        self.running.append(one)
         return one
 
-    def _replay(self, one: Running, request: Request, history: np.ndarray) -> None:
+    def _replay(self, one: Running, request: Request) -> None:
         """Bring an instance to a place. Raises UserError if the environment does not repeat itself."""
         one.reset(request.seed)
-        for action in history:
+        for action in request.history:
             one.step(action)
-        self.replays += len(history)
+        self.replays += len(request.history)
         if one.place != request.place:
             raise UserError(
-                f"{one.whose} does not repeat itself: with seed {request.seed} and the same {len(history)} actions it "
-                "came elsewhere than before: let it draw from its own np_random alone, and reset everything in "
-                "reset(seed=...)"
+                f"{one.whose} does not repeat itself: with seed {request.seed} and the same {len(request.history)} "
+                "actions it came elsewhere than before: let it draw from its own np_random alone, and reset everything "
+                "in reset(seed=...)"
             )
 
     def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray] | str:
@@ -351,27 +312,21 @@ class Instances:
         There are fewer pictures where the episode ends before its actions do.
         """
         try:
-            one = self.camera = self.camera or self._new()
-            goes_on = one.seed == seed and one.steps <= first and len(one.filmed) == one.steps
-            if not goes_on or not np.array_equal(one.filmed, actions[: one.steps]):
-                one.reset(seed)
-            frames = [one.picture()] if one.steps == first else []
-            for action in actions[one.steps :]:
+            one = self.running[0] if self.running else self._new()
+            one.reset(seed)
+            frames = [one.picture()] if first == 0 else []
+            for action in actions:
                 *_, terminated, truncated, _ = one.step(action)
                 if one.steps >= first:
                     frames.append(one.picture())
                 if terminated or truncated:
                     break
-            one.filmed = actions[: one.steps]
             return frames
         except UserError as error:
-            if self.camera is not None:
-                self.camera.close()
-            self.camera = None
+            self.close()
             return str(error)
 
     def close(self) -> None:
         """Close all instances."""
-        for one in (*self.running, *filter(None, [self.camera])):
-            one.close()
-        self.running, self.camera = [], None
+        while self.running:
+            self.running.pop().close()

@@ -15,7 +15,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from ctypes.util import find_library
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -42,8 +42,8 @@ class Process:
             sent = cloudpickle.dumps((source.make, source.name, source.max_steps, source.size))
         except Exception as error:
             raise UserError(
-                f"environment {self.name} cannot be sent to another process ({type(error).__name__}: {error}): give a "
-                "function or class of a module, or processes 1"
+                f"environment {self.name} cannot be sent to another process ({error}): give a function or class of a "
+                "module, or processes 1"
             ) from error
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", "cuelearner_jax.bridges.gymnasium.pool", str(theirs.fileno())]
@@ -107,39 +107,32 @@ class Pool:
     """Instances of one source, in this process or in several."""
 
     def __init__(self, source: Source) -> None:
+        from cuelearner_jax.runs.lanes import CORES  # loads JAX, which the processes do not need
+
         self.source, self.lock = source, threading.RLock()
+        self.count = 1 if source.draws else source.processes or CORES
         self.hosts: dict[int, Process | Here] = {}
 
-    def carry_out(self, requests: Mapping[int, Request], history: Callable[[int], np.ndarray] | None) -> list[Went]:
-        """Carry out the rows of a call, each by its number. Raises UserError for the first that fails.
-
-        `history`: number of a row -> its actions (steps, action) so far, asked for where no instance stands at its
-        place; None: all rows begin episodes.
-        """
+    def carry_out(self, requests: Mapping[int, Request]) -> list[Went]:
+        """Carry out the rows of a call, each by its number. Raises UserError for the first that fails."""
         with self.lock:
-            results = self._results(requests)
-            if history is not None:
-                missing = [row for row, one in results.items() if one is None]
-                results.update(self._results({row: requests[row]._replace(history=history(row)) for row in missing}))
-            if fault := next((one for one in results.values() if isinstance(one, str)), None):
-                raise UserError(fault)
-            return list(results.values())
-
-    def _results(self, requests: Mapping[int, Request]) -> dict[int, Any]:
-        rows: dict[int, list[int]] = {}
-        for row in requests:
-            rows.setdefault(row % self.source.hosts, []).append(row)
-        for number, own in rows.items():
-            self._host(number).send("carry_out", [requests[row] for row in own])
-        results = dict.fromkeys(requests)
-        for number, own in rows.items():
-            answers = self.hosts[number].receive()
-            results.update(zip(own, [answers] * len(own) if isinstance(answers, str) else answers, strict=True))
-        return results
+            rows: dict[int, list[int]] = {}
+            for row in requests:
+                rows.setdefault(row % self.count, []).append(row)
+            for number, own in rows.items():
+                self._host(number).send("carry_out", [requests[row] for row in own])
+            results: dict[int, Any] = dict.fromkeys(requests)
+            for number, own in rows.items():
+                answers = self.hosts[number].receive()
+                results.update(zip(own, [answers] * len(own) if isinstance(answers, str) else answers, strict=True))
+        if fault := next((one for one in results.values() if isinstance(one, str)), None):
+            raise UserError(fault)
+        return list(results.values())
 
     def _host(self, number: int) -> Process | Here:
         if number not in self.hosts or self.hosts[number].is_gone:
-            self.hosts[number] = (Here if self.source.plays_here else Process)(self.source)
+            # Drawn instances need a process of their own: OpenGL does not work across threads.
+            self.hosts[number] = (Process if self.source.draws or self.count > 1 else Here)(self.source)
         return self.hosts[number]
 
     def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
@@ -148,9 +141,9 @@ class Pool:
             host = self._host(0)
             host.send("film", seed, actions, first)
             frames = host.receive()
-            if isinstance(frames, str):
-                raise UserError(frames)
-            return frames
+        if isinstance(frames, str):
+            raise UserError(frames)
+        return frames
 
     def close(self) -> None:
         """End all processes and close all instances."""

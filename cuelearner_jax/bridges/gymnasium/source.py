@@ -37,20 +37,10 @@ class Source:
     draws: bool = False  # True if its instances are drawn, which takes one process
 
     @property
-    def hosts(self) -> int:
-        """Number of processes that play."""
-        return 1 if self.draws else self.processes or cores()
-
-    @property
-    def plays_here(self) -> bool:
-        """Whether instances are played in this process. Drawn ones are not: OpenGL does not work across threads."""
-        return self.hosts == 1 and not self.draws
-
-    @property
     def make(self) -> Callable[[], Any]:
         """A function without arguments that makes one instance."""
         arguments = json.loads(self.arguments)
-        if self.draws and (self.factory is None or _takes(self.factory, "render_mode")):
+        if self.draws and (self.factory is None or _takes_render_mode(self.factory)):
             arguments["render_mode"] = "rgb_array"
         if self.factory is not None:
             return partial(make_from_code, self.factory, arguments)
@@ -60,18 +50,9 @@ class Source:
         return partial(make_registered, self.name, arguments, self.max_steps, spec)
 
 
-def _takes(factory: Callable[..., Any], name: str) -> bool:
-    """Return whether a function or class accepts an argument of that name."""
-    try:
-        parameters = inspect.signature(factory).parameters.values()
-    except (TypeError, ValueError):
-        return False
-    return any(one.name == name or one.kind is one.VAR_KEYWORD for one in parameters)
-
-
-def cores() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _takes_render_mode(factory: Callable[..., Any]) -> bool:
+    parameters = inspect.signature(factory).parameters.values()
+    return any(one.name == "render_mode" or one.kind is one.VAR_KEYWORD for one in parameters)
 
 
 def check_installed() -> None:
@@ -89,9 +70,8 @@ def registry_spec(name: str) -> Any:
         )
     import gymnasium
 
-    # imported by the caller: its environments are registered, and fail
-    is_imported = "gymnasium_robotics" in sys.modules
-    if is_imported or (name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None):
+    # Where the caller imported that package, its environments are registered, and fail.
+    if "gymnasium_robotics" in sys.modules or (name not in gymnasium.registry and find_spec("gymnasium_robotics")):
         register_robotics()
     try:
         return gymnasium.registry.get(name) or gymnasium.spec(name)  # `spec` finds an id without its version
@@ -116,21 +96,14 @@ def make_registered(name: str, arguments: dict[str, Any], max_steps: int, spec: 
 
 
 def make_from_code(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
-    """Return an environment of the user's code. Raises UserError for any other object."""
+    """Return an environment of the user's code."""
     try:
-        env = factory(**arguments)
+        return factory(**arguments)
     except AssertionError:  # of gymnasium_robotics, if the user's code makes one of its environments
         if "gymnasium_robotics" not in sys.modules:
             raise
         _supply_joint_types()
-        env = factory(**arguments)
-    wanted = ("reset", "step", "observation_space", "action_space")
-    if lacking := [name for name in wanted if not hasattr(env, name)]:
-        raise UserError(
-            f"{getattr(factory, '__qualname__', factory)} gave a {type(env).__name__} without {lacking[0]!r}: give a "
-            "class or function that gives a gymnasium.Env"
-        )
-    return env
+        return factory(**arguments)
 
 
 def register_robotics() -> None:

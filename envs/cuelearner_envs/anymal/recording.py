@@ -90,7 +90,6 @@ def still(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
 def animate(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
     """A film in real time: the hall from above on the left, the robot from the side on the right."""
     fps = 10.0 if str(file).endswith(".gif") else 25.0
-    pictures.check_film(file, fps)
     specimen = next(_pictures(frames[:1], fps))
     pictures.write_film(file, fps, partial(_pictures, frames), pictures.palette_of(specimen, COLOURS))
 

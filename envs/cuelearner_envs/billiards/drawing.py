@@ -61,7 +61,6 @@ def question(
 
 def animate(table: Table, shots: Sequence[Trajectory], file: str | os.PathLike[str], fps: float = 30.0) -> None:
     """Write an animation (.gif or .mp4) of shots; before each, an arrow shows its direction."""
-    pictures.check_film(file, fps)
     # The first picture shows every ball and the arrow.
     palette = pictures.palette_of(next(_frames(table, shots, fps)), 255)
     pictures.write_film(file, fps, lambda rate: _frames(table, shots, rate), palette)

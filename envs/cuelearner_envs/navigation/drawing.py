@@ -85,7 +85,6 @@ def animate(robot: Robot, frames: Sequence[RecordedStep], file: str | os.PathLik
 
     With steps of 0.2 s, 10 pictures a second show twice the speed of life.
     """
-    pictures.check_film(file, fps)
     # A picture that has every colour of the film: a step, and each end, one below the other.
     ends = [_film(robot, [frames[0]._replace(outcome=outcome)], frames, 1) for outcome in OUTCOMES]
     specimen = np.concatenate([picture for film in ends for picture in film])

@@ -26,17 +26,18 @@ def here(config):
 
 def fetchs_own(name, seed, actions):
     """What Gymnasium's environment gives for a seed and actions: flattened observations, rewards, success."""
-    from cuelearner_jax.bridges.gymnasium.instances import flatten, leaves_of
+    from gymnasium.spaces import flatten
+
     from cuelearner_jax.bridges.gymnasium.source import make_registered
 
     env = make_registered(name, {}, 50)
-    leaves, rows, told = leaves_of(name, env.observation_space), [env.reset(seed=seed)[0]], []
+    rows, told = [env.reset(seed=seed)[0]], []
     for action in actions:
         obs, reward, _, _, info = env.step(action)
         rows.append(obs)
         told.append((reward, info["is_success"]))
     env.close()
-    return np.stack([flatten(leaves, row) for row in rows]), np.array(told)
+    return np.float32([flatten(env.observation_space, row) for row in rows]), np.array(told)
 
 
 def turned(place):
