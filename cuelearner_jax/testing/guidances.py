@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of, offers, spaces_of
 from cuelearner_jax.guides.base import Guide
@@ -46,6 +47,8 @@ def _labels(laws: Laws, guide: Guide, env: Any, states: Any, obs: Array, actions
     teacher: Any = SimpleNamespace(best_action=lambda state, obs: space.spread(8)[3])
     answer = jax.vmap(lambda key, *situation: form.answer(key, env, teacher, *situation, Scalars()))
     answers, answered = jax.jit(answer)(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)
+    shape = (ROWS, form.width(space))
+    laws.hold(answers.shape == shape, f"{ROWS} answers have shape {answers.shape}: their form says {shape}")
     labels = Label(obs, actions, answers, answered, base=actions if guide.sees_base else None)
     targets = jax.vmap(lambda label: guide.target(label, SCALARS))(labels)
     sound = targets.ndim == 2 and np.isfinite(targets).all()
@@ -62,7 +65,9 @@ def _fitted(laws: Laws, guide: Guide, env: Any, model: GuidanceModel, labels: La
     laws.hold(shapes_of(fits) == shapes_of(former), "`fit` returns a model of other fields or shapes than `init`")
     laws.hold(fits.fitted[0], "`fit` of valid labels returns an unfitted model: set `fitted`")
     laws.hold(not fits.fitted[1], "`fit` without a valid label returns a fitted model: `fitted` must be False there")
-    return jax.tree.map(lambda leaf: leaf[0], fits)
+    one = jax.tree.map(lambda leaf: leaf[0], fits)
+    laws.hold(all_finite(one), "`fit` returns parameters that are not finite")
+    return one
 
 
 def _check_act(
@@ -70,9 +75,11 @@ def _check_act(
 ) -> None:
     """Check the changes to a batch of actions."""
     active, act = jnp.arange(ROWS) % 2 == 0, jax.jit(guide.act)
-    refined = act(fitted, env, obs, actions, active, SCALARS).actions
+    refined, passes = act(fitted, env, obs, actions, active, SCALARS)
     alone = act(unfitted, env, obs, actions, jnp.ones(ROWS, bool), SCALARS).actions
     laws.actions(actions_of(env), refined, "an action that `act` returns")
+    counts = passes.shape == (ROWS,) and jnp.issubdtype(passes.dtype, jnp.integer)
+    laws.hold(counts, "`act` returns passes that are no count for each row: how often was each moved?")
     same = np.array_equal(refined[~active], actions[~active])
     laws.hold(same, "`act` changes rows that are not active: keep them by jnp.where(active[:, None], ...)")
     same = not guide.asks or np.array_equal(alone, actions)

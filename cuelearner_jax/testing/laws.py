@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.policies import BY_LANE, SHARED
 from cuelearner_jax.spaces import Space, from_json
 
 SAMPLES = 64  # actions of a check of a space
@@ -62,6 +63,7 @@ def check_space(space: Space) -> None:
     change = jax.jit(space.log)(one, other)
     reached, retracted = jax.jit(space.exp)(one, change), space.retract(one)
     spread = space.spread(SAMPLES)
+    laws.hold(change.shape == (SAMPLES, len(space.cues)), f"`log` has shape {change.shape}: give one number a cue")
     for function, actions in (("sample", one), ("exp", reached), ("spread", spread)):
         laws.actions(space, actions, f"what `{function}` gives")
     laws.hold(laws.same(retracted, one), "`retract` changes actions: it must leave them as they are")
@@ -80,8 +82,13 @@ def check_policy(policy: Any, env: Environment) -> None:
     states, obs = jax.vmap(env.reset)(keys)
     act = jax.jit(lambda policy, key, states, obs: policy.act(key, states, obs))
     actions, again, other = (act(policy, keys[number], states, obs) for number in (0, 0, 1))
+    axes = jax.tree.leaves(policy.axes, is_leaf=lambda leaf: leaf is None)
+    broken = "`axes` holds something else than BY_LANE and SHARED: replace every field"
+    laws.hold(all(axis is SHARED or axis == BY_LANE for axis in axes), broken)
     alone = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[:1], states), obs[:1])
-    for result in (actions, alone):
+    for rows, result in ((ROWS, actions), (1, alone)):
+        shape = np.shape(result)
+        laws.hold(shape == (rows, space.size), f"`act` returns shape {shape} for {rows} observations")
         laws.actions(space, result, "an action that `act` returns")
     laws.hold(laws.same(actions, again), "the same key gives other actions: draw all random numbers from the key")
     if laws.same(actions, other):  # random actions differ where rows have another order

@@ -34,6 +34,7 @@ def check_task(task: Task, small: Any = None, steps: int = 64, pictures: Path | 
         task.check_evaluations(preset.config)
         check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
         env = shape_of(task, preset.config.task)
+        sizes = {other: shape_of(task, one.apply(preset.config.task)).obs_size for other, one in task.scenarios.items()}
         splits = [
             jax.eval_shape(lambda split=split: task.environment(preset.config.task, split))  # noqa: B023
             for split in ("training", *SPLITS)
@@ -43,8 +44,7 @@ def check_task(task: Task, small: Any = None, steps: int = 64, pictures: Path | 
         laws.hold(not odd, f"preset {name!r} compares guidance {odd[:1]}, which it cannot have: of {list(possible)}")
         same = all(shapes_of(one) == shapes_of(splits[0]) for one in splits)  # they share one compiled program
         laws.hold(same, f"preset {name!r} has environments of other shapes for other splits: only values may differ")
-        for other, scenario in task.scenarios.items():
-            size = shape_of(task, scenario.apply(preset.config.task)).obs_size
+        for other, size in sizes.items():
             broken = f"scenario {other!r} has observations of {size} entries, not {env.obs_size}"
             laws.hold(size == env.obs_size, f"{broken}: policies must act in it")
     if small is not None:
@@ -67,14 +67,17 @@ def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
         return
 
     @jax.jit
-    def answers(env: Any) -> tuple[jax.Array, ...]:
+    def answers(env: Any) -> dict[str, jax.Array]:
         teacher = task.make_teacher(config, env)
-        best = teacher.best_action(state, obs)
-        values = isinstance(teacher, ValuesDirections)
-        return (best, teacher.nearest_good(state, obs, best, 0.0, 1.0)) if values else (best,)
+        best = {"best action": teacher.best_action(state, obs)}
+        if not isinstance(teacher, ValuesDirections):
+            return best
+        return {**best, "nearest good action": teacher.nearest_good(state, obs, best["best action"], 0.0, 1.0)}
 
-    for name, one in zip(("best", "nearest good"), answers(env), strict=False):
-        laws.actions(actions_of(env), one, f"its teacher's {name} action")
+    actions = answers(env)
+    for name, one in actions.items():
+        laws.hold(one.ndim == 1, f"its teacher's {name} has shape {one.shape}: give one action")
+        laws.actions(actions_of(env), one, f"its teacher's {name}")
 
 
 def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
