@@ -83,11 +83,6 @@ def interval(
     return Interval(estimate, *np.quantile(means, [0.025, 0.975], axis=0))
 
 
-def curve(steps: Int[np.ndarray, "steps"], values: np.ndarray, each: np.ndarray | None = None) -> Curve:
-    """Return the interval at each evaluation, see `interval`."""
-    return Curve(np.asarray(steps), *interval(values, each))
-
-
 def stretches(steps: Int[np.ndarray, "steps"], marks: Bool[np.ndarray, "steps"]) -> list[tuple[int, int]]:
     """Return each unbroken stretch of marked steps as (first step, last step)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], marks, [False]]).astype(int)))
