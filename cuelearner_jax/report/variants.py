@@ -157,11 +157,11 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
         for kind, labels in sorted((tuple(key.values()) for key in keys), key=lambda key: (key[0] != "none", *key)):
             of_variant = (pc.field("guidance") == kind) & (pc.field("labels") == labels)
             rows = group.table.filter(of_variant)
-            *curves, each = _matrix(rows, metric, kind, labels)
+            seeds, steps, values, each = _matrix(rows, metric, kind, labels)
             lost = np.array([step for lane, step in failed.items() if lane[:2] == (kind, labels)], int)
             guide = _guides(rows, metric, None if group.guides is None else group.guides.filter(of_variant))
             episodes = 0 if each is None else min(rows["episodes"].to_pylist())
-            variants.append(Variant(kind, labels, *curves, lost, group.name, guide, episodes, each))
+            variants.append(Variant(kind, labels, seeds, steps, values, lost, group.name, guide, episodes, each))
     shared = min(variant.steps[-1] for variant in variants)
     ends = [int(np.searchsorted(variant.steps, shared, side="right")) for variant in variants]
     return [replace(variant, until=max(1, end)) for variant, end in zip(variants, ends, strict=True)]
