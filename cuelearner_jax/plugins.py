@@ -8,7 +8,7 @@ import re
 import sys
 from typing import Any, TypeVar
 
-from cuelearner_jax.errors import UserCodeError, UserError, suggestion
+from cuelearner_jax.errors import UserCodeError, UserError, first_line, suggestion
 
 REFERENCE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 
@@ -33,8 +33,8 @@ def load(reference: str, kind: type[T], called: str) -> T:
         if missing and f"{module_name}.".startswith(f"{missing}."):
             where = "run in the folder that holds it, or install it"
             raise UserError(f"no module {missing!r} for {reference}: {where}") from error
-        why = (str(error).strip().splitlines() or [""])[0][:200]
-        raise UserCodeError(f"{module_name} fails to import ({type(error).__name__}: {why}): mend it first") from error
+        why = f"{type(error).__name__}: {first_line(error)}"
+        raise UserCodeError(f"{module_name} fails to import ({why}): mend it first") from error
     if not hasattr(module, name):
         fitting = [other for other, value in vars(module).items() if isinstance(value, kind)]
         raise UserError(f"{module_name} has no {name!r}{suggestion(name, fitting) if fitting else f', nor {called}'}")

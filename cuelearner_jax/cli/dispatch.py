@@ -42,7 +42,6 @@ COMMANDS = {  # each a file beside this one with `run(arguments)`
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line (default: this process's own). Returns the exit status."""
     if argv is None:
-        _open_streams()
         signals.listen()  # before anything that takes seconds to load
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -50,44 +49,26 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _dispatch(arguments)
         finally:
             sys.stdout.flush()  # flush here, where a missing reader is handled
-    except UserError as error:
-        _print(f"error: {error}")
-        if isinstance(error, UserCodeError):
-            traceback.print_exception(error.__cause__)
-        return 2
-    except (signals.Interrupted, NotFinite) as error:
-        _print(str(error))
-        return error.status
     except BrokenPipeError:  # the reader of the output has gone, as `head` does
         from cuelearner_jax.terminal import abandon
 
         abandon(sys.stdout)
         return 141
     except Exception as error:
-        message = machine_message(error, resumes=arguments[0] in ("train", "sweep"))
-        if message is None:
+        from cuelearner_jax.terminal import console
+
+        if isinstance(error, UserError):
+            line, status = f"error: {error}", 2
+        elif isinstance(error, signals.Interrupted | NotFinite):
+            line, status = str(error), error.status
+        elif (message := machine_message(error, resumes=arguments[0] in ("train", "sweep"))) is not None:
+            line, status = f"error: {message}", 1
+        else:
             raise
-        _print(f"error: {message}")
-        return 1
-    except KeyboardInterrupt:  # in a process that does more than this command: see `signals`
-        _print("stopped at once; what was saved before is safe")
-        return 130
-
-
-def _open_streams() -> None:
-    """Open to null any standard stream this process lacks (`2>&-`), so that no other file gets its number."""
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # uses the lowest free number
-            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w"))
-
-
-def _print(line: str) -> None:
-    from cuelearner_jax.terminal import console
-
-    console.print(line)
+        console.print(line)
+        if isinstance(error, UserCodeError):
+            traceback.print_exception(error.__cause__)
+        return status
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -33,9 +33,8 @@ class Evaluate(Finished, EvaluateRequest):
     The policy is of a run or a policy folder, or a task's teacher, heuristic or chance; or, with --env, it is
     package.module:NAME, any function of observations."""
 
-    compare: tuple[str, ...] = ()
-    """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference. Two may
-    stand here with nothing named before: evaluate --compare A B."""
+    compare: str | None = None
+    """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference."""
     labels_from: Path | None = None
     """Instead: how many answers of this label file the policy agrees with. Also of package.module:NAME and of a file in
     ONNX; beside the policy as it was and "already right" always."""
@@ -57,10 +56,8 @@ def run(arguments: list[str]) -> None:
     if options.out and options.out.exists():
         raise UserError(f"{options.out} exists: give another --out")
     requests: list[tuple[PolicySource, Evaluate]] = [(source, options)]
-    if "--compare" in arguments and not options.compare:
-        raise UserError("--compare names nothing: give a run folder, a policy folder or a policy")
     if options.compare:
-        other, policy = _other(source, options)
+        other, policy = _other(source, options, options.compare)
         requests.append((other, replace(options, policy=policy, guidance=(), labels=(), seed=())))
     plans = [evaluate.prepare(*request) for request in requests]
     if options.compare:  # what cannot be compared is not measured first
@@ -68,25 +65,21 @@ def run(arguments: list[str]) -> None:
             *([row for block in lanes for row in evaluate.variants(env, block)] for env, lanes in plans)
         )
     with progress_bars() as bars:
-        rows, *others = [
-            evaluate.run(*request, watched_by(bars), plan) for request, plan in zip(requests, plans, strict=True)
-        ]
-    _print_measured(source, options, rows, *others)
+        watch = watched_by(bars)
+        measured = [evaluate.run(*request, watch, plan) for request, plan in zip(requests, plans, strict=True)]
+    _print_measured(source, options, measured[0], measured[1] if options.compare else [])
 
 
-def _print_measured(
-    source: PolicySource, options: Evaluate, rows: list[Measured], others: Sequence[Measured] = ()
-) -> None:
+def _print_measured(source: PolicySource, options: Evaluate, rows: list[Measured], others: Sequence[Measured]) -> None:
     """Print the measurements, or the comparison with others, and write them to the chosen file."""
     envs, steps = evaluate.amount(source.task, options)
-    compared = measurements.differences(rows, others) if options.compare else None
     about = {"robot": source.task.robot, "engine": options.engine, "scenario": options.scenario}
     about = {name: value for name, value in about.items() if value}
     lane = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
-    title, other = ", ".join([options.policy, *about.values(), lane]), " ".join(options.compare[-1:])
-    both = None if compared is None else (other, compared)
+    title, other = ", ".join([options.policy, *about.values(), lane]), options.compare or ""
+    compared = measurements.differences(rows, others) if others else []
     described = about | ({"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {})
-    text = measurements.to_json(source, options, rows, described, both)
+    text = measurements.to_json(source, options, rows, described, (other, compared) if others else None)
     if options.out:  # first: whoever reads the table may leave before its end
         options.out.parent.mkdir(parents=True, exist_ok=True)
         with replacing(options.out) as file:
@@ -94,9 +87,9 @@ def _print_measured(
     shares = f"{envs:,} episodes" if source.task.longest else f"{envs:,} environments of {steps // envs:,} steps"
     if options.json:
         print(text)
-    elif compared is None:
+    elif not others:
         out.print_table(_measurements(rows, title, shares))
-    for difference in () if options.json else compared or ():
+    for difference in () if options.json else compared:
         out.print_table(_comparison(difference, other, title, shares))
         out.print(_verdict(difference))
     if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in [*rows, *others]):
@@ -108,17 +101,15 @@ def _print_measured(
 def _print_agreement(source: PolicySource, options: Evaluate) -> None:
     """Print the share of a label file's answers that the policy agrees with. Raises UserError for other options."""
     name, path = options.policy, options.labels_from
-    if unused := [one for one in ("episodes", "steps", "envs", "engine", "compare", "out") if getattr(options, one)]:
-        raise UserError(f"the answers of a label file need the policy alone: leave out --{unused[0]}")
+    assert path is not None
+    unused = [one for one in ("episodes", "steps", "envs", "engine", "compare", "out") if getattr(options, one)]
+    unused += [one for one in LANE if len(getattr(options, one)) > 1]
+    if unused:
+        raise UserError(f"the answers of a label file need one policy: leave out --{unused[0]}, or give one value")
     if POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
-    assert path is not None
-    for option in LANE:
-        if len(values := getattr(options, option)) > 1:
-            raise UserError(f"--{option} has {len(values)} values, but one policy answers: give one value")
     kind, budget = next(iter(options.guidance), None), next(iter(options.labels), None)
-    choice = LaneChoice(policy=name, guidance=kind, labels=budget, seed=options.seed)
-    policy, _ = choice.lane_in(source, options.task)
+    policy, _ = LaneChoice(policy=name, guidance=kind, labels=budget, seed=options.seed).lane_in(source, options.task)
     result = agreement(policy, path)
     subject = options.subject if name == "own" else f"{source.folder}, {name}"
     if options.json:
@@ -131,11 +122,8 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
     out.print_table(table)
 
 
-def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
+def _other(source: PolicySource, options: Evaluate, name: str) -> tuple[PolicySource, str]:
     """Return the source and name of the policy to compare with. Raises UserError if it does not act in that world."""
-    if len(options.compare) > (1 if options.subject else 2):
-        raise UserError(f"--compare {' '.join(options.compare)} names too many policies: give two in all")
-    name = options.compare[-1]
     folder = shipped.folder_of(name)
     if folder.exists():
         code = source.adapted.code if source.adapted and policy_folders.is_one(folder) else None
@@ -155,34 +143,27 @@ def _other(source: PolicySource, options: Evaluate) -> tuple[PolicySource, str]:
 def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
     """Return a table of means with intervals (single policies: over `episodes`), by guidance and budget."""
     columns = {
-        "guidance": lambda row: row.guidance,
-        "labels": lambda row: str(row.labels),
-        "within": lambda row: row.within,
-        "seeds": lambda row: str(len(row.seeds)),
-        "trained steps": lambda row: f"{row.step:,}",
+        "guidance": [row.guidance for row in rows],
+        "labels": [str(row.labels) for row in rows],
+        "within": [row.within for row in rows],
+        "seeds": [str(len(row.seeds)) for row in rows],
+        "trained steps": [f"{row.step:,}" if row.step else "" for row in rows],
     }
-    if all(row.guidance == "-" for row in rows):  # of no folder
-        columns = {}
-    elif not any(row.step for row in rows):
-        del columns["trained steps"]
-    if all(row.bound_deg is None for row in rows):
-        columns.pop("within", None)
+    is_alone = all(row.guidance == "-" for row in rows)  # of no folder
+    columns = {} if is_alone else {name: cells for name, cells in columns.items() if any(cells)}
     over = {
         "episodes": f"one policy: mean and bootstrap over {episodes}",
         "seeds": f"several seeds: interquartile mean and bootstrap over seeds and {episodes}",
     }
     caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, rows))
     table = Table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
-    for row in rows:
-        own = [text(row) for text in columns.values()]
+    for number, row in enumerate(rows):
+        own = [cells[number] for cells in columns.values()]
         for name, values in row.metrics.items():
-            of = measurements.spread(row, name)
-            if of is None:
-                count = f"of {len(values)}, {int(np.isfinite(values).sum())} have one"
-                table.add_row(*own, name, "none", count)
-            else:
-                ends = "" if np.isnan(of.lower) else f"{of.lower:.3f} to {of.upper:.3f}"
-                table.add_row(*own, name, f"{of.estimate:.3f}", ends)
+            mean, ends = "none", f"of {len(values)}, {int(np.isfinite(values).sum())} have one"
+            if (of := measurements.spread(row, name)) is not None:
+                mean, ends = f"{of.estimate:.3f}", "" if np.isnan(of.lower) else f"{of.lower:.3f} to {of.upper:.3f}"
+            table.add_row(*own, name, mean, ends)
             own = [""] * len(own)
         table.add_section()
     return table
@@ -190,22 +171,22 @@ def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
 
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
     """Return a table of two policies side by side, with their difference."""
-    mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
+    both = difference.row, difference.other
     over = f"{episodes}, paired" if difference.over == "episodes" else f"seeds and {episodes} (interquartile means)"
-    heading = " against ".join(
-        name + (f" ({variant})" if variant else "") for name, variant in ((title, mine), (other, its))
-    )
+    names = zip((title, other), map(measurements.variant, both), strict=True)
+    heading = " against ".join(f"{name} ({variant})" if variant else name for name, variant in names)
     caption = f"mean [95% bootstrap interval]; of the difference over {over}"
     table = Table("metric", "policy", "against", "difference", title=heading, caption=caption)
     for name, less in difference.metrics.items():
-        both = (measurements.spread(row, name) for row in (difference.row, difference.other))
-        table.add_row(name, *map(str, both), f"{less.estimate:+.3f} [{less.lower:+.3f}, {less.upper:+.3f}]")
+        own = (str(measurements.spread(row, name)) for row in both)
+        table.add_row(name, *own, f"{less.estimate:+.3f} [{less.lower:+.3f}, {less.upper:+.3f}]")
     return table
 
 
 def _verdict(difference: Difference) -> str:
     """Return a sentence on which metrics' differences exclude 0."""
-    apart = [name for name, less in difference.metrics.items() if less.excludes_zero]
-    alike = [name for name in difference.metrics if name not in apart]
-    parts = [f"excludes 0 for {', '.join(apart)}"] * bool(apart) + [f"includes 0 for {', '.join(alike)}"] * bool(alike)
+    names = {"excludes": [], "includes": []}
+    for name, less in difference.metrics.items():
+        names["excludes" if less.excludes_zero else "includes"].append(name)
+    parts = [f"{verb} 0 for {', '.join(metrics)}" for verb, metrics in names.items() if metrics]
     return f"The 95% interval of the difference {'; '.join(parts)}."

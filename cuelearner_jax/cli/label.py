@@ -19,6 +19,7 @@ import tyro
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import changes
+from cuelearner_jax.adaptation.by_model import check_bounds
 from cuelearner_jax.cli.options import Flag, NewWorld, Word, about, as_options, check_numbers, look_ahead_of, out, parse
 from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, source_in, with_cues
 from cuelearner_jax.cli.train import asking_kind
@@ -26,7 +27,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import PROPOSED, actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import ReadingGuide
+from cuelearner_jax.guides.base import Guide, ReadingGuide
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, SessionPlan
 from cuelearner_jax.policies import NearAims, policy_of, uniform_in
@@ -34,6 +35,7 @@ from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.adapt import AdaptRequest
@@ -148,50 +150,54 @@ def make_plan(task: Task, config: RunConfig, options: LabelOptions, source: Poli
     check_numbers(options, labels=(1, MOST_LABELS), seed=(0, LARGEST_SEED - 1), port=(0, 65535))
     if settings.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but the page takes situations as they come: leave it out")
-    if settings.sizes.store_labelled:
-        raise UserError("this preset keeps labelled steps, but the page executes none: give another --preset")
-    robot, task = _robot(task, options.robot), task.on(options.robot)
+    usual, task = task.bodies[0].name, task.on(options.robot)
+    body = task.bodies[0]
     if task.pictures(UNDRAWN).sketch is None:
         raise UserError(f"{task.name} has no sketch of a situation: {UNDRAWN}")
     env = shape_of(task, options.task)
-    space = actions_of(env)
-    if options.bound_deg is not None and not 0 < options.bound_deg <= space.reach:
-        raise UserError(
-            f"--bound-deg is {options.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
-        )
+    if options.bound_deg is not None:
+        check_bounds(actions_of(env), (options.bound_deg,))
     guidance = settings.guide_in(env, guidances.kind_name(options.guidance))
-    if guidance.sees_base:
-        raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
-    if guidance.form is None:
-        asking = [kind.name for kind in guidances.guides().values() if kind.asks]
+    _check_guidance(guidance, task, options, actions_of(env))
+    family: Any = ()
+    if guidance.by_evidence:
+        path = options.changes
+        family = declared_distortions(env) if path is None else changes.family_of(changes.load(path), env)
+    plan = SessionPlan(
+        task,
+        settings,
+        guidance,
+        _base(task, options, source, env) if options.again is None else Base(uniform_in(env), ""),
+        labels=options.labels,
+        seed=options.seed,
+        who=options.who.strip(),
+        bound_deg=options.bound_deg,
+        robot="" if body.name == usual else f"{body.name} {body.digest}".strip(),
+        family=family,
+        one_cue=options.one_cue,
+    )
+    return plan if options.again is None else _second(plan, options, options.again)
+
+
+def _check_guidance(guidance: Guide, task: Task, options: LabelOptions, space: Space) -> None:
+    """Raise UserError for guidance that a page cannot collect answers for."""
+    if guidance.form is None or guidance.sees_base:
+        asking = [kind.name for kind in guidances.guides().values() if kind.asks and not kind.sees_base]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
     controls.check(guidance.form, space)
     if options.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):
         raise UserError("--one-cue is for relative answers about several cues: leave it out")
-    family: Any = ()
     if guidance.by_evidence:
         has_proposals = options.questions == PROPOSED and _has_proposals(task, options.task)
         if (options.policy is None and not has_proposals) or options.again is not None:
             raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
         if options.bound_deg is not None:
             raise UserError("bound_deg is given, but guidance reading asks without a bound: leave bound_deg out")
-        path = options.changes
-        family = declared_distortions(env) if path is None else changes.family_of(changes.load(path), env)
-    values = options.labels, options.seed, options.who.strip(), options.bound_deg, robot
-    base = _base(task, options, source, env) if options.again is None else Base(uniform_in(env), "")
-    plan = SessionPlan(task, settings, guidance, base, *values, family=family, one_cue=options.one_cue)
-    return plan if options.again is None else _second(plan, options, options.again)
 
 
 def _has_proposals(task: Task, config: Any) -> bool:
     """Return whether observations hold the action that a policy elsewhere proposes."""
     return any(part.kind == PROPOSED for part in getattr(shape_of(task, config), "observation", ()))
-
-
-def _robot(task: Task, name: str | None) -> str:
-    """Return the robot's name in label files; empty for the default robot. Raises UserError for an unknown robot."""
-    body = task.on(name).bodies[0]
-    return "" if body.name == task.bodies[0].name else f"{body.name} {body.digest}".strip()
 
 
 def _second(plan: SessionPlan, options: LabelOptions, path: Path) -> SessionPlan:
@@ -201,11 +207,10 @@ def _second(plan: SessionPlan, options: LabelOptions, path: Path) -> SessionPlan
         raise UserError(f"{path} was not written by the labelling page: its questions cannot be asked again")
     if options.policy is not None or options.seed or options.bound_deg is not None:
         raise UserError("--again repeats another page's questions: leave out the policy, --seed and --bound-deg")
-    for name, value in plan.world.items():
-        if file.task.get(name) != value:
-            raise UserError(f"{path} asked in a world with another {name} ({file.task.get(name)}, not {value})")
-    if (other := file.session.get("robot", "")) != plan.robot:
-        raise UserError(f"{path} asked about {other or 'its own robot'}: give the same --robot")
+    world = file.task | {"robot": file.session.get("robot", "")}
+    for name, value in (plan.world | {"robot": plan.robot}).items():
+        if (before := world.get(name)) != value:
+            raise UserError(f"{path} asked in a world with another {name} ({before!r}, not {value!r}): give the same")
     place = label_files.found_in(path)
     assert place is not None  # the file was read above
     actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(place)}
@@ -269,9 +274,7 @@ def _serve(server: Any, plan: SessionPlan, options: LabelOptions, port: Any, sto
                 file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}">\n')
             webbrowser.open(leads_there.absolute().as_uri())
 
-    def make() -> Session:
-        return Session(plan, options.out, lambda words: console.print(f"{words} ..."))
-
+    make = partial(Session, plan, options.out, lambda words: console.print(f"{words} ..."))
     try:
         return server.serve(make, f"label {plan.task.name}", port, stopping, open_page, commands)
     finally:

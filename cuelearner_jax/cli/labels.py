@@ -131,13 +131,9 @@ def _facts(file: LabelFile) -> dict[str, str]:
     if file.counts:
         facts |= {"not known": str(file.counts.get(UNSURE, 0)), "taken back": str(file.counts.get(UNDONE, 0))}
     if file.session:
-        facts |= {
-            "actions of": " ".join(
-                str(file.session[name]) for name in ("base", "base_digest") if file.session.get(name)
-            ),
-            "fitted meanwhile": str(file.session.get("guidance")),
-            "seed": f"{file.session['seed']}",
-        }
+        of = file.session.get
+        facts |= {"actions of": f"{of('base') or ''} {of('base_digest') or ''}".strip()}
+        facts |= {"fitted meanwhile": str(of("guidance")), "seed": str(of("seed"))}
     if file.people is not None:
         seconds = np.asarray(file.people.seconds, float)
         pace = f"{60 * len(seconds) / seconds.sum():.1f}" if seconds.sum() > 0 else ""

@@ -42,14 +42,13 @@ class _Output(Console):
 
     def print_table(self, table: Table) -> None:
         """Print a table whole: plain, a row a line, where there is no terminal or the table is wider than it."""
+        below, table.caption = table.caption, None
         width = self.measure(table, options=self.options.update(max_width=10_000)).maximum
         if not self.is_terminal or width > self.width:
-            table.box, table.caption, below = None, None, table.caption
-            self.print(table, width=max(width, 80))
-            if below:
-                self.print(below)
-        else:
-            self.print(table)
+            table.box = None
+        self.print(table, width=max(width, 80))
+        if below:
+            self.print(below)
 
 
 out = _Output(**PLAIN)
@@ -57,9 +56,10 @@ out = _Output(**PLAIN)
 
 def _whole(words: list[str]) -> int:
     """Return a whole number, which may have an exponent. Raises ValueError for any other word."""
-    if "e" in words[0].lower() and not float(words[0]).is_integer():
+    number = float(words[0]) if "e" in words[0].lower() else int(words[0])
+    if number != int(number):
         raise ValueError(f"{words[0]} is not a whole number")
-    return int(float(words[0])) if "e" in words[0].lower() else int(words[0])
+    return int(number)
 
 
 WHOLE = tyro.constructors.PrimitiveConstructorSpec(
@@ -123,8 +123,7 @@ class Finished(NewWorld, RunParts):
     """Code of a policy folder's base policy: package.module:NAME."""
 
 
-ONE = ("task", "env", "teacher", "preset", "scenario", "agent", "arbiter", "base", "changes", "labels-from", "judge-by")
-ONE += ("task.actions", "cues")
+ONE = ("teacher", "preset", "scenario", "agent", "arbiter", "base", "changes", "labels-from", "judge-by", "cues")
 
 
 class _Ahead(argparse.ArgumentParser):
@@ -139,9 +138,10 @@ def look_ahead(arguments: list[str]) -> argparse.Namespace:
     An option that is not given is None. Raises UserError for an option without its value.
     """
     parser = _Ahead(add_help=False, allow_abbrev=False)
-    for name in ONE:
+    parser.add_argument("--env", "--task")
+    for name in (*ONE, "task.actions"):
         parser.add_argument(f"--{name}")
-    for name, kind in {"guidance": str, "compare": str, "task.low": float, "task.high": float}.items():
+    for name, kind in {"guidance": str, "task.low": float, "task.high": float}.items():
         parser.add_argument(f"--{name}", nargs="*", type=kind)
     ahead, rest = parser.parse_known_args(arguments)
     ahead.words = list(takewhile(lambda word: not word.startswith("-"), rest))
@@ -152,7 +152,7 @@ def look_ahead_of(arguments: list[str], command: str, kind: type) -> argparse.Na
     """Return `look_ahead`'s options. Where nothing is named, print help (SystemExit) or raise UserError."""
     ahead = look_ahead(arguments)
     alone = command == "adapt" and ahead.labels_from is not None  # labels about proposed actions name their task
-    if alone or ahead.words or ahead.task or ahead.env or len(ahead.compare or ()) > 1:
+    if alone or ahead.words or ahead.env:
         return ahead
     tasks = ", ".join(registry.names())
     if {"-h", "--help"} & {*arguments}:

@@ -28,7 +28,7 @@ def task_of(ahead: Namespace) -> Task:
     """Return the task named first, or by --task or --env; --teacher makes code its teacher. Raises UserError."""
     task = _task_by_option(ahead)
     if task is not None and ahead.words:
-        raise UserError(f"the task is named twice, {ahead.words[0]!r} and {ahead.task or ahead.env!r}: name it once")
+        raise UserError(f"the task is named twice, {ahead.words[0]!r} and {ahead.env!r}: name it once")
     return _with_teacher(task or registry.resolve(ahead.words[0]), ahead.teacher)
 
 
@@ -132,8 +132,6 @@ def source_and_options(arguments: list[str], command: str, kind: Any, more: str 
     `more` is added to the help's text. Raises UserError for choices that do not exist.
     """
     ahead = look_ahead_of(arguments, command, kind)
-    if not ahead.words and len(ahead.compare or ()) > 1:  # evaluate --compare A B
-        ahead.words = ahead.compare[:1]
     source = source_of(ahead)
     world = source.config.task
     if ahead.scenario is not None:
@@ -144,12 +142,9 @@ def source_and_options(arguments: list[str], command: str, kind: Any, more: str 
 
 
 def _task_by_option(ahead: Namespace) -> Task | None:
-    """Return the task of --task or --env, where code that is no task is an environment of Gymnasium's kind."""
-    if ahead.task is not None and ahead.env is not None:
-        raise UserError(f"the task is named twice, {ahead.task!r} and {ahead.env!r}: name it once")
-    word = ahead.env
-    if word is None:
-        return None if ahead.task is None else registry.resolve(ahead.task)
+    """Return the task of --env, or --task, where code that is no task is an environment of Gymnasium's kind."""
+    if (word := ahead.env) is None:
+        return None
     is_outside = plugins.REFERENCE.fullmatch(word) and word.partition(":")[0] not in registry.FAMILIES
     if is_outside and not isinstance(plugins.load(word, object, "an environment"), Task):
         word = f"gymnasium:{word}"

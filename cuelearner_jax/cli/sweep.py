@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
 
-from cuelearner_jax.cli.train import TrainingOptions, parse_training, suggested
+from cuelearner_jax.cli.train import TrainingOptions, parse_training
 from cuelearner_jax.runs.grid import Grid, parse_seeds
 from cuelearner_jax.runs.shards import Shard
 
@@ -29,9 +29,8 @@ class Sweep(TrainingOptions):
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
-    task, grid, default = suggested(arguments, "sweep", Sweep)
-    first, seeds = grid.seeds[0], f"{grid.seeds[0]}:{grid.seeds[-1] + 1}"
-    default = replace(default, guidance=grid.guidance, labels=grid.labels, seeds=seeds)
-    options = parse_training(arguments, "sweep", task, default)
-    grid = Grid(options.guidance, parse_seeds(options.seeds, first), options.labels)
+    seeds_of = lambda grid: f"{grid.seeds[0]}:{grid.seeds[-1] + 1}"  # noqa: E731
+    usual = lambda grid: {"guidance": grid.guidance, "labels": grid.labels, "seeds": seeds_of(grid)}  # noqa: E731
+    options, preset = parse_training(arguments, "sweep", Sweep, usual)
+    grid = Grid(options.guidance, parse_seeds(options.seeds, preset.seeds[0]), options.labels)
     options.train(grid, Shard.parse(options.chosen_shard) if options.chosen_shard else None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -29,7 +30,7 @@ from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.studies import train
-from cuelearner_jax.task import QUICKSTART, Task
+from cuelearner_jax.task import QUICKSTART
 
 TrainingT = TypeVar("TrainingT", bound="TrainingOptions")
 Settled = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]  # of the order, but no option: set after parsing
@@ -80,36 +81,34 @@ class Train(TrainingOptions):
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
-    task, grid, default = suggested(arguments, "train", Train)
-    default = replace(default, guidance=asking_kind(grid.guidance), labels=grid.labels[0])
-    options = parse_training(arguments, "train", task, default)
+    usual = lambda grid: {"guidance": asking_kind(grid.guidance), "labels": grid.labels[0]}  # noqa: E731
+    options, _ = parse_training(arguments, "train", Train, usual)
     options.train(Grid((options.guidance,), (options.seed,), (options.labels,)))
 
 
-def suggested(arguments: list[str], command: str, kind: type[TrainingT]) -> tuple[Task, Grid, TrainingT]:
-    """Return the task of a training command, the grid of its preset, and the default options but for the grid's."""
+def parse_training(
+    arguments: list[str], command: str, kind: type[TrainingT], usual: Callable[[Grid], dict[str, Any]]
+) -> tuple[TrainingT, Grid]:
+    """Return the options of a training command, for the chosen robot, and the grid of its preset.
+
+    `usual`: from that grid, the default options that are not common to all training commands.
+    """
     ahead = look_ahead_of(arguments, command, kind)
     task = task_of(ahead)
     name, preset = preset_of(task, ahead.preset, QUICKSTART)
     request = train.suggested(task, preset)
-    config = request.config
+    grid, config = request.grid, request.config
     for part, table in PARTS.items():
         own = None if (word := getattr(ahead, part)) is None else plugins.resolve(table, word, part)
         if own is not None and own is not type(getattr(config, part)):
             config = replace(config, **{part: own()})
-    guides = [guidances.resolve(word) for word in ahead.guidance or request.grid.guidance]
+    guides = [guidances.resolve(word) for word in ahead.guidance or grid.guidance]
     kinds = {one.name: config.kinds.get(one.name) or one.config() for one in guides if one.config}
-    place = Path("runs") / f"{task.name}-{name}"
-    return task, request.grid, kind(config=replace(config, kinds=kinds), out=place)
-
-
-def parse_training(arguments: list[str], command: str, task: Task, default: TrainingT) -> TrainingT:
-    """Return the options of a training command, for the chosen robot. Raises UserError for a folder of a robot."""
-    kind = type(default)
+    default = kind(config=replace(config, kinds=kinds), out=Path("runs") / f"{task.name}-{name}", **usual(grid))
     options = parse(kind, arguments, command, default, about(kind, task, preset=QUICKSTART))
     if options.robot is not None and ":" in options.robot:
         raise UserError(f"--robot is {options.robot}, but training takes no folder of a robot: give its name alone")
-    return replace(options, task=task.on(options.robot))
+    return replace(options, task=task.on(options.robot)), grid
 
 
 def asking_kind(kinds: tuple[str, ...]) -> str:

@@ -6,10 +6,10 @@ the figures, and the tables of a question about label efficiency.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pyarrow as pa
 
@@ -33,6 +33,35 @@ NOTE = (
 )
 
 
+@dataclass(frozen=True, kw_only=True)
+class ReportRequest(Question):
+    """What a report shows."""
+
+    guidance: tuple[str, ...] = ()
+    """Kinds of guidance to report (default: all)."""
+    labels: tuple[int, ...] = ()
+    """Label budgets to report, beside agents without labels (default: all)."""
+    metric: str = "reward"
+    """Column of the results to report."""
+    split: str = "validation"
+    """Evaluation episodes to report: validation or tuning."""
+    lower_is_better: bool = False
+    """Smaller values of the metric are better, as for collisions."""
+    by_run: bool = False
+    """Report each folder separately, under its name, for runs of different configurations. Each is compared with its
+    own unguided agents or, without any, with those of the first folder that has some."""
+    efficiency: bool = False
+    """Add label efficiency: steps to a level, and how many labels of one kind equal those of another."""
+
+    @property
+    def asks(self) -> bool:
+        """Whether label efficiency is asked for: by `efficiency`, or by an option of the question."""
+        return self.efficiency or (self.level, self.level_at, self.reference) != (None, None, None)
+
+
+ALL = ReportRequest()
+
+
 class Contents(NamedTuple):
     """Contents of a report."""
 
@@ -44,62 +73,34 @@ class Contents(NamedTuple):
     every: pa.Table  # all recorded rows of the split
 
 
-def contents_of(
-    folders: Sequence[PathLike],
-    metric: str = "reward",
-    *,
-    split: str = "validation",
-    lower_is_better: bool = False,
-    by_run: bool = False,
-    guidance: Sequence[str] = (),
-    labels: Sequence[int] = (),
-    question: Question | None = None,
-) -> Contents:
-    """Read the results of folders and compute what a report shows.
-
-    Args:
-        folders: run folders, or folders above them.
-        metric: column of the results.
-        split: "validation" or "tuning".
-        lower_is_better: small values of the metric are good ones.
-        by_run: report each folder under its own name, as needed where the runs' configurations differ.
-        guidance, labels: kinds and label budgets to report (default: all). Unguided agents have 0 labels.
-        question: question about label efficiency (default: none).
-    """
-    groups = read_groups(folders, metric, split, by_run, guidance=guidance, labels=labels)
+def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Contents:
+    """Read the results of run folders, or of folders above them, and compute what a report shows."""
+    metric, split, lower_is_better = request.metric, request.split, request.lower_is_better
+    groups = read_groups(folders, metric, split, request.by_run, guidance=request.guidance, labels=request.labels)
     variants = variants_of(groups, metric)
-    answer = efficiency_of(variants, question, lower_is_better) if question else None
+    answer = efficiency_of(variants, request, lower_is_better) if request.asks else None
     every = pa.concat_tables([group.every for group in groups], promote_options="permissive")  # of other metrics
     missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
     return Contents(groups, variants, tables.summary(variants, lower_is_better), missing, answer, every)
 
 
 def report(
-    folders: PathLike | Sequence[PathLike],
-    out: PathLike,
-    metric: str = "reward",
-    *,
-    split: str = "validation",
-    overwrite: bool = False,
-    command: str = "",
-    **how: Any,
+    folders: Sequence[PathLike], out: Path, request: ReportRequest = ALL, overwrite: bool = False, command: str = ""
 ) -> Path:
     """Write the report of run folders, or of folders above them, into `out`; return the path of `report.md`.
 
-    `command` is the command line to record in the report. `how`: other arguments of `contents_of`.
+    `command` is the command line to record in the report.
     """
     from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, save_figure  # loads Matplotlib
 
-    folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
-    out = Path(out)
     if in_use(out) and not overwrite:
         raise UserError(f"{out} exists already: give another --out, or --overwrite to replace it")
-    contents = contents_of(folders, metric, split=split, **how)
+    contents, metric = contents_of(folders, request), request.metric
     variants, efficiency = contents.variants, contents.efficiency
     seeds = _range("seed", [len(variant.seeds) for variant in variants])
     if episodes := [variant.episodes for variant in variants if variant.episodes]:
         seeds += f" x {_range('episode', episodes)}"
-    title = f"{contents.groups[0].table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {seeds}"
+    title = f"{contents.groups[0].table['task'][0].as_py()}: {request.split} {metric.replace('_', ' ')}, {seeds}"
     figures = {"curves": draw_curves(variants, title, metric)}
     if len({variant.labels for variant in variants if variant.labels}) > 1:
         figures["label_efficiency"] = draw_label_efficiency(variants, title, metric)

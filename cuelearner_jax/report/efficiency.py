@@ -36,11 +36,11 @@ class Question:
 
 
 class Efficiency(NamedTuple):
-    """Label efficiency of recorded curves; tables by file name."""
+    """Label efficiency of recorded curves."""
 
     level: float
     origin: str  # of the level, in words
-    tables: dict[str, list[Row]]
+    tables: dict[str, list[Row]]  # by file name
 
 
 class Bounds(NamedTuple):
@@ -48,6 +48,11 @@ class Bounds(NamedTuple):
 
     lower: Samples
     upper: Samples
+
+    @classmethod
+    def exact(cls, samples: Samples) -> Bounds:
+        """Return the bounds of a quantity that is known exactly."""
+        return cls(samples, samples)
 
 
 class Sampled(NamedTuple):
@@ -102,11 +107,7 @@ def _columns(name: str, samples: Bounds, *own: Sampled) -> Row:
 
 
 def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_better: bool = False) -> Efficiency:
-    """Return the label efficiency of the variants of one task and metric.
-
-    Raises:
-        UserError: there is no level without unguided agents, or they begin at it, or a reference is not there.
-    """
+    """Return the label efficiency of the variants of one task and metric."""
     sign = -1.0 if lower_is_better else 1.0
     kinds = {variant.guidance for variant in variants if variant.labels}
     if question.reference is not None and question.reference not in kinds:
@@ -114,7 +115,8 @@ def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_bett
         raise UserError(f"--reference {question.reference}: no results with its labels; there are {there}")
     level, origin = _level(variants, question)
     every = {id(variant): _sampled(variant, level, sign) for variant in variants}
-    rows, equal = [], []
+    rows: list[Row] = []
+    asking: dict[str, dict[str, list[Sampled]]] = {}  # by run and kind
     for variant in variants:
         own, unguided = every[id(variant)], unguided_of(variant, variants)
         if variant.guidance == "none" and sign * (level - variant.curve.estimate[0]) <= 0:
@@ -123,13 +125,9 @@ def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_bett
                 f"({variant.curve.estimate[0]:.3g}): give another --level or a later --level-at"
             )
         rows.append(_row(own, None if unguided is None or unguided is variant else every[id(unguided)]))
-    for run in dict.fromkeys(variant.run for variant in variants):
-        asking: dict[str, list[Sampled]] = {}
-        for variant in variants:
-            if variant.run == run and variant.labels:
-                asking.setdefault(variant.guidance, []).append(every[id(variant)])
-        head: Row = {"run": run} if run else {}
-        equal += [head | row for row in _equal_area(asking, question.reference, sign)]
+        if variant.labels:
+            asking.setdefault(variant.run, {}).setdefault(variant.guidance, []).append(own)
+    equal = [row for run, kinds in asking.items() for row in _equal_area(run, kinds, question.reference, sign)]
     return Efficiency(level, origin, {"efficiency": rows} | ({"equal_area": equal} if equal else {}))
 
 
@@ -150,27 +148,27 @@ def _level(variants: Sequence[Variant], question: Question) -> tuple[float, str]
 
 def _row(own: Sampled, unguided: Sampled | None) -> Row:
     """Return a variant's row of `efficiency.csv`; ratios and differences are to the unguided agents'."""
-    variant, ends = own.variant, ("", "_lower", "_upper")
+    variant = own.variant
     row: Row = {**identity(variant), "seeds": len(variant.seeds)}
-    for name, interval in (
-        ("guide", None if variant.guide is None else statistics.interval(variant.guide)),
-        ("mean", variant.mean),
-    ):
-        row |= {
-            name + end: float(value) for end, value in zip(ends, interval or (), strict=False) if np.isfinite(value)
-        }
+    intervals = {"guide": () if variant.guide is None else statistics.interval(variant.guide), "mean": variant.mean}
+    for name, of in intervals.items():
+        ends = zip(("", "_lower", "_upper"), of, strict=False)
+        row |= {name + end: float(value) for end, value in ends if np.isfinite(value)}
     row |= _columns("steps_to_level", own.steps, own) | {"reached": float(np.isfinite(own.steps.upper[1:]).mean())}
     if unguided is None:
         return row
-    means, difference = (Bounds(each.areas, each.areas) for each in (own, unguided)), own.areas - unguided.areas
-    row |= {"against": unguided.variant.name} | _columns(
-        "mean_difference", Bounds(difference, difference), own, unguided
-    )
-    row |= _columns("mean_ratio", ratio_bounds(*means), own, unguided)
-    return row | _columns("steps_ratio", ratio_bounds(own.steps, unguided.steps), own, unguided)
+    row["against"] = unguided.variant.name
+    comparisons = {
+        "mean_difference": Bounds.exact(own.areas - unguided.areas),
+        "mean_ratio": ratio_bounds(Bounds.exact(own.areas), Bounds.exact(unguided.areas)),
+        "steps_ratio": ratio_bounds(own.steps, unguided.steps),
+    }
+    for name, bounds in comparisons.items():
+        row |= _columns(name, bounds, own, unguided)
+    return row
 
 
-def _equal_area(asking: dict[str, list[Sampled]], reference: str | None, sign: float) -> list[Row]:
+def _equal_area(run: str, asking: dict[str, list[Sampled]], reference: str | None, sign: float) -> list[Row]:
     """Return the labels of one kind that give the mean over the curve of another's (or the reference's) budgets."""
     budgets = {kind: np.array([each.variant.labels for each in own]) for kind, own in asking.items()}
     fitted = {}  # each sample's nondecreasing least-squares fit (pool adjacent violators)
@@ -183,7 +181,8 @@ def _equal_area(asking: dict[str, list[Sampled]], reference: str | None, sign: f
             for kind in (kind for kind in asking if kind != base):
                 needed = labels_for(budgets[kind], fitted[kind], fitted[base][:, place])
                 both = (*asking[base], *asking[kind])
-                row: Row = {"reference": base, "reference_labels": labels, "mean": float(sign * fitted[base][0, place])}
+                row: Row = {"run": run} if run else {}
+                row |= {"reference": base, "reference_labels": labels, "mean": float(sign * fitted[base][0, place])}
                 row |= {"guidance": kind} | _columns("labels", needed, *both)
                 rows.append(row | _columns("labels_ratio", Bounds(*(bound / labels for bound in needed)), *both))
     return rows
@@ -229,8 +228,7 @@ def section(efficiency: Efficiency) -> list[str]:
         keys = [key for key in ("run", "reference", "reference_labels", "guidance") if key in table[0]]
         keys += ["labels"] if name == "efficiency" else []
         header = [key.replace("_", " ") for key in keys] + [*forms[name]]
-        cells = [
-            [markdown(row[key]) for key in keys] + [cell(row, *of) for of in forms[name].values()] for row in table
-        ]
+        columns = forms[name].values()
+        cells = [[*(markdown(row[key]) for key in keys), *(cell(row, *of) for of in columns)] for row in table]
         lines += ["", *markdown_table(header, cells)]
     return lines

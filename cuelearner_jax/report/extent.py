@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -22,13 +21,11 @@ def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[
     """Return one line for everything planned that the table lacks, or whose plan is unknown."""
     ends = table.group_by("folder").aggregate([("step", "max")]).to_pylist()
     last = {row["folder"]: row["step_max"] for row in ends}
-    # the config.json of each folder with results; a run's lies above the folders of its kinds of guidance
-    places = {folder: (Path(folder) / CONFIG, Path(folder).parent / CONFIG) for folder in last}
-    configurations = {folder: next((file for file in files if file.exists()), None) for folder, files in places.items()}
+    configurations = {folder: _configuration(Path(folder)) for folder in last}
     files = {file for folder in folders for file in Path(folder).rglob(CONFIG)} | set(configurations.values())
     plans: dict[Path, dict[str, Any]] = {}
     lines = []
-    for file in sorted(file for file in files if file):
+    for file in sorted(filter(None, files)):
         try:
             plans[file] = formats.read("config", file)
         except UserError as error:
@@ -45,6 +42,11 @@ def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[
     for file, plan in plans.items():
         lines += _absent(file.parent, plan.get("grid", {}), table)
     return lines
+
+
+def _configuration(folder: Path) -> Path | None:
+    """Return the config.json of a folder with results; a run's lies above the folders of its kinds of guidance."""
+    return next((place / CONFIG for place in (folder, folder.parent) if (place / CONFIG).exists()), None)
 
 
 def _absent(run: Path, grid: dict[str, Any], table: pa.Table) -> list[str]:
@@ -72,32 +74,30 @@ def _absent(run: Path, grid: dict[str, Any], table: pa.Table) -> list[str]:
 def gaps(groups: Sequence[Group], variants: Sequence[Variant], metric: str, split: str) -> list[str]:
     """Return one line for everything in the results that the figures do not show."""
     lines: list[str] = []
-    omissions: list[str] = []
     for group in groups:
         own = [variant for variant in variants if variant.run == group.name]
         counts = {(variant.guidance, variant.labels): len(variant.seeds) for variant in own}
         for key, seeds in failures.describe_failed(group.failed).items():
             rest = f"curve and means are over the other {counts[key]}" if key in counts else "no lane is left"
             lines.append(f"{failures.variant_name(*key)}: {seeds} failed, no longer finite: {rest}")
-        omissions += _short(group.every, own)
+        lines += _short(group.every, own)
         if group.invalid:
-            omissions.append(f"{group.invalid:,} {split} rows have no finite {metric}; their steps are left out")
-    ends = {int(variant.curve.steps[-1]) for variant in variants}
+            lines.append(f"{group.invalid:,} {split} rows have no finite {metric}; their steps are left out")
+    ends = {int(variant.steps[-1]) for variant in variants}
     if len(ends) > 1:
-        omissions.append(
+        lines.append(
             "curves end at different steps, so their final values cannot be compared; "
             f"means over the curve are taken to step {min(ends):,}, shared by all"
         )
-    return lines + omissions
+    return lines
 
 
 def _short(table: pa.Table, variants: Sequence[Variant]) -> list[str]:
     """Return one line for each variant shown to less than its last step or without an interval, and for mixed runs."""
     lines = []
-    guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
     for variant in variants:
-        rows = (guidance == variant.guidance) & (labels == variant.labels)
-        furthest, last = int(table["step"].to_numpy()[rows].max()), int(variant.curve.steps[-1])
+        rows = table.filter((pc.field("guidance") == variant.guidance) & (pc.field("labels") == variant.labels))
+        furthest, last = pc.max(rows["step"]).as_py(), int(variant.steps[-1])  # pyright: ignore[reportAttributeAccessIssue]
         if furthest > last:
             words = f"the curve ends at {last:,}, the last step of all seeds"
             lines.append(f"{variant.name}: some seeds have reached step {furthest:,}; {words}")

@@ -91,6 +91,11 @@ def _less(row: Measured, other: Measured, name: str) -> Interval:
     return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(draws, [0.025, 0.975]))
 
 
+def _numbers(of: Any) -> Any:
+    """Return an interval, or values, as plain JSON numbers."""
+    return plain(np.asarray(of).tolist())
+
+
 def _row(row: Measured) -> dict[str, Any]:
     return {
         "guidance": row.guidance,
@@ -98,12 +103,14 @@ def _row(row: Measured) -> dict[str, Any]:
         **({} if row.bound_deg is None else {"bound_deg": float(f"{row.bound_deg:g}")}),
         "trained_steps": row.step,
         "seeds": row.seeds.tolist(),
-        **{metric: plain(values.tolist()) for metric, values in row.metrics.items()},
-        "intervals": {
-            "over": over(row),
-            **{metric: plain(np.asarray(spread(row, metric)).tolist()) for metric in row.metrics},
-        },
+        **{metric: _numbers(values) for metric, values in row.metrics.items()},
+        "intervals": {"over": over(row), **{metric: _numbers(spread(row, metric)) for metric in row.metrics}},
     }
+
+
+def _compared(one: Difference) -> dict[str, Any]:
+    difference = {metric: _numbers(value) for metric, value in one.metrics.items()}
+    return {"of": variant(one.row), "less": _row(one.other), "over": one.over, "difference": difference}
 
 
 def to_json(
@@ -131,10 +138,5 @@ def to_json(
     }
     if compared is not None:
         name, pairs = compared
-        entries = [
-            {"of": variant(one.row), "less": _row(one.other), "over": one.over}
-            | {"difference": {metric: plain(np.asarray(value).tolist()) for metric, value in one.metrics.items()}}
-            for one in pairs
-        ]
-        contents["compared"] = {"with": name, "differences": entries}
+        contents["compared"] = {"with": name, "differences": [_compared(one) for one in pairs]}
     return json.dumps(contents, indent=1)

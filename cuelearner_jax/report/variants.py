@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +18,7 @@ from jaxtyping import Float, Int
 from cuelearner_jax.errors import UserError, one_line
 from cuelearner_jax.guides import registry
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.statistics import Curve, Interval, curve, interquartile_mean, interval, mean_over_curve
+from cuelearner_jax.report.statistics import Curve, Interval, interquartile_mean, interval, mean_over_curve
 from cuelearner_jax.runs import failures
 from cuelearner_jax.storage import results
 
@@ -24,22 +26,32 @@ PathLike = str | os.PathLike[str]
 LONGEST_NAME = 40  # characters
 
 
-class Variant(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Variant:
     """All seeds with one kind of guidance and one label budget, at the steps that all of them have reached."""
 
     guidance: str
     labels: int
     seeds: Int[np.ndarray, "seeds"]
+    steps: Int[np.ndarray, "steps"]
     values: Float[np.ndarray, "seeds steps"]
-    curve: Curve
-    mean: Interval  # mean over the curve, up to the last step that all variants share
     # steps by which the failed lanes had failed; nothing else here is about these lanes
-    failed: Int[np.ndarray, "lanes"]
+    failed: Int[np.ndarray, "lanes"] = field(default_factory=lambda: np.array([], int))
     run: str = ""  # name of the group of runs, where groups are reported separately
     guide: Float[np.ndarray, "guides"] | None = None  # metric of each seed's guide alone, where it was measured
     episodes: int = 0  # of an evaluation, at least; 0: the runs, of an earlier version, keep none
     each: Float[np.ndarray, "seeds groups steps"] | None = None  # values of groups of episodes; None: of one group
     until: int | None = None  # number of steps up to the last one that all variants share; None: all steps
+
+    @cached_property
+    def curve(self) -> Curve:
+        """The interval at each evaluation."""
+        return Curve(self.steps, *interval(self.values, self.groups))
+
+    @cached_property
+    def mean(self) -> Interval:
+        """The mean over the curve, up to the last step that all variants share."""
+        return interval(self.area(self.values), self.area(self.groups))
 
     @property
     def groups(self) -> Float[np.ndarray, "seeds groups steps"]:
@@ -48,7 +60,7 @@ class Variant(NamedTuple):
 
     def area(self, curves: Float[np.ndarray, "*seeds steps"]) -> Float[np.ndarray, "*seeds"]:
         """Return the mean of each curve up to the last step that all variants share."""
-        return mean_over_curve(self.curve.steps[: self.until], curves[..., : self.until])
+        return mean_over_curve(self.steps[: self.until], curves[..., : self.until])
 
     def samples(
         self,
@@ -98,11 +110,7 @@ def read_groups(
     folders_of = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
     if by_run and len(folders_of) < len(folders):
         raise UserError("--by-run: several folders have the same name: give them different names")
-    groups = []
-    for name, own in folders_of.items():
-        guides = results.read_guides(own)
-        guides = None if guides is None else guides.filter(pc.field("split") == split)
-        groups.append(Group(name, *_select(results.read(own), metric, split), guides))
+    groups = [_group(name, own, metric, split) for name, own in folders_of.items()]
     tasks = sorted({group.table["task"][0].as_py() for group in groups})
     for column, values in choice.items():
         there = {value for group in groups for value in group.every[column].to_pylist()}
@@ -119,28 +127,30 @@ def read_groups(
     return groups
 
 
-def _select(every: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int, pa.Table]:
-    """Return rows to report, all of failed lanes, the number whose metric is not finite, and all of the split."""
+def _group(name: str, folders: Sequence[PathLike], metric: str, split: str) -> Group:
+    """Read the results of folders, without failed lanes and without rows whose metric is not finite."""
+    every = results.read(folders)
     if metric not in results.metrics(every):
         raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(every))}")
     splits = sorted(set(every["split"].to_pylist()))
     if split not in splits:
         raise UserError(f"no {split} rows in the results: there are {', '.join(splits)} rows")
-    every = rows = every.filter(pc.field("split") == split)
-    marked, lanes = results.failures(rows), zip(*(rows[name].to_pylist() for name in results.LANE), strict=True)
-    of_failed = np.array([lane in marked for lane in lanes], bool)
-    rows, failed = rows.filter(pa.array(~of_failed)), rows.filter(pa.array(of_failed))
-    if failed.num_rows and not rows.num_rows:
+    every, guides = every.filter(pc.field("split") == split), results.read_guides(folders)
+    lost, lanes = results.failures(every), zip(*(every[name].to_pylist() for name in results.LANE), strict=True)
+    of_failed = np.array([lane in lost for lane in lanes], bool)
+    rows, failed = every.filter(pa.array(~of_failed)), every.filter(pa.array(of_failed))
+    if not rows.num_rows:
         raise UserError(f"nothing to report, {failures.summary(failed)}: train again with other settings")
     table = rows.filter(pc.field(metric).is_valid())
     if table.num_rows == 0:
         raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
-    return table, failed, rows.num_rows - table.num_rows, every
+    guides = None if guides is None else guides.filter(pc.field("split") == split)
+    return Group(name, table, failed, rows.num_rows - table.num_rows, every, guides)
 
 
 def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
     """Return the variants in the legend's order: for each group unguided first, then by guidance and label budget."""
-    entries = []
+    variants = []
     for group in groups:
         failed = results.failures(group.failed)
         keys = group.table.group_by(["guidance", "labels"]).aggregate([]).to_pylist()
@@ -150,22 +160,15 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
             seeds, steps, values, each = _matrix(rows, metric, kind, labels)
             lost = np.array([step for lane, step in failed.items() if lane[:2] == (kind, labels)], int)
             guide = _guides(rows, metric, None if group.guides is None else group.guides.filter(of_variant))
-            episodes = min(rows["episodes"].to_pylist()) if each.shape[1] > 1 else 0
-            others = (lost, group.name, guide if len(guide) else None, episodes)
-            entries.append((kind, labels, seeds, steps, values, each, *others))
-    shared = min(steps[-1] for _, _, _, steps, *_ in entries)
-    variants = []
-    for kind, labels, seeds, steps, values, each, *others in entries:
-        until = max(1, int(np.searchsorted(steps, shared, side="right")))
-        areas, parts = (mean_over_curve(steps[:until], of[..., :until]) for of in (values, each))
-        mean_curve = curve(steps, values, each)
-        mean = interval(areas, parts)
-        variants.append(Variant(kind, labels, seeds, values, mean_curve, mean, *others, each=each, until=until))
-    return variants
+            episodes = 0 if each is None else min(rows["episodes"].to_pylist())
+            variants.append(Variant(kind, labels, seeds, steps, values, lost, group.name, guide, episodes, each))
+    shared = min(variant.steps[-1] for variant in variants)
+    ends = [int(np.searchsorted(variant.steps, shared, side="right")) for variant in variants]
+    return [replace(variant, until=max(1, end)) for variant, end in zip(variants, ends, strict=True)]
 
 
-def _guides(rows: pa.Table, metric: str, guides: pa.Table | None) -> np.ndarray:
-    """Return the metric of each seed's guide after its last label, (seeds,)."""
+def _guides(rows: pa.Table, metric: str, guides: pa.Table | None) -> np.ndarray | None:
+    """Return the metric of each seed's guide after its last label, (seeds,); None where none was measured."""
     column, seeds = f"guide_{metric}", set(rows["seed"].to_pylist())  # without failed lanes
     latest: dict[int, float] = {}
     for table, mark in ((rows, "step"), (guides, "asked")):
@@ -174,10 +177,10 @@ def _guides(rows: pa.Table, metric: str, guides: pa.Table | None) -> np.ndarray:
         measured = table.filter(pc.field(column).is_valid()).sort_by(mark)
         pairs = zip(measured["seed"].to_pylist(), measured[column].to_pylist(), strict=True)
         latest |= {seed: value for seed, value in pairs if seed in seeds}
-    return np.array([latest[seed] for seed in sorted(latest)])
+    return np.array([latest[seed] for seed in sorted(latest)]) if latest else None
 
 
-def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.ndarray, ...]:
+def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
     """Return a variant's seeds (seeds,), the steps (steps,) that all seeds have, values (seeds, steps) and `each`."""
     seeds, row = np.unique(table["seed"].to_numpy(), return_inverse=True)
     steps, column = np.unique(table["step"].to_numpy(), return_inverse=True)
@@ -190,26 +193,18 @@ def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.nd
             f"seed {twice} of {kind} guidance with {labels} labels occurs twice, in {' and '.join(where)}: "
             "leave one of them out, or name each folder and add --by-run"
         )
-    values = np.full(count.shape, np.nan)
-    values[row, column] = table[metric].to_numpy()
     whole = (count == 1).all(axis=0)
     if not whole.any():
         raise UserError(
             f"the seeds of {kind} guidance with {labels} labels have no step in common: wait until all have one, or "
             "leave out the run that was evaluated at other steps"
         )
-    return seeds, steps[whole], values[:, whole], _groups(table, metric, values, (row, column), whole)
-
-
-def _groups(
-    table: pa.Table, metric: str, values: np.ndarray, place: tuple[np.ndarray, np.ndarray], whole: np.ndarray
-) -> np.ndarray:
-    """Return means over groups of episodes (seeds, groups, steps); one group unless all rows have equally many."""
-    name = f"{metric}_each"
-    lists = table[name].to_pylist() if name in table.column_names else []
-    if len({len(entries or ()) for entries in lists} - {0}) != 1 or None in lists:
-        return values[:, None, whole]
-    each = np.zeros((*values.shape, len(lists[0])))
-    each[place] = np.array(lists, float)
+    values = np.full(count.shape, np.nan)
+    values[row, column] = table[metric].to_numpy()
+    lists = table[f"{metric}_each"].to_pylist() if f"{metric}_each" in table.column_names else []
+    if None in lists or len(sizes := {len(entries) for entries in lists}) != 1 or not max(sizes) > 1:
+        return seeds, steps[whole], values[:, whole], None  # of several versions, or of one that keeps no episodes
+    each = np.zeros((*values.shape, *sizes))
+    each[row, column] = np.array(lists, float)
     each += (values - each.mean(-1))[..., None]  # groups may differ by one episode in size
-    return np.moveaxis(each[:, whole], -1, 1)
+    return seeds, steps[whole], values[:, whole], np.moveaxis(each[:, whole], -1, 1)

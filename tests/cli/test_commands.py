@@ -72,7 +72,7 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     assert (recorded["compared"]["with"], found["over"]) == ("uniform", "episodes")
     less = recorded["rows"][0]["reward"][0] - found["less"]["reward"][0]
     assert found["difference"]["reward"][0] == pytest.approx(less)
-    assert main(["evaluate", "--compare", str(run_folder), "heuristic", *few]) == 0
+    assert main(["evaluate", str(run_folder), "--compare", "heuristic", *few]) == 0
     # a table for each kind and budget
     assert capsys.readouterr().out.count("difference over seeds and 10 environments") == 3
 

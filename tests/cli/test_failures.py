@@ -23,7 +23,6 @@ ARGUMENTS = [
     (["evaluate", "nowhere"], "no run or policy folder, no task"),
     (["evaluate", "shipped:golf"], "no shipped agent 'shipped:golf': give one of shipped:arm, "),
     (["evaluate", "billiards", "--policy", "agent"], "needs a trained run"),
-    (["evaluate", "billiards", "--compare"], "--compare names nothing: give a run folder"),
     (["evaluate", "billiards", "--compare", "nowhere"], "--compare is 'nowhere': give a run folder, a policy folder"),
     (["evaluate", "billiards", "--compare", "docs/data/navigation_agent"], "not of billiards: give one of billiards"),
     (["evaluate", "billiards", "--steps", "150"], "multiple of envs"),

@@ -9,8 +9,7 @@ from _pieces import scaled, sweep_command
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.guides import registry
-from cuelearner_jax.report.document import contents_of
-from cuelearner_jax.report.efficiency import Question
+from cuelearner_jax.report.document import ReportRequest, contents_of
 from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.studies import train
 
@@ -43,8 +42,8 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, monkeypatch,
 def test_labels_for_an_equal_mean_are_what_the_recorded_runs_give():
     """Of the runs that are kept: navigation seen from the action."""
     data = ROOT / "docs/data/bootstrapping/clutter"
-    question = Question(level=0.9)
-    found = contents_of([data / "frame"], "success", by_run=True, question=question).efficiency.tables["equal_area"]
+    request = ReportRequest(metric="success", by_run=True, level=0.9)
+    found = contents_of([data / "frame"], request).efficiency.tables["equal_area"]
     mine = {(row["reference_labels"], row["guidance"]): row for row in found if row["reference"] == "relative"}
     with (data / "report/equal_area.csv").open(newline="") as file:
         recorded = [row for row in csv.DictReader(file) if row["run"] == "frame"]

@@ -10,7 +10,6 @@ import pytest
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report.efficiency import Question, cell, efficiency_of
-from cuelearner_jax.report.statistics import curve, interval, mean_over_curve
 from cuelearner_jax.report.variants import Variant
 from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.table import TableWriter
@@ -25,10 +24,8 @@ def ramp(slope, most=1.0):
 
 def variant(guidance, labels, curves, *, run="", guide: Sequence[float] | None = None):
     values = np.atleast_2d(np.asarray(curves, float))
-    mean = interval(mean_over_curve(STEPS, values))
     guides = None if guide is None else np.asarray(guide, float)
-    seeds = np.arange(len(values))
-    return Variant(guidance, labels, seeds, values, curve(STEPS, values), mean, np.array([], int), run, guides)
+    return Variant(guidance, labels, np.arange(len(values)), STEPS, values, run=run, guide=guides)
 
 
 def same(guidance, labels, slope, **more):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.report.document import report
+from cuelearner_jax.report.document import ReportRequest, report
 from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.table import TableWriter, finish
 
@@ -49,7 +49,7 @@ def runs(tmp_path):
 
 def test_a_known_difference_is_found(runs, tmp_path):
     out = tmp_path / "report"
-    text = report(runs, out, command="cuelearner report runs").read_text()
+    text = report([runs], out, command="cuelearner report runs").read_text()
     table = summary(out)
     assert list(table) == [("none", 0), ("relative", 100), ("relative", 500)]
     best = table["relative", 500]
@@ -72,12 +72,12 @@ def test_a_known_difference_is_found(runs, tmp_path):
 
 def test_nothing_is_overwritten_unasked_and_stale_figures_go(runs, tmp_path):
     out = tmp_path / "report"
-    report(runs, out)
+    report([runs], out)
     with (out / "curves.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 3 * len(STEPS)
     (out / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="exists already"):
-        report(runs, out)
+        report([runs], out)
     report([runs / "unguided", runs / "relative-500"], out, overwrite=True)
     assert not (out / "label_efficiency.png").exists()
     assert "label_efficiency" not in (out / "report.md").read_text()
@@ -92,7 +92,7 @@ def test_of_collisions_the_fewest_are_best(tmp_path):
                 writer.append(step=step, split="validation", seed=[0, 1], collision=[value, value])
     found = {}
     for lower in (True, False):
-        report(tmp_path / "runs", tmp_path / str(lower), "collision", lower_is_better=lower)
+        report([tmp_path / "runs"], tmp_path / str(lower), ReportRequest(metric="collision", lower_is_better=lower))
         row = summary(tmp_path / str(lower))["heuristic", 0]
         found[lower] = (float(row["best"]), int(row["best_step"]), row["reaches_unguided_final"])
     assert found == {True: (0.3, 10, "8"), False: (0.8, 0, "never")}
@@ -108,7 +108,7 @@ def test_says_what_is_missing(runs, tmp_path):
     (runs / "sweep" / "demonstration" / "config.json").unlink()
     grid = {"guidance": ["none", "demonstration"]}
     planned(runs / "sweep", total_steps=100, grid=grid)
-    text = report(runs, tmp_path / "report").read_text()
+    text = report([runs], tmp_path / "report").read_text()
     missing = text.split("## Missing")[1].split("## Where")[0]
     assert "scalar-a: at step 50 of 100 (50%)" in missing
     assert "scalar, 100 labels: some seeds have reached step 100; the curve ends at 50" in missing
@@ -131,7 +131,7 @@ def test_seeds_budgets_and_pieces_of_the_plan_without_results_are_named(runs, tm
     for name, index in (("unguided", 3), ("relative-100", 5)):
         shard = {"index": index, "count": 1000, "seeds": list(range(1000))}
         planned(runs / name, total_steps=100, shard=shard)
-    missing = report(runs, tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
+    missing = report([runs], tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
     for kind in grid["guidance"]:
         assert f"no results of {kind} guidance with the seeds 8, 9" in missing
     assert "no results of relative guidance with the label budgets 700" in missing
@@ -144,7 +144,7 @@ def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
     with TableWriter(tmp_path / "a", results.SCHEMA, constants) as writer:
         for step, second in ((0, 0.1), (10, float("nan")), (20, 0.3)):
             writer.append(step=step, split="validation", seed=[0, 1], reward=[0.1, second])
-    text = report(tmp_path / "a", tmp_path / "report").read_text()
+    text = report([tmp_path / "a"], tmp_path / "report").read_text()
     assert "1 validation rows have no finite reward" in text
     assert "the run keeps no results of episodes" in text
     assert float(summary(tmp_path / "report")["none", 0]["final"]) == pytest.approx(0.2)
@@ -160,10 +160,10 @@ def lose(folder, guidance, labels=0, seeds=(0, 1, 2), by=20):
 
 
 def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path):
-    report(runs, tmp_path / "before")
+    report([runs], tmp_path / "before")
     lose(runs / "relative-500", "relative", 500, seeds=[8, 9, 10])
     lose(runs / "scalar", "scalar", 100, seeds=[0, 1])
-    text = report(runs, tmp_path / "after").read_text()
+    text = report([runs], tmp_path / "after").read_text()
     before, after = summary(tmp_path / "before"), summary(tmp_path / "after")
     assert {name: row for name, row in after["relative", 500].items() if name != "failed"} == {
         name: row for name, row in before["relative", 500].items() if name != "failed"
@@ -190,13 +190,13 @@ def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path)
 def test_errors_are_clear_and_leave_no_folder(runs, tmp_path):
     out = tmp_path / "report"
     with pytest.raises(UserError, match="there are reward"):
-        report(runs, out, "success")
+        report([runs], out, ReportRequest(metric="success"))
     with pytest.raises(UserError, match="there are validation rows"):
-        report(runs, out, split="training")
+        report([runs], out, ReportRequest(split="training"))
     lose(runs / "lost", "none", by=0)
     with pytest.raises(UserError, match=r"3 of 3 lanes failed, no longer finite \(none: seeds 0 \(by step 0\)"):
-        report(runs / "lost", out)
+        report([runs / "lost"], out)
     write(runs / "again", "relative", 0.3, 100, seeds=[5])
     with pytest.raises(UserError, match=r"seed 5 of relative guidance with 100 labels occurs twice, in .*again and"):
-        report(runs, out)
+        report([runs], out)
     assert not out.exists()

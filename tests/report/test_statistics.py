@@ -45,13 +45,6 @@ def test_equal_seeds_have_no_width_and_a_single_seed_no_interval():
     assert np.isnan(single.upper).all()
 
 
-def test_missing_values_are_refused():
-    with pytest.raises(ValueError, match="NaN"):
-        statistics.interval(np.array([[1.0], [np.nan]]))
-    with pytest.raises(ValueError, match="at least one seed"):
-        statistics.interval(np.empty((0, 3)))
-
-
 def test_stretches_are_unbroken_and_the_probability_of_improvement_counts_pairs():
     steps = np.array([0, 10, 20, 30, 40])
     assert statistics.stretches(steps, np.array([False, True, True, False, True])) == [(10, 20), (40, 40)]
