@@ -8,11 +8,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import timedelta
 from typing import IO, Any, cast
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TaskID, TextColumn
+from rich.text import Text
 
 from cuelearner_jax.signals import Interrupted, interruptible
 
@@ -50,41 +50,72 @@ PLAIN: dict[str, Any] = {"markup": False, "emoji": False, "highlight": False, "s
 console = Console(file=cast(IO[str], _StandardError()), **PLAIN)
 
 
-FIRST, EVERY = 1.0, 5.0  # seconds until the first line of progress, and between two
-PACE = 24 * 3600.0  # seconds of work from which the time left is estimated; the first stretch, which compiles, is not
-
-
 @contextmanager
 def progress_bars(visible: bool = True) -> Iterator[Progress]:
     """Show progress on standard error: bars on a terminal, lines elsewhere, nothing unless `visible`."""
     if visible and not console.is_terminal:
-        yield ProgressLines(console=console, disable=True, speed_estimate_period=PACE)
+        yield ProgressLines()
         return
     name, note = (TextColumn(text, markup=False) for text in ("{task.description:<12}", "{task.fields[note]}"))
-    columns = name, BarColumn(), MofNCompleteColumn(), note, TimeRemainingColumn()
-    with Progress(*columns, console=console, disable=not visible, speed_estimate_period=PACE) as bars:
+    columns = name, BarColumn(), MofNCompleteColumn(), note, _TimeLeft()
+    with TimedProgress(*columns, console=console, disable=not visible) as bars:
         yield bars
 
 
-class ProgressLines(Progress):
+class TimedProgress(Progress):
+    """Progress with the time left of each piece of work, from its first measured stretch on.
+
+    Fields of a piece: `begun`, where it went on, and `ahead`, how many times as much work comes after it.
+    """
+
+    def update(self, task_id: TaskID, **options: Any) -> None:
+        """Set the progress of a piece of work, and estimate the time left (the field `left`)."""
+        super().update(task_id, **options)
+        task = self._tasks.get(task_id)
+        if task is None or not task.total or task.completed <= (begun := task.fields.get("begun", 0)):
+            return
+        now = (task.elapsed or 0.0, task.completed)
+        first = task.fields.setdefault("first", now)  # stretch, which compiles: without it the rest is faster
+        word, since = ("about", first) if now[1] > first[1] else ("at most", (0.0, begun))
+        pace, ahead = (now[0] - since[0]) / (now[1] - since[1]), task.fields.get("ahead", 0) * task.total
+        left = [duration(pace * steps) for steps in (task.total - task.completed, task.total - task.completed + ahead)]
+        more = f", {left[1]} with the kinds to come" if ahead else ""
+        task.fields["left"] = f"{word} {left[0]} left{more}" if more or not task.finished else ""
+
+
+class _TimeLeft(ProgressColumn):
+    def render(self, task: Any) -> Text:
+        """Return the estimate of `TimedProgress`."""
+        return Text(task.fields.get("left", ""))
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in its largest unit of which it has two."""
+    unit, size = next(((unit, size) for unit, size in (("h", 3600), ("min", 60)) if seconds >= 2 * size), ("s", 1))
+    return f"{seconds / size:.0f} {unit}"
+
+
+FIRST, EVERY = 1.0, 5.0  # seconds until the first line of progress, and between two
+
+
+class ProgressLines(TimedProgress):
     """Progress as lines, for a file or a pipe: none before `FIRST`, then at most one in `EVERY` seconds."""
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(self) -> None:
+        super().__init__(console=console, disable=True)
         self._next = time.monotonic() + FIRST
 
     def update(self, task_id: TaskID, **options: Any) -> None:
         """Set the progress of a piece of work, and print a line about it if one is due."""
         super().update(task_id, **options)
-        if time.monotonic() < self._next:
+        if time.monotonic() < self._next or task_id not in self._tasks:
             return
         self._next = time.monotonic() + EVERY
         task = self._tasks[task_id]
         amount = f"{task.completed:,.0f} of {task.total:,.0f}" if task.total else ""
-        left = f"about {timedelta(seconds=task.time_remaining)} left" if task.time_remaining else ""
         parts = ", ".join(filter(None, [task.description, amount, task.fields.get("note")]))
-        times = ", ".join(filter(None, [f"after {timedelta(seconds=round(task.elapsed or 0))}", left]))
-        console.print(f"{parts}; {times}")
+        times = filter(None, [f"after {duration(task.elapsed or 0)}", task.fields.get("left")])
+        console.print(f"{parts}; {', '.join(times)}")
 
 
 def watched_by(bars: Progress) -> Callable[[str], Callable[[int, int], None]]:

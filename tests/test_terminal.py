@@ -8,7 +8,7 @@ from rich.table import Table
 
 from cuelearner_jax import terminal
 from cuelearner_jax.cli.options import out
-from cuelearner_jax.terminal import console, progress_bars
+from cuelearner_jax.terminal import TimedProgress, console, progress_bars
 
 TEXT = "runs/br[/x]/[red]r:smile:"
 
@@ -27,7 +27,7 @@ def test_what_looks_like_markup_is_printed_as_it_is(capsys, monkeypatch):
         bars.update(work := bars.add_task(TEXT, total=1, note="[/bold]"), completed=1)
         bars.update(work, completed=1)  # no step since
     told = capsys.readouterr().err
-    assert told.startswith(f"{TEXT}, 1 of 1, [/bold]; after 0:00:00")
+    assert told.startswith(f"{TEXT}, 1 of 1, [/bold]; after 0 s")
 
 
 def test_work_goes_on_where_nobody_reads_its_messages(monkeypatch):
@@ -59,17 +59,11 @@ def test_progress_that_is_piped_is_lines_few_and_without_carriage_returns(capsys
     assert capsys.readouterr().err == ""
 
 
-def test_the_time_left_leaves_out_the_first_stretch_which_compiles(capsys, monkeypatch):
-    for name in ("FIRST", "EVERY"):
-        monkeypatch.setattr(terminal, name, 0.0)
-    clock = [0]
-    with progress_bars() as bars:
-        bars.get_time = lambda: clock[0]
-        work = bars.add_task("relative", total=100, note="")
-        for clock[0], steps in ((3600, 10), (4600, 20)):
-            bars.update(work, completed=steps)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [
-        "relative, 10 of 100; after 1:00:00",
-        "relative, 20 of 100; after 1:16:40, about 2:13:20 left",
-    ]
+def test_the_time_left_is_a_bound_until_a_second_stretch_and_counts_the_kinds_to_come():
+    clock, left, bars = [0], [], TimedProgress(disable=True)
+    bars.get_time = lambda: clock[0]
+    work = bars.add_task("relative", total=100, ahead=2)
+    for clock[0], steps in ((3600, 10), (4600, 20)):
+        bars.update(work, completed=steps)
+        left.append(bars.tasks[0].fields["left"])
+    assert left == ["at most 9 h left, 29 h with the kinds to come", "about 2 h left, 8 h with the kinds to come"]

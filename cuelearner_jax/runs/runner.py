@@ -41,14 +41,17 @@ class Runner:
         self.key = run_key(config, self.name)
         self.failed = np.zeros(len(group.seeds), bool)  # lanes whose failure has been reported
 
-    def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
-        """Train to the end, with a file's labels or the teacher's. Raises Interrupted once everything is saved."""
+    def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None, ahead: float = 0) -> None:
+        """Train to the end, with a file's labels or the teacher's. Raises Interrupted once everything is saved.
+
+        `ahead`: how many times as much work comes after this group.
+        """
         if (self.folder / results.PARQUET).exists():
             self._check_rows(self.group.config.schedule.total_steps)
             console.print(f"{self.name}: finished before, left as it is")
             return
         asks = self.group.guidance.asks
-        total = self.group.config.schedule.total_steps
+        total, self._ahead = self.group.config.schedule.total_steps, ahead
         self._bar = self.bars.add_task(self.name, total=total, note="preparing")
         with Checkpoints(self.folder / "checkpoints", run=self.key) as store:
             self._restore(store)
@@ -144,7 +147,7 @@ class Runner:
 
     def _train(self, store: Checkpoints, writer: TableWriter, tracker: tracking.Tracker | None) -> None:
         now, schedule = self.training, self.group.config.schedule
-        self.bars.reset(self._bar, completed=now.step, note="")
+        self.bars.reset(self._bar, completed=now.step, begun=now.step, ahead=self._ahead, note="")
         for row in now.stretches():
             writer.append(**row)
             if tracker is not None:

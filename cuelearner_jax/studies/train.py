@@ -83,8 +83,9 @@ def run(order: Order) -> None:
             # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
             described = formats.read("config", order.out / CONFIG)
             bars.remove_task(waiting)
-            for group in groups:
-                Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels)
+            for number, group in enumerate(groups):
+                ahead = sum(len(other.seeds) for other in groups[number + 1 :]) / len(group.seeds)
+                Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels, ahead)
     if words := failures.summary(results.read([order.out / group.guidance.name for group in groups])):
         raise NotFinite(f"{words}: their rows in {order.out} are marked and left out of reports; all else is finished")
 
