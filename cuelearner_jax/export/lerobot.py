@@ -65,7 +65,7 @@ def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: 
         post["steps"].insert(_place(post, UNNORMALIZER) + 1, _step("CorrectStep", digest, more))
         post["steps"][_place(post, UNNORMALIZER) + 1]["state_file"] = STATE_FILE
         post["steps"].insert(0, _step("PlaceStep", digest))
-        with place.writing() as folder:
+        with place() as folder:
             shutil.copytree(checkpoint, folder, dirs_exist_ok=True)
             for name, contents in ((PRE, pre), (POST, post)):
                 (folder / name).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")

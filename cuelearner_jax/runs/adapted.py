@@ -139,7 +139,7 @@ def write(
         "conventions": CONVENTIONS,
         **provenance(),
     }
-    with place.writing() as folder:
+    with place() as folder:
         with Checkpoints(folder / policy_folders.ARRAYS) as store:
             store.save(0, {"policy": arrays})
         formats.write("policy", folder / policy_folders.POLICY, {**contents, "arrays": digest(arrays)})
