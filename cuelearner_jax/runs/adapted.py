@@ -157,4 +157,4 @@ def _write_labels(folder: Path, result: AdaptationResult, task: Task, world: Any
         own = np.flatnonzero(largest & (lanes.bound_deg == bound))
         sets: Label = jax.tree.map(lambda leaf, own=own: leaf[own], result.labels)
         file = folder / (label_files.PARQUET if len(bounds) == 1 else f"labels-{bound:g}deg.parquet")
-        label_files.write(file, head, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
+        label_files.write(file, head, form.name, space, eps, lanes.seed[own], sets, meaning=form.meaning(space))

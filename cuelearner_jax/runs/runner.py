@@ -140,10 +140,9 @@ class Runner:
         assert form is not None
         task = {"name": self.order.task.name, **configuration.to_json(config.task)}
         seeds, labels = self.training.labels()
-        eps = config.scalars.eps_deg if form.by_eps else None
-        space = actions_of(self.group.env)
-        values = form.name, space, eps, seeds, labels, form.meaning(space)
-        label_files.write(self.folder / label_files.PARQUET, task, *values, run=self.key)
+        eps, space = config.scalars.eps_deg if form.by_eps else None, actions_of(self.group.env)
+        file, more = self.folder / label_files.PARQUET, {"meaning": form.meaning(space), "run": self.key}
+        label_files.write(file, task, form.name, space, eps, seeds, labels, **more)
 
     def _train(self, store: Checkpoints, writer: TableWriter, log: tracking.Log | None) -> None:
         now, schedule = self.training, self.group.config.schedule

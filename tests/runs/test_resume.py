@@ -290,7 +290,7 @@ def test_a_finished_kind_is_looked_at_before_it_is_called_finished(whole, tmp_pa
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
     refused(out, "is damaged: restore it")
-    tables.write(file, pq.read_table(whole / "relative" / results.PARQUET).slice(1), results.SCHEMA)
+    tables.write(file, pq.read_table(whole / "relative" / results.PARQUET).slice(1))
     refused(out, "has 27 of 28 results")
 
 
