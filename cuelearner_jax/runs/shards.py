@@ -37,8 +37,6 @@ class Shard(NamedTuple):
 
     def check_sweep(self, out: Path, contents: dict[str, Any]) -> None:
         """Check that the shard, with `contents` as its config.json, belongs to the sweep in the folder `out`."""
-        if out.exists() and not out.is_dir():
-            raise UserError(f"{out} is not a folder: give another --out")
         if (out / CONFIG).exists():
             raise UserError(f"{out} holds a run that is not cut into shards: give another --out")
         for folder in sorted(out.glob("shard-*-of-*")):

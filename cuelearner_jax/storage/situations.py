@@ -76,8 +76,8 @@ def read_once(path: Path) -> Situations:
 def read(path: Path) -> Situations:
     """Read a folder of situations, its table alone, or a LeRobot dataset folder."""
     if lerobot.is_dataset(path):
-        *parts, picture = lerobot.read(path)
-        situations = _situations_of(path, *parts)
+        observations, actions, names, entries, picture = lerobot.read(path)
+        situations = _situations_of(path, observations, actions, names, entries)
         return situations._replace(picture=picture) if picture else situations
     table = _table_in(path)
     columns = _columns(table)
