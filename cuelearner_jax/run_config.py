@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import plugins
@@ -73,8 +73,7 @@ class RunConfig(Generic[KindsT]):
 
     def options_of(self, kind: str) -> Any:
         """Return the options of a kind of guidance: None for its defaults, plain values for an unknown kind's."""
-        kinds: Any = self.kinds
-        own = kinds.get(kind)
+        own = cast(dict[str, Any], self.kinds).get(kind)
         return kind_from_json(kind, own) if isinstance(own, dict) else own
 
     @property

@@ -208,12 +208,10 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
 
     A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget.
     """
-    own_seeds = np.unique(file.seeds)
-    sets = []
+    own_seeds, sets = np.unique(file.seeds), []
     for seed, budget in zip(seeds, budgets, strict=True):
-        own = own_seeds[0] if len(own_seeds) == 1 else seed
-        rows = np.flatnonzero(file.seeds == own)
-        if own not in own_seeds:
+        rows = np.flatnonzero(file.seeds == (own_seeds[0] if len(own_seeds) == 1 else seed))
+        if not len(rows):
             raise UserError(
                 f"the label file has labels for the seeds {format_numbers(own_seeds.tolist())}, none for seed {seed}: "
                 "give --seeds (train: --seed) for these, or the labels of another run"

@@ -238,13 +238,7 @@ def _text(rows: Iterable[Row]) -> bytes:
 
 def _lines(path: Path) -> list[Row]:
     """Return the whole lines of a JSONL file; without the last if a crash tore it."""
-    *lines, _torn = path.read_bytes().split(b"\n")
-    return [json.loads(line) for line in lines]
-
-
-def _rewrite(path: Path, rows: Iterable[Row]) -> None:
-    with replacing(path, "wb") as file:
-        file.write(_text(rows))
+    return [json.loads(line) for line in path.read_bytes().split(b"\n")[:-1]]
 
 
 def _reopen(path: Path, schema: Schema) -> list[Row]:
@@ -261,11 +255,14 @@ def _reopen(path: Path, schema: Schema) -> list[Row]:
     return _lines(path)
 
 
+def _rewrite(path: Path, rows: Iterable[Row]) -> None:
+    with replacing(path, "wb") as file:
+        file.write(_text(rows))
+
+
 def _growing(path: Path, schema: Schema) -> pa.Table:
     """Return the table of a JSONL file, constants included."""
-    about: Row | None = None
-    constants: Row = {}
-    rows = []
+    about, constants, rows = None, {}, []
     for line in _lines(path):
         about, constants = line.get("about", about), line.get("constants", constants)
         if not line.keys() & HEADS:
