@@ -287,9 +287,12 @@ class LaneChoice:
             kind and (self.labels is not None or len(grid.labels) < 2) and (self.seed or len(grid.seeds) == 1)
         ):
             return choice
-        if name == "guide" and (guides := results.read_guides([source.folder])):
-            return best_lane(guides, choice, "guide_reward")
-        return best_lane(results.read(source.folder), choice)
+        try:
+            guides = results.read_guides([source.folder]) if name == "guide" else None
+            table = results.read(source.folder) if guides is None else guides
+        except UserError as error:
+            raise UserError(f"{error}; or choose the lane by {OPTIONS}") from error
+        return best_lane(table, choice, "reward" if guides is None else "guide_reward")
 
     def lanes_in(self, source: PolicySource, world: Any, env: Any = None) -> tuple[list[Any], list[dict[str, Any]]]:
         """Return single policies, one a seed, and what chooses each lane: its "guidance", "labels" and "seed".
