@@ -44,7 +44,7 @@ class TrainingOptions(Outside, RunParts, Order):
     grid: Settled = None
     split: Settled = "validation"
     shard: Settled = None
-    config: Annotated[RunConfig[Any, Any, Any, Kinds], unprefixed] = field(default_factory=lambda: RunConfig(Unnamed()))
+    config: Annotated[RunConfig[Kinds], unprefixed] = field(default_factory=lambda: RunConfig(Unnamed()))
     out: Path = Path("runs/NAME")
     """Folder for results and checkpoints."""
     resume: Flag[bool] = False

@@ -101,7 +101,7 @@ def write(
         }
         contract = json.loads(json.dumps(contract))
         sealed = json.dumps({**contract, runner.DIGEST: runner.digest(contract)}, indent=1) + "\n"
-        with place.writing() as folder:
+        with place() as folder:
             for name, contents in {**files, runner.CONTRACT: sealed.encode()}.items():
                 with replacing(folder / name, "wb") as stream:
                     stream.write(contents)

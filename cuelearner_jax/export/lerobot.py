@@ -62,7 +62,7 @@ def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: 
         pre["steps"].insert(_place(pre, NORMALIZER), _step("StateStep", digest, **shift))
         post["steps"].insert(last, _step("CorrectStep", digest, **more) | {"state_file": STATE_FILE})
         post["steps"].insert(0, _step("PlaceStep", digest))
-        with place.writing() as folder:
+        with place() as folder:
             shutil.copytree(checkpoint, folder, dirs_exist_ok=True)
             for name, contents in ((PRE, pre), (POST, post)):
                 (folder / name).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")

@@ -23,7 +23,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling.learner import Fitted, Row, step_back
 from cuelearner_jax.labelling.plan import SessionPlan, begin, replay
 from cuelearner_jax.labelling.questions import Item, Questions
-from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage import label_files, table
 from cuelearner_jax.storage.label_files import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import shape_of
@@ -49,8 +49,9 @@ class Record:
         """Open or continue the folder's label file. Raises UserError if it holds labels of another session."""
         shape = shape_of(plan.task, plan.config.task)
         space = actions_of(shape)
-        about = plan.world, plan.form.name, space, plan.eps, plan.form.meaning(space), plan.session(shape)
-        self._plan, self._writer = plan, label_files.LabelWriter(folder, *about, written_by=provenance())
+        about, more = (plan.world, plan.form.name, space, plan.eps), {"session": plan.session(shape)}
+        more |= {"meaning": plan.form.meaning(space), "written_by": provenance()}
+        self._plan, self._writer = plan, label_files.LabelWriter(folder, *about, **more)
         self.path, self.trouble = self._writer.path, ""
         self.rows: dict[int, Response] = {}
         for row in label_files.history(self.path):
@@ -97,7 +98,7 @@ class Record:
         if not self.count(ANSWERED):
             raise UserError("there is no answer to save yet: answer a question, or stop with Ctrl-C")
         try:
-            return label_files.finish(self.path.parent)
+            return table.finish(self.path.parent, label_files.SCHEMA)
         except OSError as error:
             raise UserError(f"not finished ({error.strerror or error}): make room, then finish again") from error
 

@@ -139,7 +139,7 @@ def write(
         "conventions": CONVENTIONS,
         **provenance(),
     }
-    with place.writing() as folder:
+    with place() as folder:
         with Checkpoints(folder / policy_folders.ARRAYS) as store:
             store.save(0, {"policy": arrays})
         formats.write("policy", folder / policy_folders.POLICY, {**contents, "arrays": digest(arrays)})
@@ -157,4 +157,4 @@ def _write_labels(folder: Path, result: AdaptationResult, task: Task, world: Any
         own = np.flatnonzero(largest & (lanes.bound_deg == bound))
         sets: Label = jax.tree.map(lambda leaf, own=own: leaf[own], result.labels)
         file = folder / (label_files.PARQUET if len(bounds) == 1 else f"labels-{bound:g}deg.parquet")
-        label_files.write(file, head, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
+        label_files.write(file, head, form.name, space, eps, lanes.seed[own], sets, meaning=form.meaning(space))

@@ -32,7 +32,8 @@ def summary(table: pa.Table) -> str:
     """Return a sentence on the failed lanes of a results table; empty if no lane failed."""
     steps = results.failures(table)
     which = "; ".join(f"{variant_name(*variant)}: {seeds}" for variant, seeds in describe_failed(table).items())
-    return f"{len(steps)} of {results.lanes(table)} lanes failed, no longer finite ({which})" if steps else ""
+    lanes = table.group_by(list(results.LANE)).aggregate([]).num_rows
+    return f"{len(steps)} of {lanes} lanes failed, no longer finite ({which})" if steps else ""
 
 
 def without_failed(blocks: Sequence[Any]) -> list[Any]:

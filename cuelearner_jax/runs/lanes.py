@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +25,6 @@ from cuelearner_jax.runs.program import Program, make_program
 from cuelearner_jax.types import Label, Teacher
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-T = TypeVar("T")
 
 
 class LaneGroup:
@@ -81,7 +79,7 @@ class LaneGroup:
             blocks = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], whole) for rows in self.cut]
         return [place(self.mesh, block, BY_LANE) for block in blocks]
 
-    def each(self, work: Callable[..., T], *blocks: list[Any]) -> list[T]:
+    def each(self, work: Callable[..., Any], *blocks: list[Any]) -> list[Any]:
         """Apply `work` to every block; a CPU works on as many blocks at once as it has cores."""
         if jax.default_backend() != "cpu" or len(blocks[0]) == 1:
             return [work(*entries) for entries in zip(*blocks, strict=True)]
@@ -110,8 +108,8 @@ class LaneGroup:
         """Train all lanes for some iterations; return (clock, blocks, each block's means (lanes,)) when done."""
         settings = self.config.settings
         results = self.each(lambda block: self.program.train(self.env, settings, clock, block, iterations), blocks)
-        after = jax.block_until_ready(results[0][0])
-        return after, [block for _, block, _ in results], [metrics for _, _, metrics in results]
+        clocks, blocks, metrics = map(list, zip(*results, strict=True))
+        return jax.block_until_ready(clocks[0]), blocks, metrics
 
     def label_round(self, teacher: Teacher, clock: Clock, blocks: list[TrainState]) -> tuple[Clock, list[TrainState]]:
         """Ask a simulated teacher one round of questions and fit the guides to all answers."""

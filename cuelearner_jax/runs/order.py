@@ -56,9 +56,8 @@ class Plan(NamedTuple):
 
 
 def resolve_request(request: RequestT) -> RequestT:
-    """Check a request; return it with its kinds of guidance by name. Raises UserError for an invalid request."""
+    """Check a request; return it with its kinds of guidance by name, once code from outside is loaded."""
     run_config.check(request.config)
-    # loads the code of kinds from outside
     names = tuple(guidances.resolve(kind).name for kind in request.grid.guidance)
     request = replace(request, grid=with_control(replace(request.grid, guidance=names)))
     check_grid(request.grid)
@@ -101,21 +100,20 @@ def read_labels(
     path: Path, task: Task, world: Any, sizes: GuideSizes, scalars: Scalars, grid: Grid
 ) -> label_files.LabelFile:
     """Read a label file for a task's world (a configuration) and a grid. Raises UserError if it does not fit."""
-    file = label_files.read(path)
-    env = shape_of(task, world)
+    file, env = label_files.read(path), shape_of(task, world)
     _check_world(path, file.task, task, world)
     asking = [kind for kind in map(guidances.find, grid.guidance) if kind.form is not None]
     if not asking:
         fitting = [kind.name for kind in guidances.guides().values() if kind.form and kind.form.name == file.answers]
         raise UserError(f"--labels-from needs a guidance that uses labels: add --guidance {' or '.join(fitting)}")
     for kind in asking:
-        assert kind.form is not None
-        if kind.form.name != file.answers:
+        form: Any = kind.form
+        if form.name != file.answers:
             raise UserError(
-                f"{path} holds {file.answers} answers, but guidance {kind.name} needs {kind.form.name} answers: "
+                f"{path} holds {file.answers} answers, but guidance {kind.name} needs {form.name} answers: "
                 "give fitting labels"
             )
-        external_labels.check_file(file, spaces_of(env), kind.form, str(path))
+        external_labels.check_file(file, spaces_of(env), form, str(path))
     if file.eps is not None and not math.isclose(file.eps, scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
             f"{path} holds labels of {file.eps:g} {file.space.unit}, the run expects {scalars.eps_deg:g}: "

@@ -19,7 +19,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import variant_name, without_failed
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.run_folders import Piece, RunLanes, lanes_of, open_run
+from cuelearner_jax.runs.run_folders import Block, Piece, lanes_of, open_run
 from cuelearner_jax.storage import label_files, policy_folders, results
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
@@ -36,7 +36,6 @@ class PolicyEntry(NamedTuple):
     from_run: bool = False  # whether the policy needs a run
     adapted: bool = False  # whether the policy needs a policy folder
     taught: bool = False  # whether the policy asks the teacher
-    needs: tuple[str, ...] = ()  # optional members of an environment that the policy needs
 
     @property
     def from_folder(self) -> bool:
@@ -52,29 +51,10 @@ POLICIES: dict[str, PolicyEntry] = {
     "adapted": PolicyEntry("the adapted policy", adapted=True),
     "base": PolicyEntry("the policy that was adapted", adapted=True),
     "teacher": PolicyEntry("the teacher", taught=True),
-    "heuristic": PolicyEntry("the task's obvious action", needs=("heuristic",)),
+    "heuristic": PolicyEntry("the task's obvious action"),
     "uniform": PolicyEntry("chance"),
     "own": PolicyEntry("code of your own, package.module:NAME, named first"),
 }
-
-
-class Block(NamedTuple):
-    """Lanes of one kind of guidance at one step, and the policies that they act with."""
-
-    guidance: str
-    seeds: np.ndarray  # (lanes,)
-    budgets: np.ndarray  # (lanes,)
-    bounds: np.ndarray  # (lanes,), in the space's unit; 0: no bound
-    step: int
-    policy: Any  # a block, or `Common`
-    failed: np.ndarray  # (lanes,) bool
-
-    def lanes(self, mask: np.ndarray) -> Block:
-        """Return the lanes of a mask (lanes,)."""
-        if mask.all():
-            return self
-        columns = {name: getattr(self, name)[mask] for name in ("seeds", "budgets", "bounds", "failed")}
-        return self._replace(**columns, policy=self.policy.lane(np.flatnonzero(mask)))
 
 
 @dataclass(frozen=True)
@@ -93,10 +73,7 @@ class PolicySource:
     def of_folder(
         cls, folder: Path, find: Callable[[str], Task], code: Any = None, changes: Any = None
     ) -> PolicySource:
-        """Return the policies of a run, whole or in shards (`open_run`), or of a policy folder (`open_folder`).
-
-        `code`, `changes`: the code that a policy folder names.
-        """
+        """Return the policies of a run (see `open_run`) or a policy folder (see `open_folder` for all arguments)."""
         if not policy_folders.is_one(folder):
             task, config, grid, pieces = open_run(folder, find)
             if code is not None:
@@ -119,40 +96,38 @@ class PolicySource:
         """Return the source with another robot of the task (None: the default). Raises UserError if unknown."""
         return replace(self, task=self.task.on(robot))
 
-    def check(self, policy: str, world: Any, guidance: str | tuple[str, ...] | None = None) -> None:
+    def check(self, policy: str, world: Any, guidance: tuple[str, ...] = ()) -> None:
         """Raise UserError unless the policy is available and acts in the changed world.
 
         A trained policy needs the observations and aims of its training world; other policies act in any world.
-        `guidance`: chosen kinds of a run's lanes.
+        `guidance`: chosen kinds of a run's lanes (none named: all).
         """
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{suggestion(policy, POLICIES)}")
         entry, after = POLICIES[policy], shape_of(self.task, world)
         if entry.from_run and not self.grid:
-            others = [name for name, one in POLICIES.items() if not one.from_folder or (one.adapted and self.adapted)]
-            raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
+            raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or another policy")
         if entry.adapted and not self.adapted:
             raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` wrote")
         if policy == "own" and self.code is None:
             raise UserError("policy 'own' is code: name it first, as package.module:NAME --env TASK")
-        if absent := [need for need in entry.needs if not offers(after, need)]:
-            raise UserError(f"{self.task.name} has no {absent[0]}: choose another policy")
+        if policy == "heuristic" and not offers(after, "heuristic"):
+            raise UserError(f"{self.task.name} has no heuristic: choose another policy")
         if not entry.from_folder:
             return
         what, own = "run" if self.grid else "policy", shape_of(self.task, self.config.task)
         check_layout(f"the {what}", own.observation, actions_of(own), after)
         if policy in ("agent", "corrected"):
             return
-        choice = (guidance,) if isinstance(guidance, str) else guidance
-        kinds = self.adapted.kinds if self.adapted else choice or (self.grid.guidance if self.grid else ())
+        kinds = self.adapted.kinds if self.adapted else guidance or (self.grid.guidance if self.grid else ())
         weighs_aims = any("aims" in kind.needs for name in kinds if (kind := guidances.guides().get(name)))
         if weighs_aims and (width := spaces_of(own).aims) != (now := spaces_of(after).aims):
             raise UserError(
                 f"the {what} uses aims of {width} features, this world's have {now}: keep the options that set the aims"
             )
 
-    def load(self, kinds: tuple[str, ...] = ()) -> list[RunLanes]:
-        """Return the lanes of a run's kinds of guidance (none named: all), grouped by step."""
+    def load(self, kinds: tuple[str, ...] = ()) -> list[Block]:
+        """Return the lanes of a run's kinds of guidance (none named: all), grouped by step; see `lanes_of`."""
         assert self.grid is not None  # ensured by `check`
         groups = []
         for name in kinds or self.grid.guidance:
@@ -190,29 +165,30 @@ class PolicySource:
 
         `view`, `teacher`: those of the world that it acts in. Raises UserError if it is not available.
         """
-        if (own := self.adapted) is not None:
+        if own := self.adapted:
             if kinds and own.guidance not in kinds:
                 raise UserError(f"{self.folder} was adapted by {own.guidance} guidance: leave out --guidance")
             policy = own.policy(view)
-            policy = policy if name == "adapted" else policy.base
             columns = (own.lanes.seed, own.lanes.budget, own.bounds_deg)
+            policy = policy if name == "adapted" else policy.base
             blocks = [Block(own.guidance, *columns, 0, policy, np.zeros(own.lanes.number, bool))]
         else:
-            blocks = [self._block(name, lanes, view, teacher) for lanes in self.load(kinds)]
+            blocks = [one._replace(policy=self._policy(name, one, view, teacher)) for one in self.load(kinds)]
         blocks = _select(blocks, seeds, labels)
         return blocks if failed_too else without_failed(blocks)
 
-    def _block(self, name: str, lanes: RunLanes, view: Any, teacher: Teacher | None) -> Block:
-        """Return a trained policy of a run's lanes, as a block."""
-        config, no_bounds, mask = self.config, np.zeros(len(lanes.seeds)), np.asarray(lanes.policies["failed"])
-        policy = agent = Agent(lanes.policies["params"], config.agent_in(view), view)
+    def _policy(self, name: str, block: Block, view: Any, teacher: Teacher | None) -> Any:
+        """Return a trained policy of a run's lanes (`lanes_of`)."""
+        config = self.config
+        agent = Agent(block.policy["params"], config.agent_in(view), view)
+        if name == "agent":
+            return agent
         if name == "corrected":
             assert teacher is not None
-            policy = Corrected(agent, teacher, config.scalars, actions_of(view))
-        elif name != "agent":
-            base = asked_from(view, config.sizes) if name == "guide" else agent
-            policy = Guided(base, lanes.policies["guidance"], view, config.scalars, lanes.guidance)
-        return Block(lanes.guidance.name, lanes.seeds, lanes.budgets, no_bounds, lanes.step, policy, mask)
+            return Corrected(agent, teacher, config.scalars, actions_of(view))
+        guide = config.guide_in(shape_of(self.task, config.task), block.guidance)
+        base = asked_from(view, config.sizes) if name == "guide" else agent
+        return Guided(base, block.policy["guidance"], view, config.scalars, guide)
 
 
 def _with_labels(task: Task, folder: Path) -> Task:
@@ -248,8 +224,7 @@ def best_lane(table: pa.Table, choice: Choice, metric: str = "reward") -> Choice
     fits = [lane for lane in fits if not seeds or lane[2] in seeds]
     if len({lane[:2] if seeds else lane for lane in fits}) < 2:
         return (*fits[0][:2], seeds or fits[0][2:]) if fits else choice
-    finite = [lane for lane in fits if last[lane] is not None]
-    if not finite:
+    if not (finite := [lane for lane in fits if last[lane] is not None]):
         raise UserError(f"no {metric} is recorded that tells which of {len(fits)} lanes is the best: give {OPTIONS}")
     best = max(finite, key=last.__getitem__)
     console.print(
@@ -260,13 +235,14 @@ def best_lane(table: pa.Table, choice: Choice, metric: str = "reward") -> Choice
 
 
 def _select(
-    blocks: list[Block], seeds: tuple[int, ...], labels: tuple[int, ...], within: tuple[float, str] = (0.0, "")
+    blocks: list[Block], seeds: tuple[int, ...], labels: tuple[int, ...], bound: float = 0.0, unit: str = ""
 ) -> list[Block]:
     """Return the lanes with some seeds, budgets (empty: all) and a bound in a unit (0: any), or raise UserError."""
-    (bound, unit), rest = within, []
+    rest = []
     for block in blocks:
         mask = np.isin(block.seeds, seeds or block.seeds) & np.isin(block.budgets, labels or block.budgets)
-        if (mask := mask & (np.isclose(block.bounds, bound, rtol=1e-4) if bound else True)).any():
+        mask &= np.isclose(block.bounds, bound, rtol=1e-4) | (bound == 0)
+        if mask.any():
             rest.append(block.lanes(mask))
     there = [{*np.concatenate([getattr(block, part) for block in blocks]).tolist()} for part in Block._fields[1:4]]
     if rest and {*seeds} <= there[0] and {*labels} <= there[1]:
@@ -298,17 +274,18 @@ class LaneChoice:
     def name_in(self, source: PolicySource, world: Any) -> str:
         """Return the policy's name. Raises UserError if the source has no such policy, or none for that world."""
         name = self.policy or source.default_policy
-        source.check(name, world, guidance=self.guidance)
+        source.check(name, world, (self.guidance,) if self.guidance else ())
         return name
 
     def _with_best(self, source: PolicySource, name: str) -> Choice:
         """Return guidance, labels and seeds; what is open in a run is that of its best lane."""
         grid, kind = source.grid, guidances.kind_name(self.guidance) if self.guidance else None
-        if grid is None:
-            return kind, self.labels, self.seed
-        kind = grid.guidance[0] if kind is None and len(grid.guidance) == 1 else kind
+        if grid and kind is None and len(grid.guidance) == 1:
+            kind = grid.guidance[0]
         choice = kind, self.labels, self.seed
-        if kind and (self.labels is not None or len(grid.labels) < 2) and (self.seed or len(grid.seeds) == 1):
+        if grid is None or (
+            kind and (self.labels is not None or len(grid.labels) < 2) and (self.seed or len(grid.seeds) == 1)
+        ):
             return choice
         try:
             guides = results.read_guides([source.folder]) if name == "guide" else None
@@ -324,14 +301,13 @@ class LaneChoice:
         training episodes).
         """
         name = self.policy or source.default_policy
-        entry = POLICIES[name]
-        if not entry.from_folder:
-            check_no_lane(name, self.guidance, self.labels, self.seed, self.bound_deg)
-        if entry.taught and env is None:
-            env = source.task.environment(world)
-        teacher = source.task.make_teacher(world, env) if entry.taught else None
+        entry, teacher = POLICIES[name], None
+        if entry.taught:
+            env = source.task.environment(world) if env is None else env
+            teacher = source.task.make_teacher(world, env)
         view = source.task.view(world) if env is None else view_of(env)
         if not entry.from_folder:
+            check_no_lane(name, self.guidance, self.labels, self.seed, self.bound_deg)
             return [source.alone(name, view, teacher)], [{"seed": 0}]
         kind, labels, seeds = self._with_best(source, name)
         blocks = source.blocks(name, view, teacher, (kind,) if kind else (), failed_too=True)
@@ -339,7 +315,7 @@ class LaneChoice:
         bound = float(max(block.bounds.max() for block in blocks)) if self.bound_deg is None else self.bound_deg
         policies, lanes = [], []
         for seed in seeds or (int(blocks[0].seeds[0]),):
-            lane = _select(blocks, (seed,), (labels,), (bound, actions_of(view).unit))[0]
+            lane = _select(blocks, (seed,), (labels,), bound, actions_of(view).unit)[0]
             if lane.failed[0]:
                 console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
             policies.append(lane.policy.lane(0))

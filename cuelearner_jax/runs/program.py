@@ -48,31 +48,15 @@ def make_program(
     expected number of lanes on each device; only speed depends on it.
     """
     leaves, structure = jax.tree.flatten(jax.eval_shape(lambda env: env, env))
-    return _program_of(
-        config.sizes,
-        parts_of(config),
-        guidance,
-        largest_budget,
-        structure,
-        tuple(leaves),
-        mesh or lane_mesh(jax.local_devices()[:1]),
-        lanes,
-    )
+    mesh = mesh or lane_mesh(jax.local_devices()[:1])
+    loop = config.sizes, parts_of(config), guidance, largest_budget
+    return _program_of(loop, (structure, tuple(leaves)), mesh, lanes)
 
 
 @lru_cache(maxsize=MOST_PROGRAMS)
-def _program_of(
-    sizes: Sizes,
-    parts: Parts,
-    guidance: Guide,
-    largest_budget: int,
-    structure: Any,
-    leaves: tuple[jax.ShapeDtypeStruct, ...],
-    mesh: Mesh,
-    lanes: int,
-) -> Program:
-    """Return the program of lanes in environments of this structure and these shapes."""
-    lane = lane_of(sizes, parts, guidance, largest_budget, jax.tree.unflatten(structure, leaves))
+def _program_of(loop: tuple[Sizes, Parts, Guide, int], shapes: tuple[Any, Any], mesh: Mesh, lanes: int) -> Program:
+    """Return the program of lanes. `loop`: see `lane_of`. `shapes`: structure and leaves of an environment."""
+    lane = lane_of(*loop, jax.tree.unflatten(*shapes))
 
     def init(env, seeds, budgets, root):
         keys = jax.vmap(lambda seed: jax.random.fold_in(root, seed))(seeds)
@@ -101,10 +85,8 @@ def _program_of(
         return after, state, metrics
 
     def stretch(env, settings, clock, state, iterations):
-        whole = over_lanes(
-            mesh, partial(train, iterations=iterations), (SHARED, SHARED, SHARED, BY_LANE), (SHARED, BY_LANE, BY_LANE)
-        )
-        return whole(env, settings, clock, state)
+        own, axes = partial(train, iterations=iterations), (SHARED, SHARED, SHARED, BY_LANE)
+        return over_lanes(mesh, own, axes, (SHARED, BY_LANE, BY_LANE))(env, settings, clock, state)
 
     init = over_lanes(mesh, init, (SHARED, BY_LANE, BY_LANE, SHARED), BY_LANE)
     label_round = over_lanes(mesh, label_round, (*(SHARED,) * 4, BY_LANE), (SHARED, BY_LANE))

@@ -61,11 +61,11 @@ class Runner:
             with (
                 TableWriter(self.folder, results.SCHEMA, constants, about) as writer,
                 TableWriter(self.folder, results.GUIDES, constants, about) if asks else nullcontext() as guides,
-                tracking.open_tracker(order.track, self.folder, self.contents, self.training.step) as tracker,
+                tracking.open_tracker(order.track, self.folder, self.contents, self.training.step) as log,
             ):
                 if guides is not None:
                     self._label(store, guides, teacher, labels)
-                self._train(store, writer, tracker)
+                self._train(store, writer, log)
         if asks:
             tables.finish(self.folder, results.GUIDES)
         tables.finish(self.folder, results.SCHEMA)  # last, since a kind with finished results counts as finished
@@ -140,18 +140,17 @@ class Runner:
         assert form is not None
         task = {"name": self.order.task.name, **configuration.to_json(config.task)}
         seeds, labels = self.training.labels()
-        eps = config.scalars.eps_deg if form.by_eps else None
-        space = actions_of(self.group.env)
-        values = form.name, space, eps, seeds, labels, form.meaning(space)
-        label_files.write(self.folder / label_files.PARQUET, task, *values, run=self.key)
+        eps, space = config.scalars.eps_deg if form.by_eps else None, actions_of(self.group.env)
+        file, more = self.folder / label_files.PARQUET, {"meaning": form.meaning(space), "run": self.key}
+        label_files.write(file, task, form.name, space, eps, seeds, labels, **more)
 
-    def _train(self, store: Checkpoints, writer: TableWriter, tracker: tracking.Tracker | None) -> None:
+    def _train(self, store: Checkpoints, writer: TableWriter, log: tracking.Log | None) -> None:
         now, schedule = self.training, self.group.config.schedule
         self.bars.reset(self._bar, completed=now.step, begun=now.step, ahead=self._ahead, note="")
         for row in now.stretches():
             writer.append(**row)
-            if tracker is not None:
-                tracker.log(now.step, tracking.means(row))
+            if log is not None:
+                log(now.step, tracking.means(row))
             self._tell_failed(f"at step {now.step:,}")
             if now.step == 0:
                 continue

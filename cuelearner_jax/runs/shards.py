@@ -37,8 +37,6 @@ class Shard(NamedTuple):
 
     def check_sweep(self, out: Path, contents: dict[str, Any]) -> None:
         """Check that the shard, with `contents` as its config.json, belongs to the sweep in the folder `out`."""
-        if out.exists() and not out.is_dir():
-            raise UserError(f"{out} is not a folder: give another --out")
         if (out / CONFIG).exists():
             raise UserError(f"{out} holds a run that is not cut into shards: give another --out")
         for folder in sorted(out.glob("shard-*-of-*")):
@@ -70,17 +68,14 @@ def differing_options(before: dict[str, Any], now: dict[str, Any]) -> str:
 
 
 def missing(configurations: list[Path]) -> list[str]:
-    """Return one line per sweep some of whose shards have not begun, given the existing config.json files.
-
-    Unreadable files are ignored, since they say nothing of a shard.
-    """
+    """Return one line per sweep some of whose shards have not begun, given the config.json files that can be read."""
     begun: dict[tuple[Path, int], set[int]] = {}
-    lines = []
     for path in configurations:
         with contextlib.suppress(UserError):
             if shard := formats.read("config", path).get("shard"):
                 begun.setdefault((path.parent.parent, shard["count"]), set()).add(shard["index"])
-    for (sweep, count), there in sorted(begun.items()):
-        if absent := set(range(1, count + 1)) - there:
-            lines.append(f"{sweep.as_posix()}: shards not begun, of {count}: {format_numbers(absent)}")
-    return lines
+    return [
+        f"{sweep.as_posix()}: shards not begun, of {count}: {format_numbers(absent)}"
+        for (sweep, count), there in sorted(begun.items())
+        if (absent := set(range(1, count + 1)) - there)
+    ]

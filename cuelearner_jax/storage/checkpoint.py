@@ -108,8 +108,8 @@ class Checkpoints(AbstractContextManager):
             raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first checkpoint")
         device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         args: dict[str, Any] = {DIGESTS: ocp.args.JsonRestore()}
+        shape = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)  # noqa: E731
         for name, item in like.items():
-            shape = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)  # noqa: E731
             args[name] = ocp.args.StandardRestore(jax.tree.map(shape, jax.eval_shape(_flat, item)))
         try:
             contents = self._manager.restore(number, args=ocp.args.Composite(**args))

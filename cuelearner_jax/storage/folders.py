@@ -53,7 +53,7 @@ def check_folder(out: Path, contents: dict[str, Any], resume: bool, overwrite: b
 
 def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
     """Yield the names, as `part.field`, in which two descriptions of runs differ; `prefix`: the part, with a dot."""
-    for name in {**before, **now}:
+    for name in before | now:
         old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
             yield from differences(old, new, f"{prefix}{name}.")
@@ -80,8 +80,7 @@ def prepare_folder(out: Path, contents: dict[str, Any], clean: bool) -> None:
     """
     out.mkdir(parents=True, exist_ok=True)
     for entry in sorted(out.iterdir(), key=lambda entry: entry.name == CONFIG) if clean else ():
-        if entry.name == LOCK:
-            continue
-        shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+        if entry.name != LOCK:
+            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
     if not (out / CONFIG).exists():
         formats.write("config", out / CONFIG, contents)

@@ -93,41 +93,29 @@ class LabelWriter(tables.TableWriter):
     """Appends rows to `labels.jsonl` in a folder, as `TableWriter` does; an existing file is continued."""
 
     def __init__(
-        self,
-        folder: Path,
-        task: dict[str, Any],
-        answers: str,
-        space: Space,
-        eps: float | None,
-        meaning: str = "",
-        session: dict[str, Any] | None = None,
-        **more: Any,
+        self, folder: Path, task: dict[str, Any], answers: str, space: Space, eps: float | None, **more: Any
     ) -> None:
         """Open the file, creating it and the folder where needed; labels of another kind there are refused unchanged.
 
-        `task`, `answers`, `space`, `eps`, `session`: see `LabelFile`. `meaning`: of an answer's numbers, for the file.
-        `more`: further entries of a new file's head, such as the versions that wrote it.
+        For the other arguments see `LabelFile` and `_head`.
         """
-        about = _about(task, answers, space, eps, meaning, session)
+        head = _head(task, answers, space, eps, **more)
         if (there := found_in(folder)) and (before := _table_and_head(there)[1]):
-            old, new = ({name: head.get(name) for name in SHARED} for head in (before, about))
+            old, new = ({name: one.get(name) for name in SHARED} for one in (before, head))
             if (differing := next(differences(old, new), None)) is not None:
                 raise UserError(f"{there} holds labels of another {differing}: give the same, or another --out")
-        self._widths: dict[str, int] = {}
-        super().__init__(folder, SCHEMA, about={**about, **more})
+        super().__init__(folder, SCHEMA, about=head)
 
     def append(
         self, *, seed: int, obs: np.ndarray, action: np.ndarray, answer: np.ndarray | None, **person: Any
     ) -> None:
         """Append one row, with columns of the names at the top of this module, or raise as `TableWriter.append`.
 
-        Raises ValueError if a number is not finite, or a width differs from that of the labels before.
+        Raises ValueError if a number is not finite: with such a row the file could not be read.
         """
         values = {name: value for name, value in zip(ROW, (obs, action, answer), strict=True) if value is not None}
         columns = {name: np.asarray(value, np.float32) for name, value in values.items()}
         for name, value in columns.items():
-            if value.shape != (self._widths.setdefault(name, value.size),):
-                raise ValueError(f"{name} has the shape {value.shape}, expected ({self._widths[name]},)")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} is not finite: {value}")
         super().append(seed=int(seed), **columns, **person)
@@ -145,11 +133,6 @@ def history(path: Path) -> list[dict[str, Any]]:
     return _table_and_head(path)[0].to_pylist()
 
 
-def finish(folder: Path) -> Path:
-    """Convert the labels of a `LabelWriter` to Parquet; return that file. Raises UserError if there are none."""
-    return tables.finish(folder, SCHEMA)
-
-
 def write(
     path: Path,
     task: dict[str, Any],
@@ -158,32 +141,30 @@ def write(
     eps: float | None,
     seeds: np.ndarray,
     labels: Label,
-    meaning: str = "",
     **more: Any,
 ) -> None:
     """Write the valid labels (lanes, slots, ...) of lanes with these seeds as Parquet, replacing `path` atomically.
 
-    For the other arguments see `LabelFile` and `LabelWriter`.
+    For the other arguments see `LabelFile` and `_head`.
     """
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
     seed = np.broadcast_to(np.asarray(seeds)[:, None], valid.shape)[valid]
-    write_file(path, LabelFile(task, answers, space, eps, seed, rows), meaning, fresh=False, **more)
+    write_file(path, LabelFile(task, answers, space, eps, seed, rows), fresh=False, **more)
 
 
 def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = True, **more: Any) -> None:
     """Write labels as a Parquet file, with the details of a person's labels.
 
-    `meaning` and `more`: see `LabelWriter`. Raises UserError if the file exists although it should be `fresh`.
+    `meaning` and `more`: see `_head`. Raises UserError if the file exists although it should be `fresh`.
     """
-    columns = {"seed": pa.array(np.asarray(file.seeds, np.int64))}
-    for name in ROW:
-        columns[name] = pa.array(list(np.asarray(getattr(file.labels, name), np.float32)), SCHEMA.type(name))
+    columns: dict[str, Any] = {"seed": file.seeds.astype(np.int64)}
+    columns |= {name: list(np.asarray(getattr(file.labels, name), np.float32)) for name in ROW}
     if file.people is not None:
         person = {**file.people._asdict(), "said": [ANSWERED] * len(file.seeds)}
-        columns |= {name: pa.array(list(person[name]), SCHEMA.type(name)) for name in PEOPLE}
-    about = _about(file.task, file.answers, file.space, file.eps, meaning, file.session)
-    tables.write(path, pa.table(columns), SCHEMA, about={**about, **more}, fresh=fresh)
+        columns |= {name: list(person[name]) for name in PEOPLE}
+    head = _head(file.task, file.answers, file.space, file.eps, meaning, file.session, **more)
+    tables.write(path, SCHEMA.table(columns, head), fresh)
 
 
 def read(path: Path) -> LabelFile:
@@ -192,35 +173,28 @@ def read(path: Path) -> LabelFile:
     if file is None or not file.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
     table, head = _table_and_head(file)
-    counts = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
-    table = _standing(table)
-    if head is None or not table.num_rows:
-        raise UserError(f"{file} holds no labels: collect some first")
     try:
+        counts = dict(Counter(table["said"].to_pylist())) if "item" in table.column_names else None
+        table = _standing(table) if counts else table
+        if head is None or not table.num_rows:
+            raise UserError(f"{file} holds no labels: collect some first")
         columns = {name: _array(table[name], name) for name in table.column_names}
         labels = Label(**{name: columns[name] for name in ROW}, valid=np.ones(table.num_rows, bool))  # pyright: ignore[reportArgumentType]
         eps = None if head["eps"] is None else float(head["eps"])
         about = {"task": dict(head["task"]), "answers": head["answers"], "space": spaces.from_json(head["space"])}
+        people = People(*(columns[name] for name in People._fields)) if counts else None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damage_error("labels", file, error) from error
-    people = None
-    if "item" in columns and not (columns["item"] < 0).any():
-        people = People(*(columns[name] for name in People._fields))
     rest = {"people": people, "session": head.get("session"), "counts": counts}
     return LabelFile(**about, eps=eps, seeds=columns["seed"], labels=labels, **rest)
 
 
 def _standing(table: pa.Table) -> pa.Table:
-    """Return the rows that count: of a person's item the last, if it is an answer; in the order of items."""
-    if not {"item", "said"} <= set(table.column_names):
-        return table
-    last: dict[Any, int] = {}
-    for row, (seed, item) in enumerate(zip(*(table[name].to_pylist() for name in ("seed", "item")), strict=True)):
-        last[seed, row if item is None else item, item is None] = row
+    """Return the rows of people that count: of each item the last, if it is an answer; in the order of items."""
+    items = zip(table["seed"].to_pylist(), table["item"].to_pylist(), strict=True)
+    last = {item: row for row, item in enumerate(items)}
     responses = table["said"].to_pylist()
-    rows = [
-        row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if responses[row] in (None, ANSWERED)
-    ]
+    rows = [last[item] for item in sorted(last) if responses[last[item]] == ANSWERED]
     return table.take(pa.array(rows, pa.int64()))
 
 
@@ -234,12 +208,10 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
 
     A file with one set serves every seed; with several, each lane gets its own seed's set, up to its budget.
     """
-    own_seeds = np.unique(file.seeds)
-    sets = []
+    own_seeds, sets = np.unique(file.seeds), []
     for seed, budget in zip(seeds, budgets, strict=True):
-        own = own_seeds[0] if len(own_seeds) == 1 else seed
-        rows = np.flatnonzero(file.seeds == own)
-        if own not in own_seeds:
+        rows = np.flatnonzero(file.seeds == (own_seeds[0] if len(own_seeds) == 1 else seed))
+        if not len(rows):
             raise UserError(
                 f"the label file has labels for the seeds {format_numbers(own_seeds.tolist())}, none for seed {seed}: "
                 "give --seeds (train: --seed) for these, or the labels of another run"
@@ -254,10 +226,16 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
 
 
-def _about(
-    task: dict[str, Any], answers: str, space: Space, eps: float | None, meaning: str, session: dict[str, Any] | None
+def _head(
+    task: dict[str, Any],
+    answers: str,
+    space: Space,
+    eps: float | None,
+    meaning: str = "",
+    session: dict[str, Any] | None = None,
+    **more: Any,
 ) -> dict[str, Any]:
-    """Return the head of a label file."""
+    """Return the head of a label file. `meaning`: of an answer's numbers. `more`: entries such as versions."""
     return {
         "format": formats.FORMATS["labels"],
         "task": task,
@@ -266,6 +244,7 @@ def _about(
         "eps": None if eps is None else float(eps),
         "conventions": {**CONVENTIONS, **({"answer": meaning} if meaning else {})},
         **({} if session is None else {"session": session}),
+        **more,
     }
 
 
@@ -279,9 +258,6 @@ def _table_and_head(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
 
 
 def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
-    """Return a column as an array; -1 for an item without a number."""
     if name in SCHEMA.strings:
         return np.array([value or "" for value in column.to_pylist()])
-    if name in SCHEMA.integers:
-        return np.array([-1 if value is None else value for value in column.to_pylist()], np.int64)
-    return np.array(column.to_pylist(), np.float32)
+    return np.array(column.to_pylist(), np.int64 if name in SCHEMA.integers else np.float32)

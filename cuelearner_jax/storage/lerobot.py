@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -50,15 +49,15 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str
     features = _features(path)
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
     parts = [_parts(path, features, name, cameras) for name in (OBSERVATION, ACTION)]
-    marks = [INTERVENTION] if INTERVENTION in features else []
     images = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
+    marks = [INTERVENTION] if INTERVENTION in features else []
+    columns = [*parts[0], *parts[1], "episode_index", "timestamp", *images, *marks]
     files = sorted((path / "data").glob("chunk-*/file-*.parquet"))
     if not files:
         raise _damage_error(path / "data", "no frames")
-    columns = [*parts[0], *parts[1], "episode_index", "timestamp", *images, *marks]
     table = pa.concat_tables([_parquet(file, columns) for file in files], promote_options="permissive")
-    for name in marks:
-        table = table.filter(pa.array(_vectors(path, table, name, 1)[:, 0] == 0))
+    if marks:
+        table = table.filter(pa.array(_vectors(path, table, INTERVENTION, 1)[:, 0] == 0))
     none = np.zeros((len(table), 0), np.float32)
     observations, actions = (
         np.concatenate([none, *(_vectors(path, table, key, features[key]["shape"][0]) for key in keys)], -1)
@@ -134,7 +133,7 @@ def _entries(features: dict[str, Any], parts: list[str]) -> tuple[str, ...]:
 def _flat(names: Any) -> list[str]:
     """Return the names in nested lists and groups, or in a map of names to positions, in the order of the entries."""
     if isinstance(names, dict) and all(type(position) is int for position in names.values()):
-        return sorted(names, key=lambda name: names[name])
+        return sorted(names, key=names.__getitem__)
     if isinstance(names, dict | list):
         return [name for group in (names.values() if isinstance(names, dict) else names) for name in _flat(group)]
     return [] if names is None else [str(names)]
@@ -143,7 +142,7 @@ def _flat(names: Any) -> list[str]:
 def _frames(path: Path, features: dict[str, Any], table: pa.Table, key: str) -> Frames:
     """Return a function from a row to its camera picture."""
     if features[key]["dtype"] == "image":
-        return lambda row: _read_embedded(path, key, table[key][row].as_py())
+        return lambda row: _read_embedded(path, table[key][row].as_py())
     names = [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     starts: dict[int, list[Any]] = {}
     for file in sorted((path / "meta/episodes").glob("chunk-*/file-*.parquet")):
@@ -152,22 +151,19 @@ def _frames(path: Path, features: dict[str, Any], table: pa.Table, key: str) -> 
 
     def frame(row: int) -> Picture:
         episode, timestamp = table["episode_index"][row].as_py(), table["timestamp"][row].as_py()
-        chunk, number, start = starts.get(episode, (None, None, None))
-        if chunk is None or number is None or start is None or not math.isfinite(start + timestamp):
-            raise UserError(f"{path / 'meta/episodes'} does not say where episode {episode} begins: restore it")
+        if episode not in starts:
+            raise _damage_error(path / "meta/episodes", f"nothing says where episode {episode} begins")
+        chunk, number, start = starts[episode]
         video = inside(path, VIDEO.format(key=key, chunk=chunk, file=number), "the video")
         return Picture(_decode_frame(video, start + timestamp), "image/png")
 
     return frame
 
 
-def _read_embedded(path: Path, key: str, value: Any) -> Picture:
+def _read_embedded(path: Path, value: dict[str, Any]) -> Picture:
     """Return the picture stored in a row, as {"bytes": ..., "path": ...}, or in a file that the row names."""
-    data, name = (value.get(part) for part in ("bytes", "path")) if isinstance(value, dict) else (None, None)
-    if data is None and isinstance(name, str):
-        return read_picture(path, name)
-    if not isinstance(data, bytes):
-        raise _damage_error(path, f"a frame of {key} holds no picture")
+    if (data := value["bytes"]) is None:
+        return read_picture(path, value["path"])
     return Picture(data, "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png")
 
 

@@ -24,16 +24,16 @@ def is_one(folder: Path) -> bool:
     return (folder / POLICY).exists()
 
 
-def check_free(folder: Path, overwrite: bool) -> None:
-    """Raise UserError unless `folder` is free, or is a policy folder and `overwrite` is given."""
-    if not is_occupied(folder):
-        return
-    if not overwrite:
-        raise UserError(f"{folder} is not empty: give --overwrite to delete it, or another --out")
-    if not is_one(folder):
-        raise UserError(f"{folder} is not a policy folder, so --overwrite will not delete it: give another --out")
-
-
 def place_of(folder: Path, overwrite: bool) -> AbstractContextManager[Place]:
-    """Claim the place of a policy folder for this process (`whole.place_of`). Raises UserError as `check_free`."""
-    return whole.place_of(folder, lambda there: check_free(there, overwrite), overwrite)
+    """Claim the place of a policy folder for this process (`whole.place_of`).
+
+    Raises UserError unless the place is free, or holds a policy folder and `overwrite` is given.
+    """
+
+    def check(there: Path) -> None:
+        if is_occupied(there) and not overwrite:
+            raise UserError(f"{there} is not empty: give --overwrite to delete it, or another --out")
+        if is_occupied(there) and not is_one(there):
+            raise UserError(f"{there} is not a policy folder, so --overwrite will not delete it: give another --out")
+
+    return whole.place_of(folder, check, overwrite)

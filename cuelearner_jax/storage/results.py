@@ -75,51 +75,40 @@ def check_complete(folder: Path, step: int, count: int, run: str) -> None:
     """
     rows = 0
     for schema in (GUIDES, SCHEMA):  # the results last: theirs are the rows that count
-        path = schema.found_in(folder)
-        table = None if path is None else tables.read(path, schema)
-        if table is not None and (tables.about_of(table) or {}).get("run", run) != run:
-            raise UserError(f"{path} belongs to another run: put its own back")
-        rows = table.filter(pc.field("step") <= step).num_rows if table is not None and table.num_rows else 0
+        rows = 0
+        if path := schema.found_in(folder):
+            table = tables.read(path, schema)
+            if (tables.about_of(table) or {}).get("run", run) != run:
+                raise UserError(f"{path} belongs to another run: put its own back")
+            rows = table.filter(pc.field("step") <= step).num_rows if table.num_rows else 0
     if rows != count:
         raise UserError(
-            f"{folder} has {rows} of {count} results up to step {step}: restore its table, or move the folder away "
-            "and give --resume, which trains these lanes anew"
+            f"{folder} has {rows} of {count} results up to step {step}: restore its table, or move the folder "
+            "away and give --resume, which trains these lanes anew"
         )
-
-
-def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> list[Path]:
-    """Return the results files at or below the given files or folders, one per run, finished or not.
-
-    `schema` is that of the wanted tables. Raises UserError if no file is at a path or below it.
-    """
-    by_path: dict[Path, Path] = {}
-    for path in map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths):
-        files = [path] if path.is_file() else sorted([*path.rglob(schema.jsonl), *path.rglob(schema.parquet)])
-        if not files:
-            raise UserError(f"no {schema.stem} at or below {path}: give the folder of a run, or one that holds runs")
-        for file in files:
-            # Both exist only after a crash between writing one and removing the other; they then hold equal rows.
-            whole = file.with_name(schema.parquet)
-            file = whole if file.name == schema.jsonl and whole.exists() else file  # noqa: PLW2901
-            by_path[file.resolve()] = file
-    return list(by_path.values())
 
 
 def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> pa.Table:
     """Read the results of any number of runs of one task, finished or not, into one table.
 
-    `paths`: results files, run folders, or folders at any height above them. The table has the columns of `MEANINGS`.
-    A column that a run lacks is null for that run.
+    `paths`: results files, run folders, or folders at any height above them; a file that is given twice counts once.
+    The table has the columns of `MEANINGS`. A column that a run lacks is null for that run.
     """
-    files = find(paths, schema)
-    parts = []
-    for file in files:
-        part = tables.read(file, schema)
-        folder = pa.repeat(pa.scalar(file.parent.as_posix()), part.num_rows)
-        parts.append(part.append_column(schema.arrow_field("folder"), folder))
-    table = pa.concat_tables(parts, promote_options="permissive")
+    parts: dict[Path, pa.Table] = {}
+    for path in map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths):
+        files = [path] if path.is_file() else sorted([*path.rglob(schema.jsonl), *path.rglob(schema.parquet)])
+        if not files:
+            raise UserError(f"no {schema.stem} at or below {path}: give the folder of a run, or one that holds runs")
+        for one in files:
+            # Both exist only after a crash between writing one and removing the other; they then hold equal rows.
+            file = (schema.found_in(one.parent) or one) if one.name == schema.jsonl else one
+            if file.resolve() not in parts:
+                part = tables.read(file, schema)
+                folder = pa.repeat(pa.scalar(file.parent.as_posix()), part.num_rows)
+                parts[file.resolve()] = part.append_column(schema.arrow_field("folder"), folder)
+    table = pa.concat_tables(parts.values(), promote_options="permissive")
     if table.num_rows == 0:
-        raise UserError(f"no rows yet in {', '.join(map(str, files))}: wait for the first evaluation")
+        raise UserError(f"no rows yet in {', '.join(map(str, parts))}: wait for the first evaluation")
     if len(tasks := sorted(set(table["task"].to_pylist()))) > 1:
         raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: give folders of one of them")
     return table
@@ -145,8 +134,3 @@ def failures(table: pa.Table) -> dict[tuple[str, int, int], int]:
     rows = table.filter(pc.field(FAILED) == 1.0)
     first = rows.group_by(list(LANE)).aggregate([("step", "min")]).to_pylist()
     return dict(sorted((tuple(row[name] for name in LANE), row["step_min"]) for row in first))
-
-
-def lanes(table: pa.Table) -> int:
-    """Return the number of lanes in a results table."""
-    return table.group_by(list(LANE)).aggregate([]).num_rows

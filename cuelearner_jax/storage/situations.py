@@ -48,6 +48,7 @@ from cuelearner_jax.storage.picture_files import Picture, read_picture
 STEM = "situations"
 SUFFIXES = (".parquet", ".csv", ".npz")
 OBSERVATION, ACTION, PICTURE, TEXT, PHASE, HAND = "observation", "action", "picture", "text", "phase", "hand"
+NUMBERS = {PHASE: 1, HAND: 2, EFFECT: 2}  # axes of the optional columns of numbers
 MOST_SLICES = 64  # largest number of observation entries that each get a slice of their own
 
 
@@ -60,7 +61,7 @@ class Situations(NamedTuple):
     entries: tuple[str, ...]  # names of an action's entries; empty: the recording names none
     digest: str  # of these situations
     # row -> its picture; None: that row has none. Raises UserError for a picture that cannot be read.
-    picture: Callable[[int], Picture | None]
+    picture: Callable[[int], Picture | None] = lambda row: None
     text: Callable[[int], str] = lambda row: ""  # row -> what the robot was told to do
     about: dict[str, Any] = {}  # the table's metadata  # noqa: RUF012
     hands: Float[np.ndarray, "n 3"] | None = None  # where the hand is; None: not known
@@ -75,33 +76,34 @@ def read_once(path: Path) -> Situations:
 def read(path: Path) -> Situations:
     """Read a folder of situations, its table alone, or a LeRobot dataset folder."""
     if lerobot.is_dataset(path):
-        return _situations_of(path, *lerobot.read(path))
+        observations, actions, names, entries, picture = lerobot.read(path)
+        situations = _situations_of(path, observations, actions, names, entries)
+        return situations._replace(picture=picture) if picture else situations
     table = _table_in(path)
     columns = _columns(table)
-    standard = (OBSERVATION, ACTION, PICTURE, TEXT, PHASE, HAND, EFFECT)
-    if strange := [name for name in columns if name not in standard and name.partition(".")[0] not in standard[:2]]:
-        raise UserError(
-            f"{table} has an unknown column {format_value(strange[0])}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
-            "or leave it out"
-        )
+    for name in columns:
+        if name not in (OBSERVATION, ACTION, PICTURE, TEXT, *NUMBERS) and not name.startswith(
+            ("observation.", "action.")
+        ):
+            raise UserError(
+                f"{table} has an unknown column {format_value(name)}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
+                "or leave it out"
+            )
+    if len({len(values) for values in columns.values()}) > 1:
+        raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
     observations, names = _matrix(table, columns, OBSERVATION)
     actions, entries = _matrix(table, columns, ACTION)
-    files, texts = columns.get(PICTURE), columns.get(TEXT)
-    if len({len(observations), len(actions), *(len(columns[name]) for name in standard[2:] if name in columns)}) > 1:
-        raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
-
-    def picture(row: int) -> Picture | None:
-        return read_picture(table.parent, str(files[row])) if files is not None and files[row] else None
-
-    phase = _numbers(table, PHASE, columns[PHASE], 1) if PHASE in columns else None
-    effect = _numbers(table, EFFECT, columns[EFFECT], 2) if EFFECT in columns else None
+    more = {name: _numbers(table, name, columns[name], axes) for name, axes in NUMBERS.items() if name in columns}
+    phase, effect = more.get(PHASE), more.get(EFFECT)
     if effect is not None and (phase is None or effect.shape[1] != observations.shape[1] * actions.shape[1]):
         raise UserError(f"{table}: give a phase, and in effect as many numbers as observation times action entries")
-    pictures = None if files is None else picture
-    situations = _situations_of(table, observations, actions, names, entries, pictures, phase, effect)
-    text: Callable[[int], str] = lambda row: str(texts[row] or "") if texts is not None else ""  # noqa: E731
-    hands = _numbers(table, HAND, columns[HAND], 2) if HAND in columns else None
-    return situations._replace(text=text, about=_about(table, actions.shape[1]), hands=hands)
+    files, texts = (columns.get(name, [None] * len(actions)) for name in (PICTURE, TEXT))
+    return _situations_of(table, observations, actions, names, entries, phase, effect)._replace(
+        picture=lambda row: read_picture(table.parent, str(files[row])) if files[row] else None,
+        text=lambda row: str(texts[row] or ""),
+        about=_about(table, actions.shape[1]),
+        hands=more.get(HAND),
+    )
 
 
 def _situations_of(
@@ -110,15 +112,25 @@ def _situations_of(
     actions: np.ndarray,
     names: tuple[str, ...],
     entries: tuple[str, ...],
-    picture: Callable[[int], Picture | None] | None,
     phase: Float[np.ndarray, " n"] | None = None,
     effect: Float[np.ndarray, "n effect"] | None = None,
 ) -> Situations:
     """Build `Situations`. Raises UserError if there are none or a number is not finite."""
-    own, is_proposed = observations.shape[-1], phase is not None or observations.shape[-1] == 0 < len(observations)
-    if is_proposed:
-        parts = [observations, None if phase is None else phase[:, None], effect, actions]
-        observations = np.concatenate([part for part in parts if part is not None], -1)
+    size = observations.shape[1]
+    slices = [Quantity(OBSERVATION, size, "1", "as recorded")]
+    if len(names) == size <= MOST_SLICES:
+        slices = [Quantity(name, 1, "1", "as recorded") for name in names]
+    parts = [observations]
+    if phase is not None:
+        parts.append(phase[:, None])
+        slices.append(Quantity(PHASE, 1, "1", "place in the chunk"))
+    if effect is not None:
+        parts.append(effect)
+        slices.append(Quantity(EFFECT, effect.shape[1], "1", "of the state on the action", EFFECT))
+    if phase is not None or size == 0 < len(observations):
+        parts.append(actions)
+        slices.append(Quantity(BASE, actions.shape[1], "1", "as recorded", PROPOSED))
+    observations, contents = np.concatenate(parts, -1), hashlib.sha256()
     for name, rows in ((OBSERVATION, observations), (ACTION, actions)):
         if not rows.size:
             raise UserError(f"{path} holds no {name}s: record some situations first")
@@ -126,21 +138,9 @@ def _situations_of(
             raise UserError(
                 f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave them out"
             )
-    slices = (Quantity(OBSERVATION, own, "1", "as recorded"),)
-    if len(names) == own <= MOST_SLICES:
-        slices = tuple(Quantity(name, 1, "1", "as recorded") for name in names)
-    if is_proposed:
-        places = () if phase is None else (Quantity(PHASE, 1, "1", "place in the chunk"),)
-        if effect is not None:
-            places = (*places, Quantity(EFFECT, effect.shape[1], "1", "of the state on the action", EFFECT))
-        slices = (*slices, *places, Quantity(BASE, actions.shape[1], "1", "as recorded", PROPOSED))
-    contents = hashlib.sha256()
-    for rows in (observations, actions):
         contents.update(str(rows.shape).encode() + np.ascontiguousarray(rows).tobytes())
     contents.update("\n".join([quantity.name for quantity in slices] + ["", *entries]).encode())
-    digest = contents.hexdigest()[:12]
-    none: Callable[[int], Picture | None] = lambda row: None  # noqa: E731
-    return Situations(observations, actions, slices, entries, digest, picture or none)
+    return Situations(observations, actions, tuple(slices), entries, contents.hexdigest()[:12])
 
 
 def _about(table: Path, size: int) -> dict[str, Any]:
@@ -161,14 +161,12 @@ def _table_in(path: Path) -> Path:
     """Return the only table in a folder, or the given table."""
     if path.is_file() and path.suffix in SUFFIXES:
         return path
-    tables = [path / f"{STEM}{suffix}" for suffix in SUFFIXES if (path / f"{STEM}{suffix}").is_file()]
+    tables = [file for suffix in SUFFIXES if (file := path / f"{STEM}{suffix}").is_file()]
     if len(tables) != 1:
-        if not path.exists():
-            raise UserError(f"there is no folder of situations at {path}: give one that holds {STEM}.parquet")
         there = f"holds {' and '.join(table.name for table in tables)}" if tables else "is no LeRobot dataset either"
         raise UserError(
-            f"{path} {there}: give the path of one table, or a folder with one {STEM}.parquet, .csv or .npz with the "
-            f"columns {OBSERVATION} and {ACTION}"
+            f"{path} {there if path.exists() else 'does not exist'}: give the path of one table, or a folder with one "
+            f"{STEM}.parquet, .csv or .npz with the columns {OBSERVATION} and {ACTION}"
         )
     return tables[0]
 

@@ -81,9 +81,16 @@ class Schema:
         meaning = next((text for key, text in self.meanings.items() if fnmatchcase(name, key)), None)
         return pa.field(name, self.type(name), metadata=meaning and {"description": meaning})
 
-    def cast(self, table: pa.Table, metadata: dict[bytes, bytes] | None = None) -> pa.Table:
-        """Return a table with the columns' types and other metadata."""
-        return table.cast(pa.schema([self.arrow_field(name) for name in table.column_names], metadata))
+    def cast(self, table: pa.Table) -> pa.Table:
+        """Return a table with the columns' types."""
+        return table.cast(pa.schema([self.arrow_field(name) for name in table.column_names], table.schema.metadata))
+
+    def table(self, columns: Mapping[str, Any], about: Row | None = None) -> pa.Table:
+        """Return columns as a table of this kind, with its description."""
+        # Integers are cast last, since Arrow would truncate a fractional value.
+        types = {name: None if name in self.integers else self.type(name) for name in columns}
+        table = pa.table({name: pa.array(column, types[name]) for name, column in columns.items()})
+        return self.cast(table.replace_schema_metadata(None if about is None else {META: json.dumps(about)}))
 
 
 class TableWriter(contextlib.AbstractContextManager):
@@ -156,19 +163,13 @@ def finish(folder: PathLike, schema: Schema) -> Path:
     """Convert a folder's JSONL table to Parquet, unless it is finished already; return the Parquet file."""
     path, target = (Path(folder) / name for name in (schema.jsonl, schema.parquet))
     if path.exists():
-        table = read(path, schema)
-        if table.num_rows == 0:
-            raise UserError(f"{path} has no rows: a table of {schema.stem} cannot be finished before its first one")
-        write(target, table, schema, about_of(table))
+        write(target, read(path, schema))
         path.unlink()
-    elif not target.exists():
-        raise UserError(f"no {schema.stem} in {path.parent}: expected {schema.jsonl} or {schema.parquet}")
     return target
 
 
-def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None, fresh: bool = False) -> None:
-    """Write a whole table as Parquet, atomically. `about`: its description. `fresh`: see `whole.replacing`."""
-    table = schema.cast(table, _metadata(about))
+def write(path: Path, table: pa.Table, fresh: bool = False) -> None:
+    """Write a table of some schema as Parquet, atomically. `fresh`: see `whole.replacing`."""
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), DIGEST: digest(table)})
     with replacing(path, "wb", fresh) as file:
         pq.write_table(table, file, compression="zstd", write_page_checksum=True)
@@ -200,7 +201,7 @@ def read(path: Path, schema: Schema) -> pa.Table:
         else:
             with path.open("rb") as file:
                 raw = pq.ParquetFile(file).read()
-            table = schema.cast(raw, raw.schema.metadata)
+            table = schema.cast(raw)
             if (table.schema.metadata or {}).get(DIGEST, b"").decode() != digest(table):
                 raise ValueError("its contents are not those that were written")
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException, OSError) as error:
@@ -221,10 +222,6 @@ def about_of(table: pa.Table) -> Row | None:
     return None if text is None else json.loads(text)
 
 
-def _metadata(about: Row | None) -> dict[bytes, bytes]:
-    return {} if about is None else {META: json.dumps(about).encode()}
-
-
 def plain(value: Any) -> Any:
     """Convert a value for strict JSON: NaN and infinity become null, a boolean becomes 1.0 or 0.0."""
     if isinstance(value, list):
@@ -241,13 +238,7 @@ def _text(rows: Iterable[Row]) -> bytes:
 
 def _lines(path: Path) -> list[Row]:
     """Return the whole lines of a JSONL file; without the last if a crash tore it."""
-    *lines, _torn = path.read_bytes().split(b"\n")
-    return [json.loads(line) for line in lines]
-
-
-def _rewrite(path: Path, rows: Iterable[Row]) -> None:
-    with replacing(path, "wb") as file:
-        file.write(_text(rows))
+    return [json.loads(line) for line in path.read_bytes().split(b"\n")[:-1]]
 
 
 def _reopen(path: Path, schema: Schema) -> list[Row]:
@@ -264,18 +255,17 @@ def _reopen(path: Path, schema: Schema) -> list[Row]:
     return _lines(path)
 
 
+def _rewrite(path: Path, rows: Iterable[Row]) -> None:
+    with replacing(path, "wb") as file:
+        file.write(_text(rows))
+
+
 def _growing(path: Path, schema: Schema) -> pa.Table:
     """Return the table of a JSONL file, constants included."""
-    about: Row | None = None
-    constants: Row = {}
-    rows = []
+    about, constants, rows = None, {}, []
     for line in _lines(path):
         about, constants = line.get("about", about), line.get("constants", constants)
         if not line.keys() & HEADS:
             rows.append(constants | line)
     names = dict.fromkeys(name for row in rows for name in row)
-    columns = {name: [row.get(name) for row in rows] for name in names}
-    # Integers are cast last, since Arrow would truncate a fractional value.
-    types = {name: None if name in schema.integers else schema.type(name) for name in names}
-    table = pa.table({name: pa.array(column, types[name]) for name, column in columns.items()})
-    return schema.cast(table, _metadata(about))
+    return schema.table({name: [row.get(name) for row in rows] for name in names}, about)

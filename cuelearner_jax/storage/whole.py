@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 from filelock import FileLock, Timeout
 
@@ -61,18 +61,14 @@ def is_occupied(folder: Path) -> bool:
     return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
-class Place(NamedTuple):
-    """A folder's path, claimed for this process alone; see `place_of`."""
-
-    folder: Path
-    # () -> a context that makes a new folder to write in, and moves it to the place at the end; a failure leaves
-    # nothing behind
-    writing: Callable[[], AbstractContextManager[Path]]
+# () -> a context that makes a new folder to write in, and moves it to its claimed place at the end; a failure leaves
+# nothing behind
+Place = Callable[[], AbstractContextManager[Path]]
 
 
 @contextmanager
 def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = False) -> Iterator[Place]:
-    """Claim the place of a folder for this process while its new contents are prepared (`Place.writing`).
+    """Claim the place of a folder for this process while its new contents are prepared.
 
     `folder`: links are followed. `check`: raises UserError for an existing folder that may not be replaced; called now,
     and again before the replacement. `overwrite`: whether an existing folder may be replaced at all.
@@ -104,4 +100,4 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
     with hold(lock, folder):
         tidy()
         check(folder)  # no other process that claims places can change it any more
-        yield Place(target, writing)
+        yield writing

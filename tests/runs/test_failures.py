@@ -95,9 +95,9 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
         _, config, grid = load(folder, {TASK.name: TASK}.__getitem__)
         source = policy_sources.PolicySource(TASK, config, grid, folder)
         found += evaluate.run(source, evaluate.EvaluateRequest(task=config.task, envs=10, steps=10))
-        policies = source.load()[0].policies
-        np.testing.assert_array_equal(policies["failed"], [False, folder == sick, False])
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policies["params"]))
+        (block,) = source.load()
+        np.testing.assert_array_equal(block.failed, [False, folder == sick, False])
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(block.policy["params"]))
     assert [row.seeds.tolist() for row in found] == [[3, 8], [3, 5, 8]]
     np.testing.assert_array_equal(found[0].metrics["reward"], found[1].metrics["reward"][[0, 2]])
     assert "none: seed 5 failed, no longer finite: left out" in capsys.readouterr().err

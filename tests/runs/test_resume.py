@@ -10,7 +10,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import probes
-import pyarrow.parquet as pq
 import pytest
 from small_runs import stopping_at
 
@@ -290,7 +289,7 @@ def test_a_finished_kind_is_looked_at_before_it_is_called_finished(whole, tmp_pa
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
     refused(out, "is damaged: restore it")
-    tables.write(file, pq.read_table(whole / "relative" / results.PARQUET).slice(1), results.SCHEMA)
+    tables.write(file, tables.read(whole / "relative" / results.PARQUET, results.SCHEMA).slice(1))
     refused(out, "has 27 of 28 results")
 
 

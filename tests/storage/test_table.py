@@ -127,15 +127,6 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path, text, says):
     assert "\n" not in str(caught.value)
 
 
-def test_an_empty_table_cannot_be_finished_and_a_missing_one_neither(tmp_path):
-    with pytest.raises(UserError, match=r"no catches in .*: expected catches.jsonl or catches.parquet"):
-        tables.finish(tmp_path, SCHEMA)
-    written(tmp_path)
-    with pytest.raises(UserError, match="no rows"):
-        tables.finish(tmp_path, SCHEMA)
-    assert [file.name for file in tmp_path.iterdir()] == [SCHEMA.jsonl]
-
-
 def test_every_recorded_table_is_read():
     files = [path for ending in ("jsonl", "parquet") for path in (ROOT / "docs" / "data").rglob(f"results.{ending}")]
     assert len(files) > 5

@@ -23,7 +23,7 @@ def check(folder):
 
 
 def write(folder, text, overwrite=True, meanwhile=lambda: None):
-    with whole.place_of(folder, check, overwrite) as place, place.writing() as new:
+    with whole.place_of(folder, check, overwrite) as place, place() as new:
         if isinstance(text, BaseException):
             raise text
         (new / "ours").write_text(text)
