@@ -113,9 +113,9 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
     for field in before:
         if field not in apart and before[field] != now[field]:
             raise UserError(
-                f"the teacher in {folder} learned with {field} {before[field]}, this world has {now[field]}: use the "
-                f"search teacher (--task.teacher search), or train one for this world ({TRAIN} {task}) and give "
-                "--task.teacher FOLDER"
+                f"the teacher in {folder} learned with --task.{field.replace('_', '-')} {before[field]}, this world "
+                f"has {now[field]}: use the search teacher (--task.teacher search), or train one for this world "
+                f"({TRAIN} {task}) and give --task.teacher FOLDER"
             )
     return own
 
