@@ -78,21 +78,21 @@ class AdaptationResult:
         return lines
 
     def _verdict(self, lane: int, unit: str) -> str:
-        judgement, bound = self.judgement, self.lanes.bound_deg[lane]
-        before, after, narrowed = (column[lane] for column in (judgement.before, judgement.after, judgement.within_deg))
-        if judgement.by == PERSON:
+        of, bound = self.judgement, self.lanes.bound_deg[lane]
+        before, after, narrowed = of.before[lane], of.after[lane], of.within_deg[lane]
+        if of.by == PERSON:
             preferred = f"the policy as it was in {before:.0%}, the corrected in {after:.0%}"
             why = f"of pairs of films a person preferred {preferred}"
-        elif judgement.by != LABELS:
-            difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*judgement.difference[lane])
-            spent = f"difference {difference}; {judgement.rewarded_steps[lane]:,} rewarded steps"
-            why = f"{judgement.by} on tuning episodes {before:.4g} before, {after:.4g} after ({spent})"
+        elif of.by != LABELS:
+            difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*of.difference[lane])
+            spent = f"difference {difference}; {of.rewarded_steps[lane]:,} rewarded steps"
+            why = f"{of.by} on tuning episodes {before:.4g} before, {after:.4g} after ({spent})"
         elif self.results:
             factor = f"{np.exp(after):.3g}" if after < MOST_NATS else "more than a million"
             why = f"answers predicted before they were read: {factor} times as likely as without a change"
         else:
             why = f"predicts {after:.4g} of held-out answers, always 'already right' {before:.4g}"
-        if not judgement.in_use[lane]:
+        if not of.in_use[lane]:
             return f"{why}; not shown to be better, so the policy stays as it was"
         return f"{why}; the correction is used" + (f" within {narrowed:g} {unit}" if narrowed < 0.999 * bound else "")
 
@@ -134,24 +134,24 @@ def adapt(
 
 def result_of(judge: Judge, block: Any, count: int, results: tuple[Result, ...] = ()) -> AdaptationResult:
     """Judge a block's first `count` lanes and take out corrections that are not used."""
-    judgement, block = judge.judge_lanes(block)
+    judgement, block = judge.judge_lanes(block, results)
     block = judge.of.drop_unused(block, jnp.asarray(judgement.in_use))
     block, lanes = jax.tree.map(lambda leaf: leaf[:count], block), Lanes(*(column[:count] for column in judge.lanes))
     judgement = Judgement(judgement.by, *(column[:count] for column in judgement[1:]))
     return AdaptationResult(judge.of, lanes, block, judgement, results)
 
 
-def check_bounds(space: Space, bounds: Sequence[float]) -> None:
-    """Raise UserError for a bound that no action can reach, or that is given twice."""
+def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars | None) -> None:
+    """Raise UserError for bounds that no action reaches, and answers from which nothing could be learned within them.
+
+    `scalars`: None where answers of any strength say something.
+    """
     if not all(0 < bound <= space.reach for bound in bounds) or len(set(bounds)) < len(bounds):  # NaN is neither
         text = " ".join(f"{bound:g}" for bound in bounds)
         raise UserError(f"bound_deg is {text}: give numbers above 0, up to {space.reach:g} ({space.unit}), each once")
-
-
-def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> None:
-    """Raise UserError for amounts from which nothing could be learned."""
+    if scalars is None:
+        return
     eps = scalars.eps_deg
-    check_bounds(space, bounds)
     if not space.grain <= eps <= min(bounds):
         raise UserError(
             f"labels of {eps:g} {space.unit} say nothing within a bound of {min(bounds):g}: give a scalars.eps_deg "
@@ -162,11 +162,6 @@ def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> No
             f"scalars.tau_deg is {scalars.tau_deg:g} and a pass moves an action by {eps:g}, after which refinement "
             f"would stop: give scalars.tau_deg {eps / PASSES:g}"
         )
-
-
-def usual_bound(space: Space) -> float:
-    """Return the default bound of corrections, in the space's unit: a quarter of the space's reach."""
-    return max(BOUND * space.reach, space.grain)
 
 
 def reach(space: Space, policy: Policy, obs: Any, action: Any) -> float:

@@ -68,8 +68,6 @@ class ReadingLanes(struct.PyTreeNode):
     labels: Label  # (lanes, slots, ...)
     bound: Float[Array, " lanes"]
     corrects: Bool[Array, " lanes"]  # True where the answers show a change
-    evidence: Any  # (lanes,) `Result.evidence`, as NumPy's
-    in_use: Any  # (lanes,) `Result.used`, the judgement where labels judge
     failed: Bool[Array, " lanes"]
 
 
@@ -106,8 +104,6 @@ def adapt(
         labels=_side_by_side(rows) if labels is None else labels,
         bound=jnp.asarray(space.from_unit(lanes.bound_deg)),
         corrects=jnp.asarray(np.array([one.changed for one in results])),
-        evidence=np.array([one.evidence for one in results]),
-        in_use=np.array([one.used for one in results]),
         failed=jnp.zeros(lanes.number, bool),
     )
     judge = Judge(of, lanes, how, lane_mesh(jax.local_devices()[:1]), watch)
@@ -128,13 +124,10 @@ def _ask(
         index, action = reading.questions(np.asarray(obs), count, k_ask)
         states, obs = pick((states, obs), index)
         answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
-        rows.append((np.asarray(obs), action, answer))
-        there = np.isfinite(answer).any(-1)
-        batch = Label(np.asarray(obs), action, answer, there)  # pyright: ignore[reportArgumentType]
-        reading.learn(*_valid(k_answer, batch, of.scalars))
-    obs, action, answer = (np.concatenate(column) for column in zip(*rows, strict=True))
-    valid = np.asarray(np.isfinite(answer).any(-1))
-    return Label(obs, action, np.where(valid[:, None], answer, 0), valid)  # pyright: ignore[reportArgumentType]
+        valid = np.asarray(np.isfinite(answer).any(-1))
+        rows.append(Label(np.asarray(obs), action, np.where(valid[:, None], answer, 0), valid))  # pyright: ignore[reportArgumentType]
+        reading.learn(*_valid(k_answer, rows[-1], of.scalars))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
 
 
 def _valid(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> list[np.ndarray]:

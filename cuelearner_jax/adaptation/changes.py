@@ -33,11 +33,8 @@ def load(reference: str) -> Any:
 
 
 def family_of(changes: Any, env: Any) -> Family:
-    """Return the family of a user's distortions: one, a list of them, or a function of the environment that returns one
-    of these.
-    """
-    if callable(changes):
-        changes = changes(env)
+    """Return a user's distortions: one, a list of them, or what a function of the environment returns of these."""
+    changes = changes(env) if callable(changes) else changes
     several = (changes,) if isinstance(changes, Distortion) else changes
     if not isinstance(several, list | tuple) or not all(isinstance(one, Distortion) for one in several):
         wanted = "give a cuelearner_jax.Distortion, several, or a function of the environment that returns them"
@@ -57,12 +54,12 @@ def check_acts(family: Family, env: Environment) -> None:
             ("acts", actions, jax.vmap(partial(undo_action, (one,), nothing))(actions)),
             ("plans", actions, jax.vmap(partial(undo_physics, (one,), nothing))(obs, actions)),
         ):
-            if result.shape != rows.shape:
-                raise UserError(f"distortion {one.name!r}: {name} returns {result.shape[1:]}: give {rows.shape[1:]}")
-            if not np.allclose(np.asarray(result), np.asarray(rows), atol=SAME, rtol=SAME):
+            if result.shape != rows.shape or not np.allclose(
+                np.asarray(result), np.asarray(rows), atol=SAME, rtol=SAME
+            ):
                 raise UserError(
-                    f"distortion {one.name!r}: {name} changes rows although all of its unknowns are "
-                    "zero: let it change nothing at zero"
+                    f"distortion {one.name!r}: {name} changes the shape or entries of a row although all of its "
+                    "unknowns are zero: let it change nothing at zero"
                 )
 
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import tempfile
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +29,7 @@ from cuelearner_jax.environment import Environment, actions_of, plays_once
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
 from cuelearner_jax.policies import Policy, PolicyNode
+from cuelearner_jax.reading import Result
 from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.task import Pictures
 
@@ -41,17 +41,11 @@ STEPS = 100  # steps of each environment, where a task counts steps
 AT_ONCE = 10  # episodes between two looks
 STAKES = np.array([0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # lambda of the sequential test
 DECIDED = 20.0  # value of the test martingale that decides
-SHARES = ("success", "finished")  # metrics within [0, 1]
+SHARES = ("success", "finished", PERSON)  # values within [0, 1]
 
 # films of the same start -> -1: the left one is better, 0: neither, 1: the right one
 Prefer = Callable[[Path, Path], int]
-
-
-class Person(NamedTuple):
-    """Who compares films, and how these are drawn."""
-
-    prefer: Prefer
-    pictures: Pictures
+Pair = tuple[dict[str, np.ndarray], dict[str, np.ndarray]]  # values (lanes, episodes) by name, before and after
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,8 @@ class Judging:
     num_envs: int = 50  # episodes at most
     steps: int = 100  # environment steps of each
     by: str = "reward"  # a metric, "labels" or "person"
-    person: Person | None = None
+    prefer: Prefer | None = None  # where a person judges: who compares films of `pictures`
+    pictures: Pictures | None = None
     bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
 
 
@@ -91,98 +86,113 @@ def _step_of(env: Any) -> Any:
     return jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))[1]
 
 
+@dataclass(frozen=True)
 class Judge:
     """Decides which models of an adaptation's lanes are used.
 
     A block of lanes is a `LaneState`, or any record with `base`, `bound`, `corrects` and `failed`.
     """
 
-    def __init__(self, of: Adaptation, lanes: Lanes, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
-        """`mesh`: devices that share the lanes; `watch`: given the name of a piece of work, who is told progress."""
-        self.of, self.lanes, self.how, self.watch = of, lanes, how, watch
-        self.mesh = mesh if mesh.size > 1 else None
+    of: Adaptation
+    lanes: Lanes
+    how: Judging
+    mesh: Mesh  # devices that share the lanes
+    watch: Callable[[str], Tell]  # given the name of a piece of work, returns its progress callback
 
-    def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
-        """Return the judgement of the finished lanes, and the lanes with the bounds that are used."""
+    def judge_lanes(self, block: Any, results: Sequence[Result] = ()) -> tuple[Judgement, Any]:
+        """Return the judgement of the finished lanes, and the lanes with the bounds that are used.
+
+        `results`: of a reading, whose evidence judges in place of held-out labels.
+        """
         how, lanes = self.how, self.lanes
-        if how.by == LABELS:
-            if self.of.guidance.by_evidence:
-                verdict = np.zeros(lanes.number), block.evidence, block.in_use
-            else:
-                verdict = judge_by_labels(self.of, block)
-            unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
-            return Judgement(LABELS, *verdict, bounds_of(self.of, block), unknown, none), block
-        usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
-        if how.person is not None:
-            return self._compared(how.person, block, usable), block
-        block, steps = self._narrowed(block)
-        test, values = PairedTest(lanes.number), []
-        for number in range(-(-how.num_envs // AT_ONCE)):
-            pair, own_steps = self._pair(block, number)
-            values.append(pair)
-            steps += own_steps
-            test.add(differences(pair, how.by))
-            if (test.decided | ~usable).all():
-                break
-        before, after = (np.concatenate([pair[end][how.by] for pair in values], -1) for end in (0, 1))
-        means, difference = (before.mean(-1), after.mean(-1)), mean_interval(after - before).T
-        return Judgement(how.by, *means, usable & test.better, bounds_of(self.of, block), difference, steps), block
+        difference, steps = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
+        if how.by != LABELS:
+            block, steps = self._narrowed(block)
+            before, after, in_use, spent = self._by_episodes(block)
+            difference, steps = mean_interval(after - before).T, steps + spent
+            before, after = before.mean(-1), after.mean(-1)
+        elif results:
+            before, after = np.zeros(lanes.number), np.array([one.evidence for one in results])
+            in_use = np.array([one.used for one in results])
+        else:
+            before, after, in_use = judge_by_labels(self.of, block)
+        within = actions_of(self.of.env).to_unit(np.asarray(block.bound), np)
+        return Judgement(how.by, before, after, in_use, within, difference, steps), block
 
-    def _compared(self, person: Person, block: Any, usable: np.ndarray) -> Judgement:
-        """Return what a person says of the only lane's episodes."""
-        assert self.how.env is not None
-        assert self.lanes.number == 1  # `AdaptRequest`
-        test, answers = PairedTest(1), []
-        policies = self.of.bases.lane(0), self.of.policy(block, self.how.env).lane(0)
-        answers_of_person = preferences(person, self.how.env, policies, episodes(SPLIT), self.how.steps)
-        with contextlib.closing(answers_of_person):
-            for answer in itertools.islice(answers_of_person, self.how.num_envs if usable[0] else 0):
-                answers.append(answer)
-                test.add(np.array([[float(answer)]]))
-                if test.decided[0]:
+    def _by_episodes(self, block: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return values before and after (lanes, episodes), whether each lane is used, and its rewarded steps."""
+        number, usable = self.lanes.number, ~np.asarray(block.failed) & np.asarray(block.corrects)
+        test, values, steps = PairedTest(number), [], np.zeros(number, int)
+        is_person = self.how.by == PERSON  # who is not asked about a policy that cannot be used
+        with contextlib.closing(self._by_person(block) if is_person else self._by_metric(block)) as pairs:
+            for pair, spent in pairs if usable.any() or not is_person else ():
+                values.append([one[self.how.by] for one in pair])
+                steps += spent
+                test.add(differences(pair, self.how.by))
+                if (test.decided | ~usable).all():
                     break
-        each = np.array([answers], float).reshape(1, -1)
-        before, after = (np.mean(each == which, -1) if answers else np.zeros(1) for which in (-1, 1))
-        difference = mean_interval(each).T if answers else np.full((1, 3), np.nan)
-        in_use, steps = usable & test.better, np.zeros(1, int)
-        return Judgement(PERSON, before, after, in_use, bounds_of(self.of, block), difference, steps)
+        before, after = np.concatenate(values, -1) if values else np.full((2, number, 1), np.nan)
+        return before, after, usable & test.better, steps
 
-    def _pair(self, block: Any, number: int) -> tuple[tuple[dict[str, np.ndarray], ...], np.ndarray]:
-        """Play episodes by base and adapted policy; return the values of each (lanes, episodes), and the steps."""
-        key = jax.random.fold_in(episodes(SPLIT), number)
-        bases = self._rolled(self.of.bases, "the policy as it was", key, AT_ONCE)
-        after = self._rolled(self.of.policy(block, self.how.env), "the corrected policy", key, AT_ONCE)
-        shared = len(next(iter(bases.each.values()))) == 1
-        own = np.zeros(self.lanes.number, int) if shared else self.lanes.base
-        pair = ({name: np.asarray(values)[own] for name, values in bases.each.items()}, after.each)
-        return pair, self._counted_steps(after, AT_ONCE) + self._counted_steps(bases, AT_ONCE)[own]
+    def _by_metric(self, block: Any) -> Generator[tuple[Pair, np.ndarray], None, None]:
+        """Yield values of base and adapted policy on the same episodes, and the rewarded steps (lanes,) of these."""
+        adapted = self.of.policy(block, self.how.env)
+        for number in range(-(-self.how.num_envs // AT_ONCE)):
+            key = jax.random.fold_in(episodes(SPLIT), number)
+            bases, base_steps = self._rolled(self.of.bases, "the policy as it was", key, AT_ONCE)
+            after, steps = self._rolled(adapted, "the corrected policy", key, AT_ONCE)
+            own = self.lanes.base if len(base_steps) > 1 else np.zeros(self.lanes.number, int)
+            yield ({name: values[own] for name, values in bases.each.items()}, after.each), steps + base_steps[own]
+
+    def _by_person(self, block: Any) -> Generator[tuple[Pair, int], None, None]:
+        """Yield which policy a person prefers, for one start after another; films change sides by chance.
+
+        Raises UserError for an answer other than -1, 0 and 1.
+        """
+        how: Any = self.how  # with `prefer` and `pictures`
+        policies = self.of.bases.lane(0), self.of.policy(block, how.env).lane(0)
+        with tempfile.TemporaryDirectory() as folder:
+            for number in range(how.num_envs):
+                start = jax.random.fold_in(episodes(SPLIT), number)
+                films = [Path(folder, f"{number}{name}.gif") for name in "ab"]
+                for policy, file in zip(policies, films, strict=True):
+                    steps = int(_length(how.env, policy, start, how.steps))
+                    how.pictures.animate(how.env, how.pictures.record(how.env, policy, start, steps)[0], file)
+                is_swapped = bool(jax.random.bernoulli(jax.random.fold_in(start, 1)))
+                answer = how.prefer(*(films[::-1] if is_swapped else films))
+                if answer not in (-1, 0, 1):
+                    says = f"judge_by gave {format_value(answer)}"
+                    raise UserError(f"{says}: give -1 (left), 0 (no difference) or 1 (right)")
+                better = -answer if is_swapped else answer
+                before, after = ({PERSON: np.array([[better == which]], float)} for which in (-1, 1))
+                yield (before, after), 0
 
     def _narrowed(self, block: Any) -> tuple[Any, np.ndarray]:
         """Return lanes within the best share of their bounds, and the rewarded steps (lanes,) of this."""
-        spent = np.zeros(self.lanes.number, int)
-        best, value = block.bound, np.full(self.lanes.number, -np.inf)
+        steps, best, value = np.zeros(self.lanes.number, int), block.bound, np.full(self.lanes.number, -np.inf)
         for share in (1.0, *self.how.bounds) if self.how.bounds else ():
             within = block.replace(bound=share * block.bound)
             what = f"the adapted policy within {share:g} of its bound"
-            rollout = self._rolled(self.of.policy(within, self.how.env), what)
-            spent = spent + self._counted_steps(rollout, self.how.num_envs)
-            better = np.asarray(rollout.means[self.how.by]) > value
-            value = np.where(better, rollout.means[self.how.by], value)
+            policy = self.of.policy(within, self.how.env)
+            rolled, spent = self._rolled(policy, what, episodes(SPLIT), self.how.num_envs)
+            steps = steps + spent
+            better = np.asarray(rolled.means[self.how.by]) > value
+            value = np.where(better, rolled.means[self.how.by], value)
             best = jnp.where(jnp.asarray(better), within.bound, best)
-        return block.replace(bound=best), spent
+        return block.replace(bound=best), steps
 
-    def _rolled(self, policy: PolicyNode, what: str, key: Any = None, num_envs: int | None = None) -> Rollout:
+    def _rolled(self, policy: PolicyNode, what: str, key: PRNGKeyArray, num_envs: int) -> tuple[Rollout, np.ndarray]:
+        """Play episodes; return their values, and the steps (lanes,) whose rewards or outcomes count.
+
+        Where an outcome judges, or no other episodes are played, these are the steps of first episodes.
+        """
         how = self.how
         assert how.env is not None  # a metric needs episodes
-        mesh = None if policy is self.of.bases else self.mesh  # the number of environments may differ
-        key, envs = episodes(SPLIT) if key is None else key, num_envs or how.num_envs
-        return rollout_lanes(how.env, policy, key, envs, envs * how.steps, self.watch(what), mesh)
-
-    def _counted_steps(self, rolled: Rollout, num_envs: int) -> np.ndarray:
-        """Return the steps (lanes,) that count: for an outcome, or where no others are played, of first episodes."""
-        first, whole = np.asarray(rolled.episode_steps), num_envs * self.how.steps
-        is_of_first = plays_once(self.how.env) or self.how.by in _step_of(self.how.env).outcome
-        return first.sum(-1) if is_of_first else np.full(len(first), whole)
+        mesh = None if policy is self.of.bases or self.mesh.size == 1 else self.mesh
+        rolled = rollout_lanes(how.env, policy, key, num_envs, num_envs * how.steps, self.watch(what), mesh)
+        is_of_first = plays_once(how.env) or how.by in _step_of(how.env).outcome
+        first = rolled.episode_steps.sum(-1)
+        return rolled, first if is_of_first else np.full(len(first), num_envs * how.steps)
 
 
 class PairedTest:
@@ -211,7 +221,7 @@ class PairedTest:
             self.worse |= open_yet & worse & ~better
 
 
-def differences(pair: tuple[dict[str, np.ndarray], ...], by: str) -> np.ndarray:
+def differences(pair: Pair, by: str) -> np.ndarray:
     """Return how much better each episode (lanes, episodes) of the second policy was, in [-1, 1].
 
     Values of a share, as success, count as they are; others in units of the largest value of both policies in the
@@ -235,10 +245,9 @@ def judge_by_labels(of: Adaptation, block: LaneState) -> tuple[np.ndarray, np.nd
 
     The model in use is fitted to all labels; a second one is fitted for this comparison alone.
     """
-    form = of.guidance.form
-    if form is None or not form.by_eps:
-        name = form.name if form else "no"
-        raise UserError(f"{name} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
+    form: Any = of.guidance.form
+    if not form.by_eps:
+        raise UserError(f"{form.name} answers cannot be held out for judging: give --judge-by a metric of the task")
     failed = np.asarray(block.failed)
     if np.asarray(block.guide.labels.valid).sum(-1)[~failed].min(initial=HELD_OUT) < HELD_OUT:
         raise UserError(f"fewer than {HELD_OUT} labels cannot judge a model: give more, or --judge-by a metric")
@@ -270,44 +279,10 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
     return each_lane(one)(block)
 
 
-def bounds_of(of: Adaptation, block: Any) -> np.ndarray:
-    """Return the bounds (lanes,) of a block of lanes, in the space's unit."""
-    return actions_of(of.env).to_unit(np.asarray(block.bound), np)
-
-
-def preferences(
-    person: Person, env: Environment, policies: tuple[Policy, Policy], key: PRNGKeyArray, steps: int
-) -> Generator[int, None, None]:
-    """Yield, for one start after another, 1 where the second policy is preferred, -1 where the first is, else 0.
-
-    Films change sides by chance. `steps`: of an episode, at most. Raises UserError for another answer.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        number = 0
-        while True:
-            start = jax.random.fold_in(key, number)
-            films = [Path(folder, f"{number}{name}.gif") for name in "ab"]
-            for policy, file in zip(policies, films, strict=True):
-                frames, _ = person.pictures.record(env, policy, start, int(_length(env, policy, start, steps)))
-                person.pictures.animate(env, frames, file)
-            swapped = bool(jax.random.bernoulli(jax.random.fold_in(start, 1)))
-            answer = person.prefer(*(films[::-1] if swapped else films))
-            if answer not in (-1, 0, 1):
-                raise UserError(f"judge_by gave {format_value(answer)}: give -1 (left), 0 (no difference) or 1 (right)")
-            yield -answer if swapped else answer
-            for file in films:
-                file.unlink()
-            number += 1
-
-
 @jax.jit
 def _length(env: Environment, policy: Policy, key: PRNGKeyArray, steps: Int[Array, ""] | int) -> Int[Array, ""]:
     """Return the steps of an episode that begins by a key, with the random numbers of `Pictures.record`."""
     k_reset, k_play = jax.random.split(key)
-
-    def unfinished(carry: tuple[Any, ...]) -> Array:
-        number, *_, ended = carry
-        return (number < steps) & ~ended
 
     def advance(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         number, state, obs, _ = carry
@@ -317,4 +292,4 @@ def _length(env: Environment, policy: Policy, key: PRNGKeyArray, steps: Int[Arra
         return number + 1, following, step.obs, step.terminated | step.truncated
 
     first = (jnp.zeros((), jnp.int32), *env.reset(k_reset), jnp.array(False))
-    return jax.lax.while_loop(unfinished, advance, first)[0]
+    return jax.lax.while_loop(lambda carry: (carry[0] < steps) & ~carry[-1], advance, first)[0]

@@ -29,7 +29,6 @@ from cuelearner_jax.run_config import kind_from_json, part_from_json
 # the kinds that can be stored, and the arrays of those that have any
 STORED = ("agent", "guided", READING, "uniform", "heuristic", "code")
 ARRAYS = {Agent: ("params",), Guided: ("model", "bound"), ReadingPolicy: ("correction", "bound")}
-PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # groups in a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other values and the arrays hold them already
 
 
@@ -85,9 +84,9 @@ def from_json(values: dict[str, Any], env: Any, code: Any = None, changes: Any =
         return Heuristic(view_of(env))
     if kind == "guided":
         base, guide = from_json(values["base"], env, code, changes), _guidance(values, env)
-        sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
+        scalars = configuration.from_json(Scalars, values["scalars"])
         bound = jnp.zeros(()) if values["bounded"] else None
-        return Guided(base, jax.eval_shape(guide.init, key), view_of(env), scalars, guide, bound, sizes)
+        return Guided(base, jax.eval_shape(guide.init, key), view_of(env), scalars, guide, bound, guide.sizes)
     if kind == READING:
         base, family = from_json(values["base"], env, code, changes), own_changes.rebuild_family(values, env, changes)
         sizes = values["labels"], values["mixed"]

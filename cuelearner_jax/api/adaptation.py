@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -24,9 +24,9 @@ from cuelearner_jax.adaptation.judging import LABELS, PERSON, Prefer
 from cuelearner_jax.adaptation.lanes import blame
 from cuelearner_jax.api.labels import Labels, labels_from_file, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, config_of, load_policy
-from cuelearner_jax.api.worlds import World, numbers, teacher_of_world
+from cuelearner_jax.api.worlds import World, numbers, teacher_of_world, world_around
 from cuelearner_jax.config import GuideSizes, Scalars, from_json, normalize_options
-from cuelearner_jax.environment import Environment, Spaces, actions_of
+from cuelearner_jax.environment import Environment, Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
@@ -34,7 +34,7 @@ from cuelearner_jax.guides.base import ReadingGuide
 from cuelearner_jax.policies import ONNX, Common, policy_of
 from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.spaces import Box, Choices, Space, cues_from
+from cuelearner_jax.spaces import DIRECTIONS, Box, Space, cues_from
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.studies.adapt import AdaptedStudy, AdaptRequest, Subject
@@ -53,7 +53,6 @@ class AdaptedPolicy(CallablePolicy):
     """
 
     outcome: AdaptedStudy
-    base_name: str  # the base, as Python calls it
 
     @property
     def used(self) -> bool:
@@ -105,7 +104,10 @@ class AdaptedPolicy(CallablePolicy):
         """
         if self.world is None:
             raise UserError("a policy folder names its world, and an environment has no name: adapt in one of cl.make")
-        subject = self.outcome.subject._replace(origin={"code": self.base_name})
+        base: Any = self.outcome.subject.bases
+        base = getattr(base.policy, "function", base.policy)
+        of = base if hasattr(base, "__qualname__") else type(base)
+        subject = self.outcome.subject._replace(origin={"code": f"{base.__module__}:{of.__qualname__}"})
         with policy_folders.place_of(Path(folder), overwrite) as place:
             self.outcome._replace(subject=subject).write(place)
 
@@ -135,76 +137,56 @@ def adapt(
     Arguments that are left out follow the world's scenario, else the defaults of `cuelearner adapt`.
 
     Args:
-        policy: the policy to correct: a policy, or any function of a batch of observations (NumPy in, NumPy out; one
-            that `jax.jit` made is compiled in).
+        policy: a policy, or any function of a batch of observations (NumPy in, NumPy out; one of `jax.jit` is compiled
+            in).
         world: the world that the policy acts in; a bare environment will do.
-        teacher: a teacher; or a function of observations (NumPy in, NumPy out) or another policy, which teaches what
-            it does itself; None where labels are given.
-        labels: number of questions (default: 100 of a reading, else 500); or labels that are there already: arrays,
-            or a label file.
-        bound_deg: how far corrections may lead from the policy's own actions [deg] (default: the scenario's, of labels
-            that are there already as far as they reach, or else 45).
+        teacher: a teacher; or a function or a policy, which teaches what it does itself; None where labels are given.
+        labels: number of questions (default: 100 of a reading, else 500); or labels: arrays, or a label file.
+        bound_deg: how far corrections may lead from the policy's own actions [deg] (default: the scenario's, as far as
+            given labels reach, or else 45).
         eps_deg: strength of an answer [deg] (default: as labels, scenario or training had it).
-        guidance: kind of guidance: what is asked, and what a model makes of it (default: the scenario's or "reading").
-        sizes: sizes of the network, of its fitting, and of a round of labels.
-        scalars: settings of fitting, of refinement and of the teacher's faults.
+        guidance: kind of guidance (default: the scenario's or "reading").
+        sizes, scalars: settings of the model and its fitting, of refinement and of the teacher's faults.
         seed: seed of all random numbers.
-        judge_by: the metric by which it is judged, or "labels": by predictions of answers (default: the scenario's or
-            the task's; of a reading "labels"). Or a function of two film files (.gif) of the same start, which returns
-            -1 where the left one is better, 1 where the right one is, else 0.
+        judge_by: a metric, or "labels" (default: the scenario's or the task's; of a reading "labels"). Or a function of
+            two film files (.gif) of the same start: -1 where the left one is better, 1 where the right one is, else 0.
         judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
-        changes: for guidance "reading", the possible changes, as `Distortion`s of your own, or a function of the
-            environment that returns them (default: what the world declares).
+        changes: for "reading", the possible changes: `Distortion`s of your own, or a function of the environment that
+            returns them (default: what the world declares).
     """
     if hasattr(world, "observation_space"):
         raise UserError("world is an environment of Gymnasium: give cl.from_gymnasium(its id, class or function)")
-    own_world = world if isinstance(world, World) else None
-    env = world.env if isinstance(world, World) else world
-    space = actions_of(env)
-    if own_world is not None:
-        config = config_of(policy, own_world)
-    else:
-        config = getattr(policy, "trained", None) or RunConfig(None, scalars=plain_scalars(space))
+    own_world = world if isinstance(world, World) else world_around(world)
+    env, task, config = own_world.env, own_world.task, config_of(policy, own_world)
     file = Path(labels) if isinstance(labels, str | os.PathLike) else None
     rows = rows_of(labels) if isinstance(labels, tuple) else None
     if teacher is not None:
-        teacher = teacher_of_world(teacher, space)
+        teacher = teacher_of_world(teacher, own_world.actions)
     elif file is None and rows is None:
         raise UserError("teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels")
-    scalars, eps_deg = scalars and normalize_options(scalars, "scalars"), eps_deg and float(eps_deg)
-    task, scenario = (own_world.task, own_world.scenario) if own_world else (None, None)
-    optional = {
-        "labels": (labels,) if file is None and rows is None and labels is not None else None,
-        "sizes": sizes and normalize_options(sizes, "sizes"),
-        "bound_deg": None if bound_deg is None else (float(bound_deg),),
-        "judge_bounds": None if judge_bounds is None else tuple(map(float, judge_bounds)),
-    }
-    options: dict[str, Any] = {name: value for name, value in optional.items() if value is not None}
-    options |= {"task": config.task, "seeds": f"{seed}:{seed + 1}", "judge_episodes": judge_episodes}
     prefer, judge_by = (judge_by, PERSON) if callable(judge_by) else (None, judge_by)
-    request = AdaptRequest.of(task, config, scenario, guidance, judge_by, file, eps_deg, scalars)
-    about = {"task": task, "teacher": teacher, "rows": rows, "changes": changes, "prefer": prefer}
-    subject = Subject(env, Common(as_policy_in(policy, env)), **about)
-    outcome = dataclasses.replace(request, **options).run(subject)
+    request = AdaptRequest.of(task, config, own_world.scenario, guidance, judge_by, file, eps_deg, scalars)
+    options: dict[str, Any] = {
+        "labels": request.labels if labels is None or isinstance(labels, str | os.PathLike | tuple) else (labels,),
+        "bound_deg": request.bound_deg if bound_deg is None else (bound_deg,),
+        "judge_bounds": request.judge_bounds if judge_bounds is None else tuple(judge_bounds),
+        "sizes": normalize_options(sizes or request.sizes, "sizes"),
+        "scalars": normalize_options(request.scalars, "scalars"),
+    }
+    request = dataclasses.replace(request, **options, seeds=f"{seed}:{seed + 1}", judge_episodes=judge_episodes)
+    bases = Common(as_policy_in(policy, env))
+    outcome = request.run(Subject(task, env, bases, teacher=teacher, rows=rows, changes=changes, prefer=prefer))
     result = outcome.result
     if result.failed.any():
         blame(result.of, teacher, result.block)
         raise UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")
     if not result.judgement.in_use.all():
         warnings.warn(result.words[-1], stacklevel=3)
-    inner, observation = result.policy(env).lane(0), getattr(env, "observation", ())
-    about = {"trained": RunConfig(config.task), "actions": space, "world": own_world}
-    return AdaptedPolicy(inner, observation, **about, outcome=outcome, base_name=_called(policy))
-
-
-def _called(policy: Any) -> str:
-    """Return a policy's name in Python."""
-    inner = as_policy(policy)
-    inner = getattr(inner, "function", inner)
-    name = getattr(inner, "__qualname__", type(inner).__qualname__)
-    return f"{getattr(inner, '__module__', type(inner).__module__)}:{name}"
+    about = {"trained": RunConfig(config.task), "actions": own_world.actions}
+    about["world"] = None if own_world is not world else world
+    return AdaptedPolicy(result.policy(env).lane(0), getattr(env, "observation", ()), **about, outcome=outcome)
 
 
 @user_code.report_user_errors
@@ -230,11 +212,11 @@ def correct(
     warning.
 
     Args:
-        policy: the policy to correct: a function of a batch of observations, a module of PyTorch, a model of
-            Stable-Baselines3, the path of a file in ONNX or of a folder of ours, or a policy.
+        policy: a function of a batch of observations, a module of PyTorch, a model of Stable-Baselines3, the path of a
+            file in ONNX or of a folder of ours, or a policy.
         labels: `Labels(observations, actions, answers)` as arrays, or a label file.
-        bound: how far corrections may lead from the policy's own actions, in the space's unit: shares of the range of
-            each entry (default: as far as the labels reach).
+        bound: how far corrections may lead from the policy's own actions, in shares of the range of each entry, or the
+            space's unit (default: as far as the labels reach).
         eps: strength of an answer, in the same unit (default: the file's, or 1/36 of the range).
         guidance: how answers are used: "reading" finds what changed, "relative" fits a network.
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
@@ -247,19 +229,16 @@ def correct(
     before = getattr(getattr(policy, "trained", None), "task", None)
     before = before if isinstance(before, LogsConfig) else None
     file = _labels(labels, space, cues, low, high, before)
-    if file.eps is not None:
-        if eps is not None and not math.isclose(eps, file.eps, rel_tol=1e-6):
-            raise UserError(f"the label file holds answers of {file.eps:g} {file.space.unit}: leave out eps")
-        eps = file.eps
-    own = as_policy(policy)
-    acting = CallablePolicy(policy_of(own, file.space), actions=file.space)
+    if eps is not None and file.eps is not None and not math.isclose(eps, file.eps, rel_tol=1e-6):
+        raise UserError(f"the label file holds answers of {file.eps:g} {file.space.unit}: leave out eps")
+    acting = CallablePolicy(policy_of(as_policy(policy), file.space), actions=file.space)
     acting(file.labels.obs)  # refuses what gives no actions
     return adapt(
-        policy if isinstance(policy, CallablePolicy) else own,
+        policy if isinstance(policy, CallablePolicy) else acting,
         world_of(file, before),
         labels=labels_of(file.labels),
         bound_deg=bound,
-        eps_deg=eps,
+        eps_deg=eps if file.eps is None else file.eps,
         guidance=guidance,
         sizes=sizes,
         scalars=scalars,
@@ -293,8 +272,7 @@ def agreement(
             raise UserError("space is None, and arrays of labels name none: give space=, or a label file")
         space = policy.actions
     file = _labels(labels, space)
-    eps = file.eps if eps is None else eps
-    if eps is None:
+    if eps is None and (eps := file.eps) is None:
         eps = float((getattr(own, "scalars", None) or plain_scalars(file.space)).eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base)
     base = None if base is None else policy_of(base, file.space)
@@ -322,8 +300,6 @@ def _labels(
     if space is None:
         low, high = (None if end is None else numbers("low and high", end).tolist() for end in (low, high))
         low, high = logs.bounds_of(np.asarray(rows.action), low, high, note=note)
-        if not len(low) == len(high) == rows.action.shape[1]:
-            raise UserError(f"low and high bound {len(low)} and {len(high)} entries: give {rows.action.shape[1]} each")
         space = Box(tuple(low), tuple(high), cues_from(cues) if cues else ())
     external_labels.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
     return LabelFile({}, RELATIVE.name, space, None, np.zeros(len(rows.obs)), rows)
@@ -335,25 +311,25 @@ def world_of(file: LabelFile, before: LogsConfig | None = None) -> World:
     Networks of a policy that was corrected `before` keep their view. Raises UserError where that cannot be.
     """
     size, obs, space = file.labels.obs.shape[1], np.asarray(file.labels.obs), file.space
+    if before is not None and logs.space_of(before) != space:
+        raise UserError(
+            "the policy was corrected with other bounds or cues before: leave out cues, low, high and space"
+        )
     own = {name: value for name, value in file.task.items() if name not in ("name", "from")}
-    config = from_json(LogsConfig, own) if file.task.get("name") == logs.NAME else None
-    if before is not None:
-        if logs.space_of(before) != space:
-            raise UserError(
-                "the policy was corrected with other bounds or cues before: leave out cues, low, high and space"
-            )
-        config = before if sum(before.entries) == size else config
-    if config is None or sum(config.entries) != size:
-        centre, spread = logs.scales_of(obs)
-        config = LogsConfig(entries=(size,), centre=centre, spread=spread)
-    config = dataclasses.replace(config, path="", digest="", order="recorded", rows=len(obs))
-    if logs.space_of(config) != space:
-        cues = space.cues if isinstance(space, Box | Choices) else ()
-        config = dataclasses.replace(
-            config,
-            actions=space.name,
-            low=space.low if isinstance(space, Box) else (0.0,) * space.size,
-            high=space.high if isinstance(space, Box) else (1.0,) * space.size,
+    recording = before or (from_json(LogsConfig, own) if file.task.get("name") == logs.NAME else None)
+    if recording is not None and sum(recording.entries) == size:
+        config = dataclasses.replace(recording, path="", digest="", order="recorded", rows=len(obs))
+    else:
+        (centre, spread), kind = logs.scales_of(obs), cast(logs.Actions, space.name)
+        cues = () if space == DIRECTIONS else space.cues
+        config = LogsConfig(
+            rows=len(obs),
+            entries=(size,),
+            centre=centre,
+            spread=spread,
+            actions=kind,
+            low=getattr(space, "low", (0.0,) * space.size),
+            high=getattr(space, "high", (1.0,) * space.size),
             cues=tuple(",".join(cue.words) for cue in cues),
             cue_names=tuple(cue.name for cue in cues),
             keys=tuple(",".join(cue.keys) for cue in cues),

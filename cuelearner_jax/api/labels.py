@@ -60,5 +60,4 @@ def labels_from_file(path: Path) -> LabelFile:
     if file.answers != RELATIVE.name:
         raise UserError(f"{path} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
     external_labels.check_file(file, None, RELATIVE, str(path))
-    own = file.seeds == file.seeds[0]
-    return file._replace(labels=jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels))
+    return file._replace(labels=jax.tree.map(lambda leaf: leaf[file.seeds == file.seeds[0]], file.labels))

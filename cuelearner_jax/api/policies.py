@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -64,37 +65,27 @@ class CallablePolicy:
 
     @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
-        """Return actions for observations.
+        """Return actions (action,) or (n, action); of directions unit vectors.
 
         Args:
             obs: (obs,) or (n, obs), as `observation` orders them.
             key: for a policy that acts at random (default: always the same).
-
-        Returns:
-            Actions (action,) or (n, action); of directions unit vectors.
         """
         if self.asks:
             raise UserError("this policy asks a teacher, who looks at the true state: call its act(key, states, obs)")
-        rows = observations(obs, sum(quantity.size for quantity in self.observation) or None)
-        batch = rows[None] if rows.ndim == 1 else rows
+        rows = numbers("obs", obs)
+        width = sum(quantity.size for quantity in self.observation) or (rows.shape[-1:] and rows.shape[-1])
+        if rows.ndim not in (1, 2) or rows.shape[-1] != width or not width:
+            raise UserError(f"obs: observations have shape {rows.shape}: give ({width},) or (n, {width})")
         key = jax.random.key(0) if key is None else key
-        # A copy, which the caller may write in.
-        result = np.array(_act(self.policy, key, jnp.asarray(batch), self.actions))
+        # a copy, which the caller may write in
+        result = np.array(_act(self.policy, key, jnp.asarray(np.atleast_2d(rows)), self.actions))
         user_code.check_actions(result, policy_name(self.policy))
         return result[0] if rows.ndim == 1 else result
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Act as `types.Policy.act`."""
         return self.policy.act(key, states, obs)
-
-
-def observations(value: Any, size: int | None) -> Float[np.ndarray, "*n obs"]:
-    """Return one observation (size,) or many (n, size); `size` None: any size above 0."""
-    rows = numbers("obs", value)
-    width = rows.shape[-1] if size is None and rows.ndim else size
-    if rows.ndim not in (1, 2) or rows.shape[-1] != width or not width:
-        raise UserError(f"obs: observations have shape {rows.shape}: give ({width},) or (n, {width})")
-    return rows
 
 
 def as_policy(source: Any) -> Policy:
@@ -136,14 +127,12 @@ def load_policy(
 
     Args:
         folder: folder of a run, of a sweep in pieces, or of a policy; or a shipped agent, as "shipped:navigation".
-        policy: "agent", "guided" or another that `evaluate TASK --help` lists (default: the trained agent, or the
-            adapted policy).
-        guidance, labels, seed: of the lane (default: the run's lane with the best last reward, which is printed; of a
-            policy folder the largest budget and the first seed).
+        policy: "agent", "guided" or another that `evaluate TASK --help` lists (default: trained agent, adapted policy).
+        guidance, labels, seed: of the lane (default: of a run the lane with the best last reward, which is printed; of
+            a policy folder the largest budget and the first seed).
         bound_deg: bound [deg] of a lane of a policy folder (default: the largest).
-        base: the policy that was adapted, where it is code: the folder names it, and does not hold it.
-        changes: the distortions of your own that a reading corrected: the folder names them, and does not hold them.
-        task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
+        base, changes: code of the adapted policy, and distortions of your own, which a folder names and does not hold.
+        task: of a run of a task from outside the package, whose code is not loaded because a file names it.
         world: the world to act in, for policies that need more than observations (default: as it was trained).
     """
     path = shipped.folder_of(os.fspath(folder))
@@ -152,15 +141,13 @@ def load_policy(
     own = registry.resolve(task) if isinstance(task, str) else task
     find = lambda name: own if own and own.name == name else registry.find(name)  # noqa: E731
     source = policy_sources.PolicySource.of_folder(path, find, None if base is None else as_policy(base), changes)
-    own_task, name = source.task, policy or source.default_policy
-    config = world.config if world else source.config.task
-    source.check(name, config)
-    shape = shape_of(own_task, config)
-    seeds = () if seed is None else (seed,)
+    where, name = world or World(source.task, source.config.task), policy or source.default_policy
+    source.check(name, where.config)
+    shape, seeds = shape_of(source.task, where.config), () if seed is None else (seed,)
     choice = LaneChoice(policy=name, guidance=guidance, labels=labels, bound_deg=bound_deg, seed=seeds)
-    own_policy, lane = choice.lane_in(source, config)
-    where, taught = world or World(own_task, config), policy_sources.POLICIES[name].taught
-    return CallablePolicy(own_policy, shape.observation, taught, source.config, actions_of(shape), where, lane)
+    acting, lane = choice.lane_in(source, where.config)
+    taught = policy_sources.POLICIES[name].taught
+    return CallablePolicy(acting, shape.observation, taught, source.config, actions_of(shape), where, lane)
 
 
 @user_code.report_user_errors
@@ -179,8 +166,8 @@ def measure(
         policy: a policy, or any function of a batch of observations in NumPy.
         world: the world that the policy acts in.
         episodes: whole episodes, where the task counts episodes (default: 100).
-        steps: environment steps in place of episodes (default, where the task counts steps: 10,000).
-        envs: environments that share the steps (default: 100).
+        steps, envs: environment steps in place of episodes, and the environments that share them (default, where the
+            task counts steps: 10,000 and 100).
         engine: other physics that the world's robot has (default: its own).
 
     Returns:
@@ -200,23 +187,21 @@ def export_policy(
     """Write a policy's whole decision as a file, with a contract of its inputs and outputs.
 
     Args:
-        policy: one that was loaded, adapted or refined, or anything else made of JAX functions that acts.
+        policy: one that was loaded or adapted, or anything else made of JAX functions that acts.
         out: a new folder.
-        world: the world that names the slices of the observation and supplies golden cases (default:
-            where it was corrected).
+        world: names the slices of the observation and supplies golden cases (default: where it was corrected).
         format: "stablehlo", "onnx" or "numpy".
 
     Returns:
         The contract, with "difference": the largest difference of the file's golden cases.
     """
-    from cuelearner_jax.export import contract, decisions  # only exports need it
+    from cuelearner_jax.export import decisions  # only exports need it
 
-    world, out = _world_of(policy, world), Path(out)
-    contract.check_request(format, out)
-    env = world.env
-    acting = as_policy_in(policy, env)
-    draw = lambda: decisions.observations(env, acting)  # noqa: E731
-    return contract.write(acting, env, draw, format, out, _about(policy, world))
+    def whole(env: Any) -> tuple[Policy, Any, Callable[[], np.ndarray]]:
+        acting = as_policy_in(policy, env)
+        return acting, env, lambda: decisions.observations(env, acting)
+
+    return _export(policy, out, world, format, whole)
 
 
 @user_code.report_user_errors
@@ -224,37 +209,28 @@ def export_correction(policy: Any, out: str | Path, world: World | None = None, 
     """Write the correction of a corrected policy alone: observation and base action in, action out.
 
     It runs beside a base that stays where it is: `decide(observation, base_action)`. In ONNX its inputs are `obs` and
-    `base_action`, its output `action`.
-
-    Args:
-        policy: a policy from `correct`, `adapt` or `refine`, or loaded from a policy folder.
-        out: a new folder.
-        world: the world that the policy acts in (default: where it was corrected).
-        format: "onnx", "numpy" or "stablehlo".
-
-    Returns:
-        The contract, as `export_policy` does.
+    `base_action`, its output `action`. `policy`: from `correct` or `adapt`, or loaded from a policy folder. The other
+    arguments and the returned contract are those of `export_policy`.
     """
-    from cuelearner_jax.export import contract, correction
+    from cuelearner_jax.export import correction
 
-    world, out = _world_of(policy, world), Path(out)
-    contract.check_request(format, out)
-    alone, interface = correction.correction_of(as_policy(policy), world.env)
-    return contract.write(alone, interface, lambda: correction.cases(world.env), format, out, _about(policy, world))
+    def alone(env: Any) -> tuple[Policy, Any, Callable[[], np.ndarray]]:
+        return *correction.correction_of(as_policy(policy), env), lambda: correction.cases(env)
+
+    return _export(policy, out, world, format, alone)
 
 
-def _world_of(policy: Any, world: World | None) -> World:
-    """Return where a policy acts. Raises UserError if it is not known."""
-    world = world or getattr(policy, "world", None)
-    if world is None:
+def _export(policy: Any, out: str | Path, world: World | None, format: str, part: Callable[[Any], Any]) -> Any:
+    """Write a part of a policy; `part`: environment -> policy, its interface, and observations for golden cases."""
+    from cuelearner_jax.export import contract
+
+    if (world := world or getattr(policy, "world", None)) is None:
         raise UserError("world is None, and this policy names none: give world=cl.make(...)")
-    return world
-
-
-def _about(policy: Any, world: World) -> dict[str, Any]:
-    lane = getattr(policy, "lane", None)  # of a `PolicyNode` a method
-    head = {"subject": type(policy).__name__, **(lane if isinstance(lane, dict) else {})}
-    return {**head, "world": {"name": world.task.name, **to_json(world.config)}}
+    contract.check_request(format, Path(out))
+    lane = policy.lane if isinstance(policy, CallablePolicy) else {}
+    about = {"subject": type(policy).__name__, **lane, "world": {"name": world.task.name, **to_json(world.config)}}
+    alone, interface, draw = part(world.env)
+    return contract.write(alone, interface, draw, format, Path(out), about)
 
 
 def load_exported(folder: str | Path) -> Any:

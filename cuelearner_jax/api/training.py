@@ -47,17 +47,15 @@ class Run:
         """Return one lane's trained agent: that of the best last reward among those that fit, which is printed."""
         if guidance is not None and guidance not in self.trainings:
             raise UserError(f"no guidance {guidance!r} was trained{suggestion(guidance, self.trainings)}")
-        seeds = () if seed is None else (seed,)
-        name, budget, seeds = best_lane(self.results, (guidance, labels, seeds))
+        name, budget, seeds = best_lane(self.results, (guidance, labels, () if seed is None else (seed,)))
         training = self.trainings[name or [*self.trainings][-1]]
         group = training.group
         lanes = np.flatnonzero((group.budgets == budget) & np.isin(group.seeds, seeds))
         if not len(lanes):
             raise UserError(f"no lane with seed {seed} and {labels} labels was trained")
-        agents = training.policies(view_of(group.env))
+        agent = training.policies(view_of(group.env)).lane(int(lanes[0]))
         lane = {"guidance": name, "labels": budget, "seed": seeds[0]}
-        space = self.world.actions
-        return CallablePolicy(agents.lane(int(lanes[0])), self.world.observation, actions=space, lane=lane)
+        return CallablePolicy(agent, self.world.observation, actions=self.world.actions, lane=lane)
 
 
 @user_code.report_user_errors
@@ -82,8 +80,7 @@ def train(
         teacher: a teacher (a function of observations, or another policy, teaches what it does); needed by kinds of
             guidance that ask, unless a label file answers.
         config: everything else, or the name of one of the task's presets; its world is the one given.
-        guidance: kinds of guidance (default: the preset's, of these what can be had without a teacher if there is none;
-            with a configuration, all that the world can have).
+        guidance: kinds of guidance (default: the preset's, or all, as far as the world can have them).
         labels: label budgets, or a label file in place of the teacher, with as many as its shortest seed has (default:
             the preset's budgets; with a configuration, 100).
         seeds: their number (0, 1, ...), or the seeds (default: the preset's; with a configuration, 8).
@@ -93,21 +90,29 @@ def train(
     if teacher is not None:
         teacher = teacher_of_world(teacher, world.actions)
     file = Path(labels) if isinstance(labels, str | os.PathLike) else None
-    request = _suggested(world, config, taught=teacher is not None or file is not None)
-    grid = dataclasses.replace(request.grid, guidance=tuple(guidance or request.grid.guidance))
+    task, possible = world.task, guidances.possible(world.env, taught=teacher is not None or file is not None)
+    if isinstance(config, RunConfig):
+        groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
+        settings = {name: configuration.normalize_options(getattr(config, name), name) for name in groups}
+        config, usual = dataclasses.replace(config, **settings), Grid(possible, tuple(range(SEEDS)), LABELS)
+    elif config in task.presets:
+        usual = study.suggested(task, task.presets[config]).grid
+        config = task.presets[config].config
+    else:
+        raise UserError(f"config: unknown preset {config!r}{suggestion(config, task.presets)}")
     if isinstance(labels, str | os.PathLike):
-        grid = dataclasses.replace(grid, labels=(label_files.read(Path(labels)).budget,))
-    elif labels is not None:
-        grid = dataclasses.replace(grid, labels=tuple(map(index, labels)))
-    if seeds is not None:
-        own = seeds_of(0, seeds) if isinstance(seeds, int) else tuple(map(index, seeds))
-        grid = dataclasses.replace(grid, seeds=own)
-    request = dataclasses.replace(request, grid=grid, labels_from=file, split=split)
+        labels = (label_files.read(Path(labels)).budget,)
+    seeds = usual.seeds if seeds is None else seeds
+    own = seeds_of(0, seeds) if isinstance(seeds, int) else tuple(map(index, seeds))
+    kinds = tuple(guidance) or tuple(kind for kind in usual.guidance if kind in possible)
+    grid = Grid(kinds, own, usual.labels if labels is None else tuple(map(index, labels)))
+    config = dataclasses.replace(config, task=world.config)
+    request = TrainRequest(task, config, grid, labels_from=file, split=split)
     results, trainings = study.in_memory(request, world.env, world.environment(split), teacher, progress)
     failed = failures.summary(results)
     if failed:
         warnings.warn(f"{failed}: leave out the rows with failed = 1", stacklevel=2)
-    return Run(world, request.config, results, trainings)
+    return Run(world, config, results, trainings)
 
 
 @user_code.report_user_errors
@@ -115,30 +120,7 @@ def read_run(folder: str | os.PathLike[str]) -> pa.Table:
     """Return recorded results as one table, with a row a lane and evaluation.
 
     `run.to_pandas()` is a data frame, where pandas is installed. Each column's field holds its meaning, as
-    `run.field("reward").metadata[b"description"]`.
-
-    Args:
-        folder: folder of a run, finished or not, of a sweep in pieces, or of several runs of one task.
-
-    Raises:
-        UserError: there are no results at or below the folder, or they are of several tasks.
+    `run.field("reward").metadata[b"description"]`. `folder`: of a run, finished or not, of a sweep in pieces, or of
+    several runs of one task; else UserError.
     """
     return stored.read(folder)
-
-
-def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequest:
-    """Return the defaults for this world."""
-    task, possible = world.task, guidances.possible(world.env, taught=taught)
-    if isinstance(config, RunConfig):
-        groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
-        settled = {name: configuration.normalize_options(getattr(config, name), name) for name in groups}
-        request = TrainRequest(
-            task, dataclasses.replace(config, **settled), Grid(possible, tuple(range(SEEDS)), LABELS)
-        )
-    elif config in task.presets:
-        request = study.suggested(task, task.presets[config])
-    else:
-        raise UserError(f"config: unknown preset {config!r}{suggestion(config, task.presets)}")
-    kinds = tuple(kind for kind in request.grid.guidance if kind in possible)
-    grid, config = dataclasses.replace(request.grid, guidance=kinds), request.config
-    return dataclasses.replace(request, config=dataclasses.replace(config, task=world.config), grid=grid)

@@ -14,13 +14,15 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.config import LARGEST_FLOAT, normalize_options
 from cuelearner_jax.environment import Environment, Quantity, actions_of
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.policies import Teaching, policy_of, teaching
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Space
-from cuelearner_jax.task import Task
+from cuelearner_jax.task import PAPER, Body, Preset, Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.types import EnvState, Policy, Step, Teacher
 
@@ -34,10 +36,7 @@ class World:
     scenario: str | None = None  # name of the scenario, whose suggestions `adapt` follows
 
     def __post_init__(self) -> None:
-        """Raise UserError for a configuration of another task."""
-        if not isinstance(self.config, self.task.config):
-            wanted = f"a {self.task.config.__name__}, or use cl.make"
-            raise UserError(f"config is {format_value(self.config)}: give {wanted}")
+        """Take numbers of NumPy in the configuration as Python's."""
         object.__setattr__(self, "config", normalize_options(self.config, "task"))
 
     @cached_property
@@ -75,7 +74,15 @@ class World:
 
         Raises UserError for an action outside the space.
         """
-        return jax.jit(self.env.step)(key, state, action_in(action, self.actions))
+        space = self.actions
+        if not isinstance(action, Tracer):
+            value, action = action, numbers("action", action)
+            if action.shape != (space.size,) or not space.usable(action, np):
+                example = np.asarray(space.spread(4))[0].round(2).tolist()
+                raise UserError(
+                    f"action is {format_value(value)}: give an action of shape ({space.size},), as {example}"
+                )
+        return jax.jit(self.env.step)(key, state, action)
 
 
 @user_code.report_user_errors
@@ -137,6 +144,19 @@ def teacher_of(source: World | Policy) -> Teacher:
     return Teaching(policy_of(getattr(source, "policy", source)))
 
 
+@dataclasses.dataclass(frozen=True)
+class NoOptions:
+    """The configuration of an environment without a task."""
+
+
+def world_around(env: Environment) -> World:
+    """Return an environment without a task as a world, in which nobody answers."""
+    start = Preset("as adaptation starts", RunConfig(NoOptions(), scalars=plain_scalars(actions_of(env))))
+    body = Body("actor", "who acts", lambda config, split: env)
+    about = "an environment without a task"
+    return World(Task("environment", about, NoOptions, (body,), presets={PAPER: start}), NoOptions())
+
+
 def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
     """Return numbers of any shape, all finite in single precision."""
     array = np.asarray(value)
@@ -149,19 +169,7 @@ def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
     return array.astype(np.float32)
 
 
-def action_in(value: Any, space: Space) -> Any:
-    """Return one action, which may be traced."""
-    if isinstance(value, Tracer):
-        return value
-    action = numbers("action", value)
-    if action.shape != (space.size,) or not space.usable(action, np):
-        example = np.asarray(space.spread(4))[0].round(2).tolist()
-        raise UserError(f"action is {format_value(value)}: give an action of shape ({space.size},), as {example}")
-    return action
-
-
 def teacher_of_world(value: Any, space: Space) -> Teacher:
     """Return a teacher: the given one, or one that shows what a given policy does itself."""
-    if not callable(getattr(value, "best_action", None)):
-        value = getattr(value, "policy", value)  # a `CallablePolicy`, which is above this module
-    return teaching(value, space)
+    is_teacher = callable(getattr(value, "best_action", None))
+    return teaching(value if is_teacher else getattr(value, "policy", value), space)  # that of a `CallablePolicy`

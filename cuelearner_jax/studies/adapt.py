@@ -1,9 +1,9 @@
 """Adaptation as one request, filled alike by the command line and Python, which checks itself and runs.
 
 request = AdaptRequest.of(task, config, scenario="rooms")    # the defaults
-found = replace(request, labels=(250,)).run(Subject(env, bases, task=task))
+study = replace(request, labels=(250,)).run(Subject(task, env, bases))
 with policy_folders.place_of(out) as place:
-    found.write(place)
+    study.write(place)
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from cuelearner_jax.adaptation import by_model, by_reading, changes, judging, serialization
 from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.by_reading import ReadingAdaptation
-from cuelearner_jax.adaptation.judging import Judging, Person, Prefer
+from cuelearner_jax.adaptation.judging import LABELS, PERSON, Judging, Prefer
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, product, side_by_side
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
@@ -30,7 +30,7 @@ from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide, ReadingGuide
-from cuelearner_jax.policies import Common, lanes_in, policy_of
+from cuelearner_jax.policies import Common, lanes_in
 from cuelearner_jax.reading.families import declared_distortions
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import adapted, policy_sources
@@ -42,18 +42,17 @@ from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Scenario, Task
 from cuelearner_jax.types import Label, Teacher
 
-MOST_ENVS = 100_000  # more do not fit into memory
 AS_IT_IS = Scenario("the world as it is", {})
 
 
 class Subject(NamedTuple):
     """The policies to adapt, the world that they act in, and who answers."""
 
+    task: Task
     env: Environment
     bases: Any  # a block of policies, or `Common`
     seeds: tuple[int, ...] = (0,)  # of several base policies, each of which is adapted with its own
     origin: dict[str, Any] = {}  # noqa: RUF012  # the base policies in plain values; empty: no folder will hold them
-    task: Task | None = None  # None: an environment without a task
     teacher: Teacher | None = None  # None: the task's teacher
     rows: Label | None = None  # labels (labels, ...) in place of questions; None: ask
     changes: Any = None  # what may have changed, as `changes.family_of` takes it; None: what the world declares
@@ -66,27 +65,18 @@ def subject_of(source: PolicySource, world: Any, base: LaneChoice, reference: st
 
     `reference`: package.module:NAME of code that acts or is in the folder.
     """
-    env = source.task.environment(world)
-    if source.code is not None:
-        if base != LaneChoice():
-            raise UserError(
-                f"--base.… chooses among the lanes of a folder, but {reference} is not a folder: leave it out"
-            )
-        policy = policy_of(source.code, actions_of(env))
-        return Subject(env, Common(policy), origin={"code": reference}, task=source.task)
-    name = base.name_in(source, world)
+    env, name = source.task.environment(world), base.name_in(source, world)
     if policy_sources.POLICIES[name].taught:
         raise UserError(f"policy {name!r} asks the teacher, so there is nothing to adapt: choose another")
-    if len(set(base.seed)) < len(base.seed):
-        raise UserError("--base.seed: give each seed once")
     policies, lanes = base.lanes_in(source, world, env)
     seeds = tuple(lane["seed"] for lane in lanes)
-    lane = {name: value for name, value in lanes[0].items() if name != "seed"}
-    lane |= {} if base.bound_deg is None else {"bound_deg": base.bound_deg}
-    origin = {"folder": source.folder.name, **lane, "policy": name, "seeds": list(seeds)}
-    origin |= {"code": reference} if reference else {}
+    origin = {"code": reference} if reference else {}
+    if source.code is None:
+        lane = {name: value for name, value in lanes[0].items() if name != "seed"}
+        lane |= {} if base.bound_deg is None else {"bound_deg": base.bound_deg}
+        origin = {"folder": source.folder.name, **lane, "policy": name, "seeds": list(seeds), **origin}
     bases = Common(policies[0]) if len(policies) == 1 else side_by_side(policies)
-    return Subject(env, bases, seeds, origin, source.task)
+    return Subject(source.task, env, bases, seeds, origin)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +112,7 @@ class AdaptRequest:
     @classmethod
     def of(
         cls,
-        task: Task | None,
+        task: Task,
         config: RunConfig,
         scenario: str | None = None,
         guidance: str | None = None,
@@ -133,12 +123,12 @@ class AdaptRequest:
     ) -> Any:
         """Return the default request; the only place where the rules of scenarios are applied.
 
-        `task`: None for an environment without one. `config`: of the policy's training, whose frame and scalars the
-        model uses. `guidance`, `judge_by`: None for what the scenario suggests, or the general default; a scenario's
-        other suggestions apply to the kind that it suggests, its shares of a bound to judging on episodes. `eps_deg`:
-        None for the label file's, that of given scalars, the scenario's, or the training's.
+        `config`: of the policy's training, whose frame and scalars the model uses. `guidance`, `judge_by`: None for
+        what the scenario suggests, or the general default; a scenario's other suggestions apply to the kind that it
+        suggests, its shares of a bound to judging on episodes. `eps_deg`: None for the label file's, that of given
+        scalars, the scenario's, or the training's.
         """
-        rules = task.scenario(scenario) if task and scenario else AS_IT_IS
+        rules = task.scenario(scenario) if scenario else AS_IT_IS
         kind = guidances.resolve(guidance or rules.guidance or ReadingGuide.name)
         if kind.name != rules.guidance:
             rules = replace(rules, sizes={}, scalars={}, options={})  # these apply to the suggested kind
@@ -148,26 +138,21 @@ class AdaptRequest:
         if labels_from is not None:
             file = label_files.read(labels_from)
             eps_deg, labels = file.eps if eps_deg is None else eps_deg, (file.budget,)
-        if scalars is None:
-            eps_deg = rules.eps_deg if eps_deg is None else eps_deg
-            scalars = replace(by_model.settling(config.scalars, eps_deg), **rules.scalars)
-        else:
-            scalars = by_model.settling(scalars, eps_deg)
-        by = judging.LABELS if kind.by_evidence else task.judge_by(config.task) if task else cls.judge_by
+        if scalars is None and eps_deg is None:
+            eps_deg = rules.eps_deg
+        own_scalars = by_model.settling(scalars or config.scalars, eps_deg)
         own = config.kinds.get(kind.name) or (kind.config and kind.config())
-        kinds: Any = {kind.name: replace(own, **rules.options)} if own else {}
-        world: Any = rules.apply(config.task) if task else None
         return cls(
-            task=world,
+            task=rules.apply(config.task),
             labels=labels,
             bound_deg=() if rules.bound_deg is None else (rules.bound_deg,),
             guidance=kind.name,
             labels_from=labels_from,
-            judge_by=judge_by or rules.judge_by or by,
-            judge_bounds=() if judge_by == judging.LABELS else rules.judge_bounds,
+            judge_by=judge_by or rules.judge_by or (LABELS if kind.by_evidence else task.judge_by(config.task)),
+            judge_bounds=() if judge_by == LABELS else rules.judge_bounds,
             sizes=replace(by_model.SIZES, **{"frame": config.sizes.frame, **rules.sizes}),
-            scalars=scalars,
-            kinds=kinds,
+            scalars=own_scalars if scalars else replace(own_scalars, **rules.scalars),
+            kinds={kind.name: replace(own, **rules.options)} if own else {},
         )
 
     def run(self, subject: Subject, watch: Callable[[str], Tell] = lambda what: ignore_progress) -> AdaptedStudy:
@@ -176,51 +161,40 @@ class AdaptRequest:
         `watch`: given the name of a step, returns the function that reports its progress.
         """
         release_programs()
-        env, bases, sizes, scalars = subject.env, subject.bases, self.sizes, self.scalars
-        check_guide(sizes, scalars)
-        kinds: Any = self.kinds
-        for name, options in kinds.items():
+        task, env, bases = subject.task, subject.env, subject.bases
+        of, is_shared = self._adaptation(subject), lanes_in(bases) is None
+        if not is_shared and self.seeds != AdaptRequest.seeds:
+            raise UserError("several base policies are adapted each with its own seed: leave out --seeds")
+        seeds = parse_seeds(self.seeds) if is_shared else subject.seeds
+        budgets = self.labels if subject.rows is None else (len(subject.rows.obs),)
+        file = self._labels(subject, of.guidance, Grid((of.guidance.name,), seeds, budgets))
+        lanes = product(1, seeds, budgets, self._bounds(subject, of.guidance, file), one_each=not is_shared)
+        how, rows, teacher = self._judging(subject, lanes.number), None, subject.teacher
+        if file is not None:
+            slots = label_slots(int(lanes.budget.max()), self.sizes)
+            rows = label_files.for_lanes(file, lanes.seed, lanes.budget, slots)
+        else:
+            teacher = teacher or task.make_teacher(self.task, env, questions=int(lanes.budget.sum()))
+            check_teacher(teacher, self.scalars)
+        if subject.origin:  # a folder will hold the policy: UserError if it cannot
+            plain = of.unread(bases) if isinstance(of, ReadingAdaptation) else of.policy(begin(of, lanes))
+            serialization.to_json(plain)
+        adapt: Any = by_reading.adapt if of.guidance.by_evidence else by_model.adapt
+        return AdaptedStudy(adapt(of, lanes, how, teacher, rows, watch=watch), subject, self)
+
+    def _adaptation(self, subject: Subject) -> Adaptation:
+        """Return the settings that all lanes share. Raises UserError for settings that do not fit the world."""
+        check_guide(self.sizes, self.scalars)
+        for name, options in self.kinds.items():
             check_part(options, name)
-        kind = guidances.resolve(self.guidance)
+        kind, env = guidances.resolve(self.guidance), subject.env
         if not kind.asks:
             raise UserError(f"guidance {kind.name!r} asks no questions, so nothing is learned: choose another kind")
         if subject.changes is not None and not kind.by_evidence:
             raise UserError(f"changes is given, but guidance {kind.name!r} does not use it: give guidance reading")
-        guidance = guidances.make(kind.name, sizes, env, kinds.get(kind.name))
-        shared = lanes_in(bases) is None
-        if not shared and self.seeds != AdaptRequest.seeds:
-            raise UserError("several base policies are adapted each with its own seed: leave out --seeds")
-        seeds = parse_seeds(self.seeds) if shared else subject.seeds
-        grid = Grid((kind.name,), seeds, self.labels if subject.rows is None else (len(subject.rows.obs),))
-        file = self._labels(subject, guidance, grid)
-        bounds = self._bounds(subject, guidance, file)
+        guidance = guidances.make(kind.name, self.sizes, env, self.kinds.get(kind.name))
+        shared = guidance, self.sizes, self.scalars, env, subject.bases
         if not kind.by_evidence:
-            by_model.check_amounts(actions_of(env), bounds, scalars)
-        lanes = product(1, seeds, grid.labels, bounds, one_each=not shared)
-        how = self._judging(subject)
-        if how.by == judging.PERSON and lanes.number > 1:
-            raise UserError("a person judges one policy: give one seed, one number of labels and one bound")
-        rows, teacher = None, subject.teacher
-        if file is not None:
-            slots = label_slots(int(lanes.budget.max()), sizes)
-            rows = label_files.for_lanes(file, lanes.seed, lanes.budget, slots)
-        else:
-            if teacher is None:
-                if subject.task is None:
-                    raise UserError("this environment has no task, so no teacher: give one, or labels")
-                teacher = subject.task.make_teacher(self.task, env, questions=int(lanes.budget.sum()))
-            check_teacher(teacher, scalars)
-        of = self._adaptation(subject, guidance)
-        if subject.origin:  # a folder will hold the policy: UserError if it cannot
-            plain = of.unread(bases) if isinstance(of, ReadingAdaptation) else of.policy(begin(of, lanes))
-            serialization.to_json(plain)
-        adapt: Any = by_reading.adapt if kind.by_evidence else by_model.adapt
-        return AdaptedStudy(adapt(of, lanes, how, teacher, rows, watch=watch), subject, self)
-
-    def _adaptation(self, subject: Subject, guidance: Guide) -> Adaptation:
-        """Return the settings that all lanes share. Raises UserError for changes that do not fit the world."""
-        env, shared = subject.env, (guidance, self.sizes, self.scalars, subject.env, subject.bases)
-        if not guidance.by_evidence:
             return Adaptation(*shared)
         if subject.changes is None:
             return ReadingAdaptation(*shared, declared_distortions(env))
@@ -233,60 +207,57 @@ class AdaptRequest:
         check_grid(grid, adapts=True)
         if guidance.by_evidence and (least := min(grid.labels)) < by_reading.LEAST:
             raise UserError(f"labels is {least}: give at least {by_reading.LEAST}, since each is predicted first")
-        rows, form, spaces = subject.rows, guidance.form, spaces_of(subject.env)
-        assert form is not None  # a kind that asks has a form
-        if rows is not None:
+        if (rows := subject.rows) is not None:
+            spaces, form = spaces_of(subject.env), guidance.form
+            assert form is not None  # a kind that asks has a form
             external_labels.check(rows, spaces, form)
-            eps, seeds = self.scalars.eps_deg if form.by_eps else None, np.full(len(rows.obs), grid.seeds[0])
-            return label_files.LabelFile({}, form.name, spaces.actions, eps, seeds, rows)
+            return label_files.LabelFile({}, form.name, spaces.actions, None, np.zeros(len(rows.obs), int), rows)
         if self.labels_from is None:
             return None
-        if subject.task is None:
-            raise UserError("a label file names its task, and an environment has none: give the labels as arrays")
         return read_labels(self.labels_from, subject.task, self.task, self.sizes, self.scalars, grid)
 
     def _bounds(self, subject: Subject, guidance: Guide, file: label_files.LabelFile | None) -> tuple[float, ...]:
-        """Return the bounds of corrections, in the space's unit."""
+        """Return the bounds of corrections, in the space's unit. Raises UserError for those that nothing can reach."""
         space = actions_of(subject.env)
         if self.bound_deg:
-            by_model.check_bounds(space, self.bound_deg)
-            return self.bound_deg
-        if guidance.by_evidence:
-            return (space.reach,)
-        if file is None:
-            return (by_model.usual_bound(space),)
-        if lanes_in(subject.bases) is not None:
+            bounds = self.bound_deg
+        elif guidance.by_evidence:
+            bounds = (space.reach,)
+        elif file is None:
+            bounds = (max(by_model.BOUND * space.reach, space.grain),)
+        elif lanes_in(subject.bases) is not None:
             raise UserError("the labels of several base policies differ in their largest change: give --bound-deg")
-        reach = by_model.reach(space, subject.bases.policy, file.labels.obs, file.labels.action)
-        return (max(reach, self.scalars.eps_deg),)
+        else:
+            reach = by_model.reach(space, subject.bases.policy, file.labels.obs, file.labels.action)
+            bounds = (max(reach, self.scalars.eps_deg),)
+        by_model.check_amounts(space, bounds, None if guidance.by_evidence else self.scalars)
+        return bounds
 
-    def _judging(self, subject: Subject) -> Judging:
+    def _judging(self, subject: Subject, lanes: int) -> Judging:
         """Return how policies are judged. Raises UserError for invalid settings."""
-        by, task, shares = self.judge_by, subject.task, self.judge_bounds
-        if not 1 <= self.judge_episodes <= MOST_ENVS:
-            raise UserError(f"judge_episodes is {self.judge_episodes}: give a number from 1 to {MOST_ENVS:,}")
-        if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
+        by, task, shares, env, pictures = self.judge_by, subject.task, self.judge_bounds, None, None
+        if self.judge_episodes < 1:
+            raise UserError(f"judge_episodes is {self.judge_episodes}: give a number from 1")
+        if not all(0 < share < 1 for share in shares):
             text = " ".join(f"{share:g}" for share in shares)
-            raise UserError(f"judge_bounds is {text}: give shares of the bound above 0 and below 1, each once")
-        if shares and by in (judging.LABELS, judging.PERSON):
+            raise UserError(f"judge_bounds is {text}: give shares of the bound above 0 and below 1")
+        if shares and by in (LABELS, PERSON):
             raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
-        names = [*judging.metrics_of(subject.env), judging.LABELS, judging.PERSON]
+        names = [*judging.metrics_of(subject.env), LABELS, PERSON]
         if by not in names:
-            name = task.name if task else "this environment"
-            raise UserError(f"judge_by is {by!r}, which is not a metric of {name}{suggestion(by, names)}")
-        steps, tuned, person = judging.STEPS, None, None
-        if task and task.longest:
-            steps = task.longest(self.task)
-        if by != judging.LABELS:
-            tuned = task.environment(self.task, judging.SPLIT) if task else subject.env
-        if by == judging.PERSON:
-            if task is None or subject.prefer is None:
-                raise UserError("a person compares films: give a world of cl.make or cl.from_gymnasium, and judge_by=")
+            raise UserError(f"judge_by is {by!r}, which is not a metric of {task.name}{suggestion(by, names)}")
+        if by != LABELS:
+            env = task.environment(self.task, judging.SPLIT)
+        if by == PERSON:
+            if subject.prefer is None:
+                raise UserError("judge_by is person: give judge_by= a function that compares two films")
+            if lanes > 1:
+                raise UserError("a person judges one policy: give one seed, one number of labels and one bound")
             pictures = task.pictures("judge by a metric")
             if pictures.check is not None:
-                pictures.check(tuned)
-            person = Person(subject.prefer, pictures)
-        return Judging(tuned, self.judge_episodes, steps, by, person, shares)
+                pictures.check(env)
+        steps = task.longest(self.task) if task.longest else judging.STEPS
+        return Judging(env, self.judge_episodes, steps, by, subject.prefer, pictures, shares)
 
 
 class AdaptedStudy(NamedTuple):
@@ -298,10 +269,6 @@ class AdaptedStudy(NamedTuple):
 
     def write(self, place: Place) -> None:
         """Write the policy folder. Raises UserError if the policy cannot be kept."""
-        path, task = self.request.labels_from, self.subject.task
-        assert task is not None  # a folder names it
-        inputs = {
-            "labels_from": f"{path.name} {label_files.digest(path)}" if path else None,
-            "robot": task.robot or None,
-        }
-        adapted.write(place, self.result, task, self.request.task, self.subject.origin, inputs)
+        path, task, world = self.request.labels_from, self.subject.task, self.request.task
+        inputs = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": task.robot}
+        adapted.write(place, self.result, task, world, self.subject.origin, inputs)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,9 +31,6 @@ from cuelearner_jax.types import Label
 
 Ready = tuple[Any, list[Block]]  # the validation episodes, and the lanes that act in them
 Share = tuple[float, float, float]  # estimate, and the ends of its 95% interval
-
-MOST_ENVS = 100_000  # more do not fit into memory
-MOST_STEPS = 1_000_000  # per environment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,20 +79,20 @@ class Measured(NamedTuple):
 def amount(task: Task, request: EvaluateRequest) -> tuple[int, int]:
     """Return the number of environments and the number of steps that they share."""
     longest = None if task.longest is None else task.longest(request.task)
+    envs = 100 if request.envs is None else request.envs
     if request.episodes is not None:
         if request.steps is not None or request.envs is not None:
             raise UserError("episodes determines environments and steps: leave out steps and envs")
         if longest is None:
             raise UserError(f"{task.name} counts steps, not episodes: give steps in place of episodes")
-    name = "envs" if request.episodes is None else "episodes"
-    envs = next((number for number in (request.episodes, request.envs) if number is not None), 100)
-    if not 1 <= envs <= MOST_ENVS:
-        raise UserError(f"{name} is {envs}: give a number from 1 to {MOST_ENVS:,}")
+        envs = request.episodes
+    if envs < 1:
+        raise UserError(f"{'envs' if request.episodes is None else 'episodes'} is {envs}: give at least 1")
     steps = request.steps
     if steps is None:
         steps = 10_000 if longest is None else envs * longest
-    if steps < 1 or steps % envs or steps // envs > MOST_STEPS:
-        raise UserError(f"steps is {steps}: give a positive multiple of envs ({envs}), at most {MOST_STEPS:,} for each")
+    if steps < 1 or steps % envs:
+        raise UserError(f"steps is {steps}: give a positive multiple of envs ({envs})")
     task.check_whole(request.task, envs, steps, "envs", "steps")
     return envs, steps
 
@@ -102,16 +100,13 @@ def amount(task: Task, request: EvaluateRequest) -> tuple[int, int]:
 def prepare(source: PolicySource, request: EvaluateRequest) -> Ready:
     """Return the validation episodes of the request's world and the lanes that act in it, by guidance and step."""
     release_programs()
-    entry, name = POLICIES[request.policy], request.policy
-    choice = request.labels, request.seed
-    if not entry.from_folder:
-        check_no_lane(name, request.guidance, *choice)
+    name, entry = request.policy, POLICIES[request.policy]
     env = source.task.environment(request.task, "validation")
     teacher = source.task.make_teacher(request.task, env) if entry.taught else None
     if entry.from_folder:
-        return env, source.blocks(
-            name, view_of(env), teacher, tuple(map(guidances.kind_name, request.guidance)), *choice
-        )
+        kinds = tuple(map(guidances.kind_name, request.guidance))
+        return env, source.blocks(name, view_of(env), teacher, kinds, request.labels, request.seed)
+    check_no_lane(name, request.guidance, request.labels, request.seed)
     none = np.zeros(1, int)
     return env, [Block("-", none, none, none, 0, Common(source.alone(name, view_of(env), teacher)), none > 0)]
 
@@ -121,9 +116,9 @@ def variants(env: Any, block: Block, of_lanes: Sequence[dict[str, np.ndarray]] =
     unit, is_shared, rows = actions_of(env).unit.replace("degrees", "deg"), lanes_in(block.policy) is None, []
     for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
         own = (block.budgets == budget) & (block.bounds == bound)
-        mine, apart = ({metric: values[own] for metric, values in of.items()} for of in of_lanes)
+        means, each = ({metric: values[own] for metric, values in of.items()} for of in of_lanes)
         variant = block.guidance, budget, block.step, block.seeds[own]
-        rows.append(Measured(*variant, mine, apart, bound or None, is_shared, unit))
+        rows.append(Measured(*variant, means, each, bound or None, is_shared, unit))
     return rows
 
 
@@ -139,7 +134,7 @@ def run(
     env, blocks = ready or prepare(source, request)
     rows = []
     for block in blocks:
-        count, is_shared = len(block.seeds), lanes_in(block.policy) is None
+        count, place = len(block.seeds), np.arange(len(block.seeds))
         tell = watch(request.policy if block.guidance == "-" else block.guidance)
         if engine:
             tells = [part_of(tell, lane, count) for lane in range(count)]
@@ -148,7 +143,7 @@ def run(
             means = {metric: values.mean(-1) for metric, values in each.items()}
         else:
             means, each, _ = rollout_lanes(env, block.policy, key, num_envs, steps, tell)
-        place = np.zeros(count, int) if is_shared and not engine else np.arange(count)  # row of each lane
+            place = place * 0 if lanes_in(block.policy) is None else place  # lanes that share a policy share a row
         rows += variants(env, block, [{name: np.asarray(of[name])[place] for name in of} for of in (means, each)])
     return rows
 
@@ -164,13 +159,9 @@ class Agreement(NamedTuple):
 
     def rows(self) -> list[tuple[str, Share]]:
         """Return each share with its name."""
-        shares = (
-            ("the policy", self.policy),
-            ("the policy as it was", self.base),
-            ("always already right", self.right),
-            ("difference from the policy as it was", self.difference),
-        )
-        return [(name, share) for name, share in shares if share is not None]
+        names = "the policy", "the policy as it was", "always already right", "difference from the policy as it was"
+        shares = self.policy, self.base, self.right, self.difference
+        return [(name, share) for name, share in zip(names, shares, strict=True) if share is not None]
 
     def words(self) -> list[str]:
         """Return the agreement in words, line by line."""
@@ -185,33 +176,33 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
     policy before its correction; None: unknown.
     """
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(says_something(rows.answer))], rows)
-    if not len(rows.obs):
-        raise UserError("labels say nothing of any cue: give labels with answers")
     answers = np.asarray(rows.answer)
+    if not len(answers):
+        raise UserError("labels say nothing of any cue: give labels with answers")
     counts = np.asarray(is_answered(answers)) if len(space.cues) > 1 else np.ones(answers.shape, bool)
 
-    def agreed(own: Any) -> Float[np.ndarray, " labels"]:
+    def agreed(policy: Any) -> Float[np.ndarray, " labels"]:
+        own = 0 if policy is None else _answers_of(policy, rows, space, eps)
         return ((own == answers) & counts).sum(-1) / counts.sum(-1)
 
     def interval(values: Float[np.ndarray, " labels"]) -> Share:
         estimate, low, high = (float(value) for value in mean_interval(values))
         return estimate, low, high
 
-    own, right = agreed(_says(policy, rows, space, eps)), interval(agreed(0))
+    own, right = agreed(policy), agreed(None)
     if base is None:
-        return Agreement(len(own), interval(own), right)
-    before = agreed(_says(base, rows, space, eps))
-    return Agreement(len(own), interval(own), right, interval(before), interval(own - before))
+        return Agreement(len(own), interval(own), interval(right))
+    before = agreed(base)
+    return Agreement(len(own), *map(interval, (own, right, before, own - before)))
 
 
-def _says(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarray, "labels cues"]:
-    """Return the answers (labels, cues) that a policy would give about the labels' actions."""
+def _answers_of(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarray, "labels cues"]:
+    """Return the answers that a policy would give about the labels' actions."""
 
     @jax.jit
     def answered(policy: Any, obs: Any, action: Any) -> Any:
         own = space.only_actions(policy.act(jax.random.key(0), None, obs))
-        strength = space.from_unit(eps)
-        return own, jax.vmap(lambda row, own: relative_feedback(space, row, own, strength))(action, own)
+        return own, jax.vmap(partial(relative_feedback, space), (0, 0, None))(action, own, space.from_unit(eps))
 
     own, result = answered(policy, jnp.asarray(rows.obs), jnp.asarray(rows.action))
     user_code.check_actions(own, policy_name(policy))

@@ -44,21 +44,22 @@ def suggested(task: Task, preset: Preset) -> TrainRequest:
     return TrainRequest(task, preset.config, Grid(preset_kinds(task, preset), seeds, preset.labels))
 
 
-def _groups(request: TrainRequest, env: Any) -> list[LaneGroup]:
-    """Return the lane group of each kind in an environment."""
-    config = request.config
-    return [LaneGroup(config, env, config.guide_in(env, kind), request.grid) for kind in request.grid.guidance]
+def _begin(
+    request: TrainRequest, env: Any, labels: Any, find: Callable[[Any], Teacher | None]
+) -> tuple[list[LaneGroup], Teacher | None]:
+    """Return the lane group of each kind, and who answers: None where no kind asks, or labels answer.
 
-
-def _teacher(request: TrainRequest, groups: list[LaneGroup], labels: Any, find: Callable[[], Any]) -> Teacher | None:
-    """Return who answers; None where no kind asks, or labels answer. Raises UserError for one that cannot be asked."""
+    `find`: environment -> teacher. Raises UserError for one that cannot be asked.
+    """
+    config, env = request.config, place(lane_mesh(), env, SHARED)
+    groups = [LaneGroup(config, env, config.guide_in(env, kind), request.grid) for kind in request.grid.guidance]
     asking = [group.guidance.name for group in groups if group.guidance.asks]
     if not asking or labels is not None:
-        return None
-    if (teacher := find()) is None:
+        return groups, None
+    if (teacher := find(env)) is None:
         raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")
-    check_teacher(teacher, request.config.scalars)
-    return place(lane_mesh(), teacher, SHARED)
+    check_teacher(teacher, config.scalars)
+    return groups, place(lane_mesh(), teacher, SHARED)
 
 
 def run(order: Order) -> None:
@@ -72,9 +73,7 @@ def run(order: Order) -> None:
     order, task, world = plan.order, plan.order.task, plan.order.config.task
     with progress_bars() as bars:
         waiting = bars.add_task("preparing", total=None, note="")
-        env = place(lane_mesh(), task.environment(world), SHARED)
-        groups = _groups(order, env)
-        teacher = _teacher(order, groups, plan.labels, lambda: task.make_teacher(world, env))
+        groups, teacher = _begin(order, task.environment(world), plan.labels, lambda env: task.make_teacher(world, env))
         examined = task.environment(world, order.split)
         with claimed(order.out), interruptible() as stopping:
             # Nobody else can change it any more.
@@ -100,8 +99,7 @@ def in_memory(
     release_programs()
     request = resolve_request(request)
     labels = labels_of(request)
-    groups = _groups(request, place(lane_mesh(), env, SHARED))
-    teacher = _teacher(request, groups, labels, lambda: teacher)
+    groups, teacher = _begin(request, env, labels, lambda env: teacher)
     rows, trainings = [], {}
     with progress_bars(visible=progress) as bars:
         for group in groups:
@@ -110,8 +108,7 @@ def in_memory(
             if not training.labelled and labels is not None:
                 training.take(labels)
             bar = bars.add_task(name, total=request.config.schedule.total_steps, note="")
-            if not training.labelled:
-                assert teacher is not None  # checked above
+            if not training.labelled and teacher is not None:
                 label_bar = bars.add_task(f"{name}: labels", total=group.rounds, note="")
                 for count in training.label_rounds(teacher):
                     bars.update(label_bar, completed=count)
@@ -124,10 +121,7 @@ def in_memory(
 
 def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
     """Return the columns of one evaluation as a table with a row per lane."""
-    count = len(group.seeds)
-    columns = {name: value if np.ndim(value) else np.full(count, value) for name, value in row.items()}
-    arrays = {
-        name: pa.array(values if values.ndim == 1 else list(values), from_pandas=True)
-        for name, values in columns.items()
-    }
-    return pa.table({"guidance": pa.array([group.guidance.name] * len(group.seeds)), **arrays})
+    columns = {"guidance": group.guidance.name, **row}
+    arrays = {name: np.broadcast_to(value, np.shape(value) or len(group.seeds)) for name, value in columns.items()}
+    lists = {name: values if values.ndim == 1 else list(values) for name, values in arrays.items()}
+    return pa.table({name: pa.array(values, from_pandas=True) for name, values in lists.items()})

@@ -164,7 +164,7 @@ def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path):
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
     refused([*plain, "--judge-by", "hits"], "not a metric of turned, did you mean 'hit'", tmp_path)
     refused([*plain, "--judge-bounds", "0.5", "--judge-by", "labels"], "judge_bounds needs episodes", tmp_path)
-    refused([*plain, "--base.seed", "3"], "own_turned:straight is not a folder: leave it out", tmp_path)
+    refused([*plain, "--base.seed", "3"], "leave out the options that choose a lane", tmp_path)
     refused([*CODE, "--out", adapted], "is not empty: give --overwrite", adapted)
     refused([*CODE, "--out", adapted.parent, "--overwrite"], "is not a policy folder", adapted)
     refused(["evaluate", adapted, *TASK], "add --base own_turned:straight if you trust that code", adapted)

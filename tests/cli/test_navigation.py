@@ -9,7 +9,7 @@ def test_an_evaluation_of_the_short_episodes_alone_is_refused(refused, tmp_path)
     refused([*EVALUATE, "--steps", "1200", "--envs", "120"], short, tmp_path)
     refused([*EVALUATE, "--steps", "10000", "--task.max-steps", "200"], "give steps 20000", tmp_path)
     refused([*EVALUATE, "--episodes", "12", "--envs", "12"], "leave out steps and envs", tmp_path)
-    refused([*EVALUATE, "--episodes", "0"], "from 1 to 100,000", tmp_path)
+    refused([*EVALUATE, "--episodes", "0"], "episodes is 0: give at least 1", tmp_path)
     refused(["evaluate", "billiards", "--episodes", "3"], "billiards counts steps, not episodes", tmp_path)
     few = ["--schedule.eval-envs", "10", "--schedule.eval-steps", "200"]
     sweep = ["sweep", "navigation", "--preset", "quickstart", *few, "--out", tmp_path / "none"]
