@@ -19,7 +19,7 @@ import tyro
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import changes
-from cuelearner_jax.adaptation.by_model import check_bounds
+from cuelearner_jax.adaptation.by_model import check_amounts
 from cuelearner_jax.cli.options import Flag, NewWorld, Word, about, as_options, check_numbers, look_ahead_of, out, parse
 from cuelearner_jax.cli.sources import code_of, is_code, preset_of, recorded_or_task, source_in, with_cues
 from cuelearner_jax.cli.train import asking_kind
@@ -156,7 +156,7 @@ def make_plan(task: Task, config: RunConfig, options: LabelOptions, source: Poli
         raise UserError(f"{task.name} has no sketch of a situation: {UNDRAWN}")
     env = shape_of(task, options.task)
     if options.bound_deg is not None:
-        check_bounds(actions_of(env), (options.bound_deg,))
+        check_amounts(actions_of(env), (options.bound_deg,), None)
     guidance = settings.guide_in(env, guidances.kind_name(options.guidance))
     _check_guidance(guidance, task, options, actions_of(env))
     family: Any = ()
