@@ -94,15 +94,8 @@ def start(
     k_env: PRNGKeyArray,
     sizes: GuideSizes = ONE_BY_ONE,
 ) -> GuideState:
-    """Return a guide without questions at the start of an episode; with several candidates, of as many episodes.
-
-    Raises ValueError if questions are chosen among candidates and the guide has no ensemble to choose by.
-    """
-    candidates = sizes.candidates
-    by_members = candidates > 1 and not sizes.ask_all
-    if by_members and guidance.asks and not guidance.has_members:
-        raise ValueError(f"guidance {guidance.name!r} has no members whose disagreement could choose its questions")
-    size = actions_of(env).size
+    """Return a guide without questions at the start of an episode; with several candidates, of as many episodes."""
+    candidates, size = sizes.candidates, actions_of(env).size
     state, obs = env.reset(k_env) if candidates == 1 else jax.vmap(env.reset)(jax.random.split(k_env, candidates))
     return GuideState(
         model=guidance.init(k_model),
@@ -127,11 +120,8 @@ def question(
     action.
     """
     space, scalars, several = actions_of(of.env), of.scalars, guide.obs.ndim > 1
-    if several:
-        first = call_policy(of.base, keys.base, guide.env, guide.obs, space)
-    else:
-        states = jax.tree.map(lambda leaf: leaf[None], guide.env)
-        first = call_policy(of.base, keys.base, states, guide.obs[None], space)[0]
+    first = call_policy(of.base, keys.base, *_situations(guide), space)
+    first = first if several else first[0]
     if of.bound is not None:
         scalars = bound_scalars(space, scalars, of.bound)
 
@@ -142,6 +132,12 @@ def question(
     if several:
         return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, first), first
     return one(keys.question, guide.obs, first), first
+
+
+def _situations(guide: GuideState) -> tuple[EnvState, Float[Array, "candidates obs"]]:
+    """Return states and observations of the candidates, or of the guide's one situation as the only candidate."""
+    one = (guide.env, guide.obs)
+    return one if guide.obs.ndim > 1 else jax.tree.map(lambda leaf: leaf[None], one)
 
 
 def record(
@@ -216,8 +212,7 @@ def ask(
     them number `position`.
     """
     form, keys = of.guidance.form, question_keys(lane_key, position)
-    if form is None:
-        raise ValueError(f"guidance {of.guidance.name!r} asks nothing")
+    assert form is not None  # a kind that asks
     actions, proposals = question(of, guide, keys)
 
     def answer(key: PRNGKeyArray, state: EnvState, obs: Array, action: Array) -> tuple[Array, Array]:
@@ -276,9 +271,7 @@ def blame(
     Call this for a lane that failed while asking: its situation is the one before the failure, and its labels do not
     show the fault.
     """
-    states, obs, space = guide.env, guide.obs, actions_of(env)
-    if obs.ndim == 1:
-        states, obs = jax.tree.map(lambda leaf: leaf[None], (states, obs))
+    (states, obs), space = _situations(guide), actions_of(env)
     if base is not None:
         assert key is not None
         user_code.check_actions(space.only_actions(base.act(key, states, obs)), policy_name(base))

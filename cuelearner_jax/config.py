@@ -89,15 +89,12 @@ def static(options: PartT) -> PartT:
 
 
 def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
-    """Return values for a configuration's fields: NumPy's numbers as Python's, lists as tuples.
+    """Return a configuration's values, or `changes` of some: NumPy's numbers as Python's, lists as tuples.
 
-    Args:
-        group: a configuration, or its class.
-        prefix: name of the group in messages.
-        changes: the values by field (default: those of the configuration).
+    `prefix`: name of the configuration in messages.
     """
     fields = [field.name for field in dataclasses.fields(group) if field.init]
-    kinds = get_type_hints(group if isinstance(group, type) else type(group))
+    kinds = get_type_hints(type(group))
     values = {
         name: plain(value) for name, value in (changes or {name: getattr(group, name) for name in fields}).items()
     }
@@ -115,8 +112,7 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
 
 def normalize_options(group: PartT, prefix: str) -> PartT:
     """Return a configuration with its values as `check_types` returns them. Raises UserError likewise."""
-    changes = {name: value for name, value in check_types(group, prefix).items() if value is not getattr(group, name)}
-    return dataclasses.replace(group, **changes) if changes else group  # pyright: ignore[reportArgumentType]
+    return dataclasses.replace(group, **check_types(group, prefix))  # pyright: ignore[reportArgumentType]
 
 
 def check_part(group: Any, prefix: str) -> None:
@@ -160,11 +156,10 @@ def from_json(kind: type, values: dict[str, Any]) -> Any:
 
     Raises UserError for an unknown field, or a value of another type than its field's.
     """
-    hints = get_type_hints(kind)
-    types = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    hints, fields = get_type_hints(kind), {field.name for field in dataclasses.fields(kind)}
+    values = {name: plain(value) for name, value in values.items()}
     for name, value in values.items():
-        if name not in types or not fits(value, types[name]):
+        if name not in fields or not fits(value, hints[name]):
             raise UserError(f"{name} is {value!r} in a file of another version of cuelearner or of the task")
     return kind(**values)
 

@@ -81,16 +81,13 @@ def goes_through() -> bool:
     return jax.default_backend() == "cpu" and not _written_out.get()
 
 
-def release_programs(share: float = 0.5, process: Path = Path("/proc/self"), system: Path = Path("/proc/sys")) -> bool:
-    """Forget all compiled programs if they take much of what the process may map; return whether they were forgotten.
+def release_programs(process: Path = Path("/proc/self"), system: Path = Path("/proc/sys")) -> bool:
+    """Forget all compiled programs if they take half of what the process may map; return whether they were forgotten.
 
     Each compiled program takes tens to thousands of memory maps, and Linux allows a process 65,530 of them
     (`vm.max_map_count`). JAX frees none by itself, and ends in a segmentation fault when none is left, mostly while
-    JAX writes its compilation cache (jax-ml/jax issue 27201). What is needed again is compiled again.
-
-    Args:
-        share: of the maps that are allowed, above which programs are forgotten.
-        process, system: folders of Linux with the number of maps and its limit; nothing is done without them.
+    JAX writes its compilation cache (jax-ml/jax issue 27201). What is needed again is compiled again. Nothing is done
+    without the folders `process` and `system` of Linux, which have the number of maps and its limit.
     """
     try:
         most = int((system / "vm/max_map_count").read_text())
@@ -98,7 +95,7 @@ def release_programs(share: float = 0.5, process: Path = Path("/proc/self"), sys
             mapped = sum(1 for _ in lines)
     except (OSError, ValueError):
         return False
-    if mapped <= share * most:
+    if mapped <= most / 2:
         return False
     jax.clear_caches()
     gc.collect()
@@ -126,7 +123,7 @@ def compiler_options(lanes: int) -> dict[str, Any]:
 
 def lane_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     """Return the mesh of devices that share the lanes: all of this process's, or the given ones."""
-    devices = jax.local_devices() if devices is None else list(devices)
+    devices = jax.local_devices() if devices is None else devices
     return jax.make_mesh((len(devices),), (LANES,), axis_types=(AxisType.Auto,), devices=devices)
 
 
@@ -169,7 +166,7 @@ def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def mapped(*blocks: Any) -> Any:
         if _lanes(blocks) == 1:
-            return jax.tree.map(lambda leaf: leaf[None], function(*_lane(blocks, 0)))
+            return _block(function(*_lane(blocks, 0)))
         if jax.default_backend() != "cpu":
             return jax.vmap(function)(*blocks)
         return jax.lax.map(lambda lane: function(*lane), blocks)
@@ -186,7 +183,7 @@ def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Calla
     def mapped(block: Any) -> tuple[Any, Any, Any]:
         if _lanes(block) == 1:
             lane, common, own = function(_lane(block, 0))
-            return *jax.tree.map(lambda leaf: leaf[None], (lane,)), common, jax.tree.map(lambda leaf: leaf[None], own)
+            return _block(lane), common, _block(own)
         if jax.default_backend() != "cpu":
             return jax.vmap(function, out_axes=(0, None, 0))(block)
 
@@ -203,6 +200,10 @@ def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Calla
 
 def _lanes(blocks: Any) -> int:
     return len(jax.tree.leaves(blocks)[0])
+
+
+def _block(lane: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[None], lane)
 
 
 def _lane(blocks: Any, index: Any) -> Any:

@@ -29,23 +29,10 @@ def episodes(split: str = "validation") -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(0), SPLITS[split])
 
 
-def rollout(
-    policy: Policy, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int
-) -> dict[str, Float[Array, ""]]:
-    """Return means over `steps` environment steps, shared by `num_envs` environments that reset automatically.
-
-    These are "reward" a step, every metric of the environment's, and, where it has outcomes, these (nan unless all
-    first episodes have ended) and "finished", the share of first episodes that have. Outcomes are those of each
-    environment's first episode: the same episodes for every policy, long ones included. Give steps enough for the
-    longest one, since without it there is no mean over all of them.
-    """
-    return _rolled(policy, env, key, num_envs, steps).means
-
-
 class Rollout(NamedTuple):
     """The results of a roll-out: means over all environments, and each environment's values, which are independent."""
 
-    means: dict[str, Any]  # (*lanes,) over the environments, as `rollout` gives them
+    means: dict[str, Any]  # (*lanes,) over the environments, as `evaluate_policy` gives them
     # (*lanes, envs) means over an environment's own steps (those of its first episode, where the environment
     # `plays_once`); outcomes are of its first episode, nan until that has ended
     each: dict[str, Any]
@@ -137,8 +124,14 @@ def _together(each: Any, shared: Any) -> Any:
 def evaluate_policy(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int
 ) -> dict[str, Float[Array, ""]]:
-    """Run the compiled `rollout` of one policy."""
-    return rollout(policy, env, key, num_envs, steps)
+    """Return means over `steps` environment steps, shared by `num_envs` environments that reset automatically.
+
+    These are "reward" a step, every metric of the environment's, and, where it has outcomes, these (nan unless all
+    first episodes have ended) and "finished", the share of first episodes that have. Outcomes are those of each
+    environment's first episode: the same episodes for every policy, long ones included. Give steps enough for the
+    longest one, since without it there is no mean over all of them.
+    """
+    return _rolled(policy, env, key, num_envs, steps).means
 
 
 RESAMPLES = 2_000
@@ -190,7 +183,7 @@ def part_of(tell: Tell, number: int, parts: int) -> Tell:
 def rollout_with_progress(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = ignore_progress
 ) -> Rollout:
-    """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,)."""
+    """Roll out one policy, as `evaluate_policy` does, in stretches. Returns NumPy arrays: means (), values (envs,)."""
     return _in_stretches(env, None, policy, key, num_envs, steps, tell, policy_name(policy))
 
 

@@ -254,18 +254,13 @@ def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:
     return (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
 
 
-def make_lane(config: RunConfig, guidance: Guide, env: Environment, largest_budget: int) -> Lane:
-    """Return the loop of one lane for an environment, of which only the shapes are used."""
-    return lane_of(config.sizes, parts_of(config), guidance, largest_budget, env)
-
-
 def parts_of(config: RunConfig) -> Parts:
     """Return the parts of a configuration that shape a lane."""
     return static(config.agent), static(config.arbiter), config.bootstraps
 
 
 def lane_of(sizes: Sizes, parts: Parts, guidance: Guide, largest_budget: int, env: Environment) -> Lane:
-    """Return the loop of one lane for parts whose float options are None."""
+    """Return the loop of one lane for parts whose float options are None; of the environment only shapes are used."""
     agent, arbiter, bootstraps = parts
     learner = agent.make(sizes.frame, spaces_of(env), bootstraps)
     buffer = buffer_for(env, bootstraps)

@@ -24,7 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_envs.billiards.environment import Balls
 from cuelearner_jax.adaptation.by_model import settling
 from cuelearner_jax.adaptation.by_reading import CHOICE
 from cuelearner_jax.agents.choice import best_near_peaks
@@ -32,7 +31,7 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import policy_of
-from cuelearner_jax.reading import Distortion, Reading, Unknown, Walk, declared_distortions, simulator_distortion
+from cuelearner_jax.reading import Distortion, Reading, Walk, declared_distortions
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.report.statistics import RESAMPLES
 from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
@@ -46,20 +45,18 @@ SCENES: dict[str, tuple[str, dict[str, Any]]] = {
     "turned_strike": ("turned_strike", {}),
     "shifted_balls": ("shifted_balls", {}),
     "turned_and_shifted": ("turned_strike", {"observation_bias": (0.0071, 0.0071)}),
-    "tilted_table": ("tilted_table", {}),
     "turned_lidar": ("turned_lidar", {}),
     "turned_sensors": ("turned_lidar", {"goal_rotation_deg": 10.0}),
     "noisy_lidar": ("turned_lidar", {"lidar_rotation_deg": 0.0, "lidar_dropout": 0.3}),
 }
 LIKE = {"billiards": "turned_strike", "navigation": "turned_lidar"}
 WORLDS = {
-    "billiards": (UNCHANGED, "turned_strike", "shifted_balls", "turned_and_shifted", "tilted_table"),
+    "billiards": (UNCHANGED, "turned_strike", "shifted_balls", "turned_and_shifted"),
     "navigation": (UNCHANGED, "turned_lidar", "turned_sensors", "noisy_lidar"),
 }
 METRIC = {"billiards": "reward", "navigation": "success"}
 LABELS = (10, 25, 50, 100)
 ENVS = 200
-REACH_DEG = 0.6  # how far a tilt may bend a shot
 COARSE, PEAKS = 450, 8  # of the shipped network's search: directions of a first look, and maxima that are looked at
 
 
@@ -83,26 +80,6 @@ def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, fault
     scalars = dataclasses.replace(settling(scalars, rules.eps_deg), **{**rules.scalars, **faults})
     env = task.environment(config)
     return World(config, env, task.environment(config, split), scalars, task.make_teacher(config, env))
-
-
-def family_of(task: Any, own: Any, world: World, tilt: bool) -> tuple[Distortion, ...]:
-    """Return what may have changed, as the world declares; with `tilt` also the table, by a simulator."""
-    if not tilt:
-        return declared_distortions(world.env)
-    known, space = task.environment(own), actions_of(world.env)
-
-    def env_of(theta: Any) -> Any:
-        return known.replace(table=known.table.replace(acceleration=theta))
-
-    def state_of(obs: Any) -> Balls:
-        balls = obs.reshape(-1, 3)
-        return Balls(balls[:, :2], balls[:, 2] > 0, jnp.zeros((), jnp.int32))
-
-    unknowns = (Unknown("tilt x", "m/s^2"), Unknown("tilt y", "m/s^2"))
-    return (
-        *declared_distortions(world.env),
-        simulator_distortion("table: tilt", unknowns, env_of, state_of, space, REACH_DEG),
-    )
 
 
 def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, Any]]:
@@ -162,7 +139,7 @@ class Study(NamedTuple):
         if self.asked.eps_deg:
             faults["eps_deg"] = self.asked.eps_deg
         world = world_of(self.task, name, self.own, self.scalars, self.asked.split, faults)
-        self.made[name] = world, family_of(self.task, self.own, world, name == "tilted_table")
+        self.made[name] = world, declared_distortions(world.env)
         return self.made[name]
 
     def row(self, name: str, base: int, seed: int, labels: int) -> dict[str, Any]:

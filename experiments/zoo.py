@@ -30,7 +30,7 @@ from cuelearner_jax.devices import each_lane
 from cuelearner_jax.reading import fitting
 from cuelearner_jax.reading.fitting import Fit, Hypothesis, Reader
 from cuelearner_jax.reading.linear import RelativeLabels
-from cuelearner_jax.reading.posterior import PRIORS, habits
+from cuelearner_jax.reading.posterior import habits
 from cuelearner_jax.reading.session import BATCHES, FIRST, LEAST_EVIDENCE, MOST_WRONG
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 from cuelearner_jax.storage.provenance import provenance
@@ -204,7 +204,7 @@ def _played(worlds: Any, states: Asked) -> dict[str, jax.Array]:
 @jax.jit
 def _wrong(fits: Fit) -> jax.Array:
     """Return the share of answers about something else, by each cell's fit."""
-    return jax.vmap(lambda fit: habits(fit.posterior.hyper, 1.0, PRIORS).lapse)(fits)
+    return jax.vmap(lambda fit: habits(fit.posterior.hyper, 1.0).lapse)(fits)
 
 
 def worlds_of(robots: Any, cells: list[Cell]) -> tuple[Any, jax.Array]:

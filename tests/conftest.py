@@ -93,7 +93,7 @@ def optimise_readings():
     from cuelearner_jax.reading import fitting
 
     options = {"xla_backend_optimization_level": 1}
-    update = jax.jit(fitting._update.__wrapped__, static_argnames="priors", compiler_options=options)
+    update = jax.jit(fitting._update.__wrapped__, compiler_options=options)
     fitting._update = update
 
 

@@ -37,7 +37,7 @@ ENV = Fuse()
 
 
 def rolled(num_envs, steps, env=ENV):
-    return jax.device_get(jax.jit(lambda env: evaluate.rollout(Uniform(), env, KEY, num_envs, num_envs * steps))(env))
+    return jax.device_get(evaluate.evaluate_policy(env, Uniform(), KEY, num_envs, num_envs * steps))
 
 
 def test_means_over_first_episodes_are_of_all_of_them_or_of_none():

@@ -296,9 +296,9 @@ class PlainWindow:
 
 def test_a_plain_environment_between_acting_and_learning_gives_the_compiled_loop():
     program, guide = probes.window_program("heuristic"), guidances.make("heuristic", probes.SIZES, ENV)
-    lane, settings, key = loop.make_lane(probes.CONFIG, guide, ENV, 0), replaced(), jax.random.key(0)
+    lane, settings = loop.lane_of(probes.SIZES, loop.parts_of(probes.CONFIG), guide, 0, ENV), replaced()
     _, compiled, _ = run(program, settings, loop.start_clock(), probes.start(program, [3], [0]))
-    clock, state = loop.start_clock(), lane.init(ENV, jax.random.fold_in(key, 3), 0)
+    clock, state = loop.start_clock(), lane.init(ENV, jax.random.fold_in(jax.random.key(0), 3), 0)
 
     def drawn(step):  # the contexts that the environment of JAX draws
         return jax.vmap(ENV.reset)(jax.random.split(lane.keys(clock.replace(step=step), state).step, 4))[1]

@@ -22,7 +22,7 @@ from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces import check_directions
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.types import Params
 
 ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment
@@ -67,8 +67,8 @@ class DDQNConfig:
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> DoubleDQN:
         """Return the agent for an environment's spaces."""
-        if self.coarse_directions:
-            check_directions(spaces.actions, "agent.coarse_directions", "give 0")
+        if self.coarse_directions and spaces.actions != DIRECTIONS:
+            raise UserError(f"agent.coarse_directions is for directions alone, not for {spaces.actions.name}: give 0")
         widths(frame, spaces)
         return DoubleDQN(self, frame, spaces, bootstraps)
 

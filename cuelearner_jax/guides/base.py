@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, ClassVar
 
 import jax
@@ -18,7 +18,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
-from cuelearner_jax.guides.fitting import Example, GuideModel, fit_least_squares, guide_model
+from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, squared_errors
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -46,6 +46,7 @@ class Guide:
     title: ClassVar[str] = ""  # title in figures, if other than the name
     colour: ClassVar[str | None] = None  # colour in figures
     moves: ClassVar[bool] = True  # False if it never changes an action
+    outputs: ClassVar[int | None] = None  # of its network, such as 1 for a value; None: a vector added to an action
     sees_base: ClassVar[bool] = False  # True if it needs a finished policy's actions; it then serves adaptation only
     by_cues: ClassVar[bool] = False  # True if its model measures along cues, whatever its answers say
     by_evidence: ClassVar[bool] = False  # True if `reading` reads its answers; it then serves adaptation only
@@ -81,8 +82,8 @@ class Guide:
 
     @cached_property
     def network(self) -> GuideModel:
-        """The network, or ensemble, whose outputs are added to an action."""
-        return guide_model(self.sizes, self.spaces)
+        """The network, or ensemble, of situations and actions."""
+        return guide_model(self.sizes, self.spaces, self.outputs)
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " outputs"]:
         """Return what the network is to predict for one label; here the answer."""
@@ -122,11 +123,17 @@ class Guide:
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """Return the model of labels (slots, ...); fitting from scratch ignores `former`, the previous model."""
-        rows, predict = self.examples(labels, scalars), partial(self.predict, env)
-        return fit_least_squares(
-            key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes, augment=self.augmented
-        )
+        """Return the model of labels (slots, ...); fitting from scratch ignores `former`, the previous model.
+
+        Examples are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
+        answer in the mirror image is mostly not the mirror image of its answer.
+        """
+
+        def losses(params: Params, rows: Example) -> Float[Array, " n"]:
+            return squared_errors(rows, self.predict(env, params, rows.obs, rows.action))
+
+        rows, init = self.examples(labels, scalars), self.network.init
+        return fit_model(key, rows, scalars, init=init, losses=losses, sizes=self.sizes, augment=self.augmented)
 
     def question(
         self,

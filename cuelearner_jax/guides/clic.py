@@ -26,7 +26,6 @@ here where silence is meant there. A cue of which nothing was said is no part of
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import jax
@@ -38,7 +37,7 @@ from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
-from cuelearner_jax.guides.fitting import GuideModel, fit_model, guide_model
+from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Box, is_answered, says_something
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -116,12 +115,7 @@ class Clic(Guide):
 
     name, title = "clic", "CLIC"
     about = "an energy over actions, low in the sets that corrections leave possible"
-    form, colour = RELATIVE, "#117733"
-
-    @cached_property
-    def network(self) -> GuideModel:
-        """The network, or ensemble, whose output is minus the energy of an action."""
-        return guide_model(self.sizes, self.spaces, outputs=1)
+    form, colour, outputs = RELATIVE, "#117733", 1  # minus the energy of an action
 
     def energy(
         self,

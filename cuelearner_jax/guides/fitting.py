@@ -131,18 +131,6 @@ def held_out(count: int) -> Bool[np.ndarray, " count"]:
     return np.arange(count) % VALIDATION_STRIDE == VALIDATION_STRIDE - 1
 
 
-def fit_least_squares(
-    key: PRNGKeyArray, rows: Example, scalars: GuideScalars, *, apply: Callable[..., Array], **how: Any
-) -> GuidanceModel:
-    """Fit by least squares (paper, Eq. 3), as `fit_model`. `apply`: (params, obs, actions) -> predictions (n, outputs).
-
-    Examples are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
-    answer in the mirror image is mostly not the mirror image of its answer.
-    """
-    losses = lambda params, rows: squared_errors(rows, apply(params, rows.obs, rows.action))  # noqa: E731
-    return fit_model(key, rows, scalars, losses=losses, **how)
-
-
 def fit_model(
     key: PRNGKeyArray,
     rows: Any,

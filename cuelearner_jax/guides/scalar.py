@@ -14,7 +14,6 @@ give more `guide_directions`.
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Annotated, Any
 
 import jax
@@ -25,7 +24,6 @@ from cuelearner_jax.agents.choice import best_of
 from cuelearner_jax.config import POSITIVE, SHARE, GuideScalars, part
 from cuelearner_jax.feedback.answers import SCALAR
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
-from cuelearner_jax.guides.fitting import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel
 
@@ -45,12 +43,8 @@ class Scalar(Guide):
 
     name, about = "scalar", "a model of which actions the teacher calls good"
     form, colour, config = SCALAR, "#E69F00", ScalarConfig
+    outputs = 1  # whether an action is called good
     options: ScalarConfig
-
-    @cached_property
-    def network(self) -> GuideModel:
-        """The network, or ensemble, whose output is whether an action is called good."""
-        return guide_model(self.sizes, self.spaces, outputs=1)
 
     def act(
         self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars

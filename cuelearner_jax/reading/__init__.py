@@ -4,7 +4,6 @@ from cuelearner_jax.reading.families import Distortion, Unknown, declared_distor
 from cuelearner_jax.reading.policy import ReadingPolicy
 from cuelearner_jax.reading.result import Estimate, Result
 from cuelearner_jax.reading.session import Reading
-from cuelearner_jax.reading.simulator import simulator_distortion
 from cuelearner_jax.reading.walk import Walk
 
 __all__ = [
@@ -16,5 +15,4 @@ __all__ = [
     "Unknown",
     "Walk",
     "declared_distortions",
-    "simulator_distortion",
 ]

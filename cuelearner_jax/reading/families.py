@@ -43,7 +43,7 @@ class Distortion(NamedTuple):
     unknowns: tuple[Unknown, ...]
     sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
     acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
-    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulator`
+    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same
     effect: tuple[int, int] = (0, 0)  # first entry of the observation that `plans` alone reads, and the end of these
 
 
@@ -65,25 +65,14 @@ def undo_observation(
     return obs
 
 
-def undo_physics(
+def undo_action(
     family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"], action: Float[Array, " action"]
 ) -> Float[Array, " action"]:
-    """Return the action that has the effect which `action` had before the physics changed.
-
-    `obs`: the observation without the changes.
-    """
+    """Return the action that, after the changes, does what `action` did before them; `obs`: without the changes."""
     for distortion, values in _parts(family, theta):
         action = action if distortion.plans is None else distortion.plans(values, obs, action)
-    return action
-
-
-def undo_action(
-    family: Family, theta: Float[Array, " unknowns"], action: Float[Array, " action"]
-) -> Float[Array, " action"]:
-    """Return the action that, after the changes, does what `action` did before them."""
     for distortion, values in _parts(family, theta):
-        if distortion.acts is not None:
-            action = distortion.acts(values, action)
+        action = action if distortion.acts is None else distortion.acts(values, action)
     return action
 
 
@@ -194,11 +183,14 @@ def _gain(slices: list[tuple[Quantity, int]]) -> Distortion:
     return Distortion(name, (Unknown(name, "percent", most=100.0),), sees)
 
 
+def _turn(what: str, sees: Undoing) -> Distortion:
+    return Distortion(f"{what}: turn", (Unknown(f"{what}: turn", "degrees", most=180.0),), sees)
+
+
 def _roll(quantity: Quantity, start: int) -> Distortion:
     if quantity.step_deg <= 0:
         raise UserError(f"slice {quantity.name!r} has beams and no angle between them: give its `step_deg`")
     ring = abs(quantity.size * quantity.step_deg - 360) < 0.5 * quantity.step_deg
-
     own = slice(start, start + quantity.size)
 
     def sees(theta: Array, obs: Array) -> Array:
@@ -211,8 +203,7 @@ def _roll(quantity: Quantity, start: int) -> Distortion:
         before, after = obs[every.at[own].set(start + here)], obs[every.at[own].set(start + following)]
         return before + jnp.zeros(len(obs)).at[own].set(number - first) * (after - before)
 
-    name = f"{quantity.name}: turn"
-    return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)
+    return _turn(quantity.name, sees)
 
 
 def _turned(quantity: Quantity, start: int) -> Distortion:
@@ -225,8 +216,7 @@ def _turned(quantity: Quantity, start: int) -> Distortion:
         along = jnp.ones(len(obs)).at[x].set(cos).at[y].set(cos)
         return along * obs + jnp.zeros(len(obs)).at[x].set(sin).at[y].set(-sin) * other
 
-    name = f"{quantity.name}: turn"
-    return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)
+    return _turn(quantity.name, sees)
 
 
 def _turned_places(places: list[tuple[Quantity, int]]) -> list[Distortion]:
@@ -267,5 +257,4 @@ def _turned_about(
         change_x, change_y = cos * x + sin * y - x, cos * y - sin * x - y
         return obs + jnp.zeros(len(obs)).at[entries].set(change_x).at[entries + 1].set(change_y)
 
-    name = f"{_called(slices)}: turn"
-    return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)
+    return _turn(_called(slices), sees)

@@ -8,6 +8,7 @@ estimate `ROUNDS` times. They are compared by how well each answer is predicted 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -21,8 +22,8 @@ from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.likelihood import Habits, curvature, log_likelihood, predictive_log_likelihood
 from cuelearner_jax.reading.linear import PARTS, SCALE, Acts, Change, ObservationFrame, RelativeLabels
-from cuelearner_jax.reading.policy import Correction, corrected, correction_of
-from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, ModelParts, Posterior, Priors
+from cuelearner_jax.reading.policy import Correction, corrected
+from cuelearner_jax.reading.posterior import TAU, Data, Hyper, ModelParts, Posterior
 from cuelearner_jax.spaces import Space
 
 ROUNDS = 3  # linearisations of each fit
@@ -60,7 +61,6 @@ class Fit(struct.PyTreeNode):
     posterior: Posterior
     data: Data
     frame: ObservationFrame
-    evidence: Float[Array, ""]  # bound of the log evidence
     score: Float[Array, ""]  # sum over answers of log p(answer | all others) [nats]
 
 
@@ -90,30 +90,17 @@ def unfitted(space: Space, family: Family, obs_size: int) -> tuple[Hypothesis, H
     return stack([one(names, False) for names in HYPOTHESES]), stack([one((), True)] * WITH_PROCESS)
 
 
+@dataclass(frozen=True)
 class Reader:
-    """Reads labels about a policy. `acts` may be plain Python, or be traced with everything else.
+    """Reads labels about a policy."""
 
-    Args:
-        space: space of the actions, with cues.
-        family: distortions that the world declares or the user names; empty: any entry of the observation may shift.
-        acts: the policy: observations (n, obs) -> actions (n, action).
-        eps: strength of an answer, in the unit of `space.log`.
-        step: size of each unknown of the family that changes actions by a usual correction; None without a family.
-        process: whether corrections may depend on the situation in ways that no parameter describes.
-    """
-
-    def __init__(
-        self,
-        space: Space,
-        family: Family,
-        acts: Acts,
-        eps: Float[Array, ""] | float,
-        step: Float[Array, " unknowns"] | None = None,
-        priors: Priors = PRIORS,
-        process: bool = True,
-    ) -> None:
-        self.space, self.family, self.acts, self.eps, self.step, self.priors = space, family, acts, eps, step, priors
-        self.process = process
+    space: Space  # of the actions, with cues
+    family: Family  # what the world declares or the user names; empty: any entry of the observation may shift
+    acts: Acts  # the policy; plain Python, or traced with everything else
+    eps: Float[Array, ""] | float  # strength of an answer, in the unit of `space.log`
+    # size of each unknown of the family that changes actions by a usual correction; None without a family
+    step: Float[Array, " unknowns"] | None = None
+    process: bool = True  # whether corrections may depend on the situation in ways that no parameter describes
 
     def read(self, labels: RelativeLabels, plain: Hypothesis, smooth: Hypothesis) -> Fit:
         """Return all hypotheses fitted to labels, stacked in the order of `HYPOTHESES`, those with the process last."""
@@ -163,9 +150,9 @@ class Reader:
         posteriors = _unread(rows, hypothesis.hyper)
         for number in range(ROUNDS):
             rows = self._data(frame, labels, hypothesis.change) if number else rows
-            posteriors, hypothesis = _update(rows, frame, hypothesis, posteriors, self.priors)
+            posteriors, hypothesis = _update(rows, frame, hypothesis, posteriors)
         rows = self._data(frame, labels, hypothesis.change)
-        return _scored(rows, frame, hypothesis, posteriors, self.priors)
+        return _scored(rows, frame, hypothesis, posteriors)
 
     def _data(self, frame: ObservationFrame, labels: RelativeLabels, change: Change) -> Data:
         """Return the linear models at stacked estimates."""
@@ -176,7 +163,7 @@ class Reader:
         """Return corrected actions by one fit."""
         before = linear.undone(self.family, fitted.hypothesis.change, obs)
         actions = self._ask(jnp.stack([obs, before]))
-        return _act(self.space, self.family, fitted, obs, before, actions, self.eps, self.priors)
+        return _act(self.space, self.family, fitted, obs, before, actions, self.eps)
 
     def predict(
         self, fitted: Fit, labels: RelativeLabels
@@ -187,9 +174,8 @@ class Reader:
         """
         frame, change = fitted.frame, fitted.hypothesis.change
         probe_obs = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
-        own = self.act(fitted, labels.obs)
-        rest = (labels, probe_obs, self._ask(probe_obs), own, self.eps, self.priors)
-        return _predicted(self.space, self.family, fitted, *rest)
+        own, actions = self.act(fitted, labels.obs), self._ask(probe_obs)
+        return _predicted(self.space, self.family, fitted, labels, probe_obs, actions, own, self.eps)
 
     def ratio(self, fits: Fit, labels: RelativeLabels) -> Float[Array, ""]:
         """Return log((1 + r) / 2), r = p(answers | best hypothesis) / p(answers | nothing changed)."""
@@ -203,11 +189,12 @@ class Reader:
         return SCALE * self.eps * jnp.sqrt(self.predict(fitted, labels)[1])
 
 
-@partial(jax.jit, static_argnames="priors")
-def correction(fitted: Fit, eps: Any, priors: Priors = PRIORS) -> Correction:
+@jax.jit
+def correction(fitted: Fit, eps: Any) -> Correction:
     """Return what is needed to act by a fit."""
-    change, frame = fitted.hypothesis.change, fitted.frame
-    return correction_of(fitted.posterior, change, frame, fitted.data.inputs, eps, priors)
+    change, hyper, situations = fitted.hypothesis.change, fitted.posterior.hyper, fitted.data.inputs
+    alpha = posterior.amplitudes(hyper)[None] ** 2 * fitted.posterior.alpha
+    return Correction(change, fitted.frame, situations, alpha, posterior.lengths(hyper), jnp.float32(SCALE * eps))
 
 
 @jax.jit
@@ -238,14 +225,12 @@ def pick(stacked: Any, number: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[number], stacked)
 
 
-@partial(jax.jit, static_argnames=("space", "family", "priors"))
-def _act(
-    space: Space, family: Family, fitted: Fit, obs: Array, before: Array, actions: Array, eps: Any, priors: Priors
-) -> Array:
-    return corrected(space, family, correction(fitted, eps, priors), obs, before, actions[0], actions[1])
+@partial(jax.jit, static_argnames=("space", "family"))
+def _act(space: Space, family: Family, fitted: Fit, obs: Array, before: Array, actions: Array, eps: Any) -> Array:
+    return corrected(space, family, correction(fitted, eps), obs, before, actions[0], actions[1])
 
 
-@partial(jax.jit, static_argnames=("space", "family", "priors"))
+@partial(jax.jit, static_argnames=("space", "family"))
 def _predicted(
     space: Space,
     family: Family,
@@ -255,13 +240,12 @@ def _predicted(
     actions: Array,
     own: Array,
     eps: Any,
-    priors: Priors,
 ) -> tuple[Array, Array, Array]:
     rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, probe_obs, actions, eps)
     parts, hyper = fitted.hypothesis.parts, fitted.posterior.hyper
-    _, variance = posterior.predict(fitted.posterior, fitted.data, parts, rows.features, rows.inputs, priors)
+    _, variance = posterior.predict(fitted.posterior, fitted.data, parts, rows.features, rows.inputs)
     mean = space.log(labels.action, own) / (SCALE * eps)
-    habits = posterior.habits(hyper, 1 / SCALE, priors)
+    habits = posterior.habits(hyper, 1 / SCALE)
     return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, habits)
 
 
@@ -291,17 +275,12 @@ def _replace_worse(changes: Change, own: Array, change: Change, worth: Array) ->
     return jax.tree.map(lambda own, other: choose(better, other, own), changes, change)
 
 
-@partial(jax.jit, static_argnames="family")
-def _undone_each(family: Family, changes: Change, obs: Array) -> Array:
-    return jax.vmap(lambda change: linear.undone(family, change, obs))(changes)
-
-
 @partial(jax.jit, static_argnames=("space", "family"))
 def _worth(
     space: Space, family: Family, changes: Change, labels: RelativeLabels, before: Array, actions: Array, eps: Any
 ) -> Array:
     answers = linear.answers_of(space, labels, eps)
-    usual = Habits(jnp.float32(PRIORS.tau / SCALE), jnp.float32(1 / SCALE), jnp.float32(0.1))
+    usual = Habits(jnp.float32(TAU / SCALE), jnp.float32(1 / SCALE), jnp.float32(0.1))
 
     def one(change: Change, before: Array, action: Array) -> Array:
         base = linear.meant(family, change.theta, before, action)
@@ -311,34 +290,21 @@ def _worth(
     return jax.vmap(one)(changes, before, actions)
 
 
-@partial(jax.jit, static_argnames="family")
-def _probes(family: Family, frame: ObservationFrame, change: Change, obs: Array) -> Array:
-    return jax.vmap(lambda one: linear.probes(family, frame, one, obs))(change)
+# Of stacked estimates, and of what the policy does about each
+_undone_each = jax.jit(jax.vmap(linear.undone, (None, 0, None)), static_argnums=0)
+_probes = jax.jit(jax.vmap(linear.probes, (None, None, 0, None)), static_argnums=0)
+_data = jax.jit(jax.vmap(linear.data, (None, None, None, 0, None, 0, 0, None)), static_argnums=(0, 1))
+_unread = jax.jit(jax.vmap(posterior.unread))
 
 
-@partial(jax.jit, static_argnames=("space", "family"))
-def _data(
-    space: Space,
-    family: Family,
-    frame: ObservationFrame,
-    change: Change,
-    labels: RelativeLabels,
-    probe_obs: Array,
-    actions: Array,
-    eps: Array,
-) -> Data:
-    one = lambda change, probe_obs, actions: linear.data(space, family, frame, change, labels, probe_obs, actions, eps)  # noqa: E731
-    return jax.vmap(one)(change, probe_obs, actions)
-
-
-@partial(jax.jit, static_argnames="priors")
+@jax.jit
 def _update(
-    rows: Data, frame: ObservationFrame, hypothesis: Hypothesis, posteriors: Posterior, priors: Priors
+    rows: Data, frame: ObservationFrame, hypothesis: Hypothesis, posteriors: Posterior
 ) -> tuple[Posterior, Hypothesis]:
     """Infer each hypothesis, and move its estimate."""
 
     def one(rows: Data, hypothesis: Hypothesis, posteriors: Posterior) -> tuple[Posterior, Hypothesis]:
-        posteriors = posterior.infer(rows, hypothesis.parts, jnp.float32(1 / SCALE), posteriors, priors)
+        posteriors = posterior.infer(rows, hypothesis.parts, jnp.float32(1 / SCALE), posteriors)
         at = linear.weights_of(frame, hypothesis.change)
         weights = hypothesis.parts.weights * (at + jnp.clip(posteriors.mean - at, -TRUST, TRUST))
         change = linear.change_of(frame, weights, hypothesis.change)
@@ -348,28 +314,24 @@ def _update(
 
 
 @jax.jit
-def _unread(rows: Data, hyper: Hyper) -> Posterior:
-    return jax.vmap(posterior.unread)(rows, hyper)
-
-
-@partial(jax.jit, static_argnames="priors")
-def _scored(rows: Data, frame: ObservationFrame, hypothesis: Hypothesis, posteriors: Posterior, priors: Priors) -> Fit:
+def _scored(rows: Data, frame: ObservationFrame, hypothesis: Hypothesis, posteriors: Posterior) -> Fit:
     """Return fits with the sum of log p(answer | all others) of each, by the cavity of each answer's site."""
 
     def one(rows: Data, hypothesis: Hypothesis, posteriors: Posterior) -> Array:
-        _, variance = posterior.predict(posteriors, rows, hypothesis.parts, rows.features, rows.inputs, priors)
+        _, variance = posterior.predict(posteriors, rows, hypothesis.parts, rows.features, rows.inputs)
         # at the estimate itself, of which the linear model is only a tangent
         weights = linear.weights_of(frame, hypothesis.change)
         mean = rows.offset + rows.features @ weights
-        mean = mean + posterior.process(posteriors, rows.inputs, rows.inputs, priors, hypothesis.parts)
-        habits = posterior.habits(posteriors.hyper, 1 / SCALE, priors)
+        if hypothesis.parts.process:
+            mean = mean + posterior.process(posteriors, rows.inputs, rows.inputs)
+        habits = posterior.habits(posteriors.hyper, 1 / SCALE)
         slope, _ = curvature(mean, variance, rows.answers, habits)
         cavity = variance / jnp.maximum(1 - variance * posteriors.precision, 0.05)
         return predictive_log_likelihood(mean - cavity * slope, cavity, rows.answers, habits).sum()
 
     score = each_lane(one)(rows, hypothesis, posteriors)
     frames = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(score), *leaf.shape)), frame)
-    return Fit(hypothesis, posteriors, rows, frames, posteriors.bound, score)
+    return Fit(hypothesis, posteriors, rows, frames, score)
 
 
 @jax.jit

@@ -19,16 +19,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax.reading.families import (
-    Family,
-    has_effects,
-    undo_action,
-    undo_observation,
-    undo_physics,
-    unknowns_of,
-)
+from cuelearner_jax.reading.families import Family, has_effects, undo_action, undo_observation, unknowns_of
 from cuelearner_jax.reading.likelihood import Answers, intervals
-from cuelearner_jax.reading.posterior import PRIORS, Data
+from cuelearner_jax.reading.posterior import TAU, Data
 from cuelearner_jax.spaces import DIRECTIONS, Space
 
 Acts = Callable[[Float[Array, "n obs"]], Float[Array, "n action"]]
@@ -108,10 +101,7 @@ def meant(
     family: Family, theta: Float[Array, " unknowns"], before: Float[Array, "n obs"], action: Float[Array, "n action"]
 ) -> Float[Array, "n action"]:
     """Return what a policy's actions about undone observations `before` mean in the changed world."""
-    if not family:
-        return action
-    action = jax.vmap(partial(undo_physics, family, theta))(before, action)
-    return jax.vmap(partial(undo_action, family, theta))(action)
+    return jax.vmap(partial(undo_action, family, theta))(before, action) if family else action
 
 
 def basis_size(space: Space) -> int:
@@ -158,9 +148,7 @@ def probes(
 
     k = 2 + 2 * unknowns.
     """
-    steps, theta = jnp.diag(frame.step), change.theta[None]
-    sides = jnp.concatenate([theta, theta - steps, theta + steps])
-    shifted = jax.vmap(lambda theta: undone(family, change.replace(theta=theta), obs))(sides)
+    shifted = jax.vmap(lambda theta: undone(family, change.replace(theta=theta), obs))(_sides(frame, change))
     return jnp.concatenate([obs[None], shifted])
 
 
@@ -178,20 +166,24 @@ def jumps(
 
     A policy that takes the best of far-apart actions does so near ties, where a slope says nothing.
     """
-    near, far = _sides(space, family, frame, change, probe_obs, actions)
+    whole, size = _whole(family, frame, change, probe_obs, actions), len(frame.step)
+    near, far = space.log(whole[:1], whole[1 : 1 + size]), space.log(whole[:1], whole[1 + size :])
     largest = jnp.maximum(jnp.abs(near), jnp.abs(far)) / (SCALE * eps)
     bent = jnp.abs(near + far) > 0.5 * jnp.abs(near - far)
     return ((largest > JUMP) & bent).any(-1).T
 
 
-def _sides(
-    space: Space, family: Family, frame: ObservationFrame, change: Change, probe_obs: Array, actions: Array
-) -> tuple[Float[Array, "u n cues"], Float[Array, "u n cues"]]:
-    """Return the changes from a policy's actions at an estimate to those at both sides of each unknown."""
-    size, steps = len(frame.step), jnp.diag(frame.step)
-    sides = jnp.concatenate([change.theta[None], change.theta[None] - steps, change.theta[None] + steps])
-    whole = jax.vmap(partial(meant, family))(sides, probe_obs[1:], actions[1:])
-    return space.log(whole[:1], whole[1 : 1 + size]), space.log(whole[:1], whole[1 + size :])
+def _sides(frame: ObservationFrame, change: Change) -> Float[Array, "k unknowns"]:
+    """Return the unknowns of an estimate, and those at both sides of each."""
+    steps, theta = jnp.diag(frame.step), change.theta[None]
+    return jnp.concatenate([theta, theta - steps, theta + steps])
+
+
+def _whole(
+    family: Family, frame: ObservationFrame, change: Change, probe_obs: Array, actions: Array
+) -> Float[Array, "k n action"]:
+    """Return what a policy's answers to `probes`, but for the first, mean in the changed world."""
+    return jax.vmap(partial(meant, family))(_sides(frame, change), probe_obs[1:], actions[1:])
 
 
 @partial(jax.jit, static_argnums=0)
@@ -215,18 +207,13 @@ def data(
     actions: Float[Array, "k n action"],
     eps: Float[Array, ""],
 ) -> Data:
-    """Return the linear model at labels, about an estimate; its weights count from no change.
+    """Return the linear model at labels, about the estimate `change`; its weights count from no change.
 
-    Args:
-        space, family, frame, change, labels: the model; `change` is the estimate.
-        probe_obs: `probes` of the labels' observations.
-        actions: what the policy does there.
-        eps: strength of an answer, in the unit of `space.log`.
+    `probe_obs`: `probes` of the labels' observations. `actions`: what the policy does there. `eps`: strength of an
+    answer, in the unit of `space.log`.
     """
     scale, size = SCALE * eps, len(frame.step)
-    steps, theta = jnp.diag(frame.step), change.theta[None]
-    sides = jnp.concatenate([theta, theta - steps, theta + steps])
-    whole = jax.vmap(partial(meant, family))(sides, probe_obs[1:], actions[1:])
+    whole = _whole(family, frame, change, probe_obs, actions)
     base, slope = whole[0], jnp.moveaxis(space.log(whole[1 : 1 + size], whole[1 + size :]), 0, -1) / (2 * scale)
     slope = jnp.where(jumps(space, family, frame, change, probe_obs, actions, eps)[:, None], 0.0, slope)
     x = features(space, frame, slope, labels.obs, base)
@@ -238,7 +225,7 @@ def data(
 
 def answers_of(space: Space, labels: RelativeLabels, eps: Float[Array, ""]) -> Answers:
     """Return the interval that each answer names."""
-    return intervals(labels.answer, labels.valid, *space.room(labels.action), PRIORS.tau * eps)
+    return intervals(labels.answer, labels.valid, *space.room(labels.action), TAU * eps)
 
 
 def features(

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, describe
 from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.families import Family, has_effects, unknowns_of
-from cuelearner_jax.reading.linear import SCALE, Change, ObservationFrame
-from cuelearner_jax.reading.posterior import Posterior, Priors
+from cuelearner_jax.reading.linear import Change, ObservationFrame
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import EnvState
 
@@ -38,21 +37,6 @@ class Correction(struct.PyTreeNode):
         return posterior.correlation(self.length, inputs, self.known) @ self.alpha
 
 
-def correction_of(
-    fitted: Posterior,
-    change: Change,
-    frame: ObservationFrame,
-    situations: Float[Array, "n z"],
-    eps: Any,
-    priors: Priors,
-) -> Correction:
-    """Return what is needed to act by a posterior."""
-    alpha = posterior.amplitudes(fitted.hyper, priors)[None] ** 2 * fitted.alpha
-    return Correction(
-        change, frame, situations, alpha, posterior.lengths(fitted.hyper, priors), jnp.float32(SCALE * eps)
-    )
-
-
 def corrected(
     space: Space,
     family: Family,
@@ -64,11 +48,9 @@ def corrected(
 ) -> Float[Array, "n action"]:
     """Return corrected actions.
 
-    Args:
-        space, family, correction: the correction.
-        obs, before: observations as they are, and as they would be without the change (`linear.undone`).
-        first, action: what the policy does about the two. With recorded effects of the state, the process depends on
-            the action about the shifted state in place of `first`: where the policy runs, it acts about that alone.
+    `obs`, `before`: observations as they are, and as they would be without the change (`linear.undone`). `first`,
+    `action`: what the policy does about the two. With recorded effects of the state, the process depends on the action
+    about the shifted state in place of `first`: where the policy runs, it acts about that alone.
     """
     base = linear.meant(family, correction.change.theta, before, action)
     more = correction.more(space, obs, base if has_effects(family) else first)

@@ -62,26 +62,16 @@ class Hyper(struct.PyTreeNode):
     actions: int = struct.field(pytree_node=False)  # entries of an action, the last of the process's inputs
 
 
-class Priors(NamedTuple):
-    """Middles and spreads (of logarithms) of the priors of `Hyper`."""
-
-    size: float = 0.55  # of a weight
-    amplitude: float = 0.5
-    length: float = 1.0  # times the root of the number of inputs
-    tau: float = 0.5  # of eps
-    width: float = 0.5  # of eps
-    lapse: float = 0.05
-    spread_groups: float = 1.5
-    spread_sizes: float = 1.0
-    spread_amplitude: float = 1.0
-    spread_amplitudes: float = 0.5
-    spread_length: float = 1.5
-    spread_lengths: float = 0.7
-    spread_width: float = 0.7
-    spread_lapse: float = 0.7
-
-
-PRIORS = Priors()
+# Middles of the priors of `Hyper`
+SIZE = 0.55  # of a weight
+AMPLITUDE = 0.5
+LENGTH = 1.0  # times the root of the number of inputs
+TAU = 0.5  # of eps
+WIDTH = 0.5  # of eps
+LAPSE = 0.05
+# Spreads of the priors' logarithms
+SPREADS = {"groups": 1.5, "sizes": 1.0, "amplitude": 1.0, "amplitudes": 0.5}
+SPREADS |= {"length": 1.5, "lengths": 0.7, "width": 0.7, "lapse": 0.7}
 
 
 class Posterior(struct.PyTreeNode):
@@ -105,18 +95,18 @@ class _Solved(NamedTuple):
     log_z: Array
 
 
-def habits(hyper: Hyper, eps: Float[Array, ""] | float, priors: Priors) -> Habits:
+def habits(hyper: Hyper, eps: Float[Array, ""] | float) -> Habits:
     """Return a teacher's habits; `eps`: strength of an answer in the unit of the changes."""
-    lapse = jnp.clip(priors.lapse * jnp.exp(hyper.lapse), 0.005, 0.6)
-    return Habits(jnp.asarray(priors.tau * eps), priors.width * eps * jnp.exp(hyper.width), lapse)
+    lapse = jnp.clip(LAPSE * jnp.exp(hyper.lapse), 0.005, 0.6)
+    return Habits(jnp.asarray(TAU * eps), WIDTH * eps * jnp.exp(hyper.width), lapse)
 
 
-@partial(jax.jit, static_argnums=1)
-def lengths(hyper: Hyper, priors: Priors) -> Float[Array, " z"]:
+@jax.jit
+def lengths(hyper: Hyper) -> Float[Array, " z"]:
     """Return the length scale of each input of the process."""
     size = len(hyper.lengths)
     observed = jnp.arange(size) < size - hyper.actions
-    return priors.length * size**0.5 * jnp.exp(hyper.lengths + observed * hyper.length)
+    return LENGTH * size**0.5 * jnp.exp(hyper.lengths + observed * hyper.length)
 
 
 @jax.jit
@@ -129,41 +119,29 @@ def correlation(
     return jnp.exp(-0.5 * jnp.maximum(square, 0.0))
 
 
-def amplitudes(hyper: Hyper, priors: Priors) -> Float[Array, " cues"]:
+def amplitudes(hyper: Hyper) -> Float[Array, " cues"]:
     """Return the standard deviation of the process along each cue."""
-    return priors.amplitude * jnp.exp(hyper.amplitudes + hyper.amplitude)
+    return AMPLITUDE * jnp.exp(hyper.amplitudes + hyper.amplitude)
 
 
-@partial(jax.jit, static_argnums=3)
-def process(
-    posterior: Posterior,
-    labelled: Float[Array, "n z"],
-    inputs: Float[Array, "m z"],
-    priors: Priors,
-    parts: ModelParts | None = None,
-) -> Float[Array, "m cues"]:
+@jax.jit
+def process(posterior: Posterior, labelled: Float[Array, "n z"], inputs: Float[Array, "m z"]) -> Float[Array, "m cues"]:
     """Return the mean of the process at `inputs`; `labelled`: those of the answers."""
-    if parts is not None and not parts.process:
-        return jnp.zeros((len(inputs), posterior.alpha.shape[1]))
-    amplitude = amplitudes(posterior.hyper, priors)[None]
-    return amplitude**2 * (correlation(lengths(posterior.hyper, priors), inputs, labelled) @ posterior.alpha)
+    amplitude = amplitudes(posterior.hyper)[None]
+    return amplitude**2 * (correlation(lengths(posterior.hyper), inputs, labelled) @ posterior.alpha)
 
 
-def _sizes(hyper: Hyper, parts: ModelParts, group: Array, priors: Priors) -> Array:
-    return parts.weights * priors.size * jnp.exp(hyper.groups[group] + hyper.sizes)
-
-
-def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target: Array, priors: Priors) -> _Solved:
+def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target: Array) -> _Solved:
     """Return the posterior under pseudo-measurements `target` (n, cues) of f with `precision`."""
-    size = _sizes(hyper, parts, jnp.array(data.group), priors)
+    size = parts.weights * SIZE * jnp.exp(hyper.groups[jnp.array(data.group)] + hyper.sizes)
     x = data.features * size[None, None]  # (n, cues, p)
     residual = target - data.offset
     root = jnp.sqrt(precision).T  # (cues, n)
     hx, hr = root[:, :, None] * jnp.moveaxis(x, 1, 0), root * residual.T
     logs, hk, back, prior = jnp.zeros(()), None, None, jnp.zeros(residual.shape[1])
     if parts.process:
-        prior = amplitudes(hyper, priors)
-        correlations = correlation(lengths(hyper, priors), data.inputs, data.inputs)
+        prior = amplitudes(hyper)
+        correlations = correlation(lengths(hyper), data.inputs, data.inputs)
         hx, hr, hk, back, logs = each_lane(partial(_whitened, correlations))(hx, hr, root, prior)
         logs = logs.sum()
     inner = jnp.linalg.cholesky(jnp.eye(len(size)) + jnp.einsum("cnp,cnq->pq", hx, hx))
@@ -197,51 +175,30 @@ def _whitened(
     return inverse @ hx, inverse @ hr, inverse @ half_k, back, 2 * jnp.log(jnp.diag(factor)).sum()
 
 
-def _log_prior(hyper: Hyper, parts: ModelParts, priors: Priors) -> Array:
-    terms = (
-        (hyper.groups, priors.spread_groups),
-        (hyper.sizes * parts.weights, priors.spread_sizes),
-        (hyper.amplitude, priors.spread_amplitude),
-        (hyper.amplitudes, priors.spread_amplitudes),
-        (hyper.length, priors.spread_length),
-        (hyper.lengths, priors.spread_lengths),
-        (hyper.width, priors.spread_width),
-        (hyper.lapse, priors.spread_lapse),
-    )
-    return -0.5 * jnp.stack([((value / spread) ** 2).sum() for value, spread in terms]).sum()
+def _log_prior(hyper: Hyper, parts: ModelParts) -> Array:
+    own = hyper.replace(sizes=hyper.sizes * parts.weights)
+    terms = [((getattr(own, name) / spread) ** 2).sum() for name, spread in SPREADS.items()]
+    return -0.5 * jnp.stack(terms).sum()
 
 
-def infer(
-    data: Data,
-    parts: ModelParts,
-    eps: Float[Array, ""],
-    start: Posterior,
-    priors: Priors = PRIORS,
-    iterations: int = ITERATIONS,
-) -> Posterior:
+def infer(data: Data, parts: ModelParts, eps: Float[Array, ""], start: Posterior) -> Posterior:
     """Return the posterior of one hypothesis, and its evidence.
 
-    Args:
-        data: the answers.
-        parts: the hypothesis.
-        eps: strength of an answer, in the unit of the changes.
-        start: where to start: `unread`, or what was read before.
-        priors: broad priors.
-        iterations: number of updates of sites and sizes.
+    `eps`: strength of an answer, in the unit of the changes. `start`: `unread`, or what was read before.
     """
     answers = data.answers
     optimizer = optax.adam(STEP)
 
     def bound(hyper: Hyper, precision: Array, target: Array) -> tuple[Array, _Solved]:
-        solved = _solve(hyper, parts, data, precision, target, priors)
-        likelihood = expected_log_likelihood(solved.mean, solved.variance, answers, habits(hyper, eps, priors)).sum()
+        solved = _solve(hyper, parts, data, precision, target)
+        likelihood = expected_log_likelihood(solved.mean, solved.variance, answers, habits(hyper, eps)).sum()
         fit = 0.5 * (precision * ((target - solved.mean) ** 2 + solved.variance)).sum()
-        return likelihood + fit + solved.log_z + _log_prior(hyper, parts, priors), solved
+        return likelihood + fit + solved.log_z + _log_prior(hyper, parts), solved
 
     def update(carry: tuple, _: None) -> tuple[tuple, None]:
         hyper, state, precision, target = carry
         (_, solved), slope = jax.value_and_grad(bound, has_aux=True)(hyper, precision, target)
-        first, second = curvature(solved.mean, solved.variance, answers, habits(hyper, eps, priors))
+        first, second = curvature(solved.mean, solved.variance, answers, habits(hyper, eps))
         wanted = jnp.where(answers.valid, jnp.maximum(-second, LEAST_PRECISION), 0.0)
         both = (1 - DAMPING) * precision + DAMPING * wanted
         natural = (1 - DAMPING) * precision * target + DAMPING * (wanted * solved.mean + first)
@@ -250,7 +207,7 @@ def infer(
         return (jax.tree.map(jnp.add, hyper, changes), state, both, target), None
 
     first = (start.hyper, optimizer.init(cast(Any, start.hyper)), start.precision, start.target)
-    (hyper, _, precision, target), _ = jax.lax.scan(update, first, None, iterations)
+    (hyper, _, precision, target), _ = jax.lax.scan(update, first, None, ITERATIONS)
     worth, solved = bound(hyper, precision, target)
     return Posterior(solved.weights, solved.root, solved.alpha, precision, target, hyper, worth)
 
@@ -264,20 +221,15 @@ def unread(data: Data, hyper: Hyper) -> Posterior:
 
 
 def predict(
-    posterior: Posterior,
-    data: Data,
-    parts: ModelParts,
-    features: Float[Array, "m cues p"],
-    inputs: Float[Array, "m z"],
-    priors: Priors = PRIORS,
+    posterior: Posterior, data: Data, parts: ModelParts, features: Float[Array, "m cues p"], inputs: Float[Array, "m z"]
 ) -> tuple[Float[Array, "m cues"], Float[Array, "m cues"]]:
     """Return mean and variance of x . u + g in other situations."""
     mean, eye = features @ posterior.mean, jnp.eye(len(data.inputs))
     if not parts.process:
         return mean, jnp.maximum(((features @ posterior.root) ** 2).sum(-1), 1e-8)
-    hyper, amplitude = posterior.hyper, amplitudes(posterior.hyper, priors)
-    cross = correlation(lengths(hyper, priors), data.inputs, inputs)  # (n, m)
-    correlations = correlation(lengths(hyper, priors), data.inputs, data.inputs)
+    hyper, amplitude = posterior.hyper, amplitudes(posterior.hyper)
+    cross = correlation(lengths(hyper), data.inputs, inputs)  # (n, m)
+    correlations = correlation(lengths(hyper), data.inputs, data.inputs)
 
     def of_cue(x: Array, train: Array, w: Array, a: Array) -> Array:
         root = jnp.sqrt(w)
@@ -287,5 +239,5 @@ def predict(
         return a**2 - (hk**2).sum(0) + (((x - hk.T @ hx) @ posterior.root) ** 2).sum(-1)
 
     rows = jnp.moveaxis(features, 1, 0), jnp.moveaxis(data.features, 1, 0), posterior.precision.T, amplitude
-    mean = mean + process(posterior, data.inputs, inputs, priors)
+    mean = mean + process(posterior, data.inputs, inputs)
     return mean, jnp.maximum(each_lane(of_cue)(*rows).T, 1e-8)

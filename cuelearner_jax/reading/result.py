@@ -78,11 +78,8 @@ def describe_fit(
 ) -> tuple[tuple[Estimate, ...], float, float | None, float]:
     """Return the entries of `Result` from `estimates` to `wrong`.
 
-    Args:
-        fitted: one hypothesis.
-        space, family, eps: as for `Reading`; eps in the unit of `space.log`.
-        observation: slices of the observation; empty: entries have numbers alone.
-        walk: situations that the policy met, as `linear.inputs` has them.
+    `eps` is in the unit of `space.log`. `observation`: slices of the observation; empty: entries have numbers alone.
+    `walk`: situations that the policy met, as `linear.inputs` has them.
     """
     weights = np.asarray(linear.weights_of(fitted.frame, fitted.hypothesis.change), np.float64)
     root = np.asarray(fitted.posterior.root, np.float64) * np.asarray(fitted.hypothesis.parts.weights)[:, None]
@@ -95,15 +92,15 @@ def describe_fit(
     estimates = _changes_of_observation(weights[:unknowns], root[:unknowns], effect[:, :unknowns], names, family, step)
     own = slice(len(weights) - linear.terms(*fitted.hypothesis.change.action.shape).shape[1], None)
     estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
-    hyper, inputs, priors = fitted.posterior.hyper, fitted.data.inputs, posterior.PRIORS
-    more = np.asarray(posterior.process(fitted.posterior, inputs, inputs, priors))[valid]
+    hyper, inputs = fitted.posterior.hyper, fitted.data.inputs
+    more = np.asarray(posterior.process(fitted.posterior, inputs, inputs))[valid]
     depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
     depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
     near = None
     if len(walk):
-        alike = posterior.correlation(posterior.lengths(hyper, priors), jnp.asarray(walk), inputs[valid])
+        alike = posterior.correlation(posterior.lengths(hyper), jnp.asarray(walk), inputs[valid])
         near = float((alike.max(1) >= ALIKE_SITUATION).mean())
-    wrong = float(posterior.habits(hyper, 1 / SCALE, priors).lapse)
+    wrong = float(posterior.habits(hyper, 1 / SCALE).lapse)
     return tuple(estimates), depends, near, wrong
 
 

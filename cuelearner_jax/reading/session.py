@@ -87,13 +87,8 @@ class Reading:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Choose situations and actions to ask about, as wide around the right action as it is unknown.
 
-        Args:
-            obs: situations that the policy meets.
-            count: number of questions.
-            key: key of the choice.
-
-        Returns:
-            Numbers of the situations (count,), and actions (count, action).
+        `obs`: situations that the policy meets. Returns the numbers of the chosen ones (count,) and the actions
+        (count, action).
         """
         k_where, k_action = jax.random.split(key)
         self.situations = np.concatenate([self.situations.reshape(-1, obs.shape[1]), obs])[-MOST_SITUATIONS:]
@@ -123,9 +118,8 @@ class Reading:
             new = [np.concatenate(both) for both in zip(self.rows[:3], new, strict=True)]
         self.rows = RelativeLabels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]
         self.slots = max(self.slots, -(-len(new[0]) // self.slots) * self.slots)
-        start = fitting.unfitted(self.space, self.family, new[0].shape[1]) if self.fits is None else None
-        start = fitting.again(self.fits) if start is None and self.fits is not None else start
-        assert start is not None
+        former, size = self.fits, new[0].shape[1]
+        start = fitting.unfitted(self.space, self.family, size) if former is None else fitting.again(former)
         self.fits = reader.read(_padded(new, self.slots), *start)
         self.fit = fitting.pick(self.fits, int(fitting.best_of(self.fits)))
 
@@ -149,14 +143,10 @@ class Reading:
         if self.fits is None or self.fit is None:
             return Result(False, False, 0.0, (), 0.0, None, 0.0, self.policy())
         number = int(fitting.best_of(self.fits))
-        situations = jnp.asarray(self.situations)
-        inputs = (
-            linear.inputs(self.space, self.fit.frame, situations, self._acts(situations))
-            if len(situations)
-            else situations
-        )
-        rest = (self.space, self.family, self.eps, self.observation, np.asarray(inputs))
-        described = describe_fit(self.fit, *rest)
+        inputs = situations = jnp.asarray(self.situations)
+        if len(situations):
+            inputs = linear.inputs(self.space, self.fit.frame, situations, self._acts(situations))
+        described = describe_fit(self.fit, self.space, self.family, self.eps, self.observation, np.asarray(inputs))
         in_use = number > 0 and self.evidence >= LEAST_EVIDENCE and described[-1] < MOST_WRONG
         return Result(in_use, number > 0, self.evidence, *described, self.policy())
 

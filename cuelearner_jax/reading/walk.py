@@ -21,13 +21,7 @@ EACH, APART = 4, 12  # situations of each environment between two batches; steps
 
 
 class Walk:
-    """Environments in which a policy acts between questions.
-
-    Args:
-        env: the changed world.
-        teacher: that world's teacher.
-        scalars: strength of answers, in the space's unit, and faults of the teacher.
-    """
+    """Environments of the changed world in which a policy acts between questions, and that world's teacher."""
 
     def __init__(self, env: Environment, teacher: Teacher, scalars: Scalars) -> None:
         self.env, self.teacher, self.scalars = env, teacher, scalars

@@ -8,7 +8,7 @@ from typing import Any
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.box import Box, cues_from
 from cuelearner_jax.spaces.choices import Choices
-from cuelearner_jax.spaces.directions import DIRECTIONS, check_directions
+from cuelearner_jax.spaces.directions import DIRECTIONS
 from cuelearner_jax.spaces.space import SPACES, UNSAID, Cue, Space, is_answered, says_something
 
 

@@ -154,18 +154,13 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
         unit: unit of a change.
     """
     try:
-        pairs = [
-            part.split(",") if isinstance(part, str) else part
-            for part in (words.split(";") if isinstance(words, str) else words)
-        ]
+        parts = words.split(";") if isinstance(words, str) else words
+        pairs = [part.split(",") if isinstance(part, str) else part for part in parts]
         pairs = [tuple(" ".join(word.split()) for word in pair) for pair in pairs]
         pairs = _by_name(pairs, names) if pairs and "=" in pairs[0][0] else pairs
     except (TypeError, AttributeError):
         pairs = []
-    sound = (len({*pair}) == len(pair) == 2 and all(0 < len(word) <= LONGEST for word in pair) for pair in pairs)
-    if not any(map(any, pairs)) or not all(
-        is_sound or pair == UNASKED for is_sound, pair in zip(sound, pairs, strict=True)
-    ):
+    if not any(map(any, pairs)) or not all(map(_is_pair, pairs)):
         raise UserError(f'cues is {format_value(words)}: give two words an entry of an action, as "left,right;up,down"')
     in_words = [pair for pair in pairs if pair != UNASKED]
     if not names and len({*in_words}) < len(in_words):
@@ -188,6 +183,11 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
         name = names[number] if names else " or ".join(pair)
         cues.append(Cue(name, (pair[0], pair[1]), tuple(keys) if all(keys) else (), unit))
     return tuple(cues)
+
+
+def _is_pair(words: tuple[str, ...]) -> bool:
+    """Return whether words are two different ones, or those of an entry that people are not asked about."""
+    return words == UNASKED or (len({*words}) == len(words) == 2 and all(0 < len(word) <= LONGEST for word in words))
 
 
 def _by_name(pairs: list[tuple[str, ...]], names: Sequence[str]) -> list[tuple[str, ...]]:

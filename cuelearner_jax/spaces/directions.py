@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.space import Cue, Space
 
 SQUARABLE = 1e15  # entries between this and its inverse have squares within single precision
@@ -126,13 +125,6 @@ class Directions(Space):
 
 
 DIRECTIONS = Directions()
-
-
-def check_directions(space: Space, what: str, instead: str) -> None:
-    """Raise UserError for a space other than `DIRECTIONS`; `what`: what needs directions; `instead`: what to do."""
-    if space != DIRECTIONS:
-        about = f"{space.name} of {space.size} entries"
-        raise UserError(f"{what} works for directions in the plane alone, not for actions of a {about}: {instead}")
 
 
 def best_direction(

@@ -1,4 +1,4 @@
-"""First episodes in another engine, with the starts, policies and keys of `cuelearner_jax.evaluate.rollout`."""
+"""First episodes in another engine, with the starts, policies and keys of `cuelearner_jax.evaluate`."""
 
 from __future__ import annotations
 

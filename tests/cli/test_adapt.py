@@ -194,7 +194,7 @@ def test_the_way_from_the_command_line_to_the_fit_is_short(tmp_path, monkeypatch
                 way.append(module)
         raise cl.UserError("enough")
 
-    monkeypatch.setattr(base, "fit_least_squares", fit)
+    monkeypatch.setattr(base, "fit_model", fit)
     assert main([*CODE, "--labels", "20", "--out", str(tmp_path / "new")]) == 2
     rows = [ROW[Path(module).parts[0].removesuffix(".py")] for module in way]
     assert len({*way}) <= 11

@@ -12,7 +12,7 @@ import pytest
 from cuelearner_jax.agents.networks import MLP, as_function
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.feedback.answers import relative_feedback
-from cuelearner_jax.guides.fitting import Example, fit_least_squares
+from cuelearner_jax.guides.fitting import Example, fit_model, squared_errors
 from cuelearner_jax.spaces import DIRECTIONS, directions
 
 DEG = math.pi / 180
@@ -73,18 +73,14 @@ SCALARS = Scalars(feedback_learning_rate=5e-3)
 ROWS = 100
 NETWORK = MLP(SIZES.feedback_layers, 2)
 HELD_OUT = np.arange(ROWS) % 5 == 4
-
-
-def fresh(key):
-    return NETWORK.init(key, jnp.zeros(2), jnp.zeros(2))
-
-
 predict = as_function(NETWORK)
 
 
 @jax.jit
-def fit(key, rows, scalars=SCALARS):
-    return fit_least_squares(key, rows, scalars, init=fresh, apply=predict, sizes=SIZES)
+def fit(key, rows):
+    init = lambda key: NETWORK.init(key, jnp.zeros(2), jnp.zeros(2))  # noqa: E731
+    losses = lambda params, rows: squared_errors(rows, predict(params, rows.obs, rows.action))  # noqa: E731
+    return fit_model(key, rows, SCALARS, init=init, losses=losses, sizes=SIZES)
 
 
 def label_set(seed, noise=0.0, valid=ROWS, dtype=np.float32):
@@ -119,12 +115,12 @@ def test_what_stands_in_rows_that_are_not_valid_changes_nothing(garbage_values):
 def test_of_all_looks_the_one_nearest_to_the_validation_labels_is_kept():
     # A model of one vector, which walks from 0 by 0.01 a step toward (1, 0): 0.2, 0.4, 0.6, 0.8 at the looks.
     labels = label_set(0).replace(target=np.stack([np.where(HELD_OUT, 0.45, 1.0), np.zeros(ROWS)], -1))
-    model = fit_least_squares(
+    model = fit_model(
         jax.random.key(0),
         jax.tree.map(jnp.asarray, labels),
         Scalars(feedback_learning_rate=0.01, max_grad_norm=0.1),
         init=lambda key: jnp.zeros(2),
-        apply=lambda params, obs, action: jnp.broadcast_to(params, action.shape),
+        losses=lambda params, rows: squared_errors(rows, jnp.broadcast_to(params, rows.action.shape)),
         sizes=dataclasses.replace(SIZES, fit_steps=80),
     )
     np.testing.assert_allclose(model.params, [0.4, 0.0], atol=1e-3)

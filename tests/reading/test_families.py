@@ -158,7 +158,7 @@ def test_beams_between_two_are_interpolated_and_nothing_is_seen_beyond_the_last(
 
 def test_an_action_leads_where_the_policy_meant_it_to():
     turn = Distortion("turn", (Unknown("turn", "degrees"),), acts=lambda theta, a: rotate(a, -jnp.deg2rad(theta[0])))
-    action = undo_action((turn,), jnp.array([30.0]), from_angle(1.0))
+    action = undo_action((turn,), jnp.array([30.0]), jnp.zeros(1), from_angle(1.0))
     np.testing.assert_allclose(rotate(action, jnp.deg2rad(30.0)), from_angle(1.0), atol=1e-6)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from cuelearner_jax.reading import posterior
 from cuelearner_jax.reading.likelihood import intervals, log_likelihood
 from cuelearner_jax.reading.linear import SCALE
-from cuelearner_jax.reading.posterior import PRIORS, Data, Hyper, ModelParts
+from cuelearner_jax.reading.posterior import SIZE, TAU, Data, Hyper, ModelParts
 
 EPS, COUNT, TRUTH = 1 / SCALE, 24, 0.6
 PARTS = ModelParts(jnp.ones(1), False)
@@ -17,7 +17,7 @@ def answered():
     offset = np.random.default_rng(0).uniform(-1.6, 0.4, (COUNT, 1)).astype(np.float32)
     answer = np.where(np.abs(offset + TRUTH) <= EPS / 2, 0.0, np.sign(offset + TRUTH)).astype(np.float32)
     room = jnp.full((COUNT, 1), jnp.inf)
-    said = intervals(jnp.asarray(answer), jnp.ones(COUNT, bool), room, room, PRIORS.tau * EPS)
+    said = intervals(jnp.asarray(answer), jnp.ones(COUNT, bool), room, room, TAU * EPS)
     return Data(jnp.asarray(offset), jnp.ones((COUNT, 1, 1)), jnp.zeros((COUNT, 1)), said, (0,))
 
 
@@ -25,8 +25,8 @@ def test_one_weight_has_the_posterior_of_its_integral_and_a_bound_below_its_evid
     data, zero = answered(), jnp.zeros(())
     hyper = Hyper(jnp.zeros(1), jnp.zeros(1), jnp.zeros(1), zero, zero, jnp.zeros(1), zero, zero, 0)
     found = posterior.infer(data, PARTS, jnp.float32(EPS), posterior.unread(data, hyper))
-    habits = posterior.habits(found.hyper, EPS, PRIORS)
-    size = float(PRIORS.size * np.exp(found.hyper.groups[0] + found.hyper.sizes[0]))
+    habits = posterior.habits(found.hyper, EPS)
+    size = float(SIZE * np.exp(found.hyper.groups[0] + found.hyper.sizes[0]))
     grid = np.linspace(-1.0, 2.0, 1501)
     said = [log_likelihood(data.offset + u, data.answers, habits).sum() for u in grid[::10]]
     height = np.exp(np.interp(grid, grid[::10], said) - 0.5 * (grid / size) ** 2) / (size * np.sqrt(2 * np.pi))
@@ -35,5 +35,5 @@ def test_one_weight_has_the_posterior_of_its_integral_and_a_bound_below_its_evid
     spread = np.sqrt(np.trapezoid((grid - mean) ** 2 * height, grid) / volume)
     assert abs(found.mean[0] - mean) < 0.2 * spread
     np.testing.assert_allclose(abs(found.root[0, 0]), spread, rtol=0.2)
-    evidence = np.log(volume) + float(posterior._log_prior(found.hyper, PARTS, PRIORS))
+    evidence = np.log(volume) + float(posterior._log_prior(found.hyper, PARTS))
     assert evidence - 0.3 < found.bound < evidence + 0.01

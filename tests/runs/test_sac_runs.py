@@ -106,7 +106,7 @@ def test_a_policy_folder_can_keep_the_agent(whole):
 @pytest.fixture(scope="module")
 def lanes():
     """Two lanes after eight iterations: vmapped, as an accelerator has them, and each alone."""
-    lane = loop.make_lane(CONFIG, registry.make("heuristic", CONFIG.sizes, ENV), ENV, 0)
+    lane = loop.lane_of(CONFIG.sizes, loop.parts_of(CONFIG), registry.make("heuristic", CONFIG.sizes, ENV), 0, ENV)
 
     def iterated(state):
         def one(carry, _):

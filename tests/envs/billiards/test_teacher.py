@@ -9,7 +9,7 @@ from probes import long_but
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import PROPOSALS, LocalSearchTeacher, SearchTeacher, Transferred
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, rollout
+from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.tasks.billiards import BILLIARDS, SHIPPED_TEACHERS, make_teacher
@@ -131,5 +131,5 @@ def test_the_shipped_teachers_play_well(table, least):
     env = make_environment(config)
     teacher = make_teacher(config, env)
     coarse = coarsely(teacher)
-    measured = jax.jit(lambda teacher: rollout(Taught(teacher), env, episodes("tuning"), 30, 150))(coarse)
+    measured = jax.jit(lambda teacher: evaluate_policy(env, Taught(teacher), episodes("tuning"), 30, 150))(coarse)
     assert float(measured["reward"]) > least  # over 10,000 steps with their 3,600 directions: see teacher.json

@@ -188,7 +188,7 @@ def test_a_map_that_is_made_when_asked_answers_as_one_that_is_kept(teacher):
 
 @pytest.mark.long
 def test_whoever_follows_the_teacher_arrives(teacher):
-    measure = jax.jit(lambda teacher, key: evaluate.rollout(Taught(teacher), teacher.env, key, 24, 24 * 160))
+    measure = jax.jit(lambda teacher, key: evaluate.evaluate_policy(teacher.env, Taught(teacher), key, 24, 24 * 160))
     found = {name: float(value) for name, value in measure(teacher, jax.random.key(5)).items()}
     assert found["finished"] == 1
     assert found["success"] >= 23 / 24

@@ -11,7 +11,7 @@ from cuelearner_envs.navigation.geometry import line_clearance
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
 from cuelearner_envs.navigation.roadmap import make_teacher
 from cuelearner_envs.navigation.world import closed, count_passed
-from cuelearner_jax.evaluate import episodes, rollout
+from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import Taught
 
 # A corridor of 20 m by 4.6 m with a box in the middle, a circle at x = 5 and the walls of all worlds.
@@ -55,7 +55,7 @@ BACK = WORLD.replace(starts=WORLD.goals, goals=WORLD.starts)
 TWO = Navigation(jax.tree.map(lambda *leaves: jnp.stack(leaves), WORLD, BACK), max_steps=jnp.int32(120), sides=True)
 
 
-walked = jax.jit(lambda teacher, env: rollout(Taught(teacher), env, episodes("tuning"), 20, 20 * 120))
+walked = jax.jit(lambda teacher, env: evaluate_policy(env, Taught(teacher), episodes("tuning"), 20, 20 * 120))
 
 
 @pytest.mark.long
