@@ -9,7 +9,7 @@ from cuelearner_jax.spaces import directions
 
 EASY = make_environment(BilliardsConfig("easy"))
 KEY = jax.random.key(0)
-BATCH = 600  # size of every batch, so that each function compiles once
+BATCH = 300  # size of every batch, so that each function compiles once
 step_many = jax.jit(lambda env, keys, states, actions: jax.vmap(env.step)(keys, states, actions))
 reset_many = jax.jit(lambda env, keys: jax.vmap(env.reset)(keys))
 observe = jax.jit(lambda env, balls: env.observe(balls))

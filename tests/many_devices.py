@@ -1,6 +1,6 @@
 """A small sweep that `test_devices` runs in processes of their own, on as many devices as JAX_NUM_CPU_DEVICES says.
 
-python many_devices.py run FOLDER [STEP TO STOP AT] | resume FOLDER | communication
+python many_devices.py FOLDER LOOK TO STOP AT | communication
 """
 
 import re
@@ -67,7 +67,5 @@ if __name__ == "__main__":
     asked, *rest = sys.argv[1:]
     if asked == "communication":
         print(jax.device_count(), communication())
-    elif asked == "resume":
-        run(Path(rest[0]), resume=True)
     else:
-        run(Path(rest[0]), int(rest[1]) if len(rest) > 1 else None)
+        run(Path(asked), int(rest[0]))

@@ -226,11 +226,6 @@ def label_set(obs, action, answer, valid):
     return Label(obs, action, answer, valid)
 
 
-def compilations(*functions):
-    """Return how often each jitted function has been compiled."""
-    return [function._cache_size() for function in functions]
-
-
 def lane(tree, index):
     """Return one lane of a block as NumPy arrays."""
     raw = partial(jax.tree.map, lambda leaf: words(leaf)[index])

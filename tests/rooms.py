@@ -1,8 +1,9 @@
-"""Worlds of navigation that are made by hand."""
+"""Worlds of navigation that are made by hand, and distances in any world by NumPy."""
 
 import math
 
 import jax.numpy as jnp
+import numpy as np
 
 from cuelearner_envs.navigation import NavigationWorld
 from cuelearner_envs.navigation.world import FAR_AWAY
@@ -38,3 +39,25 @@ def room(starts, goals):
     boxes, heights = [*walls(12.0, 8.0), [0.0, 2.0, math.pi / 6, 0.9, 0.4]], [1.5] * 4 + [0.8, 1.0]
     circles, tall = [[2.0, -2.0, 0.5]], [1.4, 1.0]
     return world(boxes, circles, (12.0, 8.0), starts, goals, heights, tall, rows=(6, 2))
+
+
+def used(rows):
+    return rows[np.abs(rows[:, 0]) < FAR_AWAY / 2]
+
+
+def to_box(points, box):
+    """Distance from points (..., 2) to a box; 0 inside."""
+    cos, sin = math.cos(box[2]), math.sin(box[2])
+    offset = points - box[:2]
+    own = np.abs(offset @ np.array([[cos, -sin], [sin, cos]]))
+    return np.linalg.norm(np.maximum(own - box[3:], 0.0), axis=-1)
+
+
+def to_circle(points, circle):
+    return np.maximum(np.linalg.norm(points - circle[:2], axis=-1) - circle[2], 0.0)
+
+
+def distance(points, boxes, circles):
+    """From each point to the nearest solid; 0 inside one."""
+    each = [to_box(points, box) for box in boxes] + [to_circle(points, circle) for circle in circles]
+    return np.min(each, axis=0)

@@ -38,20 +38,6 @@ def on_four(*arguments):
     return done.stdout.strip()
 
 
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("one") / "run"
-    many_devices.run(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("four") / "run"
-    on_four("run", folder)
-    return folder
-
-
 def test_empty_arrays_do_not_enter_the_shared_program():
     double = over_lanes(lane_mesh(), lambda by, lanes: jax.tree.map(by.__mul__, lanes), (SHARED, BY_LANE), BY_LANE)
     two, lanes = jnp.asarray(2.0), {"labels": jnp.zeros((4, 0)), "values": jnp.arange(4.0)}
@@ -86,28 +72,18 @@ def measured(folder):
     return {name: np.array([np.nan if row[name] is None else row[name] for row in rows], float) for name in names}
 
 
-def assert_alike(one, other):
-    assert one.keys() == other.keys()
-    for name, values in one.items():
-        np.testing.assert_allclose(other[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
-
-
-@pytest.mark.long
-def test_four_devices_learn_what_one_does(alone, shared):
-    assert_alike(measured(alone), measured(shared))
-
-
 @pytest.mark.long
 def test_no_device_waits_for_another():
     assert on_four("communication") == "4 []"
 
 
 @pytest.mark.long
-def test_a_run_begun_on_four_devices_goes_on_with_one(alone, tmp_path):
-    out = tmp_path / "run"
-    on_four("run", out, 5)  # three rounds of labels, then in the middle of training
+def test_a_run_begun_on_four_devices_goes_on_with_one(tmp_path):
+    alone, out = tmp_path / "alone", tmp_path / "run"
+    many_devices.run(alone)
+    on_four(out, 5)  # three rounds of labels, then in the middle of training
     many_devices.run(out, resume=True)
-    assert_alike(measured(alone), measured(out))
+    chex.assert_trees_all_close(measured(out), measured(alone), rtol=1e-5, atol=1e-6)
 
 
 def test_programs_are_forgotten_above_half_of_the_allowed_maps_and_compiled_again(tmp_path, monkeypatch):

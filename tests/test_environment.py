@@ -22,28 +22,8 @@ from cuelearner_jax.environment import (
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Box
 from cuelearner_jax.spaces.directions import difference, rotate
-from cuelearner_jax.task import shape_of
-from cuelearner_jax.tasks import registry
 
 ROWS = 200
-PROBES = {"window": probes.Window(), "mirrored window": probes.Window(mirrors=True), "chain": probes.Chain()}
-PRESETS = [(task, name) for task in registry.BUILT_IN for name in registry.find(task).presets]
-
-
-# Slices of an observation.
-
-
-@pytest.mark.parametrize("name", [*PRESETS, *PROBES], ids=str)
-def test_an_observation_has_as_many_entries_as_its_slices_together(name):
-    task = registry.find(name[0]) if isinstance(name, tuple) else None
-    env = PROBES[name] if task is None else shape_of(task, task.presets[name[1]].config.task)
-    slices = env.observation
-    assert env.obs_size == sum(quantity.size for quantity in slices) > 0
-    _, obs = jax.eval_shape(lambda env, key: env.reset(key), env, jax.random.key(0))
-    assert obs.shape == (env.obs_size,)
-    assert len({quantity.name for quantity in slices}) == len(slices)
-    assert all(quantity.name and quantity.unit and quantity.size > 0 for quantity in slices)
-
 
 TRAINED = (Quantity("gripper", 2, "m"), Quantity("goal", 2, "m"))
 GIVEN = tuple(quantity._replace(unit=UNKNOWN_UNIT) for quantity in TRAINED)

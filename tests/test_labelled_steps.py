@@ -64,15 +64,6 @@ def test_an_unanswered_question_executes_the_asked_action():
     np.testing.assert_array_equal(state.guide.stored[:, :10, 2:4], state.guide.labels.action[:, :10])
 
 
-def test_the_agent_trains_with_them():
-    program, clock, state, guide = labelled("relative")
-    copied = jax.tree.map(jnp.copy, state)
-    _, after, metrics = program.train(ENV, CONFIG.settings, clock, copied, 40)
-    assert (np.asarray(metrics["loss"]) > 0).all()
-    np.testing.assert_array_equal(after.guide.stored, guide.stored)
-    assert not after.failed.any()
-
-
 # Minibatches.
 
 BUFFER = buffer_for(ENV, False)

@@ -99,19 +99,14 @@ def chain_values(truncates):
     return values, state
 
 
-def test_values_of_a_chain_that_terminates():
-    # Q(1, a) = a_x; Q(0, a) = a_y / 2 + 0.5 * 1.
-    (start, end), _ = chain_values(truncates=False)
-    np.testing.assert_allclose(end, [1, 0, -1, 0], atol=0.06)
-    np.testing.assert_allclose(start, [0.5, 1.0, 0.5, 0.0], atol=0.06)
-
-
-def test_values_of_a_chain_that_is_truncated():
-    # Place 1 goes on as if it had no end: Q(1, a) = a_x + 0.5 / (1 - 0.5); Q(0, a) = a_y / 2 + 0.5 * 2.
-    # Had the observation after the reset been used, the largest value at 1 would be 5 / 3 and not 2.
-    (start, end), _ = chain_values(truncates=True)
-    np.testing.assert_allclose(end, [2, 1, 0, 1], atol=0.1)
-    np.testing.assert_allclose(start, [1.0, 1.5, 1.0, 0.5], atol=0.1)
+@pytest.mark.parametrize("truncates", [False, True])
+def test_values_of_a_chain(truncates):
+    # Terminated: Q(1, a) = a_x; Q(0, a) = a_y / 2 + 0.5 * 1. Truncated, place 1 goes on as if it had no end:
+    # Q(1, a) = a_x + 0.5 / (1 - 0.5); Q(0, a) = a_y / 2 + 0.5 * 2. With the observation after the reset in its place,
+    # the largest value at 1 would be 5 / 3 and not 2.
+    (start, end), _ = chain_values(truncates)
+    np.testing.assert_allclose(end, np.array([1, 0, -1, 0]) + truncates, atol=0.1)
+    np.testing.assert_allclose(start, np.array([0.5, 1.0, 0.5, 0.0]) + 0.5 * truncates, atol=0.1)
 
 
 def test_replay_keeps_what_each_step_led_to():
@@ -180,11 +175,8 @@ def test_learning_begins_after_learn_after(learn_after, updates):
     before = probes.lane(state.agent.params, 0)
     clock, state, _ = run(program, replaced(learn_after=learn_after), loop.start_clock(), state)
     assert int(clock.update) == updates  # one for each of four environments, from the iteration that reaches the step
-    same = [
-        np.array_equal(*pair)
-        for pair in zip(*map(jax.tree.leaves, (before, probes.lane(state.agent.params, 0))), strict=True)
-    ]
-    assert not any(same) if updates else all(same)
+    changed = jax.tree.map(lambda one, other: (one != other).any(), before, probes.lane(state.agent.params, 0))
+    assert set(jax.tree.leaves(changed)) == {updates > 0}
 
 
 # Relative guidance.
@@ -246,18 +238,6 @@ def test_a_lane_that_diverges_stays_at_its_last_finite_state_and_touches_no_othe
     assert_equal(probes.lane(after.agent.params, 1), probes.lane(poisoned, 1))
     for other in (0, 2, 3):
         assert_equal(probes.lane(after, other), probes.lane(healthy, other))
-
-
-def test_a_step_beyond_all_numbers_is_taken_back():
-    program = probes.window_program("none")
-    state = probes.start(program, [0], [0])
-    fresh = jax.tree.map(jnp.copy, state.agent)
-    # In the last iteration alone: nothing looks at its parameters after that.
-    settings = replaced(learning_rate=3e38, learn_after=48)
-    _, state, _ = run(program, settings, loop.start_clock(), state)
-    assert state.failed.all()
-    assert_equal(state.agent.params, fresh.params)
-    assert_equal(state.agent.training, fresh.training)
 
 
 def test_a_fit_that_diverges_fails_the_lane_and_leaves_its_guide():
@@ -324,8 +304,8 @@ def test_a_plain_environment_between_acting_and_learning_gives_the_compiled_loop
 
 def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
     program = probes.window_program("relative")
-    functions = (program.init, program.label_round, program.train)
-    before = probes.compilations(*functions)
+    compilations = lambda: [part._cache_size() for part in (program.init, program.label_round, program.train)]  # noqa: E731
+    before = compilations()
     clock, state = loop.start_clock(), probes.start(program, [7, 8, 9, 10], [1, 11, 33, LARGEST])
     for index in range(3):
         env = probes.Window(0.1 * index, 0.2 * index)
@@ -335,4 +315,4 @@ def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
         settings = settings._replace(agent=dataclasses.replace(settings.agent, target_every=1 + index))
         clock, state = program.label_round(env, probes.Expert(env), scalars, clock, state)
         clock, state, _ = program.train(env, settings, clock, state, STRETCH)
-    assert probes.compilations(*functions) == before
+    assert compilations() == before

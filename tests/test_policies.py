@@ -4,7 +4,6 @@ import dataclasses
 import json
 from functools import cache
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,7 +29,6 @@ from cuelearner_jax.policies import (
     Teaching,
     Uniform,
     describe,
-    lanes_in,
     layers,
     policy_of,
 )
@@ -222,19 +220,6 @@ def test_a_block_is_evaluated_as_each_of_its_lanes(name):
         assert values.shape == (LANES,)
         np.testing.assert_allclose(values, [found[metric] for found in alone], atol=1e-6)
     assert len(set(np.asarray(together["reward"]).tolist())) > 1  # lanes differ
-
-
-def test_one_lane_has_its_own_leaves_and_what_all_share():
-    policy = guided(agents())
-    one = policy.lane(2)
-    chex.assert_trees_all_equal(one.base.params, jax.tree.map(lambda leaf: leaf[2], policy.base.params))
-    chex.assert_trees_all_equal(one.model, jax.tree.map(lambda leaf: leaf[2], policy.model))
-    chex.assert_trees_all_equal((one.view, one.scalars), (policy.view, policy.scalars))
-    assert one.guidance is policy.guidance
-    assert one.base.functions == policy.base.functions
-    chex.assert_trees_all_equal(policy.lane(np.array([2, 0])).lane(0), one)
-    assert (lanes_in(policy), lanes_in(Common(policy)), lanes_in(Uniform())) == (LANES, None, None)
-    assert Common(one).lane(1) is one
 
 
 def test_every_policy_says_what_it_is():

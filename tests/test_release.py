@@ -29,10 +29,6 @@ def test_one_version_stands_everywhere():
     assert first == f"## [{cl.__version__}] - {date}"
 
 
-def test_formats_of_files_are_1():
-    assert set(formats.FORMATS.values()) == {1}
-
-
 def test_packages_are_typed_and_import_declared_dependencies_and_extras_alone():
     wanted = [*PROJECT["dependencies"], *chain(*PROJECT["optional-dependencies"].values())]
     declared = {re.match(r"[\w.-]+", one)[0].lower() for one in wanted}

@@ -13,11 +13,7 @@ from cuelearner_jax.types import Policy, Step
 
 
 def record_steps(
-    env: Any,
-    policy: Policy,
-    key: PRNGKeyArray,
-    steps: int,
-    see: Callable[[Any, Any, jax.Array, Step], Any],
+    env: Any, policy: Policy, key: PRNGKeyArray, steps: int, see: Callable[[Any, Any, jax.Array, Step], Any]
 ) -> list[Any]:
     """Return `see(env, state, action, step)` of each step in NumPy arrays; a new episode follows the end of one."""
 

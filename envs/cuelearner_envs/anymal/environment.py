@@ -13,9 +13,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.anymal import policy as walking_policy
 from cuelearner_envs.anymal.physics import AnymalGround, AnymalState, control, standing
-from cuelearner_envs.anymal.policy import WalkingPolicy, observe
+from cuelearner_envs.anymal.policy import WalkingPolicy, load, observe
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
 from cuelearner_envs.navigation.environment import Navigation, latest_first
@@ -24,7 +23,7 @@ from cuelearner_jax.spaces.directions import difference, from_angle, rotate
 
 Scalar = float | Float[Array, ""]
 SENSOR_NOISE = 0.02  # standard deviation of a scanner's range error [m]
-CONTROL_STEPS = 10  # per step of navigation: 0.2 s at 50 Hz
+CONTROL_STEPS = 10  # in a step of navigation, whose `period` is that many times 0.02 s
 TURNING_TIME = 0.3  # time constant of the commanded turn toward the heading; the turn rate stays bounded [s]
 # The command changes by no more than this [m/s^2, rad/s^2]: of robots turned other ways at once 11% fell within 10 s
 # (docs/data/anymal_fit.json), with these bounds none.
@@ -57,7 +56,6 @@ class LeggedNavigation(Navigation, kw_only=True):
 
     walking: WalkingPolicy
     ground: AnymalGround = AnymalGround()
-    control_steps: int = struct.field(pytree_node=False, default=CONTROL_STEPS)  # `period` is that many times 0.02 s
 
     def move(self, state: LeggedWalker, action: Float[Array, "2"]) -> LeggedWalker:
         """Return the state after a step, without a reset."""
@@ -73,7 +71,7 @@ class LeggedNavigation(Navigation, kw_only=True):
             return (body, last_action, command, fallen | felt.fallen), None
 
         start = (state.body, state.last_action, state.command, state.fallen)
-        (body, last_action, command, fallen), _ = jax.lax.scan(one, start, length=self.control_steps)
+        (body, last_action, command, fallen), _ = jax.lax.scan(one, start, length=CONTROL_STEPS)
         return state.replace(
             body=body,
             last_action=last_action,
@@ -146,11 +144,8 @@ class LeggedNavigation(Navigation, kw_only=True):
         )
 
 
-def make_environment(
-    config: NavigationConfig, split: str = "training", walking: WalkingPolicy | None = None
-) -> LeggedNavigation:
-    """Return the environment of a configuration with the quadruped, walking by a policy (default: the shipped one)."""
+def make_environment(config: NavigationConfig, split: str = "training") -> LeggedNavigation:
+    """Return the environment of a configuration with the quadruped, walking by the shipped policy."""
     plain = make_navigation(config, split)
     noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
-    walking = walking_policy.load() if walking is None else walking
-    return LeggedNavigation(**{**vars(plain), "lidar": plain.lidar.replace(noise=noise)}, walking=walking)
+    return LeggedNavigation(**{**vars(plain), "lidar": plain.lidar.replace(noise=noise)}, walking=load())

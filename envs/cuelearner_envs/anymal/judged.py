@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from cuelearner_envs import judging
 from cuelearner_envs.anymal import model as robot
-from cuelearner_envs.anymal.environment import LeggedNavigation, LeggedWalker
+from cuelearner_envs.anymal.environment import CONTROL_STEPS, LeggedNavigation, LeggedWalker
 from cuelearner_envs.anymal.physics import LEAST_UPRIGHT, LOWEST_KNEE, LOWEST_TRUNK
 from cuelearner_envs.navigation.environment import latest_first
 from cuelearner_jax.spaces.directions import rotate
@@ -121,7 +121,7 @@ class Course:
         """
         body, last, command = self.state.body, self.state.last_action, self.state.command
         headings = rotate(actions, jnp.asarray(_poses(body.qpos))[:, 2])
-        for _ in range(self.env.control_steps):
+        for _ in range(CONTROL_STEPS):
             last, command = _act(self.env, body, last, command, headings)
             self.judge.control(np.asarray(last))
             body = body.replace(qpos=jnp.asarray(self.judge.qpos), qvel=jnp.asarray(self.judge.qvel))

@@ -75,33 +75,24 @@ def from_brax(params: Any) -> WalkingPolicy:
 
 
 def save(folder: Path, policy: WalkingPolicy, about: dict[str, Any]) -> None:
-    """Write a policy and what is to be known about it; replaces an earlier one in one step each."""
+    """Write a policy and what is to be known about it."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {"mean": policy.mean, "std": policy.std}
     for number, (kernel, bias) in enumerate(policy.layers):
         arrays |= {f"kernel_{number}": kernel, f"bias_{number}": bias}
     halves: dict[str, Any] = {name: np.asarray(leaf, np.float16) for name, leaf in arrays.items()}
-    parts = folder / "unfinished.npz", folder / "unfinished.json"
-    np.savez_compressed(parts[0], **halves)
-    parts[1].write_text(json.dumps(about, indent=1) + "\n")
-    for part, name in zip(parts, (WEIGHTS, ABOUT), strict=True):
-        part.replace(folder / name)
+    np.savez_compressed(folder / WEIGHTS, **halves)
+    (folder / ABOUT).write_text(json.dumps(about, indent=1) + "\n")
 
 
 def load(folder: Path = SHIPPED) -> WalkingPolicy:
-    """Load a policy that `save` wrote (default: the shipped one). Raises UserError if missing or damaged."""
+    """Load a policy that `save` wrote (default: the shipped one). Raises UserError if it is missing."""
     file = folder / WEIGHTS
     if not file.is_file():
         command = f"python experiments/train_walking.py train --out {folder}"
         raise UserError(f"no walking policy in {folder}: train one with `{command}`")
-    try:
-        with np.load(file) as stored:
-            arrays = {name: np.asarray(stored[name], np.float32) for name in stored.files}
-        count = sum(name.startswith("kernel_") for name in arrays)
-        layers = tuple((arrays[f"kernel_{number}"], arrays[f"bias_{number}"]) for number in range(count))
-        mean, std = arrays["mean"], arrays["std"]
-    except Exception as error:  # NumPy's and zipfile's readers raise many exception types for damaged bytes
-        raise UserError(f"{file} is damaged: restore it, or train the policy anew") from error
-    if mean.shape != (OBS,) or not layers or layers[-1][1].shape != (robot.JOINTS,):
-        raise UserError(f"{file} is not a walking policy of this robot ({OBS} observations, {robot.JOINTS} joints)")
-    return WalkingPolicy(*jax.tree.map(jnp.asarray, (mean, std, layers)))
+    with np.load(file) as stored:
+        arrays = {name: jnp.asarray(stored[name], jnp.float32) for name in stored.files}
+    count = sum(name.startswith("kernel_") for name in arrays)
+    layers = tuple((arrays[f"kernel_{number}"], arrays[f"bias_{number}"]) for number in range(count))
+    return WalkingPolicy(arrays["mean"], arrays["std"], layers)

@@ -36,16 +36,12 @@ def furnish(world: NavigationWorld, goal: Float[np.ndarray, "2"], goal_radius: f
     """Return the robot's model with a world's solids and the goal, for drawing only."""
     spec = mujoco.MjSpec.from_file(str(robot.FILE))
     look: dict[str, Any] = {"contype": 0, "conaffinity": 0}
-    for (x, y, yaw, length, width), height in solids_of(world.boxes, world.box_heights):
-        turn = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
-        size, place = [length, width, height / 2], [x, y, height / 2]
-        kind = mujoco.mjtGeom.mjGEOM_BOX
+    box, disc = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+    for (x, y, *shape), height in solids_of(world):
+        yaw, *sides = shape if len(shape) == 3 else (0.0, *shape)
+        kind, size = (box, [*sides, height / 2]) if len(sides) == 2 else (disc, [*sides, height / 2, 0])
+        place, turn = [x, y, height / 2], [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
         spec.worldbody.add_geom(type=kind, pos=place, quat=turn, size=size, rgba=_shade(height), **look)
-    for (x, y, radius), height in solids_of(world.circles, world.circle_heights):
-        size, place = [radius, height / 2, 0], [x, y, height / 2]
-        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
-        spec.worldbody.add_geom(type=kind, pos=place, size=size, rgba=_shade(height), **look)
-    disc = mujoco.mjtGeom.mjGEOM_CYLINDER
     spec.worldbody.add_geom(type=disc, pos=[*goal, 0.01], size=[goal_radius, 0.01, 0], rgba=GOAL, **look)
     return spec.compile()
 

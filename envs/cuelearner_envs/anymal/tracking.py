@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.judged import MujocoAnymal
@@ -23,8 +23,6 @@ from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe
 
 HELD, SETTLING = 200, 100  # control steps for which a command is held, and how many of them are not yet settled
 STEPS = 1000  # of control that a robot walks: 20 s
-
-ENGINES = ("mjx", "mujoco")
 TRIALS = {
     "clean": Trial(),
     "disturbed": Trial(noise=1.0, push=0.5),
@@ -41,14 +39,21 @@ def _choose(
     return policy(add_noise(k_noise, observe(qpos, qvel, last, command), trial.noise)), command, k_push
 
 
+def _begin(trial: Trial, key: PRNGKeyArray, robots: int) -> tuple[AnymalGround, Key[Array, " robots"]]:
+    """Return the ground and the key of each robot."""
+    k_ground, k_run = jax.random.split(key)
+    grounds = jax.vmap(partial(random_ground, trial=trial))(jax.random.split(k_ground, robots))
+    return grounds, jax.random.split(k_run, robots)
+
+
 @partial(jax.jit, static_argnames=("robots", "steps"))
 def walk(
     policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, robots: int, steps: int
 ) -> tuple[Float[Array, "steps robots 3"], Float[Array, "steps robots 3"], Bool[Array, "steps robots"]]:
     """Velocities (`model.planar_velocity`), commands and who has fallen, step by step, in MJX."""
-    k_ground, k_run = jax.random.split(key)
-    grounds = jax.vmap(partial(random_ground, trial=trial))(jax.random.split(k_ground, robots))
+    grounds, keys = _begin(trial, key, robots)
 
+    @partial(jax.vmap, in_axes=(0, 0, 0, None))
     def one(ground: AnymalGround, key: PRNGKeyArray, state: tuple, index: jax.Array) -> tuple[tuple, tuple]:
         body, last_action, down = state
         action, command, k_push = _choose(policy, trial, key, index, body.qpos, body.qvel, last_action)
@@ -57,42 +62,32 @@ def walk(
         body = jax.tree.map(partial(jnp.where, down), body, after)  # a fallen robot stays where it is
         return (body, action, down), (robot.planar_velocity(body.qpos, body.qvel), command, down)
 
-    keys = jax.random.split(k_run, robots)
     start: AnymalState = standing(jnp.zeros(2), 0.0)
     begun = (start, jnp.zeros(robot.JOINTS), jnp.array(False))
     states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (robots, *leaf.shape)), begun)
-
-    def everyone(states: tuple, index: jax.Array) -> tuple[tuple, tuple]:
-        return jax.vmap(one, (0, 0, 0, None))(grounds, keys, states, index)
-
-    return jax.lax.scan(everyone, states, jnp.arange(steps))[1]
+    return jax.lax.scan(partial(one, grounds, keys), states, jnp.arange(steps))[1]
 
 
 def walk_in_mujoco(
     policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, robots: int, steps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`walk` in C MuJoCo at its finer step."""
-    k_ground, k_run = jax.random.split(key)
-    grounds = jax.vmap(partial(random_ground, trial=trial))(jax.random.split(k_ground, robots))
+    grounds, keys = _begin(trial, key, robots)
     judge = MujocoAnymal(np.asarray(grounds.friction).tolist(), np.asarray(grounds.payload).tolist())
-    keys = jax.random.split(k_run, robots)
 
     @jax.jit
-    def before(qpos: jax.Array, qvel: jax.Array, last: jax.Array, index: jax.Array) -> tuple[jax.Array, ...]:
-        """Actions, commands and pushes of a step."""
-
-        def one(key: PRNGKeyArray, qpos: jax.Array, qvel: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
-            action, command, k_push = _choose(policy, trial, key, index, qpos, qvel, last)
-            after = push_randomly(k_push, AnymalState(qpos, qvel, qvel), trial).qvel
-            return action, command, after[:2] - qvel[:2]
-
-        return jax.vmap(one)(keys, qpos, qvel, last)
+    @partial(jax.vmap, in_axes=(0, None, 0, 0, 0))
+    def before(key: PRNGKeyArray, index: Array, qpos: Array, qvel: Array, last: Array) -> tuple[Array, Array, Array]:
+        """Return the action, the command and the push of a step."""
+        action, command, k_push = _choose(policy, trial, key, index, qpos, qvel, last)
+        after = push_randomly(k_push, AnymalState(qpos, qvel, qvel), trial).qvel
+        return action, command, after[:2] - qvel[:2]
 
     measure = jax.jit(jax.vmap(robot.planar_velocity))
     last = np.zeros((robots, robot.JOINTS), np.float32)
     rows = []
     for index in range(steps):
-        last, command, change = (np.asarray(leaf) for leaf in before(judge.qpos, judge.qvel, last, jnp.int32(index)))
+        last, command, change = jax.device_get(before(keys, jnp.int32(index), judge.qpos, judge.qvel, last))
         for number in np.flatnonzero(change.any(-1)):
             judge.push(int(number), change[number])
         judge.control(last)
@@ -132,7 +127,7 @@ def figures(
 
 def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> Iterator[tuple[str, dict[str, float]]]:
     """Figures of every trial of `TRIALS` in both engines, one after the other as they are measured."""
-    for engine in ENGINES:
+    for engine in ("mjx", "mujoco"):
         for name, trial in TRIALS.items():
             yield f"{engine}, {name}", measure(policy, engine, trial, key, robots)
 

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import jax.numpy as jnp
 
-from cuelearner_envs.arm.environment import REWARDS, Arm, Camera, Reward, Skill
+from cuelearner_envs.arm.environment import Arm, Camera, Reward, Skill
 from cuelearner_envs.arm.physics import ArmGround
 from cuelearner_envs.bounds import MOST_STEPS, check_number, check_vector, check_word
 from cuelearner_jax.environment import Quantity
@@ -45,7 +45,7 @@ class ArmConfig:
     def __post_init__(self) -> None:
         """Raise UserError with one line for the first value that cannot work."""
         check_word("skill", self.skill, get_args(Skill))
-        check_word("reward", self.reward, REWARDS)
+        check_word("reward", self.reward, get_args(Reward))
         check_word("preferred_side", self.preferred_side, SIDES)
         if self.preferred_side != "none" and not self.has_post:
             raise UserError(f"task.preferred_side is {self.preferred_side}: that needs --task.skill push and its post")

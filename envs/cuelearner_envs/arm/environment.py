@@ -6,7 +6,7 @@ gripper, or the cube, is within 5 cm of the goal.
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,6 @@ from cuelearner_jax.types import EnvState, Step
 Scalar = float | Float[Array, ""]
 Skill = Literal["reach", "push", "pick"]
 Reward = Literal["shaped", "dense", "sparse"]
-REWARDS = get_args(Reward)
 PLACEMENTS = 16  # draws of a cube position that must not lie near the gripper
 SPREAD = 0.15  # of cubes and goals round where the gripper begins, along each axis [m]
 APART = 0.1  # of the cube from there, at least [m]
@@ -58,9 +57,8 @@ class Camera(struct.PyTreeNode):
         """Return the observed position of a point [m]."""
         cos, sin, base = jnp.cos(self.turn), jnp.sin(self.turn), jnp.asarray(BASE)
         x, y = place[:2] - base
-        return jnp.stack([cos * x - sin * y + base[0], sin * x + cos * y + base[1], place[2]]) + jnp.asarray(
-            self.offset
-        )
+        turned = [cos * x - sin * y + base[0], sin * x + cos * y + base[1], place[2]]
+        return jnp.stack(turned) + jnp.asarray(self.offset)
 
 
 class Arm(WholeObservations, struct.PyTreeNode):
@@ -94,24 +92,7 @@ class Arm(WholeObservations, struct.PyTreeNode):
 
     def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, "4"]) -> tuple[EnvState, Step]:
         """Execute an action; a new episode follows the end of one."""
-        body = physics.control(state.body, self.command(state, action), self.ground)
-        return self.followed(key, self.after(state, body))
-
-    def command(self, state: Situation, action: Float[Array, "4"]) -> physics.Command:
-        """Return the targets of the drives that an action means."""
-        fingers = state.body.qpos[physics.FINGERS] if self.has_object else jnp.zeros(2)
-        post = self.ground.post if self.has_object else 0.0
-        return physics.command(self.gripper(state), fingers, action, post, self.grasps)
-
-    def after(self, state: Situation, body: ArmState) -> Situation:
-        """Return the state that physics has led to; what blew up stays where it was."""
-        sound = jnp.isfinite(body.qpos).all() & jnp.isfinite(body.qvel).all()
-        body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), body, state.body)
-        after = state.replace(body=body, steps=state.steps + 1)
-        return after.replace(passed=self._passed(state, after)) if self.has_object else after
-
-    def followed(self, key: PRNGKeyArray, after: Situation) -> tuple[Situation, Step]:
-        """Return the state to act in next, and what the step to `after` has led to."""
+        after = self.after(state, physics.control(state.body, self.command(state, action), self.ground))
         outcome, truncated = self.ends(after)
         following = jax.tree.map(lambda new, old: jnp.where(truncated, new, old), self._start(key), after)
         final_obs = self.observe(after)
@@ -126,6 +107,19 @@ class Arm(WholeObservations, struct.PyTreeNode):
             outcome=outcome,
         )
         return following, step
+
+    def command(self, state: Situation, action: Float[Array, "4"]) -> physics.Command:
+        """Return the targets of the drives that an action means."""
+        fingers = state.body.qpos[physics.FINGERS] if self.has_object else jnp.zeros(2)
+        post = self.ground.post if self.has_object else 0.0
+        return physics.command(self.gripper(state), fingers, action, post, self.grasps)
+
+    def after(self, state: Situation, body: ArmState) -> Situation:
+        """Return the state that physics has led to; what blew up stays where it was."""
+        sound = jnp.isfinite(body.qpos).all() & jnp.isfinite(body.qvel).all()
+        body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), body, state.body)
+        after = state.replace(body=body, steps=state.steps + 1)
+        return after.replace(passed=self._passed(state, after)) if self.has_object else after
 
     def ends(self, after: Situation) -> tuple[dict[str, Float[Array, ""]], Array]:
         """Return what an episode that ended in a state came to, and whether time is up.

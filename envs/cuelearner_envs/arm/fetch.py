@@ -90,16 +90,10 @@ def make_environment(config: ArmConfig, plays: Environment) -> FetchArm:
 
     `plays`: Fetch in the skill and steps of the configuration. Whether a post is asked for does not count.
     """
-    if config.friction != ArmConfig.friction:
-        raise UserError(
-            f"task.friction is {config.friction}, but Fetch's cube has a friction of its own: leave it out, or leave "
-            "out --robot fetch"
-        )
-    if config.preferred_side != "none":
-        raise UserError(
-            f"task.preferred_side is {config.preferred_side}, but no post stands in Fetch: leave it out, or leave out "
-            "--robot fetch"
-        )
+    reasons = {"friction": "Fetch's cube has a friction of its own", "preferred_side": "no post stands in Fetch"}
+    for name, why in reasons.items():
+        if (value := getattr(config, name)) != getattr(ArmConfig, name):
+            raise UserError(f"task.{name} is {value}, but {why}: leave it out, or leave out --robot fetch")
     plain = make_arm(config, plays.observation)
     ground = ArmGround(friction=plain.ground.friction, post=jnp.zeros(()))
     return FetchArm(**{**vars(plain), "ground": ground}, plays=plays)

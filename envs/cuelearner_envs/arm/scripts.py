@@ -23,15 +23,7 @@ AROUND = 0.02  # from the cube's middle: as near, fingers close [m]
 HELD = 0.028  # of each finger's opening: at most as wide, they hold the cube [m]
 GRASPED = 0.035  # from the cube's middle: as near it stays while it is held [m]
 PAST = Gains(
-    along=6.0,
-    side=24.0,
-    back=0.055,
-    ahead=0.015,
-    beside=0.018,
-    arrived=0.035,
-    lead=0.005,
-    fastest=0.06,
-    pushed=0.025,
+    along=6.0, side=24.0, back=0.055, ahead=0.015, beside=0.018, arrived=0.035, lead=0.005, fastest=0.06, pushed=0.025
 )
 # For a slippery cube, which slides on when the gripper stops, and leaves a gripper that is not behind it.
 SLIPPERY, CAREFUL = 0.5, PAST._replace(along=5.5, side=20.0, beside=0.014, lead=0.0, pushed=0.015)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.billiards.table import Scalar, Table, corner_gap
 
+Each = Float[Array, "*any"]  # a number of one ball, or of each of many
 # 1 / effective mass along the tangent: each disc adds 1/m + r^2/I = 3. Along the normal each disc adds 1.
 TANGENT_PER_DISC = 3.0
 RIM_PER_IMPULSE = -2.0  # change of a rim's speed by a unit tangential impulse, -r^2/I; the same for both discs
@@ -26,19 +27,13 @@ SOFT_SPEED = 1e-3  # [m/s] slower impacts are elastic: else balls that lie toget
 class Flight(NamedTuple):
     """A ball's next contact, other balls apart."""
 
-    time: Float[Array, "*any"]  # until then; infinite if nothing
-    centre_x: Float[Array, "*any"]  # point of the cushion's centre line that it touches [m]
-    centre_y: Float[Array, "*any"]  # [m]
+    time: Each  # until then; infinite if nothing
+    centre_x: Each  # point of the cushion's centre line that it touches [m]
+    centre_y: Each  # [m]
     falls: Bool[Array, "*any"]  # it drops into a pocket instead of touching a cushion
 
 
-def time_to_circle(
-    dx: Float[Array, "*any"],
-    dy: Float[Array, "*any"],
-    ux: Float[Array, "*any"],
-    uy: Float[Array, "*any"],
-    radius: Scalar,
-) -> Float[Array, "*any"]:
+def time_to_circle(dx: Each, dy: Each, ux: Each, uy: Each, radius: Scalar) -> Each:
     """Time until a point, displaced by d from a circle's centre and moving with u, enters the circle.
 
     The smaller root of |d + u t| = radius, in the form c / (-b + sqrt(disc)) that does not cancel; the discriminant
@@ -53,14 +48,12 @@ def time_to_circle(
     return jnp.where(hits, time, jnp.inf)
 
 
-def time_to_line(distance: Float[Array, "*any"], speed: Float[Array, "*any"]) -> Float[Array, "*any"]:
+def time_to_line(distance: Each, speed: Each) -> Each:
     """Time to cover a distance at a speed >= 0: at once if already beyond, never if at rest."""
     return jnp.where(speed > 0.0, jnp.maximum(distance, 0.0) / jnp.where(speed > 0.0, speed, 1.0), jnp.inf)
 
 
-def jaws(
-    table: Table, x: Float[Array, "*any"], y: Float[Array, "*any"]
-) -> tuple[tuple[Float[Array, "*any"], Float[Array, "*any"]], tuple[Float[Array, "*any"], Float[Array, "*any"]]]:
+def jaws(table: Table, x: Each, y: Each) -> tuple[tuple[Each, Each], tuple[Each, Each]]:
     """The two cushion ends beside the pocket nearest to a place close to the table's edge [m]."""
     half_x, half_y, gap = table.width / 2, table.height / 2, corner_gap(table)
     sign_x, sign_y = jnp.where(x < 0.0, -1.0, 1.0), jnp.where(y < 0.0, -1.0, 1.0)
@@ -73,13 +66,7 @@ def jaws(
     return first, second
 
 
-def next_on_edge(
-    table: Table,
-    x: Float[Array, "*any"],
-    y: Float[Array, "*any"],
-    ux: Float[Array, "*any"],
-    uy: Float[Array, "*any"],
-) -> Flight:
+def next_on_edge(table: Table, x: Each, y: Each, ux: Each, uy: Each) -> Flight:
     """Return the next contact on the table's edge of a ball at (x, y) moving with (ux, uy).
 
     A straight flight leaves the inner rectangle (the edge less ball and cushion radius) exactly once. Where it does, it
@@ -118,12 +105,7 @@ def next_on_edge(
     return Flight(jnp.minimum(best, pocket), best_x, best_y, falls)
 
 
-def normal_impulse(
-    approach: Float[Array, "*any"] | float,
-    unseen: Float[Array, "*any"] | float,
-    restitution: Scalar,
-    discs: Float[Array, "*any"] | float,
-) -> Float[Array, "*any"]:
+def normal_impulse(approach: Each | float, unseen: Each | float, restitution: Scalar, discs: Each | float) -> Each:
     """Impulse along the normal: (1 + e) * approach / discs (Newton's restitution); `discs` = 1 or 2 movable bodies.
 
     `unseen` is the share of the true approach speed that the flight does not carry (the part of a kick due before the
@@ -134,12 +116,7 @@ def normal_impulse(
     return (approach + jnp.maximum(separation, LEAST_SEPARATION)) / discs
 
 
-def tangential_impulse(
-    slip: Float[Array, "*any"] | float,
-    normal: Float[Array, "*any"] | float,
-    friction: Scalar,
-    discs: Float[Array, "*any"] | float,
-) -> Float[Array, "*any"]:
+def tangential_impulse(slip: Each | float, normal: Each | float, friction: Scalar, discs: Each | float) -> Each:
     """Impulse along the tangent: it ends the slip, or is clamped to Coulomb's cone (as in Chipmunk's arbiter)."""
     most = friction * normal
     return jnp.clip(-slip / (TANGENT_PER_DISC * discs), -most, most)

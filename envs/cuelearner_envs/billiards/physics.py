@@ -7,6 +7,7 @@ enters as kicks between flights (leapfrog), in slices so short that a flight ben
 are none.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,13 +18,17 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from cuelearner_envs.billiards.contacts import (
     RIM_PER_IMPULSE,
+    Each,
     next_on_edge,
     normal_impulse,
     tangential_impulse,
     time_to_circle,
 )
-from cuelearner_envs.billiards.table import Scalar, Table, as_arrays, parking_place
+from cuelearner_envs.billiards.table import Scalar, Table, as_arrays, parking
 
+Places = Float[ArrayLike, "balls 2"]  # [m]
+Flags = Bool[ArrayLike, "balls"]
+Angle = Float[ArrayLike, ""]  # [rad]
 BLOCK = 4096  # shots that `simulate_many` simulates at once
 BEND = 1e-5  # largest departure of a flight between two kicks from the true parabola [m]
 
@@ -80,17 +85,17 @@ def drag(table: Table) -> Float[Array, ""]:
     return -jnp.log(table.speed_kept)
 
 
-def warp(rate: Float[Array, ""], time: Float[Array, "*any"]) -> Float[Array, "*any"]:
+def warp(rate: Float[Array, ""], time: Each) -> Each:
     """Return the warped time at a time since the strike: the distance covered meanwhile per unit of initial speed."""
     return jnp.where(rate > 0.0, -jnp.expm1(-rate * time) / jnp.where(rate > 0.0, rate, 1.0), time)
 
 
-def unwarp(rate: Float[Array, ""], warped: Float[Array, "*any"]) -> Float[Array, "*any"]:
+def unwarp(rate: Float[Array, ""], warped: Each) -> Each:
     """Time since the strike at a warped time."""
     return jnp.where(rate > 0.0, -jnp.log1p(-rate * warped) / jnp.where(rate > 0.0, rate, 1.0), warped)
 
 
-def kick(rate: Float[Array, ""], start: Float[Array, "*any"], end: Float[Array, "*any"]) -> Float[Array, "*any"]:
+def kick(rate: Float[Array, ""], start: Each, end: Each) -> Each:
     """Gain of u per unit of acceleration between two warped times: the integral of exp(lambda t) dt."""
     return (end - start) / ((1.0 - rate * start) * (1.0 - rate * end))
 
@@ -195,7 +200,7 @@ def step(table: Table, motion: ShotState) -> ShotState:
     gain = jnp.where(kicks, kick(rate, middle, warp(rate, (motion.kicks + 1.5) * slice_)), 0.0)
     pocketed = motion.pocketed | falling
     flying = ~pocketed & ~stops
-    place_x, place_y = parking_place(table, jnp.arange(table.balls))
+    place_x, place_y = parking(table).T
     return ShotState(
         x=jnp.where(falling, place_x, hit.x),
         y=jnp.where(falling, place_y, hit.y),
@@ -210,20 +215,21 @@ def step(table: Table, motion: ShotState) -> ShotState:
     )
 
 
-def strike(
-    table: Table,
-    positions: Float[Array, "balls 2"],
-    pocketed: Bool[Array, "balls"],
-    angle: Float[Array, ""],
-) -> ShotState:
-    """The cue ball leaves without spin in the direction `angle`; every ball has had the first half kick."""
+def strike(table: Table, positions: Places, pocketed: Flags, angle: Angle) -> tuple[Table, ShotState]:
+    """Return the table in the dtype of `positions`, and the cue ball leaving it without spin in the direction `angle`.
+
+    Every ball has had the first half kick.
+    """
+    positions = jnp.asarray(positions)
+    table, pocketed = as_arrays(table, positions.dtype), jnp.asarray(pocketed, bool)
+    angle = jnp.asarray(angle, positions.dtype)
     rest, zero = jnp.zeros_like(positions[:, 0]), jnp.zeros_like(angle)
     struck = jnp.arange(table.balls) == 0
     half = kick(drag(table), zero, warp(drag(table), slice_length(table) / 2))
     gx, gy = table.acceleration[0] * half, table.acceleration[1] * half
-    place_x, place_y = parking_place(table, jnp.arange(table.balls))
+    place_x, place_y = parking(table).T
     count = jnp.zeros((), jnp.int32)
-    return ShotState(
+    return table, ShotState(
         x=jnp.where(pocketed, place_x, positions[:, 0]),
         y=jnp.where(pocketed, place_y, positions[:, 1]),
         ux=jnp.where(pocketed, 0.0, gx + jnp.where(struck, table.strike_speed * jnp.cos(angle), 0.0)),
@@ -237,22 +243,14 @@ def strike(
     )
 
 
-def simulate(
-    table: Table,
-    positions: Float[ArrayLike, "balls 2"],
-    pocketed: Bool[ArrayLike, "balls"],
-    angle: Float[ArrayLike, ""],
-) -> Shot:
+def simulate(table: Table, positions: Places, pocketed: Flags, angle: Angle) -> Shot:
     """Play one shot: strike the cue ball in the direction `angle` [rad] and wait until all balls rest.
 
     Pure; `jit` and `vmap` at will (the batch may include the table). Computes in the dtype of `positions` [m].
     """
-    positions = jnp.asarray(positions)
-    table = as_arrays(table, positions.dtype)
+    table, start = strike(table, positions, pocketed, angle)
     motion = jax.lax.while_loop(
-        lambda motion: ~motion.is_over & (motion.events < table.max_events),
-        lambda motion: step(table, motion),
-        strike(table, positions, jnp.asarray(pocketed, bool), jnp.asarray(angle, positions.dtype)),
+        lambda motion: ~motion.is_over & (motion.events < table.max_events), partial(step, table), start
     )
     return Shot(
         positions=jnp.stack([motion.x, motion.y], axis=-1),
@@ -280,16 +278,9 @@ def simulate_many(
     return jax.tree.map(lambda leaf: leaf[:shots], result)
 
 
-def trace(
-    table: Table,
-    positions: Float[ArrayLike, "balls 2"],
-    pocketed: Bool[ArrayLike, "balls"],
-    angle: Float[ArrayLike, ""],
-) -> Trajectory:
+def trace(table: Table, positions: Places, pocketed: Flags, angle: Angle) -> Trajectory:
     """Simulate a shot as `simulate` does and keep every event, for drawing; always takes max_events steps."""
-    positions = jnp.asarray(positions)
-    table = as_arrays(table, positions.dtype)
-    start = strike(table, positions, jnp.asarray(pocketed, bool), jnp.asarray(angle, positions.dtype))
+    table, start = strike(table, positions, pocketed, angle)
 
     def keep(motion: ShotState, _: None) -> tuple[ShotState, ShotState]:
         after = step(table, motion)

@@ -6,7 +6,7 @@ Lengths are metres, the origin is the table's centre, x runs along the long side
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 Scalar = float | Float[Array, ""]
 CORNER_GAP = 1.4142  # a cushion ends this many hole widths before a corner: the hole then measures two of them across
@@ -62,11 +62,8 @@ def cushions(table: Table) -> Float[Array, "segments 2 2"]:
     Their ends are the jaws of the pockets.
     """
     x, y, gap, hole = (jnp.asarray(v) for v in (table.width / 2, table.height / 2, corner_gap(table), table.hole_width))
-    inner = hole if table.side_pockets else jnp.zeros_like(hole)
-    long_sides = [[(inner, sy * y), (x - gap, sy * y)] for sy in (1, -1)]
-    long_sides += [[(-(x - gap), sy * y), (-inner, sy * y)] for sy in (1, -1)]
-    if not table.side_pockets:
-        long_sides = [[(-(x - gap), sy * y), (x - gap, sy * y)] for sy in (1, -1)]
+    stretches = [(hole, x - gap), (-(x - gap), -hole)] if table.side_pockets else [(-(x - gap), x - gap)]
+    long_sides = [[(start, sy * y), (end, sy * y)] for start, end in stretches for sy in (1, -1)]
     ends = [[(sx * x, -(y - gap)), (sx * x, y - gap)] for sx in (1, -1)]
     return jnp.asarray([[jnp.stack(end) for end in segment] for segment in long_sides + ends])
 
@@ -80,16 +77,11 @@ def pockets(table: Table) -> Float[Array, "pockets 2"]:
     return jnp.stack([jnp.stack([jnp.asarray(px), jnp.asarray(py)]) for px, py in places])
 
 
-def parking_place(table: Table, ball: Int[Array, "*any"]) -> tuple[Float[Array, "*any"], Float[Array, "*any"]]:
-    """Return the position of a pocketed ball [m]: in a row beside the table, by ball index."""
-    return table.ball_radius * (
-        1.0 + 3.0 * ball
-    ) - table.width / 2, table.height / 2 + 3.0 * table.ball_radius + 0.0 * ball
-
-
 def parking(table: Table) -> Float[Array, "balls 2"]:
-    """Return the positions of a table's balls once pocketed [m]."""
-    return jnp.stack(parking_place(table, jnp.arange(table.balls)), axis=-1)
+    """Return the positions of balls once pocketed [m]: in a row beside the table, by ball index."""
+    ball = jnp.arange(table.balls)
+    x = table.ball_radius * (1.0 + 3.0 * ball) - table.width / 2
+    return jnp.stack([x, table.height / 2 + 3.0 * table.ball_radius + 0.0 * ball], axis=-1)
 
 
 def rack(table: Table) -> Float[Array, "balls 2"]:

@@ -5,7 +5,6 @@ An observation is flattened as `cl.from_gymnasium` does: achieved goal, desired 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Observations = Float[Array, "n obs"] | Float[np.ndarray, "n obs"]  # the command line gives NumPy's
-Script = Callable[[Float[Array, "n obs"]], Float[Array, "n 4"]]
 Amount = float | Float[Array, ""]
 
 GOAL, GRIPPER, OBJECT = slice(3, 6), slice(6, 9), slice(9, 12)
@@ -81,4 +79,4 @@ def _action(move: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
     return jnp.clip(jnp.concatenate([move, jnp.zeros_like(move[:, :1])], -1), -1.0, 1.0)
 
 
-SCRIPTS: dict[str, Script] = {"FetchReach-v4": reach, "FetchPush-v4": push}
+SCRIPTS = {"FetchReach-v4": reach, "FetchPush-v4": push}

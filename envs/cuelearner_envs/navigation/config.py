@@ -15,12 +15,8 @@ from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax.errors import UserError
 
-Style = Literal["clutter", "rooms", "corridor"]
-
 SIDES = {"none": 0, "left": 1, "right": -1}
-
 MOST_WORLDS = 1 << 24  # replay keeps a world's number in single precision, which is exact up to here
-
 # Folded into the key of the worlds, so that no training world is used for validation.
 SPLITS = {"training": 0, "validation": 1, "tuning": 2}
 
@@ -29,7 +25,7 @@ SPLITS = {"training": 0, "validation": 1, "tuning": 2}
 class NavigationConfig:
     """A family of worlds and the robot in it."""
 
-    style: Style = "clutter"
+    style: Literal["clutter", "rooms", "corridor"] = "clutter"
     """clutter: a hall of boxes and columns. rooms: rooms, doorways, thin obstacles. corridor: pass left or right."""
     worlds: int = 1024
     """Number of worlds, each with 16 routes. Training and validation use different worlds."""

@@ -26,18 +26,17 @@ from cuelearner_envs import canvas
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import RecordedStep
 from cuelearner_envs.navigation.robot import Robot, hull
-from cuelearner_envs.navigation.world import solids_of, tallness
+from cuelearner_envs.navigation.world import corners, from_frame, solids_of, tallness
 from cuelearner_jax import pictures
 
 # Okabe and Ito's palette, as in the figures of results: told apart with any colour vision.
 BODY, GOAL, CRASH, ARROW, BEAMS, HITS = "#0072B2", "#009E73", "#D55E00", "#E69F00", "#56B4E9", "#CC79A7"
 START, INK = "#000000", "#333333"
-OUTCOMES = {"success": GOAL, "collision": CRASH, "fall": CRASH, "timeout": INK}
-WORDS = {
-    "success": "reached the goal after",
-    "collision": "collision after",
-    "fall": "fell after",
-    "timeout": "out of time after",
+ENDINGS = {  # words and colours
+    "success": ("reached the goal after", GOAL),
+    "collision": ("collision after", CRASH),
+    "fall": ("fell after", CRASH),
+    "timeout": ("out of time after", INK),
 }
 CHOICE, QUESTION = "direction chosen", "direction in question"  # what an arrow means
 COURSE = ("start", "goal", "lidar", CHOICE)
@@ -64,9 +63,9 @@ def still(robot: Robot, frames: Sequence[RecordedStep], file: str | os.PathLike[
     _body(axes, robot, middle.pose)
     _body(axes, robot, last.next_pose, CRASH if last.outcome in ("collision", "fall") else BODY)
     _arrow(axes, middle)
-    words = WORDS.get(last.outcome, "still walking after")
+    words, colour = ENDINGS.get(last.outcome, ("still walking after", INK))
     length = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=-1).sum()
-    _caption(strip, f"{words} {last.seconds:.1f} s, {length:.1f} m", OUTCOMES.get(last.outcome, INK))
+    _caption(strip, f"{words} {last.seconds:.1f} s, {length:.1f} m", colour)
     canvas.save(figure, file)
 
 
@@ -86,7 +85,7 @@ def animate(robot: Robot, frames: Sequence[RecordedStep], file: str | os.PathLik
     With steps of 0.2 s, 10 pictures a second show twice the speed of life.
     """
     # A picture that has every colour of the film: a step, and each end, one below the other.
-    ends = [_film(robot, [frames[0]._replace(outcome=outcome)], frames, 1) for outcome in OUTCOMES]
+    ends = [_film(robot, [frames[0]._replace(outcome=outcome)], frames, 1) for outcome in ENDINGS]
     specimen = np.concatenate([picture for film in ends for picture in film])
     palette = pictures.palette_of(specimen, 88, (BODY, GOAL, CRASH, ARROW, HITS, FLOOR, "#ffffff"))
 
@@ -120,15 +119,9 @@ def _film(
         seconds = frame.seconds
     if last.outcome:
         body = _body(axes, robot, last.next_pose, CRASH if last.outcome in ("collision", "fall") else BODY)
-        words = _caption(strip, f"{WORDS[last.outcome]} {last.seconds:.1f} s", OUTCOMES[last.outcome])
-        yield from itertools.repeat(over.picture(*trail(len(episode)), *body, words), hold)
-
-
-def _to_world(pose: np.ndarray, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
-    """Points in the frame of the body as points of the world [m]."""
-    x, y, yaw = np.asarray(pose, float)
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
+        words, colour = ENDINGS[last.outcome]
+        caption = _caption(strip, f"{words} {last.seconds:.1f} s", colour)
+        yield from itertools.repeat(over.picture(*trail(len(episode)), *body, caption), hold)
 
 
 def _way(episode: Sequence[RecordedStep]) -> Float[np.ndarray, "poses 3"]:
@@ -154,12 +147,8 @@ def _figure(
     world, half = first.world, np.asarray(first.world.extent, float) / 2
     axes.set(xlim=(-half[0] - MARGIN, half[0] + MARGIN), ylim=(-half[1] - MARGIN, half[1] + MARGIN), aspect="equal")
     axes.add_patch(Rectangle((-half[0], -half[1]), *(2 * half), facecolor=FLOOR, edgecolor="none", zorder=0))
-    square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-    solids = [
-        (h, Polygon(_to_world(row[:3], square * row[3:]))) for row, h in solids_of(world.boxes, world.box_heights)
-    ]
-    solids += [(h, Circle((row[0], row[1]), row[2])) for row, h in solids_of(world.circles, world.circle_heights)]
-    for height, patch in sorted(solids, key=lambda solid: solid[0]):  # from above, the tall covers the low
+    for row, height in solids_of(world):
+        patch = Polygon(corners(row)) if len(row) == 5 else Circle((row[0], row[1]), row[2])
         patch.set(facecolor=shade(height), edgecolor="none", zorder=1)
         axes.add_patch(patch)
     x, y = np.asarray(first.goal, float)
@@ -201,14 +190,14 @@ def _body(axes: Axes, robot: Robot, pose: np.ndarray, colour: str = BODY, alpha:
     looks = {"facecolor": colour, "edgecolor": "white", "linewidth": 0.8}, {"facecolor": "white", "edgecolor": "none"}
     rest: dict[str, Any] = {"alpha": alpha, "zorder": 6 if alpha == 1 else 5}
     shapes = zip(hull(robot), looks, strict=True)
-    return [axes.add_patch(Polygon(_to_world(pose, points), **look, **rest)) for points, look in shapes]
+    return [axes.add_patch(Polygon(from_frame(pose, points), **look, **rest)) for points, look in shapes]
 
 
 def _lidar(axes: Axes, frame: RecordedStep) -> list[Artist]:
     """Add one scan, as the robot takes it: the space that it found free, and dots where beams met something."""
     angles = np.asarray(BEAM_ANGLES, float)
     beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    ends = _to_world(frame.pose, np.asarray(frame.ranges)[:, None] * beams)
+    ends = from_frame(frame.pose, np.asarray(frame.ranges)[:, None] * beams)
     hits = np.asarray(frame.ranges) < 0.999 * frame.max_range
     free = Polygon(np.concatenate([[frame.pose[:2]], ends]), facecolor=BEAMS, alpha=0.22, edgecolor="none", zorder=2)
     dots = axes.plot(*ends[hits].T, linestyle="none", marker="o", markersize=1.8, color=HITS, zorder=4)
@@ -217,5 +206,5 @@ def _lidar(axes: Axes, frame: RecordedStep) -> list[Artist]:
 
 def _arrow(axes: Axes, frame: RecordedStep) -> Artist:
     """Add an arrow beside the body, along the direction that was chosen."""
-    ends = _to_world(frame.pose, np.outer(ARROW_REACH, frame.action))
+    ends = from_frame(frame.pose, np.outer(ARROW_REACH, frame.action))
     return canvas.arrow(axes, ends, ARROW, 13, canvas.edged(3.6, "#000000aa"))

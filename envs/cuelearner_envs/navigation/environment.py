@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_envs.navigation.aims import aims_of
+from cuelearner_envs.navigation.aims import UNSEEN, aims_of
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
-from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
+from cuelearner_envs.navigation.robot import Robot, collides, walk
 from cuelearner_envs.navigation.world import NavigationWorld, count_passed, heading
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.environment import Aims, Described, Features, Quantity
@@ -23,7 +23,6 @@ from cuelearner_jax.types import Step
 
 REMEMBERED = 3  # actions in the observation
 RING = 360  # directions all round in which `features` gives how near things are: as far apart as beams are
-UNSEEN = -1.0  # what it gives where the lidar does not look; nearness is from 0 to 1
 Scalar = float | Float[Array, ""]
 
 
@@ -108,14 +107,10 @@ class Navigation(Described, struct.PyTreeNode):
         return following, step
 
     def ends(self, after: AnyWalker) -> tuple[dict[str, Float[Array, ""]], Bool[Array, ""], Bool[Array, ""]]:
-        """Return how a step that led to a state ends its episode, if it does.
-
-        Returns:
-            outcome (1 or 0 each, and the time since the start [s]), terminated, truncated.
-        """
+        """Return outcome (1 or 0 each, and the time since the start [s]), terminated and truncated of a step's end."""
         failures = self.failures(after)
         failed = jnp.stack(list(failures.values())).any()
-        success = self.arrived(after) & ~failed
+        success = (jnp.linalg.norm(after.goal - after.pose[:2]) < self.goal_radius) & ~failed
         terminated = success | failed
         truncated = (after.steps >= self.max_steps) & ~terminated
         outcomes = {"success": success, **failures, "timeout": truncated, **self.sides_of(after)}
@@ -141,17 +136,9 @@ class Navigation(Described, struct.PyTreeNode):
 
     def move(self, state: AnyWalker, action: Float[Array, "2"]) -> AnyWalker:
         """The state after a step, without a reset."""
-        motion = walk(self.robot, Motion(state.pose, state.velocity), action, self.period)
-        return state.replace(
-            pose=motion.pose,
-            velocity=motion.velocity,
-            previous=latest_first(action, state.previous),
-            steps=state.steps + 1,
-        )
-
-    def arrived(self, state: AnyWalker) -> Bool[Array, ""]:
-        """Whether the goal is reached."""
-        return jnp.linalg.norm(state.goal - state.pose[:2]) < self.goal_radius
+        pose, velocity = walk(self.robot, state.pose, state.velocity, action, self.period)
+        previous = latest_first(action, state.previous)
+        return state.replace(pose=pose, velocity=velocity, previous=previous, steps=state.steps + 1)
 
     def failures(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
         """Return the failures that end an episode, by name; at most one holds."""
@@ -254,16 +241,13 @@ class Navigation(Described, struct.PyTreeNode):
         _, goal, previous, world, route = _remembered(memory)
         return self.observe(self.placed(aftermath, goal, latest_first(action, previous), world, route))
 
-    def start(self, key: PRNGKeyArray) -> tuple[Float[Array, "3"], Float[Array, "2"], Int[Array, ""], Int[Array, ""]]:
-        """A random route: pose at its start, turned at random; goal, number of the world and of the route."""
+    def _start(self, key: PRNGKeyArray) -> AnyWalker:
+        """At rest at the start of a random route, turned at random."""
         k_world, k_route, k_yaw = jax.random.split(key, 3)
         worlds, routes = self.worlds.starts.shape[:2]
         world, route = jax.random.randint(k_world, (), 0, worlds), jax.random.randint(k_route, (), 0, routes)
         yaw = jax.random.uniform(k_yaw, (), minval=-jnp.pi, maxval=jnp.pi)
-        return jnp.append(self.worlds.starts[world, route], yaw), self.worlds.goals[world, route], world, route
-
-    def _start(self, key: PRNGKeyArray) -> AnyWalker:
-        pose, goal, world, route = self.start(key)
+        pose, goal = jnp.append(self.worlds.starts[world, route], yaw), self.worlds.goals[world, route]
         state = self.placed(self.at_rest(pose), goal, jnp.zeros((REMEMBERED, 2)), world, route)
         return state.replace(passed=jnp.zeros(2)) if self.sides else state
 

@@ -45,36 +45,27 @@ def hull(robot: Robot) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray,
     return np.concatenate([front, -front]), np.array([[tip, 0.0], [back, 0.6 * radius], [back, -0.6 * radius]])
 
 
-class Motion(struct.PyTreeNode):
-    """Pose and velocity of a robot."""
+def walk(
+    robot: Robot, pose: Float[Array, "3"], velocity: Float[Array, "2"], direction: Float[Array, "2"], duration: Scalar
+) -> tuple[Float[Array, "3"], Float[Array, "2"]]:
+    """Return pose and velocity after `duration` [s] of the command to walk in `direction`, in the body's frame.
 
-    pose: Float[Array, "3"]  # x, y, yaw [m, rad]
-    velocity: Float[Array, "2"]  # in the world's frame [m/s]
-
-
-def walk(robot: Robot, motion: Motion, direction: Float[Array, "2"], duration: Scalar) -> Motion:
-    """Return the motion after `duration` [s] of the command to walk in `direction` (unit vector in the body's frame).
-
-    The command is held in the world's frame meanwhile: the body turns under it.
+    Poses are x, y, yaw [m, rad]; velocities are in the world's frame [m/s]. There the command is held meanwhile: the
+    body turns under it.
     """
-    position, yaw = motion.pose[:2], motion.pose[2]
+    position, yaw = pose[:2], pose[2]
     wanted = robot.speed * rotate(direction, yaw)
     fading = jnp.exp(-duration / robot.lag)
-    velocity = wanted + (motion.velocity - wanted) * fading
-    position = position + wanted * duration + (motion.velocity - wanted) * robot.lag * (1.0 - fading)
+    off = velocity - wanted
+    position = position + wanted * duration + off * robot.lag * (1.0 - fading)
     limit = robot.turn_rate * duration
     turned = yaw + jnp.clip(to_angle(direction), -limit, limit)
-    return Motion(jnp.concatenate([position, to_angle(from_angle(turned))[None]]), velocity)
-
-
-def discs(robot: Robot, pose: Float[Array, "3"]) -> Float[Array, "3 2"]:
-    """Centres of the body's discs: rear, middle, front [m]."""
-    along = jnp.array([-1.0, 0.0, 1.0]) * robot.disc_offset
-    return pose[None, :2] + along[:, None] * from_angle(pose[2])[None]
+    return jnp.concatenate([position, to_angle(from_angle(turned))[None]]), wanted + off * fading
 
 
 def collides(robot: Robot, world: NavigationWorld, pose: Float[Array, "3"]) -> Bool[Array, ""]:
     """Whether the body touches a solid, or stands outside the walls."""
-    centres = discs(robot, pose)
+    along = jnp.array([-1.0, 0.0, 1.0]) * robot.disc_offset  # of the rear, the middle and the front disc
+    centres = pose[None, :2] + along[:, None] * from_angle(pose[2])[None]
     touching = jax.vmap(lambda centre: clearance(world, centre))(centres) < robot.disc_radius
     return touching.any() | (jnp.abs(pose[:2]) > world.extent / 2).any()

@@ -17,7 +17,7 @@ from cuelearner_envs import svg
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.robot import hull
-from cuelearner_envs.navigation.world import solids_of
+from cuelearner_envs.navigation.world import corners, solids_of
 from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Reel, Sketch
 
@@ -33,10 +33,12 @@ def sketch(env: Navigation, state: Any) -> Sketch:
     """Return the robot's surroundings as a sketch, from above."""
     world, goal, pose, ranges = jax.device_get(_view(env, state))
     parts = [svg.rectangle(-AROUND, -AROUND, 2 * AROUND, 2 * AROUND, "fill:var(--floor)")]
-    solids = [(height, _box(row, height, pose)) for row, height in solids_of(world.boxes, world.box_heights)]
-    for row, height in solids_of(world.circles, world.circle_heights):
-        solids.append((height, svg.circle(_placed(row[None, :2], pose)[0], float(row[2]), _fill(height))))
-    parts += [shape for _, shape in sorted(solids)]  # from above, the tall covers the low
+    shapes = []
+    for row, height in solids_of(world):
+        fill, is_box = "fill:var(--solid)" if height > 1.0 else "fill:var(--low)", len(row) == 5
+        at = _placed(corners(row) if is_box else row[None, :2], pose)
+        shapes.append((height, svg.polygon(at, fill) if is_box else svg.circle(at[0], float(row[2]), fill)))
+    parts += [shape for _, shape in sorted(shapes)]  # seen from above, the tall cover the low
     ends = _up(ranges[:, None] * np.stack([np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES)], axis=-1))
     parts.append(svg.polygon([(0.0, 0.0), *ends], "fill:var(--free);fill-opacity:0.25"))
     hits = ends[ranges < 0.999 * float(env.lidar.max_range)]
@@ -102,17 +104,6 @@ def _placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Points of the world as they are on the screen."""
     cos, sin = math.cos(float(pose[2])), math.sin(float(pose[2]))
     return _up((np.asarray(points, float) - pose[:2]) @ np.array([[cos, -sin], [sin, cos]]))
-
-
-def _fill(height: float) -> str:
-    return "fill:var(--solid)" if height > 1.0 else "fill:var(--low)"
-
-
-def _box(row: np.ndarray, height: float, pose: np.ndarray) -> str:
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * row[3:]
-    cos, sin = math.cos(row[2]), math.sin(row[2])
-    corner_points = _placed(corners @ np.array([[cos, sin], [-sin, cos]]) + row[:2], pose)
-    return svg.polygon(corner_points, _fill(height))
 
 
 def _goal(at: np.ndarray, radius: float, away: float) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 FAR_AWAY = 1000.0  # where unused rows lie [m]: a solid there is out of reach of everything
 LOWEST, TALLEST = 0.6, 1.5  # heights of the solids drawn lightest and darkest [m]
@@ -33,10 +33,27 @@ class NavigationWorld(struct.PyTreeNode):
     goals: Float[Array, "routes 2"]  # [m], 5 to 15 m from the start as the crow flies
 
 
-def solids_of(rows: ArrayLike, heights: ArrayLike) -> list[tuple[np.ndarray, float]]:
-    """Return boxes or circles with their heights, without those that only fill the arrays."""
-    pairs = zip(np.asarray(rows, float), np.asarray(heights, float).tolist(), strict=True)
-    return [(row, height) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
+def solids_of(world: NavigationWorld) -> list[tuple[np.ndarray, float]]:
+    """Return boxes (5,) and circles (3,) with their heights, the lowest first: seen from above, the tall cover the low.
+
+    Rows that only fill the arrays are left out.
+    """
+    rows = [*np.asarray(world.boxes, float), *np.asarray(world.circles, float)]
+    heights = np.concatenate([world.box_heights, world.circle_heights]).tolist()
+    solids = [(row, height) for row, height in zip(rows, heights, strict=True) if abs(row[0]) < FAR_AWAY / 2]
+    return sorted(solids, key=lambda pair: pair[1])
+
+
+def from_frame(pose: np.ndarray, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
+    """Return points in the frame of a pose (x, y, yaw) as points of the world [m]."""
+    x, y, yaw = np.asarray(pose, float)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
+
+
+def corners(box: np.ndarray) -> Float[np.ndarray, "4 2"]:
+    """Return the corners of a box (x, y, yaw, half-length, half-width), in turn [m]."""
+    return from_frame(box[:3], np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * box[3:])
 
 
 def tallness(height: float) -> float:

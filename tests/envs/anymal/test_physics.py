@@ -11,6 +11,8 @@ from cuelearner_envs.anymal.locomotion import Locomotion, Trial
 from cuelearner_envs.anymal.physics import AnymalGround
 from cuelearner_envs.anymal.policy import OBS
 
+pytestmark = pytest.mark.long
+
 ROBOTS = 8
 SCENES = ("standing", "trotting", "flying", "slippery", "loaded", "on its side", "low", "blown up")
 CALM = Trial(rest=1.0)  # no noise, no pushes; commands to stand
@@ -61,7 +63,6 @@ def in_c(state, action, number):
     return data
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("number", range(7), ids=SCENES[:7])
 def test_a_step_of_control_is_that_of_c_mujoco(scenes, stepped, number):
     data, body = in_c(*scenes, number), stepped.pipeline_state.body

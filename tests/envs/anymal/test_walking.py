@@ -10,7 +10,6 @@ import pytest
 
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal import policy, tracking
-from cuelearner_jax.errors import UserError
 
 
 def random_policy(layers=(16, 8)):
@@ -45,19 +44,6 @@ def test_a_saved_policy_acts_as_before(tmp_path):
     np.testing.assert_allclose(policy.load(tmp_path / "kept")(obs), made(obs), atol=5e-3)  # kept in half precision
     assert json.loads((tmp_path / "kept" / policy.ABOUT).read_text()) == {"seed": 3}
     assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == [policy.ABOUT, policy.WEIGHTS]
-
-
-def test_what_is_no_policy_is_refused(tmp_path):
-    with pytest.raises(
-        UserError, match=r"no walking policy in .*: train one with `python experiments/train_walking.py train"
-    ):
-        policy.load(tmp_path)
-    (tmp_path / policy.WEIGHTS).write_bytes(b"nothing")
-    with pytest.raises(UserError, match="is damaged"):
-        policy.load(tmp_path)
-    np.savez(tmp_path / policy.WEIGHTS, mean=np.zeros(3), std=np.ones(3), kernel_0=np.zeros((3, 2)), bias_0=np.zeros(2))
-    with pytest.raises(UserError, match="not a walking policy of this robot"):
-        policy.load(tmp_path)
 
 
 def test_errors_count_where_commands_are_settled_and_the_robot_stands():

@@ -72,7 +72,7 @@ def test_a_step_goes_3_cm_as_in_fetch():
     assert np.abs(steps[4:]).max() < 0.004
 
 
-@pytest.mark.parametrize("skill", ["reach", "push", "pick"])
+@pytest.mark.parametrize("skill", ["reach", "pick"])
 def test_a_declared_family_names_the_turn_and_the_offset(skill):
     config = ARM.configure(skill=skill, camera_turn_deg=10.0, camera_offset=(0.01, -0.02, 0.03))
     world, plain = ARM.environment(config), ARM.environment(ARM.configure(skill=skill))

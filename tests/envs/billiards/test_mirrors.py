@@ -19,7 +19,7 @@ def test_mirrored_shots_have_mirrored_results():
     keys = jax.random.split(KEY, BATCH)
     obs = observe_many(EASY, states)
     plain = np.asarray(step_many(EASY, keys, states, strikes)[1].reward)
-    assert plain[np.asarray(states.pocketed).any(1)].sum() > 20
+    assert plain[np.asarray(states.pocketed).any(1)].sum() > 10
     for which, signs in enumerate(jnp.array([(1, 1), (-1, 1), (1, -1), (-1, -1)])):
         image = states.replace(positions=states.positions * signs[None, None])
         mirrored_obs, mirrored_strikes = mirror_many(jnp.array(which), obs, strikes)
@@ -27,7 +27,7 @@ def test_mirrored_shots_have_mirrored_results():
         np.testing.assert_array_equal(mirrored_strikes, strikes * signs[None])
         rewards = np.asarray(step_many(EASY, keys, image, mirrored_strikes)[1].reward)
         # The angle of the mirrored strike is rounded elsewhere in float32, which may decide a grazing contact: allow 2
-        # of 600. None differed in 48,000 shots; a wrong mirror changes dozens.
+        # of 300. None differed in 48,000 shots; a wrong mirror changes dozens.
         assert (rewards != plain).sum() <= 2
         back, vector = mirror_many(jnp.array(which), mirrored_obs, mirrored_strikes)
         np.testing.assert_allclose(back, obs, atol=1e-7)

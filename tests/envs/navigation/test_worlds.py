@@ -1,4 +1,4 @@
-"""Generated worlds keep their promises, in hundreds of each style: NumPy and SciPy look at every one."""
+"""Generated worlds keep their promises, in dozens of each style: NumPy and SciPy look at every one."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import long_but
+from rooms import distance, to_box, to_circle, used
 from scipy import ndimage
 
 from cuelearner_envs.navigation import generate
-from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import any_of, generate_many
 
-KEYS = 100
+KEYS = 40
 STYLES = ("clutter", "rooms", "corridor")
 REACH = 0.2 + 0.265  # of the body: its front disc's offset and radius [m]
 GRID = 0.1  # between nodes [m]
@@ -24,41 +24,19 @@ GRID = 0.1  # between nodes [m]
 NEEDED = math.hypot(REACH, GRID / 2)
 
 
-# Runs 300 times: optimising it costs less than it saves.
+# Runs 120 times: optimising it costs less than it saves.
 OPTIMISED = {"xla_backend_optimization_level": 1}
 generate_one = jax.jit(generate, static_argnames="style", compiler_options=OPTIMISED)
 
 
 @pytest.fixture(scope="module", params=long_but(["rooms"], STYLES))
 def sample(request):
-    """Hundreds of worlds of a style, as numpy arrays: those of `generate_many`, one at a time on two threads."""
+    """Dozens of worlds of a style, as numpy arrays: those of `generate_many`, one at a time on two threads."""
     keys = list(jax.vmap(partial(jax.random.fold_in, jax.random.key(3)))(jnp.arange(KEYS)))
     generate_one(keys[0], style=request.param)
     with ThreadPoolExecutor(2) as threads:
         worlds = list(threads.map(lambda key: jax.device_get(generate_one(key, style=request.param)), keys))
     return request.param, jax.tree.map(lambda *leaves: np.stack(leaves).astype(float), *worlds)
-
-
-def used(rows):
-    return rows[np.abs(rows[:, 0]) < FAR_AWAY / 2]
-
-
-def to_box(points, box):
-    """Distance from points (..., 2) to a box; 0 inside."""
-    cos, sin = math.cos(box[2]), math.sin(box[2])
-    offset = points - box[:2]
-    own = np.abs(offset @ np.array([[cos, -sin], [sin, cos]]))
-    return np.linalg.norm(np.maximum(own - box[3:], 0.0), axis=-1)
-
-
-def to_circle(points, circle):
-    return np.maximum(np.linalg.norm(points - circle[:2], axis=-1) - circle[2], 0.0)
-
-
-def distance(points, boxes, circles):
-    """From each point to the nearest solid; 0 inside one."""
-    each = [to_box(points, box) for box in boxes] + [to_circle(points, circle) for circle in circles]
-    return np.min(each, axis=0)
 
 
 def walkable(boxes, circles, extent):
