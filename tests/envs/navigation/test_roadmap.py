@@ -144,11 +144,10 @@ def test_the_teacher_points_at_the_next_place_in_the_bodys_frame(teacher, index)
 def test_a_map_that_is_made_when_asked_answers_as_one_that_is_kept(teacher):
     """Up to rounding, by which another of two ways that are as long may be the shortest."""
     brief, found = make_brief_teacher(teacher.env), []
-    answers = jax.jit(lambda states: jax.lax.map(lambda state: brief.best_action(state, None), states))
+    answers = jax.jit(lambda states: jax.lax.map(lambda state: brief.best_action(state, jnp.zeros(280)), states))
     for index in range(3):
-        states = walkers(
-            one(teacher.env.worlds, index), index, 0, free_places(one(teacher.env.worlds, index), index), 0.3
-        )
+        world = one(teacher.env.worlds, index)
+        states = walkers(world, index, 0, free_places(world, index), np.full(ASKED, 0.3))
         found.append(np.abs(np.asarray(answers(states)) - np.asarray(best(teacher, states))).max(-1))
     assert np.mean(np.concatenate(found) < 1e-3) > 0.98
 
