@@ -61,7 +61,12 @@ class LearnedTeacher(struct.PyTreeNode):
         return geometry.best_direction(values, self.aim_error, self.habit)
 
     def nearest_good(
-        self, state: Any, obs: Float[Array, " obs"], action: Float[Array, "2"], spread: Any, share: Any
+        self,
+        state: Any,
+        obs: Float[Array, " obs"],
+        action: Float[Array, "2"],
+        spread: Float[Array, ""] | float,
+        share: Float[Array, ""] | float,
     ) -> Float[Array, "2"]:
         """Return the nearest good direction (`cuelearner_jax.types.ValuesDirections`)."""
         values = self.values(obs, geometry.evenly_spaced(self.directions))
@@ -109,13 +114,13 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
     if (name := world.pop("name")) != task:
         raise UserError(f"the teacher in {folder} is one of {name}, not of {task}: give another folder")
     own = from_json(type(config), world)
-    before, now = to_json(own), to_json(config)
-    for field in before:
-        if field not in apart and before[field] != now[field]:
+    before, now = ({name: one for name, one in to_json(world).items() if name not in apart} for world in (own, config))
+    for field, value in before.items():
+        if value != now[field]:
             raise UserError(
-                f"the teacher in {folder} learned with --task.{field.replace('_', '-')} {before[field]}, this world "
-                f"has {now[field]}: use the search teacher (--task.teacher search), or train one for this world "
-                f"({TRAIN} {task}) and give --task.teacher FOLDER"
+                f"the teacher in {folder} learned with {_typed({field: value})} and does not know this world's "
+                f"{_typed({field: now[field]})}: use the search teacher (--task.teacher search), or train one for this "
+                f"world ({TRAIN} {task} {_typed(now)} --out FOLDER) and give --task.teacher FOLDER"
             )
     return own
 
@@ -138,3 +143,9 @@ def read_about(folder: Path) -> dict[str, Any]:
             "(--task.teacher FOLDER), or use the search teacher (--task.teacher search)"
         )
     return formats.read("teacher", folder / ABOUT)
+
+
+def _typed(fields: dict[str, Any]) -> str:
+    """Return fields of a task's configuration as command-line arguments."""
+    values = {name: value if isinstance(value, list) else [value] for name, value in fields.items()}
+    return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in values.items())

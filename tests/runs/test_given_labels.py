@@ -46,7 +46,7 @@ def test_labels_that_fit_a_run(path):
     task = dataclasses.replace(probes.make_task(), labels_hold=("half_width_deg",))
     written(path, task={"name": "window", "half_width_deg": 14.0})
     assert len(read_for(path, task=task).seeds) == 40
-    with pytest.raises(ValueError, match="labels_hold names 'colour'"):
+    with pytest.raises(ValueError, match=r"labels_hold names .'colour'"):
         dataclasses.replace(task, labels_hold=("colour",))
 
 

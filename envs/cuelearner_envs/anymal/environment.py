@@ -144,8 +144,10 @@ class LeggedNavigation(Navigation, kw_only=True):
         )
 
 
-def make_environment(config: NavigationConfig, split: str = "training") -> LeggedNavigation:
-    """Return the environment of a configuration with the quadruped, walking by the shipped policy."""
+def make_environment(
+    config: NavigationConfig, split: str = "training", walking: WalkingPolicy | None = None
+) -> LeggedNavigation:
+    """Return the environment of a configuration with the quadruped, walking by a policy (default: the shipped one)."""
     plain = make_navigation(config, split)
     noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
-    return LeggedNavigation(**{**vars(plain), "lidar": plain.lidar.replace(noise=noise)}, walking=load())
+    return LeggedNavigation(**{**vars(plain), "lidar": plain.lidar.replace(noise=noise)}, walking=walking or load())
