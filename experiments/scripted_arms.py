@@ -275,20 +275,22 @@ def run(options: argparse.Namespace, name: str) -> None:
 
 def table(rows: list[dict[str, Any]]) -> None:
     """Print, for each robot and change, success before, after and unchanged, and how many cells get worse."""
-    print(f"{'robot':<17}{'change':<30}cells before after unchanged  random  worse")
-    taught = [row for row in rows if row["labels"] == "labels"]
-    kinds = dict.fromkeys((row["robot"], row["change"]) for row in taught)
-    for kind in kinds:
-        own = [row for row in taught if (row["robot"], row["change"]) == kind]
-        control = [row["after"] for row in rows if row["labels"] != "labels" and (row["robot"], row["change"]) == kind]
+    kinds = dict.fromkeys((row["labels"], row["robot"], row["change"]) for row in rows if row["labels"] != "random")
+    print(f"{'judge':<16}{'robot':<17}{'change':<30}cells before after unchanged  random  worse")
+    for judge, *place in kinds:
+        at = [row for row in rows if [row["robot"], row["change"]] == place]
+        own, control = ([row for row in at if row["labels"] == kind] for kind in (judge, "random"))
         ends = [np.mean([row[name] for row in own]) for name in ("before", "after", "unchanged")]
-        worse = sum(row["before"] - row["after"] > WORSE for row in own)
-        shown = "  ".join(f"{end:.2f}" for end in [*ends, np.mean(control) if control else np.nan])
-        print(f"{kind[0]:<17}{kind[1]:<30}{len(own):>3}  {shown}  {worse}")
-    shares = [share for row in taught if np.isfinite(share := lost(row))]
-    print(f"share of the lost success that comes back: mean {np.mean(shares):.2f}, {len(shares)} cells that lose")
-    for name in ("used", "by labels"):
-        print(f"nothing wrong, {name}: {sum(row[name] for row in taught if row['change'] == 'nothing')}")
+        ends.append(np.mean([row["after"] for row in control]) if control and judge != TESTED else np.nan)
+        shown, worse = "  ".join(f"{end:.2f}" for end in ends), sum(row["before"] - row["after"] > WORSE for row in own)
+        print(f"{judge:<16}{place[0]:<17}{place[1]:<30}{len(own):>3}  {shown}  {worse}")
+    for judge in dict.fromkeys(kind[0] for kind in kinds):
+        own = [row for row in rows if row["labels"] == judge]
+        shares = [share for row in own if np.isfinite(share := lost(row))]
+        steps = np.median([row["rewarded steps"] for row in own])
+        print(f"{judge}: of the lost success {np.mean(shares):.2f} comes back (mean of {len(shares)} cells that lose);")
+        print(f"    nothing wrong, used: {sum(row['used'] for row in own if row['change'] == 'nothing')}", end="")
+        print(f"; rewarded steps, median: {steps:,.0f}")
 
 
 def lost(row: dict[str, Any]) -> float:
@@ -303,7 +305,7 @@ def success_of(rows: list[dict[str, Any]]) -> Iterator[tuple[str, str, str, list
         group = [row for row in rows if row["robot"].startswith("Fetch") == (panel == "Fetch")]
         for change in dict.fromkeys(row["change"] for row in group):
             own = [row for row in group if row["change"] == change and row["labels"] == "labels"]
-            control = [row for row in group if row["change"] == change and row["labels"] != "labels"]
+            control = [row for row in group if row["change"] == change and row["labels"] == "random"]
             series = (("as it was", own, "before"), ("corrected", own, "after"), ("unchanged", own, "unchanged"))
             for name, cells, end in (*series, ("random answers", control, "after")):
                 if cells:

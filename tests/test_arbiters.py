@@ -163,6 +163,7 @@ def run(program, env, seeds, stretches, schedule=SCHEDULE, clock=None, state=Non
     return clock, state, metrics
 
 
+@pytest.mark.long
 def test_a_guide_that_earns_nothing_goes_to_the_floor_and_one_that_always_wins_stays(program):
     wrong, right = probes.Window(half_width=1.5), probes.Window(offset=-1.0)  # the heuristic is off by 1.6 in the first
     _, state, metrics = run(program, wrong, [0, 1], 5)

@@ -36,6 +36,7 @@ def another_program():
         jax.config.update(f"jax_{name}", value)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_measure_and_adapt_return_the_same_numbers_in_any_program(request):
     plain = numbers()

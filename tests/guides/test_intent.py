@@ -159,6 +159,7 @@ def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
         assert sure
 
 
+@pytest.mark.long
 def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     bundle, model = told(dataclasses.replace(SIZES, ensemble=3))
     lead = acted((bundle, model), ENV).actions

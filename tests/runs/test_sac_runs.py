@@ -122,6 +122,7 @@ def lanes():
     return jax.jit(jax.vmap(iterated))(both), [alone(state) for state in start]
 
 
+@pytest.mark.long
 def test_side_by_side_lanes_are_those_of_single_seeds(lanes):
     """On a CPU lanes are taken one by one, and are equal by the bit; vmapped, products are summed in another order."""
     beside, alone = lanes
