@@ -280,8 +280,8 @@ def table(rows: list[dict[str, Any]]) -> None:
     for judge, *place in kinds:
         at = [row for row in rows if [row["robot"], row["change"]] == place]
         own, control = ([row for row in at if row["labels"] == kind] for kind in (judge, "random"))
-        ends = [np.mean([row[name] for row in own]) for name in ("before", "after", "unchanged")]
-        ends.append(np.mean([row["after"] for row in control]) if control and judge != TESTED else np.nan)
+        ends = [float(np.mean([row[name] for row in own])) for name in ("before", "after", "unchanged")]
+        ends.append(float(np.mean([row["after"] for row in control])) if control and judge != TESTED else np.nan)
         shown, worse = "  ".join(f"{end:.2f}" for end in ends), sum(row["before"] - row["after"] > WORSE for row in own)
         print(f"{judge:<16}{place[0]:<17}{place[1]:<30}{len(own):>3}  {shown}  {worse}")
     for judge in dict.fromkeys(kind[0] for kind in kinds):
