@@ -24,6 +24,7 @@ import numpy as np
 
 import cuelearner_jax as cl
 from cuelearner_jax.bridges.gymnasium import source
+from cuelearner_jax.devices import CORES
 from cuelearner_jax.storage.provenance import provenance
 
 WAYS = {"FetchReach-v4": (0,), "Pendulum-v1": (0, 1), "CartPole-v1": (0, 1)}  # processes of ours; 1: none of its own
@@ -81,7 +82,7 @@ def measured(name: str, num_envs: int, steps: int, turns: int) -> dict[str, Any]
     """Median seconds a step of each way, and ours over the faster of the plain ones."""
     ways = {f"plain {mode}": plain(name, num_envs, steps, mode) for mode in ("sync", "async")}
     for processes in WAYS[name]:
-        told = "in this process" if processes == 1 else f"in {len(os.sched_getaffinity(0))} processes"
+        told = "in this process" if processes == 1 else f"in {CORES} processes"
         ways[f"ours {told}"] = ours(name, num_envs, steps, processes)
     times: dict[str, list[float]] = {way: [] for way in ways}
     for number in range(turns):

@@ -252,10 +252,11 @@ def _classes(structure: Any) -> tuple[Any, ...]:
 
 @lru_cache(maxsize=64)
 def _traced(classes: tuple[Any, ...]) -> tuple[Callable[..., Features], Callable[..., Aims]]:
-    """Return the functions that JAX traces for the shapes of `features` and of `aims`: others for each classes.
+    """Return the functions that JAX traces for the shapes of `features` and of `aims`.
 
-    JAX keeps traces by function and tree. JAX 0.10 and 0.12 take dataclasses of different classes with equal fields for
-    the same tree, and now and then give one class the trace of another.
+    JAX keeps traces by function and tree. There are functions for each tuple of classes, since JAX 0.10 and 0.12 take
+    dataclasses of different classes with equal fields for the same tree, and now and then give one class the trace of
+    another.
     """
     return lambda env, obs, action: env.features(obs, action), lambda env, obs: env.aims(obs)
 

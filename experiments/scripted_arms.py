@@ -225,12 +225,12 @@ def measure(name: str, change: str, seed: int, labels: int, judge_by: str) -> It
     base = {"robot": name, "change": change, "seed": seed}
     base |= dict(zip(("unchanged", "unchanged return"), reference(name, "nothing"), strict=True))
     base |= dict(zip(("before", "before return"), reference(name, change), strict=True))
-    found = cl.adapt(robot.script, world, teacher, labels=labels, seed=seed, eps_deg=EPS, judge_by=judge_by)
-    yield base | _row(TESTED if judge_by == "success" else "labels", found, world)
+    policy = cl.adapt(robot.script, world, teacher, labels=labels, seed=seed, eps_deg=EPS, judge_by=judge_by)
+    yield base | _row(TESTED if judge_by == "success" else "labels", policy, world)
     if judge_by == "success" or not any(altered.aside) or altered.other_way:
         return
-    shape = np.asarray(found.labels.answer).shape
-    given = found.labels._replace(answer=np.random.default_rng(seed).integers(-1, 2, shape).astype(np.float32))
+    shape = np.asarray(policy.labels.answer).shape
+    given = policy.labels._replace(answer=np.random.default_rng(seed).integers(-1, 2, shape).astype(np.float32))
     yield base | _row("random", cl.adapt(robot.script, world, labels=given, eps_deg=EPS, seed=seed), world)
 
 
@@ -288,9 +288,9 @@ def table(rows: list[dict[str, Any]]) -> None:
         own = [row for row in rows if row["labels"] == judge]
         shares = [share for row in own if np.isfinite(share := lost(row))]
         steps = np.median([row["rewarded steps"] for row in own])
-        print(f"{judge}: of the lost success {np.mean(shares):.2f} comes back (mean of {len(shares)} cells that lose);")
-        print(f"    nothing wrong, used: {sum(row['used'] for row in own if row['change'] == 'nothing')}", end="")
-        print(f"; rewarded steps, median: {steps:,.0f}")
+        used = sum(row["used"] for row in own if row["change"] == "nothing")
+        print(f"{judge}: of the lost success {np.mean(shares):.2f} comes back (mean of {len(shares)} cells that lose)")
+        print(f"    nothing wrong, used: {used}; rewarded steps, median: {steps:,.0f}")
 
 
 def lost(row: dict[str, Any]) -> float:

@@ -103,7 +103,7 @@ def sums(own, guided):
 )
 def test_the_share_of_known_sums(own, guided, most, lead, expected):
     found = pace.guided_share(sums(own, guided), Paced(most, lead))
-    assert float(found) == pytest.approx(expected, abs=1e-5)
+    assert float(found) == pytest.approx(expected, abs=1e-5 if lead else 1e-6)
 
 
 def test_the_share_is_twice_the_chance_that_guidance_is_better():
@@ -112,6 +112,12 @@ def test_the_share_is_twice_the_chance_that_guidance_is_better():
     error = math.sqrt((0.25 + 0.245) / 39)
     chance = 0.5 * (1 + math.erf(-0.1 / error / math.sqrt(2)))
     assert float(pace.guided_share(known, HALF)) == pytest.approx(0.5 * 2 * chance, rel=1e-4)
+
+
+def test_few_episodes_that_went_alike_are_not_believed_for_certain():
+    # Three guided failures against own luck of 0.3: by their own variance (0) guidance were worse for certain.
+    known = sums((200, 60), (3, 0))
+    assert float(pace.guided_share(known, HALF)) > 0.1
 
 
 @partial(jax.jit, static_argnames="episodes")

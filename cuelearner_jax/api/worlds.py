@@ -150,7 +150,7 @@ class NoOptions:
 
 
 def world_around(env: Environment) -> World:
-    """Return an environment without a task as a world, in which nobody answers."""
+    """Return an environment without a task as a world without a teacher."""
     start = Preset("as adaptation starts", RunConfig(NoOptions(), scalars=plain_scalars(actions_of(env))))
     body = Body("actor", "who acts", lambda config, split: env)
     about = "an environment without a task"

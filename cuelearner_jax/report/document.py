@@ -35,7 +35,7 @@ NOTE = (
 
 @dataclass(frozen=True, kw_only=True)
 class ReportRequest(Question):
-    """What a report shows."""
+    """Options of a report's contents."""
 
     guidance: tuple[str, ...] = ()
     """Kinds of guidance to report (default: all)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -14,7 +13,7 @@ from jax.sharding import Mesh
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.asking import label_slots
-from cuelearner_jax.devices import BY_LANE, fixed_numerics, lane_mesh, place
+from cuelearner_jax.devices import BY_LANE, CORES, fixed_numerics, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import group_means, rollout_lanes
 from cuelearner_jax.guides.base import Guide
@@ -23,8 +22,6 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.program import Program, make_program
 from cuelearner_jax.types import Label, Teacher
-
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class LaneGroup:

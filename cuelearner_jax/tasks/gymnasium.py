@@ -262,9 +262,9 @@ def _with_names(
     """Return the slices with names and units that the caller, or this package, knows."""
     rows: Sequence[Any] = names or slices
     own = [Quantity(*one) for one in rows]
-    total, wanted = (sum(quantity.size for quantity in row) for row in (own, slices))
-    if total != wanted:
-        raise UserError(f"observation names {total} entries, and {name} has {wanted}: name each entry once")
+    total, size = (sum(quantity.size for quantity in row) for row in (own, slices))
+    if total != size:
+        raise UserError(f"observation names {total} entries, and {name} has {size}: name each entry once")
     if unknown := sorted(set(units) - {quantity.name for quantity in own}):
         raise UserError(
             f"units names {unknown[0]!r}, the slices are {', '.join(quantity.name for quantity in own)}: name one of "

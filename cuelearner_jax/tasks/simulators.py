@@ -101,7 +101,8 @@ def _from_playground(name: str) -> Any:
     except ModuleNotFoundError:
         raise UserError("tasks of playground need an extra: pip install 'cuelearner-jax[playground]'") from None
     if name not in dm_control_suite.ALL_ENVS:
-        raise UserError(f"playground has no dm_control task {name!r}{suggestion(name, dm_control_suite.ALL_ENVS)}")
+        near = suggestion(name, dm_control_suite.ALL_ENVS)
+        raise UserError(f"playground has no dm_control task {name!r}{near}; pass others to from_brax")
     try:
         return dm_control_suite.load(name, config_overrides={"impl": "jax"})
     except AttributeError as error:  # MuJoCo's own interface has changed

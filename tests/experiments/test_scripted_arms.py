@@ -51,4 +51,10 @@ def test_the_page_tells_what_was_recorded(study):
             own = [row for row in taught if row["change"] == change]
             ends = [np.mean([row[name] for row in own]) for name in ("unchanged", "before", "after")]
             assert f"| {robots} | {change} | {len(own)} | " + " | ".join(f"{end:.2f}" for end in ends) in page
-    assert not any(row["rewarded steps"] for row in rows)
+    tested = [row for row in rows if row["labels"] == study.TESTED]
+    assert not any(row["rewarded steps"] for row in rows if row not in tested)
+    assert not any(row["before"] - row["after"] > study.WORSE for row in tested)
+    shares = [share for row in tested if np.isfinite(share := study.lost(row))]
+    told = f"the mean over these {len(shares)} cells is {np.mean(shares):.0%}.** Tried were {len(tested)} cells"
+    assert told in page
+    assert f"median is {np.median([row['rewarded steps'] for row in tested]):,.0f} rewarded steps" in page

@@ -107,7 +107,7 @@ class Pool:
     """Instances of one source, in this process or in several."""
 
     def __init__(self, source: Source) -> None:
-        from cuelearner_jax.runs.lanes import CORES  # loads JAX, which the processes do not need
+        from cuelearner_jax.devices import CORES  # loads JAX, which the processes do not need
 
         self.source, self.lock = source, threading.RLock()
         self.count = 1 if source.draws else source.processes or CORES

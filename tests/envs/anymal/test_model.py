@@ -26,6 +26,13 @@ def placed(model, joints, qpos=(0, 0, 1, 1, 0, 0, 0)):
     return data
 
 
+def test_it_weighs_50_kg_and_each_leg_what_is_published(model):
+    assert model.body_mass.sum() == pytest.approx(50.0, abs=1e-6)
+    for leg in LEGS:
+        masses = [float(model.body(f"{leg}_{part}").mass[0]) for part in ("HIP", "THIGH", "SHANK")]
+        np.testing.assert_allclose(masses, [2.781, 3.071, 0.588], atol=1e-3)
+
+
 @pytest.mark.parametrize("leg", LEGS)
 def test_with_straight_legs_the_feet_are_where_the_lengths_add_up_to(model, leg):
     front, left = LEGS[leg]

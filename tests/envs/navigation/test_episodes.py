@@ -90,6 +90,15 @@ def test_an_end_is_followed_by_a_new_episode_of_any_world_and_nothing_else_is(pl
     np.testing.assert_array_equal(np.asarray(following.steps), np.where(ended, 0, states.steps + 1))
 
 
+def test_each_step_has_one_end_at_most_and_pays_accordingly(plays):
+    _, (_, _, _, _, result, _) = plays["plain"]
+    ends = np.stack([np.asarray(result.outcome[name]) for name in ("success", "collision", "timeout")])
+    assert set(ends.sum(0).ravel().tolist()) == {0.0, 1.0}
+    np.testing.assert_array_equal(result.reward, 10 * ends[0] - 10 * ends[1])
+    np.testing.assert_array_equal(result.terminated, ends[0] + ends[1] > 0)
+    np.testing.assert_array_equal(result.truncated, ends[2] > 0)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_remembered_steps_rebuild_what_was_seen_before_and_after(plays, kind):
     env, played_steps = plays[kind]
@@ -144,3 +153,22 @@ def assert_mostly_close(found, expected):
     apart = np.abs(np.asarray(found) - np.asarray(expected))
     np.testing.assert_allclose(np.sort(apart, axis=-1)[:, :-2], 0, atol=1e-4)
     assert (apart > 1e-4).mean() < 1e-3
+
+
+def test_changed_worlds_compile_nothing_new():
+    chex.clear_trace_counter()  # it counts by hash, which a function of an earlier test may have had
+    counted = jax.jit(chex.assert_max_traces(lambda env, state, action: env.step(KEY, state, action), n=1))
+    env = worlds().replace(robot=jax.tree.map(jnp.float32, worlds().robot))
+    lidars = [
+        env.lidar.replace(**{name: jnp.float32(value)})
+        for name, value in (("max_range", 3.0), ("rotation", 0.2), ("noise", 0.1), ("dropout", 0.2))
+    ]
+    changed = [env, *(env.replace(lidar=lidar) for lidar in lidars)]
+    changed += [
+        env.replace(worlds=mirrored_worlds(env.worlds)),
+        env.replace(robot=env.robot.replace(speed=jnp.float32(0.5))),
+        env.replace(max_steps=jnp.int32(1)),
+    ]
+    state, _ = reset(env, KEY)
+    seen = [tuple(np.asarray(counted(one, state, LEFT)[1].obs).tolist()) for one in changed]
+    assert len(set(seen)) == len(changed)

@@ -7,10 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 from rooms import world
 
-from cuelearner_envs.navigation.geometry import clearance, line_clearance
+from cuelearner_envs.navigation.geometry import clearance, in_frame, line_clearance
 
 clearances = jax.jit(jax.vmap(clearance, (None, 0)))
 line_clearances = jax.jit(jax.vmap(line_clearance, (None, 0, 0)))
+
+
+def test_a_point_in_the_frame_of_a_box_by_hand():
+    boxes = jnp.array([
+        [1.0, 2.0, 0.0, 9.0, 9.0],
+        [1.0, 2.0, math.pi / 2, 9.0, 9.0],
+        [0.0, 0.0, math.pi / 6, 9.0, 9.0],
+        [3.0, 2.0, -1.0, 9.0, 9.0],
+    ])  # fmt: skip
+    root = math.sqrt(3) / 2
+    # From (1, 2) the point (3, 2) is 2 m along x; in a frame turned by 90 degrees that is 2 m along -y.
+    expected = [[2.0, 0.0], [0.0, -2.0], [3 * root + 1.0, 2 * root - 1.5], [0.0, 0.0]]
+    np.testing.assert_allclose(in_frame(boxes, jnp.array([3.0, 2.0])), expected, atol=1e-6)
 
 
 def test_clearance_by_hand():

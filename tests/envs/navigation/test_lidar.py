@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rooms
 
-from cuelearner_envs.navigation import generate, scan
+from cuelearner_envs.navigation import BEAM_ANGLES, generate, scan
 from cuelearner_envs.navigation.lidar import Lidar
 
 AHEAD = 135  # number of the middle beam; neighbours are a degree apart
@@ -28,6 +28,19 @@ def world(boxes=(), circles=(), walls=0.0):
 
 def ranges(solids, x=0.0, y=0.0, yaw=0.0, max_range=10.0):
     return np.asarray(scan_one(solids, jnp.array([x, y, yaw]), max_range), float)
+
+
+def test_beams_go_from_right_behind_counterclockwise_a_degree_apart():
+    np.testing.assert_allclose(np.rad2deg(BEAM_ANGLES), np.arange(-135, 136), atol=1e-4)
+
+
+def test_from_inside_a_solid_beams_read_the_way_out():
+    box = ranges(world(boxes=[[0.2, 0.0, 0.0, 1.0, 2.0]]))
+    assert box[AHEAD] == pytest.approx(1.2, rel=1e-6)
+    assert box[AHEAD + 90] == pytest.approx(2.0, rel=1e-6)
+    circle = ranges(world(circles=[[0.3, 0.0, 0.5]]))
+    assert circle[AHEAD] == pytest.approx(0.8, rel=1e-6)
+    assert circle[AHEAD + 90] == pytest.approx(0.4, rel=1e-6)
 
 
 def test_a_turned_sensor_shifts_the_beams():
