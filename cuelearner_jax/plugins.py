@@ -36,7 +36,7 @@ def load(reference: str, kind: type[T], called: str) -> T:
         why = f"{type(error).__name__}: {first_line(error)}"
         raise UserCodeError(f"{module_name} fails to import ({why}): mend it first") from error
     if not hasattr(module, name):
-        fitting = [other for other, value in vars(module).items() if isinstance(value, kind)]
+        fitting = [other for other, value in vars(module).items() if isinstance(value, kind) and other[0] != "_"]
         raise UserError(f"{module_name} has no {name!r}{suggestion(name, fitting) if fitting else f', nor {called}'}")
     if not isinstance(value := getattr(module, name), kind):
         wanted = f"{called} is a {kind.__module__}.{kind.__name__}"
