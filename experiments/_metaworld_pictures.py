@@ -131,7 +131,8 @@ class Episode(NamedTuple):
     """An episode of a policy."""
 
     success: bool
-    inputs: np.ndarray  # (steps, 25): state, phase in the chunk, effects of the state, proposed action
+    picture: np.ndarray  # (height, width, 3): the first
+    inputs: np.ndarray  # (steps, 25): state, phase in the chunk, effects of the state, action proposed without a shift
     intended: np.ndarray  # (steps, 4): the script's actions in these situations
 
 
@@ -186,7 +187,7 @@ class Robots:
     def _wave(
         self, change: str, seeds: Sequence[int], plan: Callable[..., np.ndarray], correction: Correction | None
     ) -> list[Episode]:
-        replies = self.call({number: ("start", change, seed) for number, seed in enumerate(seeds)})
+        replies = first = self.call({number: ("start", change, seed) for number, seed in enumerate(seeds)})
         inputs: list[list[np.ndarray]] = [[] for _ in seeds]
         intended: list[list[np.ndarray]] = [[] for _ in seeds]
         success, chunks = np.zeros(len(seeds), bool), np.zeros((0, 0, 0))
@@ -211,13 +212,19 @@ class Robots:
             replies = {number: one for number, one in replies.items() if not one["success"]}
             if not replies:
                 break
-        return [Episode(bool(success[n]), np.stack(inputs[n]), np.stack(intended[n])) for n in range(len(seeds))]
+        return [
+            Episode(bool(success[n]), first[n]["picture"], np.stack(inputs[n]), np.stack(intended[n]))
+            for n in range(len(seeds))
+        ]
 
 
 def _with_effects(
     plan: Plan, every: int, widths: np.ndarray, pictures: np.ndarray, states: np.ndarray, shift: np.ndarray | int
 ) -> np.ndarray:
-    """Return, for each step of a chunk, the effects of the state and the proposed action (n, every, 20)."""
+    """Return, for each step of a chunk, the effects of the state and the proposed action (n, every, 20).
+
+    With effects the action is that without the shift, as far as they tell.
+    """
     ways = np.concatenate([np.diag(widths), -np.diag(widths)]) if len(widths) else np.zeros((0, 4))
     probes = (np.concatenate([np.zeros((1, 4)), ways])[:, None] + states + shift).astype(np.float32)
     chunks = plan(np.tile(pictures, (len(probes), 1, 1, 1)), probes.reshape(-1, 4))[:, :every]
@@ -225,7 +232,8 @@ def _with_effects(
     effects = np.zeros((len(states), every, 4, 4))
     for entry, width in enumerate(widths):
         effects[:, :, entry] = (chunks[1 + entry] - chunks[1 + len(widths) + entry]) / max(2 * width, 1e-6)
-    return np.concatenate([effects.reshape(len(states), every, 16), chunks[0]], 2)
+    own = chunks[0] - np.einsum("s,ntsa->nta", np.broadcast_to(shift, 4), effects)
+    return np.concatenate([effects.reshape(len(states), every, 16), own], 2)
 
 
 def _serve(task: str, pipe: Any) -> None:

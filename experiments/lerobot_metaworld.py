@@ -24,7 +24,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from _metaworld_pictures import CHANGES, SIZE, TASKS, TUNING, Episode, Robots
+from _metaworld_pictures import CHANGES, SIZE, TASKS, TUNING, Episode, Plan, Robots
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 DEMONSTRATIONS, REPORTED = 50, 50  # episodes
@@ -67,6 +67,22 @@ def collect(robots: Robots, folder: Path, change: str, first_seed: int, count: i
     dataset.finalize()
 
 
+def without_pictures(dataset: Path, out: Path) -> None:
+    """Write a dataset with the state in the place of pictures."""
+    table = pq.read_table(dataset / "data", columns=["observation.state", "action", "episode_index"]).to_pydict()
+    entries = {"observation.environment_state": "observation.state", "observation.state": "observation.state"}
+    features = {name: {"dtype": "float32", "shape": (4,), "names": None} for name in (*entries, "action")}
+    written = LeRobotDataset.create("local/metaworld", fps=80, features=features, root=out, use_videos=False)
+    entries |= {"action": "action"}
+    for row, episode in enumerate(table["episode_index"]):
+        if row and episode != table["episode_index"][row - 1]:
+            written.save_episode()
+        values = {name: np.asarray(table[of][row], np.float32) for name, of in entries.items()}
+        written.add_frame({**values, "task": "state"})
+    written.save_episode()
+    written.finalize()
+
+
 def train(dataset: Path, out: Path, seconds: float, sizes: dict[str, Any], base: Path | None = None) -> None:
     """Run `lerobot-train` for a wall time, and keep its last checkpoint."""
     shutil.rmtree(out, ignore_errors=True)
@@ -97,20 +113,26 @@ def checkpoint(out: Path) -> Path:
     return last / "pretrained_model"
 
 
-def planner(place: Path, device: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return a checkpoint's chunks, by LeRobot's own processors."""
+def planner(place: Path, device: str, places: np.ndarray | None = None) -> Plan:
+    """Return a checkpoint's chunks, by LeRobot's own processors; `places`: where pictures are moved back from."""
     import torch
     from lerobot.policies.act.modeling_act import ACTPolicy
     from lerobot.policies.factory import make_pre_post_processors
+    from lerobot_processor_cuelearner.pictures import moved_back
 
     policy = ACTPolicy.from_pretrained(place).to(device).eval()
     where = {"device_processor": {"device": device}}
     before, after = make_pre_post_processors(policy.config, str(place), preprocessor_overrides=where)
 
     def plan(pictures: np.ndarray, states: np.ndarray) -> np.ndarray:
-        image = torch.from_numpy(np.ascontiguousarray(pictures)).permute(0, 3, 1, 2).float() / 255
+        seen = {"observation.state": torch.from_numpy(states)}
+        if policy.config.image_features:
+            image = torch.from_numpy(np.ascontiguousarray(pictures)).permute(0, 3, 1, 2).float() / 255
+            seen["observation.image"] = image if places is None else moved_back(image, torch.from_numpy(places))
+        else:
+            seen["observation.environment_state"] = seen["observation.state"]
         with torch.inference_mode():
-            rows = before({"observation.image": image, "observation.state": torch.from_numpy(states)})
+            rows = before(seen)
             return after(policy.predict_action_chunk(rows)).float().cpu().numpy()
 
     return plan
@@ -135,6 +157,7 @@ class Labeller:
         about = (declared_distortions(env), env.actions, eps, LABELS, env.observation)
         self.make = lambda: Reading(Heuristic(env.view()), *about)
         self.early, self.eps, self.reading = early, eps, self.make()
+        self.alike: list[np.ndarray] = []  # cosines of the script's way and the proposed one
 
     @property
     def shift(self) -> np.ndarray:
@@ -146,6 +169,7 @@ class Labeller:
     def correct(self, inputs: np.ndarray) -> np.ndarray:
         """Return corrected actions of a policy that sees the shifted state; rows are filled up for one program."""
         rows = np.concatenate([inputs, np.repeat(inputs[-1:], -len(inputs) % 32, 0)])
+        rows[:, -4:] += np.einsum("s,nsa->na", self.shift, rows[:, 5:21].reshape(len(rows), 4, 4))
         rows[:, 5:21] = 0
         return np.asarray(self.reading.act(rows))[: len(inputs)]
 
@@ -159,7 +183,8 @@ class Labeller:
         failed, early = [one for one in episodes if not one.success] or episodes, slice(self.early)
         inputs = np.concatenate([one.inputs[early] for one in failed])
         intended = np.concatenate([one.intended[early] for one in failed])
-        intended = as_fast(intended, inputs[:, -4:])
+        intended, ways = as_fast(intended, inputs[:, -4:]), inputs[:, -4:-1]
+        self.alike.append((ways * intended[:, :3]).sum(1) / np.maximum((ways**2).sum(1), 1e-6))
         some = self.random.choice(len(inputs), min(SITUATIONS * count, len(inputs)), replace=False)
         self.key, key = jax.random.split(self.key)
         index, action = self.reading.questions(inputs[some], count, key)
@@ -203,25 +228,36 @@ class Cells:
         self.widths = SIDES * np.ptp(states, 0)
         self.early = round(len(states) / np.sum(rows["frame_index"].to_numpy() == 0))  # length of a demonstration
         self.rows: list[dict[str, Any]] = pq.read_table(self.file).to_pylist() if self.file.exists() else []
+        self.bases: dict[str, np.ndarray] = {}  # success of the policy's episodes in each world
 
     def played(self, change: str, correction: Any = None, first: int = REPORT_SEED, count: int = 0) -> list[Episode]:
         """Return episodes by the policy, or by the corrected policy; `count` of them are asked about."""
         seeds = range(first, first + (count or self.options.episodes))
         return self.robots.play(change, seeds, self.plan, correction, EXECUTED, self.widths if count else ())
 
+    def base(self, change: str) -> np.ndarray:
+        """Return the success of each episode of the policy as it was."""
+        if change not in self.bases:
+            self.bases[change] = np.array([one.success for one in self.played(change)], float)
+        return self.bases[change]
+
+    def has(self, change: str, kind: str, seed: int = 0) -> bool:
+        """Return whether a cell was measured."""
+        return any((row["change"], row["labels"], row["seed"]) == (change, kind, seed) for row in self.rows)
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Print a row, and write all."""
+        self.rows.append({"task": self.options.task, "unchanged": self.base("nothing").mean(), **row})
+        print({**self.rows[-1], "words": "; ".join(row["words"])[:300]}, flush=True)
+        pq.write_table(pa.Table.from_pylist(self.rows), self.file, compression="zstd")
+
     def measure(self, seeds: int, until: float) -> None:
         """Measure all cells, those of one seed of labels after those of another, while there is time."""
-        bases: dict[str, np.ndarray] = {}
         for seed in range(seeds):
             for change in CHANGES:
-                if any((row["change"], row["seed"]) == (change, seed) for row in self.rows) or time.time() > until:
-                    continue
-                for name in {"nothing": 0, change: 0}:
-                    bases.setdefault(name, np.array([one.success for one in self.played(name)], float))
-                for row in self.cell(change, seed, bases[change]):
-                    self.rows.append({"task": self.options.task, "unchanged": bases["nothing"].mean(), **row})
-                    print({**self.rows[-1], "words": "; ".join(row["words"])[:300]}, flush=True)
-                pq.write_table(pa.Table.from_pylist(self.rows), self.file, compression="zstd")
+                if not self.has(change, "labels", seed) and time.time() < until:
+                    for row in self.cell(change, seed, self.base(change)):
+                        self.add(row)
 
     def cell(self, change: str, seed: int, before: np.ndarray) -> Iterator[dict[str, Any]]:
         """Yield the row of a change, and of its control."""
@@ -238,32 +274,59 @@ class Cells:
         self, change: str, seed: int, kind: str, before: np.ndarray, labeller: Labeller, began: float
     ) -> dict[str, Any]:
         """Return how the corrected policy does, whether labels use it, and what paired episodes say."""
-        from cuelearner_jax.adaptation.judging import PairedTest
-
         result, seconds = labeller.reading.result(), time.time() - began
         after = np.array([one.success for one in self.played(change, labeller)], float)
-        test = PairedTest(1)
-        test.add((after - before)[None])
-        verdict = "better" if test.better[0] else "worse" if test.worse[0] else "open"
-        row = {"change": change, "seed": seed, "labels": kind, "before": before.mean(), "corrected": after.mean()}
-        row |= {"used": bool(result.used), "after": (after if result.used else before).mean(), "paired": verdict}
-        return row | {"evidence": float(result.evidence), "seconds": seconds, "words": list(result.words())}
+        row = outcome(change, kind, before, after, bool(result.used)) | {"seed": seed, "seconds": seconds}
+        alike = float(np.concatenate(labeller.alike).mean())
+        return row | {"evidence": float(result.evidence), "words": list(result.words()), "alike": alike}
 
 
-def fine_tune(cells: Cells, folder: Path, options: argparse.Namespace, sizes: dict[str, Any]) -> None:
-    """Measure fine-tuning by five new demonstrations in a changed world, for a wall time."""
-    own = [row for row in cells.rows if row["change"] == TUNED]
-    if not own or any(row["labels"] == "demonstrations" for row in own):
-        return
-    place = folder / "tuned"
-    collect(cells.robots, emptied(place / "dataset"), TUNED, 500_000, 5)
-    train(place / "dataset", place / "act", options.tune, sizes | {"save": 50}, checkpoint(folder / "act"))
-    cells.plan = planner(checkpoint(place / "act"), options.device)
-    after = float(np.mean([one.success for one in cells.played(TUNED)]))
-    row = {"corrected": after, "after": after, "labels": "demonstrations", "used": True, "paired": "open"}
-    cells.rows.append(own[0] | row | {"evidence": 0.0, "seconds": options.tune, "words": []})
-    print(cells.rows[-1], flush=True)
-    pq.write_table(pa.Table.from_pylist(cells.rows), cells.file, compression="zstd")
+def outcome(change: str, kind: str, before: np.ndarray, after: np.ndarray, used: bool = True) -> dict[str, Any]:
+    """Return the row of a corrected policy by the success of its episodes; `alike` is of the script's way."""
+    from cuelearner_jax.adaptation.judging import PairedTest
+
+    test = PairedTest(1)
+    test.add((after - before)[None])
+    verdict = "better" if test.better[0] else "worse" if test.worse[0] else "open"
+    row = {"change": change, "seed": 0, "labels": kind, "before": before.mean(), "corrected": after.mean()}
+    row |= {"used": used, "after": (after if used else before).mean(), "paired": verdict}
+    return row | {"evidence": 0.0, "seconds": 0.0, "words": [], "alike": np.nan}
+
+
+def without_labels(cells: Cells, folder: Path, options: argparse.Namespace, sizes: dict[str, Any]) -> None:
+    """Measure pictures moved back, a policy without pictures, and fine-tuning by five new demonstrations."""
+    from lerobot_processor_cuelearner.pictures import align, first_pictures
+
+    act, first = checkpoint(folder / "act"), None
+    for change in CHANGES:
+        if not change.startswith(("camera", "nothing")) or cells.has(change, "pictures"):
+            continue
+        if first is None:
+            first = first_pictures(LeRobotDataset("local/metaworld", root=folder / "dataset"), "observation.image")
+        before, met = cells.base(change), cells.played(change, None, LABEL_SEED, len(cells.robots.pipes))
+        places, *alike = align(first, np.stack([one.picture for one in met]) / 255)
+        _with_plan(cells, planner(act, options.device, places.astype(np.float32)), change, "pictures", before, alike)
+    for change in CHANGES if options.state else ():
+        place = folder / "state"
+        if not (place / "act").exists():
+            without_pictures(folder / "dataset", emptied(place / "dataset"))
+            train(place / "dataset", place / "act", options.state, sizes)
+        if not cells.has(change, "state alone"):
+            plan, before = planner(checkpoint(place / "act"), options.device), cells.base(change)
+            _with_plan(cells, plan, change, "state alone", before, [])
+    if options.tune and not cells.has(TUNED, "demonstrations"):
+        place, before = folder / "tuned", cells.base(TUNED)
+        collect(cells.robots, emptied(place / "dataset"), TUNED, 500_000, 5)
+        train(place / "dataset", place / "act", options.tune, sizes | {"save": 50}, act)
+        _with_plan(cells, planner(checkpoint(place / "act"), options.device), TUNED, "demonstrations", before, [])
+
+
+def _with_plan(cells: Cells, plan: Plan, change: str, kind: str, before: np.ndarray, alike: Sequence[float]) -> None:
+    """Measure another policy in a world, and add its row."""
+    own, cells.plan = cells.plan, plan
+    after = np.array([one.success for one in cells.played(change)], float)
+    cells.plan = own
+    cells.add(outcome(change, kind, before, after) | {"words": [f"alike {value:.3f}" for value in alike]})
 
 
 def emptied(folder: Path) -> Path:
@@ -312,9 +375,8 @@ def run(options: argparse.Namespace) -> None:
     if doing in ("evaluate", "all"):
         plan = planner(checkpoint(folder / "act"), options.device)
         cells = Cells(robots, plan, folder, options)
+        without_labels(cells, folder, options, sizes)
         cells.measure(options.seeds, options.until)
-        if options.tune:
-            fine_tune(cells, folder, options, sizes)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -333,6 +395,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--tune", type=float, default=0.0, help="seconds of fine-tuning by five demonstrations; 0: none"
     )
+    parser.add_argument("--state", type=float, default=0.0, help="seconds of training without pictures; 0: none")
     parser.add_argument("--eps", type=float, default=0.05, help="strength of an answer, as a share of the range")
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--save", type=int, default=500, help="steps between checkpoints")
