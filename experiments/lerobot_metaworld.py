@@ -10,8 +10,8 @@
 any, up to the usual length of a demonstration, are labelled in four rounds by a program that knows the script, with a
 person's slips. The answers are about the way of the hand, not about its speed. The correction acts beside
 the policy, on the hand's state, the proposed action and the phase in the chunk; with the effects of the state, also on
-the state that the policy sees. Labels alone decide whether it is used. A control has answers drawn by chance about the
-same actions. Each task has a file, which grows with each cell.
+the state that the policy sees. Labels alone decide whether it is used. Beside it stand answers drawn by chance,
+pictures moved back without labels, and a policy without pictures. Each task has a file, which grows with each cell.
 """
 
 from __future__ import annotations
@@ -251,11 +251,11 @@ class Cells:
         print({**self.rows[-1], "words": "; ".join(row["words"])[:300]}, flush=True)
         pq.write_table(pa.Table.from_pylist(self.rows), self.file, compression="zstd")
 
-    def measure(self, seeds: int, until: float) -> None:
-        """Measure all cells, those of one seed of labels after those of another, while there is time."""
+    def measure(self, seeds: int) -> None:
+        """Measure all cells, those of one seed of labels after those of another."""
         for seed in range(seeds):
             for change in CHANGES:
-                if not self.has(change, "labels", seed) and time.time() < until:
+                if not self.has(change, "labels", seed):
                     for row in self.cell(change, seed, self.base(change)):
                         self.add(row)
 
@@ -297,26 +297,27 @@ def without_labels(cells: Cells, folder: Path, options: argparse.Namespace, size
     """Measure pictures moved back, a policy without pictures, and fine-tuning by five new demonstrations."""
     from lerobot_processor_cuelearner.pictures import align, first_pictures
 
-    act, first = checkpoint(folder / "act"), None
+    act = checkpoint(folder / "act")
+    first = first_pictures(LeRobotDataset("local/metaworld", root=folder / "dataset"), "observation.image")
     for change in CHANGES:
         if not change.startswith(("camera", "nothing")) or cells.has(change, "pictures"):
             continue
-        if first is None:
-            first = first_pictures(LeRobotDataset("local/metaworld", root=folder / "dataset"), "observation.image")
         before, met = cells.base(change), cells.played(change, None, LABEL_SEED, len(cells.robots.pipes))
         places, *alike = align(first, np.stack([one.picture for one in met]) / 255)
         _with_plan(cells, planner(act, options.device, places.astype(np.float32)), change, "pictures", before, alike)
     for change in CHANGES if options.state else ():
         place = folder / "state"
         if not (place / "act").exists():
-            without_pictures(folder / "dataset", emptied(place / "dataset"))
+            shutil.rmtree(place, ignore_errors=True)
+            without_pictures(folder / "dataset", place / "dataset")
             train(place / "dataset", place / "act", options.state, sizes)
         if not cells.has(change, "state alone"):
             plan, before = planner(checkpoint(place / "act"), options.device), cells.base(change)
             _with_plan(cells, plan, change, "state alone", before, [])
     if options.tune and not cells.has(TUNED, "demonstrations"):
         place, before = folder / "tuned", cells.base(TUNED)
-        collect(cells.robots, emptied(place / "dataset"), TUNED, 500_000, 5)
+        shutil.rmtree(place, ignore_errors=True)
+        collect(cells.robots, place / "dataset", TUNED, 500_000, 5)
         train(place / "dataset", place / "act", options.tune, sizes | {"save": 50}, act)
         _with_plan(cells, planner(checkpoint(place / "act"), options.device), TUNED, "demonstrations", before, [])
 
@@ -329,32 +330,24 @@ def _with_plan(cells: Cells, plan: Plan, change: str, kind: str, before: np.ndar
     cells.add(outcome(change, kind, before, after) | {"words": [f"alike {value:.3f}" for value in alike]})
 
 
-def emptied(folder: Path) -> Path:
-    """Return a folder's path with nothing there."""
-    shutil.rmtree(folder, ignore_errors=True)
-    return folder
-
-
 def table(out: Path) -> None:
     """Print, for each task and change, success before and after."""
     rows = [row for file in sorted(out.glob("*/cells.parquet")) for row in pq.read_table(file).to_pylist()]
-    print(f"{'task':<17}{'change':<28}{'by':<15}cells unchanged before corrected after used better worse seconds")
+    print(f"{'task':<26}{'change':<28}{'by':<15}cells unchanged before corrected after  used better worse  seconds")
     for key in dict.fromkeys((row["task"], row["change"], row["labels"]) for row in rows):
         own = [row for row in rows if (row["task"], row["change"], row["labels"]) == key]
-        ends = [float(np.mean([row[name] for row in own])) for name in ("unchanged", "before", "corrected", "after")]
-        counts = [
-            sum(row["used"] for row in own),
-            *(sum(row["paired"] == it for row in own) for it in ("better", "worse")),
-        ]
-        shown = "  ".join(f"{end:.2f}" for end in ends) + "  " + "  ".join(map(str, counts))
-        print(
-            f"{key[0]:<17}{key[1]:<28}{key[2]:<15}{len(own)}  {shown}  {np.mean([row['seconds'] for row in own]):.0f}"
+        ends = "  ".join(
+            f"{np.mean([r[name] for r in own]):.2f}" for name in ("unchanged", "before", "corrected", "after")
         )
-    for kind in ("camera", "gain", "motion"):
-        own = [r for r in rows if r["labels"] == "labels" and r["change"].startswith(kind)]
+        verdicts = [sum(row["paired"] == verdict for row in own) for verdict in ("better", "worse")]
+        counts = "  ".join(map(str, [sum(row["used"] for row in own), *verdicts]))
+        seconds = np.mean([row["seconds"] for row in own])
+        print(f"{key[0]:<26}{key[1]:<28}{key[2]:<15}{len(own)}  {ends}  {counts}  {seconds:.0f}")
+    for by, kind in (("pictures", "camera"), *(("labels", kind) for kind in ("camera", "gain", "motion"))):
+        own = [r for r in rows if r["labels"] == by and r["change"].startswith(kind) and r["task"] in TASKS]
         loss, back = (sum(r[a] - r[b] for r in own) for a, b in (("unchanged", "before"), ("after", "before")))
-        share = back / loss if loss > 0 else np.nan
-        print(f"{kind}: share of the lost success that comes back {share:.2f}, {len(own)} cells")
+        tested = sum(r["corrected"] - r["before"] for r in own if r["paired"] == "better")
+        print(f"{kind}, {by}, {len(own)} cells: lost {loss:.2f}, back {back:.2f}, by the test {tested:.2f}")
     if rows:
         pq.write_table(pa.Table.from_pylist(rows), out / "lerobot_metaworld.parquet", compression="zstd")
 
@@ -364,19 +357,17 @@ def run(options: argparse.Namespace) -> None:
     folder, doing = options.out / options.task, options.do
     robots = Robots(options.task, options.processes)
     folder.mkdir(parents=True, exist_ok=True)
-    options.until, began = time.time() + 60 * options.total, time.time()
+    began = time.time()
     sizes = {"device": options.device, "batch": options.batch, "save": options.save, "workers": options.workers}
     if doing in ("collect", "all") and not (folder / "dataset" / "meta" / "info.json").exists():
         collect(robots, folder / "dataset", "nothing", TRAIN_SEED, options.demonstrations)
-        print(f"{options.task}: dataset after {time.time() - began:.0f} s", flush=True)
     if doing in ("train", "all") and not (folder / "act" / "checkpoints" / "last").exists():
         train(folder / "dataset", folder / "act", 60 * options.minutes, sizes)
         print(f"{options.task}: {checkpoint(folder / 'act').resolve()} after {time.time() - began:.0f} s", flush=True)
     if doing in ("evaluate", "all"):
-        plan = planner(checkpoint(folder / "act"), options.device)
-        cells = Cells(robots, plan, folder, options)
+        cells = Cells(robots, planner(checkpoint(folder / "act"), options.device), folder, options)
+        cells.measure(options.seeds)
         without_labels(cells, folder, options, sizes)
-        cells.measure(options.seeds, options.until)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -391,10 +382,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=REPORTED, help="of each measurement")
     parser.add_argument("--seeds", type=int, default=3, help="of labels")
     parser.add_argument("--minutes", type=float, default=4.5, help="of training")
-    parser.add_argument("--total", type=float, default=9.0, help="minutes after which no cell is begun")
-    parser.add_argument(
-        "--tune", type=float, default=0.0, help="seconds of fine-tuning by five demonstrations; 0: none"
-    )
+    parser.add_argument("--tune", type=float, default=0.0, help="seconds of fine-tuning; 0: none")
     parser.add_argument("--state", type=float, default=0.0, help="seconds of training without pictures; 0: none")
     parser.add_argument("--eps", type=float, default=0.05, help="strength of an answer, as a share of the range")
     parser.add_argument("--batch", type=int, default=64)

@@ -1,7 +1,8 @@
 """Record a tiny LeRobot dataset: a point walks to a place that the picture shows, in the shapes of PushT.
 
 Run by the Python that has LeRobot: `python record.py FOLDER`. With `python record.py FOLDER MJCF`, the joints of an arm
-walk to a pose, and the picture shows the hand from above; `camera.json` has the projection.
+walk to a pose, and the picture shows the hand from above; `camera.json` has the projection. Behind both is a still
+scene. With `python record.py FOLDER moved`, the camera has moved: the scene is `MOVED` further right and down.
 """
 
 import json
@@ -13,6 +14,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_processor_cuelearner.kinematics import hand_of
 
 EPISODES, STEPS, SIDE = 4, 25, 96
+MOVED = (7, 3)  # pixels
 JOINTS = [f"{name}.pos" for name in ("pan", "lift", "elbow", "turn", "flex", "roll", "jaw")]
 LOW, HIGH = np.array([[-30, 0, 60, -20, 40, -20, 0.0], [30, 30, 80, 20, 80, 20, 0.04]])  # degrees and metres
 ABOVE = [[80, 0, 0, 8], [0, -80, 0, 48], [0, 0, 0, 1.0]]  # x to the right, y up in the picture
@@ -25,9 +27,11 @@ def features(names):
     return {"observation.state": numbers, "observation.image": picture, "action": numbers}
 
 
-def main(folder: Path, mjcf: Path | None = None) -> None:
+def main(folder: Path, what: Path | None = None) -> None:
     """Record the episodes."""
-    random = np.random.default_rng(0)
+    mjcf, (right, down) = (None, MOVED) if what == Path("moved") else (what, (0, 0))
+    random, (y, x) = np.random.default_rng(right), np.mgrid[-down : SIDE - down, -right : SIDE - right]
+    behind = np.repeat(np.uint8(40 * (2 + np.sin(x / 9) * np.cos(y / 11) + np.sin((x + y) / 23)))[..., None], 3, 2)
     names, low, high = (["x", "y"], [100, 100], [400, 400]) if mjcf is None else (JOINTS, LOW, HIGH)
     data = LeRobotDataset.create("tiny", fps=10, features=features(names), root=folder, use_videos=False)
     hand = hand_of(mjcf, "grip", [], "degrees", names) if mjcf else None
@@ -35,7 +39,7 @@ def main(folder: Path, mjcf: Path | None = None) -> None:
         place, goal = random.uniform(low, high, (2, len(names)))
         for _ in range(STEPS):
             action = place + 0.3 * (goal - place)
-            picture = np.zeros((SIDE, SIDE, 3), np.uint8)
+            picture = behind.copy()
             shown = goal / 512 * SIDE if hand is None else np.array(ABOVE) @ np.append(hand.place(place[None])[0], 1)
             x, y = shown[:2].astype(int)
             picture[y - 4 : y + 4, x - 4 : x + 4] = 255

@@ -28,14 +28,14 @@ EVALUATE = "--env.type=pusht --env.episode_length=12 --eval.n_episodes=2 --eval.
 pytestmark = pytest.mark.skipif(not PYTHON, reason="LEROBOT_PYTHON names no Python with LeRobot")
 
 
-def run(folder: Path, *command: str) -> str:
-    """Run a command of LeRobot's environment; return its standard output."""
+def run(folder: Path, *command: str, refused: bool = False) -> str:
+    """Run a command of LeRobot's environment; return its standard output, or why it is refused."""
     env = {**os.environ, "HF_HUB_OFFLINE": "1", "SDL_VIDEODRIVER": "dummy", "OMP_NUM_THREADS": "1", "PYTHONPATH": ""}
     program = str(Path(PYTHON).with_name(command[0])) if command[0].startswith("lerobot") else PYTHON
     arguments = command[1:] if command[0].startswith("lerobot") else command
     done = subprocess.run([program, *arguments], cwd=folder, env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
+    assert done.returncode == refused, done.stderr[-3000:]
+    return done.stderr.splitlines()[-1] if refused else done.stdout
 
 
 def answer_all(arguments: list[str], out: Path, moved: np.ndarray = MOVED) -> list[str]:
@@ -81,6 +81,25 @@ def test_a_checkpoint_is_corrected_by_labels_and_evaluated_by_lerobot(tmp_path, 
     run(tmp_path, "lerobot-eval", "--policy.path=checkpoint", "--output_dir=evaluated", *EVALUATE.split())
     assert main([*export[:-1], "checkpoint", "--out", "twice"]) == 2
     assert "holds a correction already" in capsys.readouterr().err
+
+
+def test_pictures_of_a_camera_that_moved_are_moved_back_without_labels(tmp_path):
+    checkpoint = checkpoint_of(tmp_path)
+    run(tmp_path, str(HERE / "record.py"), "later", "moved")
+    camera = ["-m", "lerobot_processor_cuelearner", "camera", "--before", "data", "--policy"]
+    told = run(tmp_path, *camera, checkpoint, "--after", "later", "--out", "back")
+    assert told.startswith("observation.image: the picture moved by 7.")
+    (step,) = [
+        one for one in json.loads((tmp_path / "back/policy_preprocessor.json").read_text())["steps"] if one.get("class")
+    ]
+    places = step["config"]["places"]["observation.image"]
+    np.testing.assert_allclose(places, [[1, 0, 14 / 96], [0, 1, 6 / 96]], atol=4e-3)
+    run(tmp_path, "lerobot-eval", "--policy.path=back", "--output_dir=evaluated", *EVALUATE.split())
+    for policy, after, message in (
+        (checkpoint, "data", "no camera moved between data and data"),
+        ("back", "later", "back moves its pictures already: give the checkpoint that it was made from"),
+    ):
+        assert run(tmp_path, *camera, policy, "--after", after, "--out", "no", refused=True) == message
 
 
 def test_the_hand_of_an_arm_is_corrected_where_people_think(tmp_path, monkeypatch):
