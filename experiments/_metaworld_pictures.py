@@ -59,9 +59,8 @@ def motion(change: Change, action: np.ndarray, back: bool = False) -> np.ndarray
 class ChangedMetaworld(of_lerobot.MetaworldEnv):
     """LeRobot's environment of a task, with smaller pictures and a change."""
 
-    def __init__(self, task: str) -> None:
-        size = {"observation_width": SIZE, "observation_height": SIZE}
-        super().__init__(task, obs_type="pixels_agent_pos", **size)
+    def __init__(self, task: str, size: int = SIZE) -> None:
+        super().__init__(task, obs_type="pixels_agent_pos", observation_width=size, observation_height=size)
         self.change = CHANGES["nothing"]
 
     def _ensure_env(self) -> None:
@@ -69,8 +68,8 @@ class ChangedMetaworld(of_lerobot.MetaworldEnv):
             return
         SawyerMocapBase.reset_mocap_welds = _reset_welds
         one = metaworld.MT1(self._env_name, seed=42)
-        size = {"camera_name": self.camera_name, "width": SIZE, "height": SIZE}
-        env: Any = one.train_classes[self._env_name](render_mode="rgb_array", **size)
+        size = {"width": self.observation_width, "height": self.observation_height}
+        env: Any = one.train_classes[self._env_name](render_mode="rgb_array", camera_name=self.camera_name, **size)
         env.set_task(one.train_tasks[0])
         env.reset()
         env._freeze_rand_vec, env.seeded_rand_vec = False, True
@@ -139,13 +138,13 @@ class Episode(NamedTuple):
 class Robots:
     """Worlds of one task in processes of their own."""
 
-    def __init__(self, task: str, processes: int) -> None:
+    def __init__(self, task: str, processes: int, size: int = SIZE) -> None:
         """Start before a GPU or JAX is in use: the processes are forks."""
         context = multiprocessing.get_context("fork")
         self.pipes = []
         for _ in range(processes):
             here, there = context.Pipe()
-            context.Process(target=_serve, args=(task, there), daemon=True).start()
+            context.Process(target=_serve, args=(task, size, there), daemon=True).start()
             self.pipes.append(here)
 
     def call(self, requests: dict[int, tuple[Any, ...]]) -> dict[int, Any]:
@@ -236,9 +235,9 @@ def _with_effects(
     return np.concatenate([effects.reshape(len(states), every, 16), own], 2)
 
 
-def _serve(task: str, pipe: Any) -> None:
+def _serve(task: str, size: int, pipe: Any) -> None:
     """Answer requests until the other end closes."""
-    world = ChangedMetaworld(task)
+    world = ChangedMetaworld(task, size)
     while True:
         try:
             what, *rest = pipe.recv()

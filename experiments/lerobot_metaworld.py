@@ -43,6 +43,7 @@ MISTAKEN, SILENT = 0.05, 0.1  # shares of the answers about a cue
 TRAIN_SEED, LABEL_SEED, REPORT_SEED = 0, 100_000, 200_000  # of episodes
 CUES = ("right,left", "forward,back", "up,down", ",")  # of the gripper nothing is said
 TUNED = "camera 10 cm aside"  # the change in which fine-tuning is measured
+EPS = 0.05  # strength of an answer, as a share of the range
 SIDES = 0.05  # by which a state is shifted to see its effect, as a share of its range
 ACT = {
     "type": "act", "push_to_hub": "false", "pretrained_backbone_weights": "null", "chunk_size": CHUNK,
@@ -53,13 +54,15 @@ ACT = {
 
 def collect(robots: Robots, folder: Path, change: str, first_seed: int, count: int) -> None:
     """Write demonstrations as a LeRobot dataset."""
+    episodes = robots.demonstrations(change, first_seed, count)
+    shape = episodes[0].pictures.shape[1:]
     features = {
-        "observation.image": {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]},
+        "observation.image": {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]},
         "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "opening"]},
         "action": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "grip"]},
     }
     dataset = LeRobotDataset.create("local/metaworld", fps=80, features=features, root=folder, use_videos=False)
-    for episode in robots.demonstrations(change, first_seed, count):
+    for episode in episodes:
         for picture, state, action in zip(*episode, strict=True):
             row = {"observation.image": picture, "observation.state": state, "action": action, "task": folder.name}
             dataset.add_frame(row)
@@ -141,8 +144,8 @@ def planner(place: Path, device: str, places: np.ndarray | None = None) -> Plan:
 class Labeller:
     """Labels about a policy in a changed world, and the correction that they give."""
 
-    def __init__(self, seed: int, early: int, eps: float) -> None:
-        """`early`: number of first steps of an episode that are asked about; `eps`: strength of an answer."""
+    def __init__(self, seed: int, early: int) -> None:
+        """`early`: number of first steps of an episode that are asked about."""
         import jax
 
         import cuelearner_jax as cl  # noqa: F401
@@ -154,9 +157,9 @@ class Labeller:
         names = {"names": ("x", "y", "z", "opening", "phase", EFFECT, BASE), "entries": (1, 1, 1, 1, 1, 16, 4)}
         env = logs.filled(logs.LogsConfig(**names, low=(-1.0,) * 4, high=(1.0,) * 4, cues=CUES))
         self.space, self.random, self.key = env.actions, np.random.default_rng(seed), jax.random.key(seed)
-        about = (declared_distortions(env), env.actions, eps, LABELS, env.observation)
+        about = (declared_distortions(env), env.actions, EPS, LABELS, env.observation)
         self.make = lambda: Reading(Heuristic(env.view()), *about)
-        self.early, self.eps, self.reading = early, eps, self.make()
+        self.early, self.reading = early, self.make()
         self.alike: list[np.ndarray] = []  # cosines of the script's way and the proposed one
 
     @property
@@ -195,7 +198,7 @@ class Labeller:
         from cuelearner_jax.spaces import UNSAID
 
         off = np.asarray(self.space.log(action, intended))
-        answer = np.where(np.abs(off) <= self.eps / 2, 0.0, np.sign(off))
+        answer = np.where(np.abs(off) <= EPS / 2, 0.0, np.sign(off))
         chance = self.random.random(off.shape)
         answer = np.where(chance < MISTAKEN, self.random.integers(-1, 2, off.shape), answer)
         is_asked = [cue.is_asked for cue in self.space.cues]
@@ -262,7 +265,7 @@ class Cells:
     def cell(self, change: str, seed: int, before: np.ndarray) -> Iterator[dict[str, Any]]:
         """Yield the row of a change, and of its control."""
         began, count = time.time(), LABELS // ROUNDS
-        labeller = Labeller(seed, self.early, self.options.eps)
+        labeller = Labeller(seed, self.early)
         for round_ in range(ROUNDS):
             first = LABEL_SEED + 1000 * seed + 100 * round_
             labeller.ask(self.played(change, labeller if round_ else None, first, len(self.robots.pipes)), count)
@@ -270,15 +273,13 @@ class Cells:
         if seed == 0:
             yield self.row(change, seed, "random", before, labeller.shuffled(), time.time())
 
-    def row(
-        self, change: str, seed: int, kind: str, before: np.ndarray, labeller: Labeller, began: float
-    ) -> dict[str, Any]:
+    def row(self, change: str, seed: int, kind: str, before: Any, labeller: Labeller, began: float) -> dict[str, Any]:
         """Return how the corrected policy does, whether labels use it, and what paired episodes say."""
         result, seconds = labeller.reading.result(), time.time() - began
         after = np.array([one.success for one in self.played(change, labeller)], float)
         row = outcome(change, kind, before, after, bool(result.used)) | {"seed": seed, "seconds": seconds}
-        alike = float(np.concatenate(labeller.alike).mean())
-        return row | {"evidence": float(result.evidence), "words": list(result.words()), "alike": alike}
+        row |= {"alike": float(np.concatenate(labeller.alike).mean())}
+        return row | {"evidence": float(result.evidence), "words": list(result.words())}
 
 
 def outcome(change: str, kind: str, before: np.ndarray, after: np.ndarray, used: bool = True) -> dict[str, Any]:
@@ -355,15 +356,14 @@ def table(out: Path) -> None:
 def run(options: argparse.Namespace) -> None:
     """Do the chosen parts for one task."""
     folder, doing = options.out / options.task, options.do
-    robots = Robots(options.task, options.processes)
+    robots = Robots(options.task, options.processes, options.size)
     folder.mkdir(parents=True, exist_ok=True)
-    began = time.time()
     sizes = {"device": options.device, "batch": options.batch, "save": options.save, "workers": options.workers}
     if doing in ("collect", "all") and not (folder / "dataset" / "meta" / "info.json").exists():
         collect(robots, folder / "dataset", "nothing", TRAIN_SEED, options.demonstrations)
     if doing in ("train", "all") and not (folder / "act" / "checkpoints" / "last").exists():
         train(folder / "dataset", folder / "act", 60 * options.minutes, sizes)
-        print(f"{options.task}: {checkpoint(folder / 'act').resolve()} after {time.time() - began:.0f} s", flush=True)
+        print(f"{options.task}: {checkpoint(folder / 'act').resolve()}", flush=True)
     if doing in ("evaluate", "all"):
         cells = Cells(robots, planner(checkpoint(folder / "act"), options.device), folder, options)
         cells.measure(options.seeds)
@@ -376,6 +376,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("do", choices=("collect", "train", "evaluate", "all", "table"))
     parser.add_argument("--task", choices=(*TASKS, *TUNING), default=TASKS[0])
     parser.add_argument("--out", type=Path, default=Path("runs/lerobot_metaworld"))
+    parser.add_argument("--size", type=int, default=SIZE, help="of pictures [pixels]")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--processes", type=int, default=17, help="that simulate")
     parser.add_argument("--demonstrations", type=int, default=DEMONSTRATIONS)
@@ -384,7 +385,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--minutes", type=float, default=4.5, help="of training")
     parser.add_argument("--tune", type=float, default=0.0, help="seconds of fine-tuning; 0: none")
     parser.add_argument("--state", type=float, default=0.0, help="seconds of training without pictures; 0: none")
-    parser.add_argument("--eps", type=float, default=0.05, help="strength of an answer, as a share of the range")
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--save", type=int, default=500, help="steps between checkpoints")
     parser.add_argument("--workers", type=int, default=12, help="that read the dataset")
