@@ -17,6 +17,7 @@ pictures moved back without labels, and a policy without pictures. Each task has
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shutil
 import signal
@@ -73,10 +74,10 @@ def collect(robots: Robots, folder: Path, change: str, first_seed: int, count: i
 def without_pictures(dataset: Path, out: Path) -> None:
     """Write a dataset with the state in the place of pictures."""
     table = pq.read_table(dataset / "data", columns=["observation.state", "action", "episode_index"]).to_pydict()
-    entries = {"observation.environment_state": "observation.state", "observation.state": "observation.state"}
-    features = {name: {"dtype": "float32", "shape": (4,), "names": None} for name in (*entries, "action")}
+    state = "observation.state"
+    entries = {"observation.environment_state": state, state: state, "action": "action"}
+    features = {name: {"dtype": "float32", "shape": (4,), "names": None} for name in entries}
     written = LeRobotDataset.create("local/metaworld", fps=80, features=features, root=out, use_videos=False)
-    entries |= {"action": "action"}
     for row, episode in enumerate(table["episode_index"]):
         if row and episode != table["episode_index"][row - 1]:
             written.save_episode()
@@ -89,7 +90,7 @@ def without_pictures(dataset: Path, out: Path) -> None:
 def train(dataset: Path, out: Path, seconds: float, sizes: dict[str, Any], base: Path | None = None) -> None:
     """Run `lerobot-train` for a wall time, and keep its last checkpoint."""
     shutil.rmtree(out, ignore_errors=True)
-    policy = {"path": base, "push_to_hub": "false"} if base else ACT | {"device": sizes["device"]}
+    policy = {"path": base, "push_to_hub": "false"} if base else ACT | sizes["act"] | {"device": sizes["device"]}
     words = {f"policy.{name}": value for name, value in policy.items()}
     words |= {"dataset.repo_id": "local/metaworld", "dataset.root": dataset, "output_dir": out, "steps": 10**6}
     words |= {"batch_size": sizes["batch"], "save_freq": sizes["save"], "num_workers": sizes["workers"]}
@@ -128,12 +129,10 @@ def planner(place: Path, device: str, places: np.ndarray | None = None) -> Plan:
     before, after = make_pre_post_processors(policy.config, str(place), preprocessor_overrides=where)
 
     def plan(pictures: np.ndarray, states: np.ndarray) -> np.ndarray:
-        seen = {"observation.state": torch.from_numpy(states)}
+        seen = dict.fromkeys(("observation.state", "observation.environment_state"), torch.from_numpy(states))
         if policy.config.image_features:
             image = torch.from_numpy(np.ascontiguousarray(pictures)).permute(0, 3, 1, 2).float() / 255
             seen["observation.image"] = image if places is None else moved_back(image, torch.from_numpy(places))
-        else:
-            seen["observation.environment_state"] = seen["observation.state"]
         with torch.inference_mode():
             rows = before(seen)
             return after(policy.predict_action_chunk(rows)).float().cpu().numpy()
@@ -244,9 +243,9 @@ class Cells:
             self.bases[change] = np.array([one.success for one in self.played(change)], float)
         return self.bases[change]
 
-    def has(self, change: str, kind: str, seed: int = 0) -> bool:
-        """Return whether a cell was measured."""
-        return any((row["change"], row["labels"], row["seed"]) == (change, kind, seed) for row in self.rows)
+    def has(self, *cell: Any) -> bool:
+        """Return whether a cell was measured: change, kind of labels, seed."""
+        return cell in [(row["change"], row["labels"], row["seed"]) for row in self.rows]
 
     def add(self, row: dict[str, Any]) -> None:
         """Print a row, and write all."""
@@ -301,7 +300,7 @@ def without_labels(cells: Cells, folder: Path, options: argparse.Namespace, size
     act = checkpoint(folder / "act")
     first = first_pictures(LeRobotDataset("local/metaworld", root=folder / "dataset"), "observation.image")
     for change in CHANGES:
-        if not change.startswith(("camera", "nothing")) or cells.has(change, "pictures"):
+        if not change.startswith(("camera", "nothing")) or cells.has(change, "pictures", 0):
             continue
         before, met = cells.base(change), cells.played(change, None, LABEL_SEED, len(cells.robots.pipes))
         places, *alike = align(first, np.stack([one.picture for one in met]) / 255)
@@ -312,10 +311,10 @@ def without_labels(cells: Cells, folder: Path, options: argparse.Namespace, size
             shutil.rmtree(place, ignore_errors=True)
             without_pictures(folder / "dataset", place / "dataset")
             train(place / "dataset", place / "act", options.state, sizes)
-        if not cells.has(change, "state alone"):
+        if not cells.has(change, "state alone", 0):
             plan, before = planner(checkpoint(place / "act"), options.device), cells.base(change)
             _with_plan(cells, plan, change, "state alone", before, [])
-    if options.tune and not cells.has(TUNED, "demonstrations"):
+    if options.tune and not cells.has(TUNED, "demonstrations", 0):
         place, before = folder / "tuned", cells.base(TUNED)
         shutil.rmtree(place, ignore_errors=True)
         collect(cells.robots, place / "dataset", TUNED, 500_000, 5)
@@ -334,7 +333,7 @@ def _with_plan(cells: Cells, plan: Plan, change: str, kind: str, before: np.ndar
 def table(out: Path) -> None:
     """Print, for each task and change, success before and after."""
     rows = [row for file in sorted(out.glob("*/cells.parquet")) for row in pq.read_table(file).to_pylist()]
-    print(f"{'task':<26}{'change':<28}{'by':<15}cells unchanged before corrected after  used better worse  seconds")
+    print(f"{'task':<26}{'change':<28}{'by':<15}cells unchanged before corrected after  used better worse")
     for key in dict.fromkeys((row["task"], row["change"], row["labels"]) for row in rows):
         own = [row for row in rows if (row["task"], row["change"], row["labels"]) == key]
         ends = "  ".join(
@@ -342,8 +341,7 @@ def table(out: Path) -> None:
         )
         verdicts = [sum(row["paired"] == verdict for row in own) for verdict in ("better", "worse")]
         counts = "  ".join(map(str, [sum(row["used"] for row in own), *verdicts]))
-        seconds = np.mean([row["seconds"] for row in own])
-        print(f"{key[0]:<26}{key[1]:<28}{key[2]:<15}{len(own)}  {ends}  {counts}  {seconds:.0f}")
+        print(f"{key[0]:<26}{key[1]:<28}{key[2]:<15}{len(own)}  {ends}  {counts}")
     for by, kind in (("pictures", "camera"), *(("labels", kind) for kind in ("camera", "gain", "motion"))):
         own = [r for r in rows if r["labels"] == by and r["change"].startswith(kind) and r["task"] in TASKS]
         loss, back = (sum(r[a] - r[b] for r in own) for a, b in (("unchanged", "before"), ("after", "before")))
@@ -358,7 +356,7 @@ def run(options: argparse.Namespace) -> None:
     folder, doing = options.out / options.task, options.do
     robots = Robots(options.task, options.processes, options.size)
     folder.mkdir(parents=True, exist_ok=True)
-    sizes = {"device": options.device, "batch": options.batch, "save": options.save, "workers": options.workers}
+    sizes = {name: getattr(options, name) for name in ("device", "batch", "save", "workers", "act")}
     if doing in ("collect", "all") and not (folder / "dataset" / "meta" / "info.json").exists():
         collect(robots, folder / "dataset", "nothing", TRAIN_SEED, options.demonstrations)
     if doing in ("train", "all") and not (folder / "act" / "checkpoints" / "last").exists():
@@ -388,6 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--save", type=int, default=500, help="steps between checkpoints")
     parser.add_argument("--workers", type=int, default=12, help="that read the dataset")
+    parser.add_argument("--act", type=json.loads, default={}, help="other options of ACT, as JSON")
     options = parser.parse_args(arguments)
     warnings.simplefilter("ignore")
     if options.do == "table":

@@ -109,6 +109,9 @@ def write(checkpoint: Path, before: Path, after: Path, out: Path) -> list[str]:
     """
     if out.exists():
         raise SystemExit(f"{out} is there already: give another --out")
+    for file in (checkpoint / PRE, before / "meta/info.json", after / "meta/info.json"):
+        if not file.exists():
+            raise SystemExit(f"{file} is missing: give folders of a LeRobot checkpoint and of datasets, format v3.0")
     config, pre = (json.loads((checkpoint / name).read_text()) for name in ("config.json", PRE))
     if any(step.get("class") == STEP for step in pre["steps"]):
         raise SystemExit(f"{checkpoint} moves its pictures already: give the checkpoint that it was made from")
@@ -119,7 +122,10 @@ def write(checkpoint: Path, before: Path, after: Path, out: Path) -> list[str]:
         for data in (first, second):
             if camera not in data.meta.features:
                 raise SystemExit(f"{data.root} has no {camera}: give a dataset of the policy's robot")
-        own, likeness, likely = align(first_pictures(first, camera), first_pictures(second, camera))
+        pictures = [first_pictures(data, camera) for data in (first, second)]
+        if pictures[0].shape[1:] != pictures[1].shape[1:]:
+            raise SystemExit(f"{camera} has pictures of other sizes in {before} and {after}: give one camera's")
+        own, likeness, likely = align(*pictures)
         if likely < LIKE:
             raise SystemExit(
                 f"{camera}: {before} and {after} begin with unlike pictures ({likely:.2f}), not moved ones"
@@ -131,14 +137,16 @@ def write(checkpoint: Path, before: Path, after: Path, out: Path) -> list[str]:
         places[camera] = own.round(7).tolist()
         lines.append(
             f"{camera}: the picture moved by {right:.1%} to the right and {down:.1%} down, and turned by {turn:.1f} "
-            f"degrees; alike {likeness:.2f} as it is, {likely:.2f} moved back"
+            f"degrees clockwise; alike {likeness:.2f} as it is, {likely:.2f} moved back"
         )
     if not places:
         raise SystemExit(f"no camera moved between {before} and {after}")
     number = [step.get("registry_name") for step in pre["steps"]].index(NORMALIZER)
     pre["steps"].insert(number, {"class": STEP, "config": {"places": places}})
-    shutil.copytree(checkpoint, out)
-    (out / PRE).write_text(json.dumps(pre, indent=2) + "\n", encoding="utf-8")
+    part = out.with_name(f"{out.name}.part")  # so that the checkpoint appears whole
+    shutil.copytree(checkpoint, part, dirs_exist_ok=True)
+    (part / PRE).write_text(json.dumps(pre, indent=2) + "\n", encoding="utf-8")
+    part.rename(out)
     return lines
 
 
@@ -146,5 +154,7 @@ def move_of(places: np.ndarray) -> tuple[float, float, float, float]:
     """Return how far the middle moved right and down, the turn [deg], and how far a corner moved at most, as shares."""
     corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
     moves = (corners @ (places[:, :2] - np.eye(2)).T + places[:, 2]) / 2
-    turn = np.rad2deg(np.arctan2(places[1, 0], places[0, 0]))
+    turn = np.rad2deg(
+        np.sign(places[1, 0]) * np.arccos(np.clip(places[0, 0], -1, 1))
+    )  # of a picture that is not square
     return float(places[0, 2] / 2), float(places[1, 2] / 2), float(turn), float(np.abs(moves).max())
