@@ -103,10 +103,10 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
             raise UserError(f"{prefix} has no field {format_value(name)}{suggestion(name, fields)}")
         if not fits(value, kind := kinds[name]):
             called = kind.__name__ if isinstance(kind, type) and not get_args(kind) else kind
-            wanted = (
+            advice = (
                 " or ".join(map(str, get_args(kind))) if get_origin(kind) is Literal else f"a value of type {called}"
             )
-            raise UserError(f"{prefix}.{name} is {format_value(value)}: give {wanted}")
+            raise UserError(f"{prefix}.{name} is {format_value(value)}: give {advice}")
     return values
 
 

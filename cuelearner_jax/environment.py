@@ -203,16 +203,16 @@ def check_layout(whose: str, observation: Sequence[Quantity], actions: Space, en
     Names and units of slices are compared where both sides come from the same sort of source: either both give units,
     or neither. `whose`: the policy in the message, for instance "the run". `env`: what `task.shape_of` gives will do.
     """
-    wanted = "give the world that it was made for, or options that keep its observations and actions"
+    advice = "give the world that it was made for, or options that keep its observations and actions"
     before, now = _entries(observation), _entries(env.observation)
     if len(before) != len(now):
-        raise UserError(f"{whose} observes {len(before)} entries, this world has {len(now)}: {wanted}")
+        raise UserError(f"{whose} observes {len(before)} entries, this world has {len(now)}: {advice}")
     for number, (own, other) in enumerate(zip(before, now, strict=True), 1):
         if own and other and own != other and (own[1] == UNKNOWN_UNIT) == (other[1] == UNKNOWN_UNIT):
             here, there = (f"{name!r} ({unit})" for name, unit in (own, other))
-            raise UserError(f"{whose} observes {here} as entry {number}, this world has {there}: {wanted}")
+            raise UserError(f"{whose} observes {here} as entry {number}, this world has {there}: {advice}")
     if (own := action_words(actions)) != (other := action_words(actions_of(env))):
-        raise UserError(f"{whose} gives actions {own}, this world takes actions {other}: {wanted}")
+        raise UserError(f"{whose} gives actions {own}, this world takes actions {other}: {advice}")
 
 
 def _entries(observation: Sequence[Quantity]) -> list[tuple[str, str] | None]:

@@ -177,7 +177,7 @@ def test_no_kind_of_guidance_is_named_outside_its_room():
 
 PARTICIPLE = re.compile(  # besides `left`, the direction, and `done`, an episode's flag; `is_...` is a boolean
     r"(?!is_)(\w*_)?(found|told|given|asked|known|kept|seen|made|taken|shown|drawn|written|chosen|met|used|named|changed|"
-    r"moved|said|learned|trained|played|judged)",
+    r"moved|said|learned|trained|played|judged|wanted)",
     re.IGNORECASE,
 )
 PUBLIC = {"api.adaptation": {"used", "judged"}, "api.policies": {"trained"}, "reading.result": {"used", "changed"}}

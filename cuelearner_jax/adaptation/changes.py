@@ -36,8 +36,8 @@ def family_of(changes: Any, env: Any) -> Family:
     changes = changes(env) if callable(changes) else changes
     several = (changes,) if isinstance(changes, Distortion) else changes
     if not isinstance(several, list | tuple) or not all(isinstance(one, Distortion) for one in several):
-        wanted = "give a cuelearner_jax.Distortion, several, or a function of the environment that returns them"
-        raise UserError(f"changes is {format_value(changes)}: {wanted}")
+        advice = "give a cuelearner_jax.Distortion, several, or a function of the environment that returns them"
+        raise UserError(f"changes is {format_value(changes)}: {advice}")
     return check_family(several)
 
 

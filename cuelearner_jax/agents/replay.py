@@ -160,8 +160,8 @@ class Memory(NamedTuple):
         if guided_share is None or self.guided is None:
             numbers = self.buffer.draw(key, self.rows, self.filled, size)
         else:
-            wanted = jnp.arange(size) < jnp.round(guided_share * size)
-            numbers = draw_sorts(key, self.guided[:, 0], self.filled, wanted)
+            is_chosen = jnp.arange(size) < jnp.round(guided_share * size)
+            numbers = draw_sorts(key, self.guided[:, 0], self.filled, is_chosen)
         batches = [self.one_step(self.buffer.read(self.rows, numbers))]
         if n_step > 1:
             batches.append(self.n_step(numbers, n_step, discount))

@@ -75,20 +75,20 @@ def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
     return Traced(graph, constants, tuple(missing), "key" in needed, {"obs": "float32", **builder.kinds})
 
 
-def _needed(ops: list[list[Any]], wanted: set[str]) -> tuple[list[list[Any]], set[str]]:
-    """Return the operations needed for `wanted`, and all names that they read."""
-    needed, wanted = [], set(wanted)
+def _needed(ops: list[list[Any]], outer: set[str]) -> tuple[list[list[Any]], set[str]]:
+    """Return the operations needed for `outer`, and all names that they read."""
+    needed, outer = [], set(outer)
     for op in reversed(ops):
         name, inputs, outputs, attributes = op
-        if not wanted & set(outputs):
+        if not outer & set(outputs):
             continue
         needed.append(op)
-        wanted |= set(inputs)
+        outer |= set(inputs)
         for part in ("test", "body") if name == "while" else ():
             inner = attributes[part]
             inner["ops"], names = _needed(inner["ops"], set(inner["outputs"]))
-            wanted |= names
-    return needed[::-1], wanted
+            outer |= names
+    return needed[::-1], outer
 
 
 class Builder:

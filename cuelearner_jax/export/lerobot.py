@@ -173,9 +173,11 @@ def _check_steps(checkpoint: Path, pre: dict[str, Any], post: dict[str, Any]) ->
         )
     if any(step.get("class", "").startswith(STEPS) for step in steps):
         raise UserError(f"{checkpoint} holds a correction already: give the checkpoint that it was made from")
-    for name, of, wanted in ((PRE, pre, NORMALIZER), (POST, post, UNNORMALIZER)):
-        if wanted not in [step.get("registry_name") for step in of["steps"]]:
-            raise UserError(f"{checkpoint / name} has no {wanted}, beside which a correction acts: give another policy")
+    for name, of, normaliser in ((PRE, pre, NORMALIZER), (POST, post, UNNORMALIZER)):
+        if normaliser not in [step.get("registry_name") for step in of["steps"]]:
+            raise UserError(
+                f"{checkpoint / name} has no {normaliser}, beside which a correction acts: give another policy"
+            )
 
 
 def _place(pipeline: dict[str, Any], name: str) -> int:

@@ -71,15 +71,15 @@ def add_bias(space: Space, action: Float[Array, " action"], bias: Float[Array, "
 
 def _taught(space: Space, teacher: Any, value: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
     """Return a teacher's action; NaN where it is not an action. Raises UserError for another shape."""
-    wanted = f"give an action of shape {action.shape}, of real numbers"
+    advice = f"give an action of shape {action.shape}, of real numbers"
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        raise UserError(f"teacher {type(teacher).__name__} gave {format_value(value)}: {wanted}") from error
+        raise UserError(f"teacher {type(teacher).__name__} gave {format_value(value)}: {advice}") from error
     if array.shape != action.shape:
-        raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {array.shape}: {wanted}")
+        raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {array.shape}: {advice}")
     if not jnp.issubdtype(array.dtype, jnp.floating) and not jnp.issubdtype(array.dtype, jnp.integer):
-        raise UserError(f"teacher {type(teacher).__name__} gave {array.dtype} numbers: {wanted}")
+        raise UserError(f"teacher {type(teacher).__name__} gave {array.dtype} numbers: {advice}")
     return space.only_actions(array.astype(action.dtype))
 
 
@@ -159,11 +159,11 @@ def demonstrate(
     the other way: the mirror image of the intended action.
     """
     space, (mistaken, answered) = actions_of(env), _slips(key, scalars)
-    wanted = intended_action(space, teacher, state, obs, action, scalars)
-    wanted = add_bias(space, wanted, space.from_unit(scalars.teacher_bias_deg))
-    right = space.distance(action, wanted) <= space.from_unit(scalars.indifference_deg)
-    mirrored = space.exp(action, -space.log(action, wanted))
-    return jnp.where(right, action, jnp.where(mistaken, mirrored, wanted)), answered
+    best = intended_action(space, teacher, state, obs, action, scalars)
+    best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
+    right = space.distance(action, best) <= space.from_unit(scalars.indifference_deg)
+    mirrored = space.exp(action, -space.log(action, best))
+    return jnp.where(right, action, jnp.where(mistaken, mirrored, best)), answered
 
 
 def scalar_answer(
@@ -181,11 +181,11 @@ def scalar_answer(
     """
     mistaken, answered = _slips(key, scalars)
     space = actions_of(env)
-    wanted = intended_action(space, teacher, state, obs, action, scalars)
-    wanted = add_bias(space, wanted, space.from_unit(scalars.teacher_bias_deg))
+    best = intended_action(space, teacher, state, obs, action, scalars)
+    best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     within = jnp.maximum(space.from_unit(scalars.scalar_within_deg), space.from_unit(scalars.indifference_deg))
-    good = space.distance(action, wanted) <= within
-    label = jnp.where(jnp.isfinite(wanted).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
+    good = space.distance(action, best) <= within
+    label = jnp.where(jnp.isfinite(best).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
     return label[None], answered
 
 

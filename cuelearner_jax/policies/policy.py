@@ -100,9 +100,9 @@ def call_policy(
     policy: Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
 ) -> Float[Array, "n action"]:
     """Return a policy's actions, NaN in place of each invalid one. Raises UserError for another shape."""
-    result, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
-    if result.shape != wanted:
-        raise UserError(f"{policy_name(policy)} returned actions of shape {result.shape}: return {wanted}")
+    result, shape = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
+    if result.shape != shape:
+        raise UserError(f"{policy_name(policy)} returned actions of shape {result.shape}: return {shape}")
     return actions.only_actions(result)
 
 

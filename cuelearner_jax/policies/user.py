@@ -97,7 +97,7 @@ class Opaque(PolicyNode):
         Of a pair of actions and None (models of Stable-Baselines3), or a dictionary (of brax), the actions are taken.
         Whole numbers in a space of choices are numbers of choices.
         """
-        name, wanted = policy_name(self), (rows, self.actions.size)
+        name, shape = policy_name(self), (rows, self.actions.size)
         if isinstance(result, tuple) and len(result) == 2 and (result[1] is None or np.ndim(result[0]) == 2):
             if not isinstance(result[1], dict | None):
                 raise UserError(f"{name} {MEMORY}")
@@ -106,22 +106,20 @@ class Opaque(PolicyNode):
             actions = as_array(result)
         except Exception as error:  # PyTorch's own kinds too
             why = " ".join(str(error).split())[:200]
-            raise UserError(f"{name} returned {format_value(result)} ({why}): return an array {wanted}") from error
+            raise UserError(f"{name} returned {format_value(result)} ({why}): return an array {shape}") from error
         is_whole = jnp.issubdtype(actions.dtype, jnp.integer)
         if not is_whole and not jnp.issubdtype(actions.dtype, jnp.floating):
-            raise UserError(f"{name} returned {actions.dtype} numbers: return real ones, of shape {wanted}")
+            raise UserError(f"{name} returned {actions.dtype} numbers: return real ones, of shape {shape}")
         if isinstance(self.actions, Choices) and actions.shape == (rows,) and is_whole:
-            inside, one_hot = (actions >= 0) & (actions < wanted[1]), actions[:, None] == np.arange(wanted[1])
+            inside, one_hot = (actions >= 0) & (actions < shape[1]), actions[:, None] == np.arange(shape[1])
             if isinstance(inside, np.ndarray) and not inside.all():
                 raise UserError(
-                    f"{name} chose {actions[~inside][0]}: give the number of a choice, 0 to {wanted[1] - 1}, whatever "
+                    f"{name} chose {actions[~inside][0]}: give the number of a choice, 0 to {shape[1] - 1}, whatever "
                     "number the environment starts from"
                 )
             return jnp.where(inside[:, None], one_hot, jnp.nan) if as_array is jnp.asarray else np.float32(one_hot)
-        if actions.shape != wanted:
-            raise UserError(
-                f"{name} returned actions of shape {actions.shape} for {rows} observations: return {wanted}"
-            )
+        if actions.shape != shape:
+            raise UserError(f"{name} returned actions of shape {actions.shape} for {rows} observations: return {shape}")
         with np.errstate(over="ignore"):
             return actions.astype(np.float32)
 
@@ -193,10 +191,10 @@ def policy_of(source: Any, space: Space | None = None) -> Any:
     if space is None or not isinstance(policy, Opaque):
         return policy
     model = getattr(policy.function, "model", None)
-    own, wanted = action_words(getattr(model, "action_space", None)), action_words(space)
-    if own and wanted and own != wanted:
+    own, other = action_words(getattr(model, "action_space", None)), action_words(space)
+    if own and other and own != other:
         raise UserError(
-            f"{policy_name(policy)} gives actions {own}, this world takes actions {wanted}: give a world with the "
+            f"{policy_name(policy)} gives actions {own}, this world takes actions {other}: give a world with the "
             "policy's actions, or a function that converts them"
         )
     return policy.replace(actions=space)

@@ -199,9 +199,9 @@ def infer(data: Data, parts: ModelParts, eps: Float[Array, ""], start: Posterior
         hyper, state, precision, target = carry
         (_, solved), slope = jax.value_and_grad(bound, has_aux=True)(hyper, precision, target)
         first, second = curvature(solved.mean, solved.variance, answers, habits(hyper, eps))
-        wanted = jnp.where(answers.valid, jnp.maximum(-second, LEAST_PRECISION), 0.0)
-        both = (1 - DAMPING) * precision + DAMPING * wanted
-        natural = (1 - DAMPING) * precision * target + DAMPING * (wanted * solved.mean + first)
+        site = jnp.where(answers.valid, jnp.maximum(-second, LEAST_PRECISION), 0.0)
+        both = (1 - DAMPING) * precision + DAMPING * site
+        natural = (1 - DAMPING) * precision * target + DAMPING * (site * solved.mean + first)
         target = jnp.where(both > 0, natural / jnp.maximum(both, 1e-12), 0.0)
         changes, state = optimizer.update(jax.tree.map(jnp.negative, slope), state)
         return (jax.tree.map(jnp.add, hyper, changes), state, both, target), None

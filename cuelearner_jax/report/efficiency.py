@@ -1,7 +1,7 @@
 """Label efficiency: steps to a level, and how many labels of one kind equal those of another, with intervals.
 
 The steps to a level are the interquartile mean over seeds of the step from which a seed stays at the level or above.
-A level is held fixed. A curve that ends below the level is right-censored (`Bounds`): its steps are "more than the
+A level is held fixed. A curve that ends below the level is right-censored (`Range`): its steps are "more than the
 last", which ratios and intervals carry on as a bound, never as a number. Intervals are those of `Variant.samples`.
 """
 
@@ -43,14 +43,14 @@ class Efficiency(NamedTuple):
     tables: dict[str, list[Row]]  # by file name
 
 
-class Bounds(NamedTuple):
-    """Bounds of a quantity; they are equal where it is known exactly."""
+class Range(NamedTuple):
+    """Range of a quantity; they are equal where it is known exactly."""
 
     lower: Samples
     upper: Samples
 
     @classmethod
-    def exact(cls, samples: Samples) -> Bounds:
+    def exact(cls, samples: Samples) -> Range:
         """Return the bounds of a quantity that is known exactly."""
         return cls(samples, samples)
 
@@ -60,7 +60,7 @@ class Sampled(NamedTuple):
 
     variant: Variant
     areas: Samples
-    steps: Bounds
+    steps: Range
 
 
 def _sampled(variant: Variant, level: float, sign: float) -> Sampled:
@@ -69,10 +69,10 @@ def _sampled(variant: Variant, level: float, sign: float) -> Sampled:
         return np.concatenate([variant.area(curves)[..., None], steps], axis=-1)
 
     areas, lower, upper = variant.samples(numbers).T
-    return Sampled(variant, areas, Bounds(lower, upper))
+    return Sampled(variant, areas, Range(lower, upper))
 
 
-def ratio_bounds(above: Bounds, below: Bounds) -> Bounds:
+def ratio_bounds(above: Range, below: Range) -> Range:
     """Return the bounds of the ratio of two non-negative quantities; 0 to infinity for 0 over 0."""
 
     def divided(numerator: Samples, denominator: Samples, otherwise: float) -> Samples:
@@ -80,12 +80,12 @@ def ratio_bounds(above: Bounds, below: Bounds) -> Bounds:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(unknown, otherwise, numerator / denominator)
 
-    return Bounds(divided(above.lower, below.upper, 0.0), divided(above.upper, below.lower, np.inf))
+    return Range(divided(above.lower, below.upper, 0.0), divided(above.upper, below.lower, np.inf))
 
 
 def labels_for(
     budgets: Int[np.ndarray, "budgets"], areas: Float[np.ndarray, "samples budgets"], target: Samples
-) -> Bounds:
+) -> Range:
     """Return the labels at which areas under the curve, nondecreasing in the budget, first reach the target.
 
     Areas lie on straight lines over the logarithm of the labels between two budgets. Beyond the budgets only a bound is
@@ -93,10 +93,10 @@ def labels_for(
     """
     first = areas[:, 0] >= target
     exact = np.where(first, float(budgets[0]), np.exp(statistics.step_at_level(np.log(budgets), areas, target)))
-    return Bounds(np.where(first, 0.0, np.minimum(exact, float(budgets[-1]))), exact)
+    return Range(np.where(first, 0.0, np.minimum(exact, float(budgets[-1]))), exact)
 
 
-def _columns(name: str, samples: Bounds, *own: Sampled) -> Row:
+def _columns(name: str, samples: Range, *own: Sampled) -> Row:
     """Return the columns of an estimate: value or bounds, and an interval where all variants have several seeds."""
     low, high = float(samples.lower[0]), float(samples.upper[0])
     row: Row = {name: low} if low == high else {f"{name}_above": low, f"{name}_below": high}
@@ -159,8 +159,8 @@ def _row(own: Sampled, unguided: Sampled | None) -> Row:
         return row
     row["against"] = unguided.variant.name
     comparisons = {
-        "mean_difference": Bounds.exact(own.areas - unguided.areas),
-        "mean_ratio": ratio_bounds(Bounds.exact(own.areas), Bounds.exact(unguided.areas)),
+        "mean_difference": Range.exact(own.areas - unguided.areas),
+        "mean_ratio": ratio_bounds(Range.exact(own.areas), Range.exact(unguided.areas)),
         "steps_ratio": ratio_bounds(own.steps, unguided.steps),
     }
     for name, bounds in comparisons.items():
@@ -184,7 +184,7 @@ def _equal_area(run: str, asking: dict[str, list[Sampled]], reference: str | Non
                 row: Row = {"run": run} if run else {}
                 row |= {"reference": base, "reference_labels": labels, "mean": float(sign * fitted[base][0, place])}
                 row |= {"guidance": kind} | _columns("labels", needed, *both)
-                rows.append(row | _columns("labels_ratio", Bounds(*(bound / labels for bound in needed)), *both))
+                rows.append(row | _columns("labels_ratio", Range(*(bound / labels for bound in needed)), *both))
     return rows
 
 

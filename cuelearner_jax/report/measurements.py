@@ -70,8 +70,8 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
     for row in rows:
         alike = others if len(others) == 1 else [other for other in others if variant(other) == variant(row)]
         if len(alike) != 1:
-            variants, wanted = "; ".join(map(variant, others)), variant(row) or "without labels"
-            raise UserError(f"--compare has {len(others)} variants ({variants}), but not {wanted}: give one")
+            variants, own = "; ".join(map(variant, others)), variant(row) or "without labels"
+            raise UserError(f"--compare has {len(others)} variants ({variants}), but not {own}: give one")
         both = row, alike[0]
         shared = [name for name in row.metrics if name in both[1].metrics]
         finite = [name for name in shared if all(np.isfinite(one.metrics[name]).all() for one in both)]

@@ -67,9 +67,14 @@ class Situations(NamedTuple):
     hands: Float[np.ndarray, "n 3"] | None = None  # where the hand is; None: not known
 
 
-@lru_cache(maxsize=4)
 def read_once(path: Path) -> Situations:
-    """Read situations as `read` does, and those of the same path only once."""
+    """Read situations as `read` does, and those of an unchanged path only once."""
+    files = (path, path / "meta/info.json", *(path / f"{STEM}{suffix}" for suffix in SUFFIXES))
+    return _read_at(path, path.resolve(), tuple(file.stat().st_mtime_ns for file in files if file.exists()))
+
+
+@lru_cache(maxsize=4)
+def _read_at(path: Path, where: Path, when: tuple[int, ...]) -> Situations:
     return read(path)
 
 

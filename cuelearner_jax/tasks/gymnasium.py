@@ -265,8 +265,8 @@ def _with_names(
         own = [Quantity(*one) for one in rows]
         total, size = (sum(quantity.size for quantity in row) for row in (own, slices))
     except TypeError as error:
-        wanted = 'give (name, entries, unit) for each slice, as ("goal", 3, "m")'
-        raise UserError(f"observation is {format_value(names)}: {wanted}") from error
+        advice = 'give (name, entries, unit) for each slice, as ("goal", 3, "m")'
+        raise UserError(f"observation is {format_value(names)}: {advice}") from error
     if total != size:
         raise UserError(f"observation names {total} entries, and {name} has {size}: name each entry once")
     if unknown := sorted(set(units) - {quantity.name for quantity in own}):

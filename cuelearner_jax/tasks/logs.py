@@ -286,8 +286,8 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     if config.digest not in ("", recording.digest):
         raise UserError(f"{config.path} holds other situations than before: restore the folder, or collect new labels")
     sizes = (recording.observations.shape[1], recording.actions.shape[1])
-    if sizes != (wanted := (layout.obs_size, layout.actions.size)):
-        raise UserError(f"{config.path} has observations and actions of {sizes} entries, not {wanted}: give another")
+    if sizes != (own := (layout.obs_size, layout.actions.size)):
+        raise UserError(f"{config.path} has observations and actions of {sizes} entries, not {own}: give another")
     places = np.arange(len(recording.observations))
     if config.order == "shuffled":
         places = np.random.default_rng(0).permutation(places)

@@ -32,10 +32,10 @@ def check_number(
     is_number = isinstance(value, kind) and not isinstance(value, bool)
     if is_number and max(least, -LARGEST) <= value <= min(most, LARGEST) and not (positive and value < 1e-45):
         return
-    wanted = f"a {'whole' if whole else 'positive' if positive else 'finite'} number"
-    wanted += f" from {_digits(least)}" if least > -math.inf else ""
-    wanted += f" up to {_digits(most)}" if most < math.inf else ""
-    raise UserError(f"task.{name} is {format_value(value)}: give {wanted}{f' ({unit})' if unit else ''}")
+    advice = f"a {'whole' if whole else 'positive' if positive else 'finite'} number"
+    advice += f" from {_digits(least)}" if least > -math.inf else ""
+    advice += f" up to {_digits(most)}" if most < math.inf else ""
+    raise UserError(f"task.{name} is {format_value(value)}: give {advice}{f' ({unit})' if unit else ''}")
 
 
 def check_word(name: str, value: Any, words: Iterable[str]) -> None:

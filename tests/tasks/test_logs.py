@@ -9,7 +9,6 @@ import recorded_situations as recorded
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box
-from cuelearner_jax.storage import situations
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import logs, registry
 
@@ -128,7 +127,6 @@ def test_networks_see_entries_of_the_order_of_one(folder):
 
 def test_other_situations_in_the_folder_are_refused(folder):
     config = logs.task_of(folder, CUES, **BOUNDS).plain()
-    situations.read_once.cache_clear()
     (folder / "situations.parquet").unlink()
     (folder / "pictures").rename(folder / "old")
     recorded.write(folder, rows=13)

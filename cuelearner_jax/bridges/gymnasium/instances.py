@@ -277,8 +277,8 @@ class Instances:
     def _vacated(self, free: Iterator[Running], replays: bool) -> Running:
         """Return the least recently used instance, or a new one where a state in use would be lost."""
         one = next(free, None)
-        wanted = one is not None and one.last_use > self.calls - RECENT
-        if one is None or (wanted and replays and len(self.running) < MOST_INSTANCES):
+        is_recent = one is not None and one.last_use > self.calls - RECENT
+        if one is None or (is_recent and replays and len(self.running) < MOST_INSTANCES):
             one = self._new()
         one.last_use = self.calls
         return one

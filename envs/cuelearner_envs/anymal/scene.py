@@ -141,8 +141,8 @@ def _sees(model: mujoco.MjModel, data: mujoco.MjData, camera: mujoco.MjvCamera) 
 
 def _gl_context() -> Any:
     """Return MuJoCo's OpenGL context class: EGL, which needs no display, unless MUJOCO_GL names another."""
-    wanted = os.environ.get("MUJOCO_GL", "").lower()
-    name = wanted if wanted in ("egl", "osmesa", "glfw") else "egl"
+    own = os.environ.get("MUJOCO_GL", "").lower()
+    name = own if own in ("egl", "osmesa", "glfw") else "egl"
     if name != "glfw":
         os.environ.setdefault("PYOPENGL_PLATFORM", name)
     return importlib.import_module(f"mujoco.{name}").GLContext

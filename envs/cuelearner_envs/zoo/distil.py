@@ -49,11 +49,11 @@ def distil(key: PRNGKeyArray, robot: ZooRobot) -> ZooRobot:
     scale = jnp.maximum(flat.std(0), 0.01 * robot.unit[robot.order])
     net = network(k_net, size, n) | {"mean": flat.mean(0), "scale": scale}
     adam = optax.adam(optax.cosine_decay_schedule(3e-3, ROUNDS * FITTING, 0.02))
-    wanted = jax.vmap(lambda obs: script(robot, robot.way, decode(robot, obs)) / robot.half)
+    target = jax.vmap(lambda obs: script(robot, robot.way, decode(robot, obs)) / robot.half)
 
     def loss(layers: Any, obs: Array) -> Float[Array, ""]:
         outputs = jax.vmap(lambda one: run_network(net | {"layers": layers}, one))(obs)
-        return jnp.mean(jnp.square(outputs - wanted(obs)))
+        return jnp.mean(jnp.square(outputs - target(obs)))
 
     def fit(data: Array, rows: Array, carry: tuple, key: PRNGKeyArray) -> tuple[tuple, None]:
         layers, moments = carry

@@ -225,10 +225,10 @@ def right(world: ZooWorld, state: State) -> Float[Array, " n"]:
     Where no action within the bounds has this effect, it is clipped.
     """
     robot, error, sight = world.robot, _error(world, state.position), sight_of(world, state)
-    wanted = jnp.where(world.other, script(robot, world.way, sight), policy(robot, encode(robot, sight)))
+    meant = jnp.where(world.other, script(robot, world.way, sight), policy(robot, encode(robot, sight)))
     if robot.cues == 1:
-        return robot.retract(world.unmixing @ rotate(wanted, -error[0]))
-    return robot.retract(world.unmixing @ (wanted / robot.half - error) * robot.half)
+        return robot.retract(world.unmixing @ rotate(meant, -error[0]))
+    return robot.retract(world.unmixing @ (meant / robot.half - error) * robot.half)
 
 
 def answer(
