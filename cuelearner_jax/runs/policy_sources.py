@@ -320,6 +320,10 @@ class LaneChoice:
                 console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
             policies.append(lane.policy.lane(0))
             lanes.append({"guidance": lane.guidance, "labels": labels, "seed": seed})
+        count = sum(len(block.seeds) for block in blocks)
+        if source.adapted and count > 1 and not (self.seed and self.labels is not None):
+            names = ", ".join(f"{variant_name(lane['guidance'], labels)}, seed {lane['seed']}" for lane in lanes)
+            console.print(f"{names}: of {count} lanes the first with most labels and bound; {OPTIONS} choose another")
         return policies, lanes
 
     def lane_in(self, source: PolicySource, world: Any, env: Any = None) -> tuple[Any, dict[str, Any]]:

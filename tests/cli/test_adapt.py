@@ -157,7 +157,7 @@ def test_the_traceback_of_a_policy_that_fails_stands_below_the_line(tmp_path, ca
     assert below[-1] == "RuntimeError: out of ink"
 
 
-def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path):
+def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path, capsys):
     new = ["--out", tmp_path / "new"]
     refused(["adapt", "own_turned:straight", *new], "needs a task to act in: give one, for instance --task", tmp_path)
     plain = ["adapt", "own_turned:straight", *TASK, *new, "--guidance", "relative"]
@@ -178,6 +178,7 @@ def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path):
     shutil.copytree(adapted, mixed)
     told = json.loads((mixed / "policy.json").read_text())
     load(mixed)
+    assert "relative, 80 labels, seed 0: of 4 lanes the first with most labels and bound" in capsys.readouterr().err
     values = {name: value for name, value in told.items() if name not in ("format", "digest")}
     formats.write("policy", mixed / "policy.json", {**values, "arrays": "0" * len(told["arrays"])})
     with pytest.raises(cl.UserError, match="holds the arrays of another policy"):
