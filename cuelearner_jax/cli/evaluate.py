@@ -174,7 +174,7 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
     both = difference.row, difference.other
     over = f"{episodes}, paired" if difference.over == "episodes" else f"seeds and {episodes} (interquartile means)"
     names = zip((title, other), map(measurements.variant, both), strict=True)
-    heading = " against ".join(f"{name} ({variant})" if variant else name for name, variant in names)
+    heading = " against ".join(f"{name} ({variant})" if variant and name != "base" else name for name, variant in names)
     caption = f"mean [95% bootstrap interval]; of the difference over {over}"
     table = Table("metric", "policy", "against", "difference", title=heading, caption=caption)
     for name, less in difference.metrics.items():

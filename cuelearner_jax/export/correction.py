@@ -66,7 +66,7 @@ def correction_of(policy: Any, env: Any) -> tuple[CorrectionAlone, Any]:
         if getattr(layer, "sees", False):
             raise UserError(
                 "this policy asks its base about other observations than are met, so its correction cannot be exported "
-                "alone: export the whole policy"
+                "alone: export the whole policy if its base is of JAX functions, or use it in Python (cl.load_policy)"
             )
         layer = below
     space, action = actions_of(env), action_of(env)

@@ -65,8 +65,8 @@ def trace_policy(policy: Policy, obs_size: int) -> Traced:
     traced = trace(decision_of(policy), obs_size)
     if CALLBACKS & set(traced.missing):
         raise UserError(
-            "this policy calls a Python function, which cannot be exported: export a policy of JAX "
-            "functions, or the correction alone (--only-correction, cl.export_correction)"
+            "this policy calls a Python function, which cannot be exported: give a base of JAX functions, or export "
+            "the correction alone (--only-correction, cl.export_correction), unless it moves what the base sees"
         )
     if traced.random:
         raise UserError("this policy acts at random, which cannot be exported: export a deterministic policy")

@@ -23,8 +23,8 @@ def main() -> None:
     camera.add_argument(
         "--policy", type=Path, required=True, help="checkpoint of a LeRobot policy (…/pretrained_model)"
     )
-    camera.add_argument("--before", type=Path, required=True, help="folder of a LeRobot dataset from before the move")
-    camera.add_argument("--after", type=Path, required=True, help="the same from after it; a few episodes will do")
+    camera.add_argument("--before", type=Path, required=True, help="folder of the LeRobot dataset that it learned from")
+    camera.add_argument("--after", type=Path, required=True, help="one from after the move; a few episodes will do")
     camera.add_argument("--out", type=Path, required=True, help="folder for the new checkpoint")
     situations = commands.add_parser("situations", help="write recorded situations with a policy's proposed actions")
     situations.add_argument("--policy", required=True, help="checkpoint of a LeRobot policy (…/pretrained_model)")

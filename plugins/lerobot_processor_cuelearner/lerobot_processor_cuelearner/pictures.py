@@ -115,13 +115,12 @@ def write(checkpoint: Path, before: Path, after: Path, out: Path) -> list[str]:
     config, pre = (json.loads((checkpoint / name).read_text()) for name in ("config.json", PRE))
     if any(step.get("class") == STEP for step in pre["steps"]):
         raise SystemExit(f"{checkpoint} moves its pictures already: give the checkpoint that it was made from")
-    cameras = [key for key, one in config["input_features"].items() if one["type"] == "VISUAL"]
+    features = {**config["input_features"], **config["output_features"]}
     first, second = (LeRobotDataset(one.name, root=one) for one in (before, after))
+    for data in (first, second):
+        _check_robot(data, features)
     places, lines = {}, []
-    for camera in cameras:
-        for data in (first, second):
-            if camera not in data.meta.features:
-                raise SystemExit(f"{data.root} has no {camera}: give a dataset of the policy's robot")
+    for camera in (key for key, one in features.items() if one["type"] == "VISUAL"):
         pictures = [first_pictures(data, camera) for data in (first, second)]
         if pictures[0].shape[1:] != pictures[1].shape[1:]:
             raise SystemExit(f"{camera} has pictures of other sizes in {before} and {after}: give one camera's")
@@ -136,8 +135,9 @@ def write(checkpoint: Path, before: Path, after: Path, out: Path) -> list[str]:
             continue
         places[camera] = own.round(7).tolist()
         lines.append(
-            f"{camera}: the picture moved by {right:.1%} to the right and {down:.1%} down, and turned by {turn:.1f} "
-            f"degrees clockwise; alike {likeness:.2f} as it is, {likely:.2f} moved back"
+            f"{camera}: the picture moved by {abs(right):.1%} to the {'right' if right > 0 else 'left'} and "
+            f"{abs(down):.1%} {'down' if down > 0 else 'up'}, and turned by {turn:.1f} degrees clockwise; alike "
+            f"{likeness:.2f} as it is, {likely:.2f} moved back"
         )
     if not places:
         raise SystemExit(f"no camera moved between {before} and {after}")
@@ -147,7 +147,16 @@ def write(checkpoint: Path, before: Path, after: Path, out: Path) -> list[str]:
     shutil.copytree(checkpoint, part, dirs_exist_ok=True)
     (part / PRE).write_text(json.dumps(pre, indent=2) + "\n", encoding="utf-8")
     part.rename(out)
-    return lines
+    return [*lines, f"wrote {out}; next: lerobot-eval --policy.path={out}"]
+
+
+def _check_robot(data: LeRobotDataset, features: dict[str, Any]) -> None:
+    """Raise SystemExit for a dataset of another robot than has a checkpoint's features."""
+    for key, one in features.items():
+        if key not in data.meta.features:
+            raise SystemExit(f"{data.root} has no {key}: give a dataset of the policy's robot")
+        if one["type"] != "VISUAL" and (shape := list(data.meta.features[key]["shape"])) != list(one["shape"]):
+            raise SystemExit(f"{key} has shape {shape} in {data.root}, {one['shape']} in the policy: give its robot's")
 
 
 def move_of(places: np.ndarray) -> tuple[float, float, float, float]:
