@@ -78,7 +78,7 @@ def test_of_a_saved_policy_it_needs_no_base(better, tmp_path):
 
 
 def test_a_whole_policy_takes_no_base_action_and_code_can_be_in_no_file(better, tmp_path):
-    with pytest.raises(cl.UserError, match="or the correction alone"):
+    with pytest.raises(cl.UserError, match="or export the correction alone"):
         cl.export_policy(better, tmp_path / "whole")
     with pytest.raises(cl.UserError, match="has no correction"):
         cl.export_correction(cl.CallablePolicy(better.policy.base), tmp_path / "no", world=better.world)
