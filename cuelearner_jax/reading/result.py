@@ -54,6 +54,7 @@ class Result(NamedTuple):
     near: float | None  # share of the situations met that are like labelled ones, which corrections may depend on
     wrong: float  # share of answers about something else
     policy: Any  # the corrected policy
+    open_ended: tuple[str, ...] = ()  # cues of which all answers name the same way, in words
 
     def words(self) -> list[str]:
         """Describe the result, line by line."""
@@ -65,7 +66,7 @@ class Result(NamedTuple):
             lines.append(f"beyond that, corrections depend on the situation: {self.depends:.3g} typically{near}")
         if self.wrong > 0.1:
             lines.append(f"{self.wrong:.0%} of the answers seem to be about something else")
-        return lines
+        return [*lines, *(f"{words}, and none says where to stop" for words in self.open_ended)]
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values, without the policy."""

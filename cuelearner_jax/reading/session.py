@@ -32,7 +32,7 @@ from cuelearner_jax.reading.fitting import Fit, Reader
 from cuelearner_jax.reading.linear import RelativeLabels, steps_of
 from cuelearner_jax.reading.policy import ReadingPolicy, unread
 from cuelearner_jax.reading.result import Result, describe_fit
-from cuelearner_jax.spaces import Space
+from cuelearner_jax.spaces import UNSAID, Space
 
 BATCHES = 5  # in which a budget of labels is asked or read
 LEAST_BATCH = 10
@@ -148,7 +148,17 @@ class Reading:
             inputs = linear.inputs(self.space, self.fit.frame, situations, self._acts(situations))
         described = describe_fit(self.fit, self.space, self.family, self.eps, self.observation, np.asarray(inputs))
         in_use = number > 0 and self.evidence >= LEAST_EVIDENCE and described[-1] < MOST_WRONG
-        return Result(in_use, number > 0, self.evidence, *described, self.policy())
+        return Result(in_use, number > 0, self.evidence, *described, self.policy(), self._open_ended())
+
+    def _open_ended(self) -> tuple[str, ...]:
+        """Return words about each cue of which all answers name the same way, where they are some."""
+        assert self.rows is not None
+        lines = []
+        for cue, answers in zip(self.space.cues, np.asarray(self.rows.answer).T, strict=True):
+            ways = answers[answers != UNSAID]
+            if len(ways) >= LEAST_BATCH and abs(ways.sum()) == len(ways):
+                lines.append(f"all {len(ways)} answers about {cue.name} say {cue.words[int(ways[0] < 0)]}")
+        return tuple(lines)
 
     def act(self, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return actions of the policy as corrected so far."""

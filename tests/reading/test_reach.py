@@ -95,3 +95,9 @@ def test_where_nothing_is_wrong_actions_stay_bitwise_as_they_were():
 
 def test_random_answers_use_no_correction():
     assert not read(None).result().used
+
+
+def test_a_cue_of_which_all_answers_name_the_same_way_is_told():
+    reading, obs = Reading(policy, (), BOX, EPS, LABELS), near(0, LABELS)
+    reading.learn(obs, moved(obs), np.tile(np.float32([[1, -1, 0], [-1, -1, 1]]), (LABELS // 2, 1)))
+    assert reading.result().open_ended == (f"all 48 answers about {BOX.cues[1].name} say {BOX.cues[1].words[1]}",)
