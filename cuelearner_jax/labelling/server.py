@@ -62,7 +62,7 @@ class Ending(NamedTuple):
         line, following, again = map(html.escape, self)
         body = f"""<h1>Finished. Thank you.</h1><p class="saved">{line}</p>
 <h2>What to type next</h2><pre id="next">{following}</pre>
-<h2>To add labels later</h2><pre>{again}</pre>
+<h2>To add labels later, with a larger --labels</h2><pre>{again}</pre>
 <p>The command in the terminal ends by itself once the last fit is done. You may close this tab.</p>"""
         return PAGE.format(title="finished", head="", body=body)
 
