@@ -75,7 +75,7 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(capsys):
     found = cl.load_exported("exported")(obs, own_arm.policy(obs))
     np.testing.assert_allclose(found, better(obs), atol=1e-5)
     assert main(["export", "policies/arm", "--format", "numpy", "--base", "own_arm:policy", "--out", "no"]) == 2
-    assert "or the correction alone (--only-correction" in capsys.readouterr().err
+    assert "or export the correction alone (--only-correction" in capsys.readouterr().err
 
 
 def test_proposed_actions_are_corrected_by_their_labels_alone(tmp_path, monkeypatch, capsys):
