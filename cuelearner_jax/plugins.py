@@ -39,8 +39,8 @@ def load(reference: str, kind: type[T], called: str) -> T:
         fitting = [other for other, value in vars(module).items() if isinstance(value, kind) and other[0] != "_"]
         raise UserError(f"{module_name} has no {name!r}{suggestion(name, fitting) if fitting else f', nor {called}'}")
     if not isinstance(value := getattr(module, name), kind):
-        advice = f"{called} is a {kind.__module__}.{kind.__name__}"
-        raise UserError(f"{reference} is of type {type(value).__name__}: {advice}")
+        meaning = f"{called} is a {kind.__module__}.{kind.__name__}"
+        raise UserError(f"{reference} is of type {type(value).__name__}: {meaning}")
     return value
 
 

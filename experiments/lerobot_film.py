@@ -18,7 +18,7 @@ import numpy as np
 from _metaworld_pictures import CAMERA, CHANGES, STEPS, ChangedMetaworld, motion
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_metaworld import EXECUTED, LABEL_SEED, REPORT_SEED, checkpoint, planner
-from lerobot_processor_cuelearner.pictures import align, first_pictures
+from lerobot_processor_cuelearner.camera import align, first_pictures
 from PIL import Image, ImageDraw
 
 SIDE, EVERY, HOLD, COMPARED = 200, 4, 10, 12  # pixels; steps a frame; frames at the end; first pictures compared

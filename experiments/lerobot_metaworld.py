@@ -129,13 +129,12 @@ def planner(place: Path, device: str, places: np.ndarray | None = None) -> Plan:
     before, after = make_pre_post_processors(policy.config, str(place), preprocessor_overrides=where)
 
     def plan(pictures: np.ndarray, states: np.ndarray) -> np.ndarray:
-        seen = dict.fromkeys(("observation.state", "observation.environment_state"), torch.from_numpy(states))
+        rows = dict.fromkeys(("observation.state", "observation.environment_state"), torch.from_numpy(states))
         if policy.config.image_features:
             image = torch.from_numpy(np.ascontiguousarray(pictures)).permute(0, 3, 1, 2).float() / 255
-            seen["observation.image"] = image if places is None else moved_back(image, torch.from_numpy(places))
+            rows["observation.image"] = image if places is None else moved_back(image, torch.from_numpy(places))
         with torch.inference_mode():
-            rows = before(seen)
-            return after(policy.predict_action_chunk(rows)).float().cpu().numpy()
+            return after(policy.predict_action_chunk(before(rows))).float().cpu().numpy()
 
     return plan
 
@@ -282,7 +281,7 @@ class Cells:
 
 
 def outcome(change: str, kind: str, before: np.ndarray, after: np.ndarray, used: bool = True) -> dict[str, Any]:
-    """Return the row of a corrected policy by the success of its episodes; `alike` is of the script's way."""
+    """Return the row of a corrected policy by the success of its episodes; `alike`: mean of `Labeller.alike`."""
     from cuelearner_jax.adaptation.judging import PairedTest
 
     test = PairedTest(1)
@@ -295,7 +294,7 @@ def outcome(change: str, kind: str, before: np.ndarray, after: np.ndarray, used:
 
 def without_labels(cells: Cells, folder: Path, options: argparse.Namespace, sizes: dict[str, Any]) -> None:
     """Measure pictures moved back, a policy without pictures, and fine-tuning by five new demonstrations."""
-    from lerobot_processor_cuelearner.pictures import align, first_pictures
+    from lerobot_processor_cuelearner.camera import align, first_pictures
 
     act = checkpoint(folder / "act")
     first = first_pictures(LeRobotDataset("local/metaworld", root=folder / "dataset"), "observation.image")

@@ -230,8 +230,8 @@ def measure(name: str, change: str, seed: int, labels: int, judge_by: str) -> It
     if judge_by == "success" or not any(altered.aside) or altered.other_way:
         return
     shape = np.asarray(policy.labels.answer).shape
-    given = policy.labels._replace(answer=np.random.default_rng(seed).integers(-1, 2, shape).astype(np.float32))
-    yield base | _row("random", cl.adapt(robot.script, world, labels=given, eps_deg=EPS, seed=seed), world)
+    by_chance = policy.labels._replace(answer=np.random.default_rng(seed).integers(-1, 2, shape).astype(np.float32))
+    yield base | _row("random", cl.adapt(robot.script, world, labels=by_chance, eps_deg=EPS, seed=seed), world)
 
 
 def _row(kind: str, found: Any, world: cl.World) -> dict[str, Any]:

@@ -75,20 +75,20 @@ def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
     return Traced(graph, constants, tuple(missing), "key" in needed, {"obs": "float32", **builder.kinds})
 
 
-def _needed(ops: list[list[Any]], outer: set[str]) -> tuple[list[list[Any]], set[str]]:
-    """Return the operations needed for `outer`, and all names that they read."""
-    needed, outer = [], set(outer)
+def _needed(ops: list[list[Any]], results: set[str]) -> tuple[list[list[Any]], set[str]]:
+    """Return the operations needed for `results`, and all names that they read."""
+    needed, results = [], set(results)
     for op in reversed(ops):
         name, inputs, outputs, attributes = op
-        if not outer & set(outputs):
+        if not results & set(outputs):
             continue
         needed.append(op)
-        outer |= set(inputs)
+        results |= set(inputs)
         for part in ("test", "body") if name == "while" else ():
             inner = attributes[part]
             inner["ops"], names = _needed(inner["ops"], set(inner["outputs"]))
-            outer |= names
-    return needed[::-1], outer
+            results |= names
+    return needed[::-1], results
 
 
 class Builder:

@@ -151,7 +151,7 @@ class Reading:
         return Result(in_use, number > 0, self.evidence, *described, self.policy(), self._open_ended())
 
     def _open_ended(self) -> tuple[str, ...]:
-        """Return words about each cue of which all answers name the same way, where they are some."""
+        """Return words about each cue of which all answers, `LEAST_BATCH` or more, name the same way."""
         assert self.rows is not None
         lines = []
         for cue, answers in zip(self.space.cues, np.asarray(self.rows.answer).T, strict=True):

@@ -44,14 +44,14 @@ class Efficiency(NamedTuple):
 
 
 class Range(NamedTuple):
-    """Range of a quantity; they are equal where it is known exactly."""
+    """Range of a quantity; its ends are equal where it is known exactly."""
 
     lower: Samples
     upper: Samples
 
     @classmethod
     def exact(cls, samples: Samples) -> Range:
-        """Return the bounds of a quantity that is known exactly."""
+        """Return the range of a quantity that is known exactly."""
         return cls(samples, samples)
 
 

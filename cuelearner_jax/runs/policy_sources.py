@@ -313,15 +313,16 @@ class LaneChoice:
         blocks = source.blocks(name, view, teacher, (kind,) if kind else (), failed_too=True)
         labels = int(max(block.budgets.max() for block in blocks)) if labels is None else labels
         bound = float(max(block.bounds.max() for block in blocks)) if self.bound_deg is None else self.bound_deg
-        policies, lanes = [], []
+        policies, lanes, unit = [], [], actions_of(view).unit
         for seed in seeds or (int(blocks[0].seeds[0]),):
-            lane = _select(blocks, (seed,), (labels,), bound, actions_of(view).unit)[0]
+            lane = _select(blocks, (seed,), (labels,), bound, unit)[0]
             if lane.failed[0]:
                 console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
             policies.append(lane.policy.lane(0))
             lanes.append({"guidance": lane.guidance, "labels": labels, "seed": seed})
-        count = sum(len(block.seeds) for block in blocks)
-        if source.adapted and count > 1 and not (self.seed and self.labels is not None):
+        budgets = () if self.labels is None else (self.labels,)
+        count = sum(len(block.seeds) for block in _select(blocks, self.seed, budgets, self.bound_deg or 0.0, unit))
+        if source.adapted and count > len(lanes):
             names = ", ".join(f"{variant_name(lane['guidance'], labels)}, seed {lane['seed']}" for lane in lanes)
             console.print(f"{names}: of {count} lanes the first with most labels and bound; {OPTIONS} choose another")
         return policies, lanes

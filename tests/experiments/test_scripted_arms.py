@@ -55,6 +55,6 @@ def test_the_page_tells_what_was_recorded(study):
     assert not any(row["rewarded steps"] for row in rows if row not in tested)
     assert not any(row["before"] - row["after"] > study.WORSE for row in tested)
     shares = [share for row in tested if np.isfinite(share := study.lost(row))]
-    told = f"the mean over these {len(shares)} cells is {np.mean(shares):.0%}.** Tried were {len(tested)} cells"
-    assert told in page
+    sentence = f"the mean over these {len(shares)} cells is {np.mean(shares):.0%}.** Tried were {len(tested)} cells"
+    assert sentence in page
     assert f"median is {np.median([row['rewarded steps'] for row in tested]):,.0f} rewarded steps" in page

@@ -87,8 +87,8 @@ def test_pictures_of_a_camera_that_moved_are_moved_back_without_labels(tmp_path)
     checkpoint = checkpoint_of(tmp_path)
     run(tmp_path, str(HERE / "record.py"), "later", "moved")
     camera = ["-m", "lerobot_processor_cuelearner", "camera", "--before", "data", "--policy"]
-    told = run(tmp_path, *camera, checkpoint, "--after", "later", "--out", "back")
-    assert told.startswith("observation.image: the picture moved by 7.3% to the right and 3.")
+    line = run(tmp_path, *camera, checkpoint, "--after", "later", "--out", "back")
+    assert line.startswith("observation.image: the picture moved by 7.3% to the right and 3.")
     (step,) = [
         one for one in json.loads((tmp_path / "back/policy_preprocessor.json").read_text())["steps"] if one.get("class")
     ]

@@ -54,13 +54,13 @@ def walk(
     body turns under it.
     """
     position, yaw = pose[:2], pose[2]
-    meant = robot.speed * rotate(direction, yaw)
+    target = robot.speed * rotate(direction, yaw)
     fading = jnp.exp(-duration / robot.lag)
-    off = velocity - meant
-    position = position + meant * duration + off * robot.lag * (1.0 - fading)
+    off = velocity - target
+    position = position + target * duration + off * robot.lag * (1.0 - fading)
     limit = robot.turn_rate * duration
     turned = yaw + jnp.clip(to_angle(direction), -limit, limit)
-    return jnp.concatenate([position, to_angle(from_angle(turned))[None]]), meant + off * fading
+    return jnp.concatenate([position, to_angle(from_angle(turned))[None]]), target + off * fading
 
 
 def collides(robot: Robot, world: NavigationWorld, pose: Float[Array, "3"]) -> Bool[Array, ""]:

@@ -225,10 +225,10 @@ def right(world: ZooWorld, state: State) -> Float[Array, " n"]:
     Where no action within the bounds has this effect, it is clipped.
     """
     robot, error, sight = world.robot, _error(world, state.position), sight_of(world, state)
-    meant = jnp.where(world.other, script(robot, world.way, sight), policy(robot, encode(robot, sight)))
+    own = jnp.where(world.other, script(robot, world.way, sight), policy(robot, encode(robot, sight)))
     if robot.cues == 1:
-        return robot.retract(world.unmixing @ rotate(meant, -error[0]))
-    return robot.retract(world.unmixing @ (meant / robot.half - error) * robot.half)
+        return robot.retract(world.unmixing @ rotate(own, -error[0]))
+    return robot.retract(world.unmixing @ (own / robot.half - error) * robot.half)
 
 
 def answer(

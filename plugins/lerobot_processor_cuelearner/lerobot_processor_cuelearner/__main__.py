@@ -6,9 +6,9 @@ import argparse
 from functools import partial
 from pathlib import Path
 
+from lerobot_processor_cuelearner import camera
 from lerobot_processor_cuelearner.judging import judge
 from lerobot_processor_cuelearner.kinematics import UNITS, hand_of
-from lerobot_processor_cuelearner.pictures import write as write_moved_back
 from lerobot_processor_cuelearner.situations import write
 
 
@@ -19,13 +19,15 @@ def main() -> None:
     judging = commands.add_parser("judge", help="tell which of two evaluations of the same episodes is better")
     judging.add_argument("before", type=Path, help="output folder of lerobot-eval, of the policy as it was")
     judging.add_argument("after", type=Path, help="the same of the corrected policy, with the same seed")
-    camera = commands.add_parser("camera", help="find how cameras moved, and let the policy see pictures as before")
-    camera.add_argument(
+    cameras = commands.add_parser("camera", help="find how cameras moved, and let the policy see pictures as before")
+    cameras.add_argument(
         "--policy", type=Path, required=True, help="checkpoint of a LeRobot policy (…/pretrained_model)"
     )
-    camera.add_argument("--before", type=Path, required=True, help="folder of the LeRobot dataset that it learned from")
-    camera.add_argument("--after", type=Path, required=True, help="one from after the move; a few episodes will do")
-    camera.add_argument("--out", type=Path, required=True, help="folder for the new checkpoint")
+    cameras.add_argument(
+        "--before", type=Path, required=True, help="folder of the LeRobot dataset that it learned from"
+    )
+    cameras.add_argument("--after", type=Path, required=True, help="one from after the move; a few episodes will do")
+    cameras.add_argument("--out", type=Path, required=True, help="folder for the new checkpoint")
     situations = commands.add_parser("situations", help="write recorded situations with a policy's proposed actions")
     situations.add_argument("--policy", required=True, help="checkpoint of a LeRobot policy (…/pretrained_model)")
     situations.add_argument("--dataset", type=Path, required=True, help="folder of a LeRobot dataset, format v3.0")
@@ -52,7 +54,7 @@ def main() -> None:
         print(judge(options.before, options.after))
         return
     if options.command == "camera":
-        print("\n".join(write_moved_back(options.policy, options.before, options.after, options.out)))
+        print("\n".join(camera.write(options.policy, options.before, options.after, options.out)))
         return
     if options.first < 0 or options.count < 1:
         parser.error("give --first 0 or more and --count 1 or more")

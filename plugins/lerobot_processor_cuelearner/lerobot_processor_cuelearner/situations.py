@@ -85,19 +85,25 @@ def write(
     return len(rows)
 
 
+def check_robot(data: LeRobotDataset, checkpoint: str | Path, shapes: Mapping[str, Sequence[int]]) -> None:
+    """Raise SystemExit where a dataset's state or action has another shape than the checkpoint's features."""
+    for key in (OBS_STATE, ACTION):
+        own, shape = data.meta.features.get(key), shapes.get(key)
+        if own is not None and shape is not None and tuple(own["shape"]) != tuple(shape):
+            raise SystemExit(
+                f"{key} has shape {tuple(own['shape'])} in {data.root}, but {tuple(shape)} in {checkpoint}: "
+                "give a dataset of the policy's robot"
+            )
+
+
 def _load(checkpoint: str, data: LeRobotDataset) -> tuple[Any, Any, Any, Any]:
     """Return the policy, its configuration and its processors. Raises SystemExit where they do not fit the dataset."""
     config = PreTrainedConfig.from_pretrained(checkpoint)
     config.pretrained_path = Path(checkpoint)
     if config.device != "cpu" and not torch.cuda.is_available():
         config.device = "cpu"
-    for key, feature in {**(config.input_features or {}), **(config.output_features or {})}.items():
-        own = data.meta.features.get(key)
-        if own is not None and key in (OBS_STATE, ACTION) and tuple(own["shape"]) != tuple(feature.shape):
-            raise SystemExit(
-                f"{key} has shape {tuple(own['shape'])} in {data.root}, but {tuple(feature.shape)} in {checkpoint}: "
-                "give a dataset of the policy's robot"
-            )
+    features = {**(config.input_features or {}), **(config.output_features or {})}
+    check_robot(data, checkpoint, {key: feature.shape for key, feature in features.items()})
     if OBS_STATE not in data.meta.features:
         raise SystemExit(f"{data.root} has no {OBS_STATE}, on which a correction depends: give a dataset with it")
     policy = make_policy(config, ds_meta=data.meta).eval()

@@ -170,5 +170,5 @@ def test_changed_worlds_compile_nothing_new():
         env.replace(max_steps=jnp.int32(1)),
     ]
     state, _ = reset(env, KEY)
-    seen = [tuple(np.asarray(counted(one, state, LEFT)[1].obs).tolist()) for one in changed]
-    assert len(set(seen)) == len(changed)
+    observations = [tuple(np.asarray(counted(one, state, LEFT)[1].obs).tolist()) for one in changed]
+    assert len(set(observations)) == len(changed)
