@@ -208,16 +208,13 @@ def export_policy(
 def export_correction(policy: Any, out: str | Path, world: World | None = None, format: str = "onnx") -> dict[str, Any]:
     """Write the correction of a corrected policy alone: observation and base action in, action out.
 
-    It runs beside a base that stays where it is: `decide(observation, base_action)`. In ONNX its inputs are `obs` and
-    `base_action`, its output `action`. `policy`: from `correct` or `adapt`, or loaded from a policy folder. The other
-    arguments and the returned contract are those of `export_policy`.
+    It runs beside a base that stays where it is: `decide(obs, *map(base, decide.base_observations(obs)))`. In ONNX its
+    inputs are `obs` and `base_action`, its outputs `action` and, if the correction changes what the base sees,
+    `base_obs`. `policy`: from `correct` or `adapt`, or loaded from a policy folder. The rest is as in `export_policy`.
     """
     from cuelearner_jax.export import correction
 
-    def alone(env: Any) -> tuple[Policy, Any, Callable[[], np.ndarray]]:
-        return *correction.correction_of(as_policy(policy), env), lambda: correction.cases(env)
-
-    return _export(policy, out, world, format, alone)
+    return _export(policy, out, world, format, partial(correction.correction_of, as_policy(policy)))
 
 
 def _export(policy: Any, out: str | Path, world: World | None, format: str, part: Callable[[Any], Any]) -> Any:

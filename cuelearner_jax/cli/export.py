@@ -55,8 +55,7 @@ def run(arguments: list[str]) -> None:
     policy, lane = options.lane_in(source, options.task, env)
     draw, view = (lambda: decisions.observations(env, policy)), env
     if options.only_correction:
-        policy, view = correction.correction_of(policy, env)
-        draw = lambda: correction.cases(env)  # noqa: E731
+        policy, view, draw = correction.correction_of(policy, env)
     origin = {
         "subject": source.folder.name,
         "policy": name,
@@ -71,6 +70,8 @@ def run(arguments: list[str]) -> None:
         f"{golden['cases']} golden cases replayed, largest difference {record['difference']:.1e} "
         f"({golden['steady']} of {golden['drawn']} decisions are insensitive to rounding); wrote {options.out}"
     )
+    if "questions" in record.get("base", {}):
+        out.print("the base is asked about other observations: those of decide.base_observations(observation)")
 
 
 def _into_checkpoint(source: PolicySource, options: Export) -> None:

@@ -2,7 +2,7 @@
 
 `contract.json` has inputs and outputs with units, versions, and digests of all files. Beside it are the decision,
 `golden.npz` with observations (cases, obs) and JAX's actions for them (cases, action), and `decide.py`, which is
-`runner`.
+`runner`. Where a correction changes what its base sees, the actions are followed by the base's observations.
 """
 
 from __future__ import annotations
@@ -31,10 +31,6 @@ from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import is_occupied, place_of, replacing
 
-BASE = (
-    "a correction alone: the last slice of the observation is the action of a base that is elsewhere, given beside the "
-    "other slices, as decide(observation, base_action)"
-)
 ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise (from x to y)"
 PLATFORMS = ("cpu", "cuda")  # platforms of a decision in StableHLO
 FORMATS = {
@@ -67,16 +63,16 @@ def write(
 ) -> dict[str, Any]:
     """Write a policy's decision and replay its golden cases; the folder appears completely or not at all.
 
-    `draw` returns observations of the environment, from which golden cases are chosen. `source` is copied to the
-    contract.
+    `env`: also what `correction_of` returns in its place, with sizes of inputs and outputs and the entry "base".
+    `draw` returns observations of it, from which golden cases are chosen. `source` is copied to the contract.
 
     Returns the contract, with "difference": the largest difference among the golden cases in this replay.
     """
     with place_of(out, check_unused) as place:
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # a trained policy may lie on several devices
-        base = getattr(env, "base_size", 0)  # only for a correction alone
+        inputs, outputs, base = getattr(env, "alone", ([env.obs_size], [actions_of(env).size], {}))
         traced = trace_policy(policy, env.obs_size)
-        file, contents, about = _artefact(format, policy, traced, env.obs_size, actions_of(env).size, base)
+        file, contents, about = _artefact(format, policy, traced, inputs, outputs)
         golden, cases = golden_cases(policy, draw(), traced), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {file: contents, runner.GOLDEN: cases.getvalue(), "decide.py": inspect.getsource(runner).encode()}
@@ -90,7 +86,7 @@ def write(
             "artefact": {"format": format, "file": file, **about},
             "observation": {"size": env.obs_size, "dtype": "float32", "slices": slices},
             "action": _action(env, describe(policy)),
-            **({"base": {"size": base, "about": BASE}} if base else {}),
+            **({"base": base} if base else {}),
             "batch": "observations (n, size), any n; every row is decided by itself",
             "policy": describe(policy),
             "source": source,
@@ -119,18 +115,14 @@ def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
 
 
 def _artefact(
-    format: str, policy: Policy, traced: Traced, obs_size: int, action_size: int, base_size: int
+    format: str, policy: Policy, traced: Traced, inputs: list[int], outputs: list[int]
 ) -> tuple[str, bytes, dict[str, Any]]:
-    """Return a decision's file, its contents, and the contract's entry.
-
-    For a correction alone, the last `base_size` entries of the observation are the base's action.
-    """
+    """Return a decision's file, its contents, and the contract's entry, for these sizes of its inputs and outputs."""
     if format == "stablehlo":
         decide, (count,) = row_by_row(policy), jax.export.symbolic_shape("n")
-        parts = [obs_size - base_size, base_size] if base_size else [obs_size]
-        shapes = [jax.ShapeDtypeStruct((count, size), jnp.float32) for size in parts]
+        shapes = [jax.ShapeDtypeStruct((count, size), jnp.float32) for size in inputs]
         together = jax.jit(lambda *parts: decide(jnp.concatenate(parts, -1)))
-        exported = jax.export.export(together if base_size else jax.jit(decide), platforms=PLATFORMS)(*shapes)
+        exported = jax.export.export(together, platforms=PLATFORMS)(*shapes)
         about = {"needs": "jax", "jax": jax.__version__, "platforms": list(PLATFORMS)}
         return "decision.stablehlo", bytes(exported.serialize()), about
     if traced.missing:
@@ -139,9 +131,11 @@ def _artefact(
             "give --format stablehlo"
         )
     if format == "onnx":
-        contents = onnx_graph.serialize(traced, obs_size, action_size, base_size)
-        about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET, "input": "obs", "output": "action"}
-        return "decision.onnx", contents, about | ({"base_input": onnx_graph.BASE} if base_size else {})
+        contents = onnx_graph.serialize(traced, inputs, outputs)
+        about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET}
+        about |= dict(zip(("input", "base_input"), onnx_graph.INPUTS[: len(inputs)], strict=False))
+        about |= dict(zip(("output", "base_output"), onnx_graph.OUTPUTS[: len(outputs)], strict=False))
+        return "decision.onnx", contents, about
     graph, stored = np.frombuffer(json.dumps(traced.graph._asdict()).encode(), np.uint8), io.BytesIO()
     arrays: dict[str, Any] = {"graph": graph, **traced.constants}
     np.savez(stored, **arrays)

@@ -19,7 +19,7 @@ from cuelearner_jax.export.graph import Traced, trace
 from cuelearner_jax.export.runner import compile_ops
 from cuelearner_jax.policies import Policy, describe, layers, policy_name
 
-TOLERANCE = 1e-5  # largest allowed difference of an action's entry on another machine
+TOLERANCE = 1e-5  # largest allowed difference of an entry on another machine, of one above 1 as a share of it
 NUDGE = 1e-6  # relative change of an observation's entry, as large as rounding may cause
 NUDGES, CASES, MIXED = 4, 64, 5
 ROUNDING = 1e-6  # relative error of an operation, larger than any library's
@@ -66,7 +66,7 @@ def trace_policy(policy: Policy, obs_size: int) -> Traced:
     if CALLBACKS & set(traced.missing):
         raise UserError(
             "this policy calls a Python function, which cannot be exported: give a base of JAX functions, or export "
-            "the correction alone (--only-correction, cl.export_correction), unless it moves what the base sees"
+            "the correction alone (--only-correction, cl.export_correction)"
         )
     if traced.random:
         raise UserError("this policy acts at random, which cannot be exported: export a deterministic policy")
@@ -77,7 +77,7 @@ class Golden(NamedTuple):
     """Golden cases: observations with the expected actions."""
 
     obs: Float[np.ndarray, "cases obs"]
-    actions: Float[np.ndarray, "cases action"]  # computed by JAX
+    actions: Float[np.ndarray, "cases output"]  # computed by JAX; of a correction also observations for its base
     candidates: int  # number of observations that they were chosen from
     steady: int  # number of these observations whose decision is insensitive to rounding
     extreme: int  # number of golden cases, the last ones, that no episode led to
@@ -108,7 +108,7 @@ def is_steady(traced: Traced, obs: Float[np.ndarray, " obs"]) -> bool:
                 error = size * random.uniform(-1, 1, value.shape) * (np.abs(value).max() if name in SUMS else value)
                 values[outputs[0]] = np.asarray(value + error, np.float32)
         actions.append(values[result])
-    return bool(np.ptp(actions, axis=0).max() <= TOLERANCE)
+    return bool((np.ptp(actions, axis=0) / np.maximum(np.abs(actions[0]), 1)).max() <= TOLERANCE)
 
 
 def golden_cases(policy: Policy, candidates: Float[np.ndarray, "n obs"], traced: Traced, most: int = CASES) -> Golden:
@@ -129,7 +129,7 @@ def golden_cases(policy: Policy, candidates: Float[np.ndarray, "n obs"], traced:
     for _ in range(NUDGES):
         nudge = NUDGE * random.uniform(-1, 1, obs.shape) * np.maximum(np.abs(obs), 1.0)
         nudged = np.asarray(decide(jnp.asarray(obs + nudge, jnp.float32)))
-        apart = np.maximum(apart, np.abs(nudged - actions).max(-1))
+        apart = np.maximum(apart, (np.abs(nudged - actions) / np.maximum(np.abs(actions), 1)).max(-1))
     steady = apart <= TOLERANCE  # never where an action is not finite
     with np.errstate(all="ignore"):
         for place in range(len(candidates), len(obs)):  # zero is no direction

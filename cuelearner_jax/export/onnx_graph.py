@@ -1,8 +1,7 @@
 """Write a decision's graph in ONNX: a scan over the rows of a batch, whose body is the graph of one observation.
 
-Written operation by operation from the graph that NumPy runs. A converter of JAX programs, jax2onnx 0.17, was tried. It
-has no rule for a dense layer under vmap, which ensembles and aims need. Its values of navigation's features are off by
-6e-5, and it needs an older Orbax than checkpoints are written with.
+Written operation by operation from the graph that NumPy runs. The converter jax2onnx 0.17 has no rule for a dense layer
+under vmap, which ensembles and aims need.
 """
 
 from __future__ import annotations
@@ -18,14 +17,11 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.export.graph import Traced
 
 OPSET, IR_VERSION = 18, 8  # of 2022, supported by runtimes of several years
-BASE = "base_action"  # the second input of a correction alone
+INPUTS, OUTPUTS = ("obs", "base_action"), ("action", "base_obs")  # the second ones of a correction alone
 
 
-def serialize(traced: Traced, obs_size: int, action_size: int, base_size: int = 0) -> bytes:
-    """Return the bytes of a model with input `obs` (n, obs_size) and output `action` (n, action_size).
-
-    For a correction alone, the last `base_size` entries of the input are a second input, `base_action`.
-    """
+def serialize(traced: Traced, inputs: list[int], outputs: list[int]) -> bytes:
+    """Return the bytes of a model, with inputs and outputs of these sizes by `INPUTS` and `OUTPUTS`."""
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
@@ -34,23 +30,19 @@ def serialize(traced: Traced, obs_size: int, action_size: int, base_size: int = 
     (result,) = traced.graph.outputs
     nodes = writer.nodes(traced.graph.ops, {"obs": "row"}, "")
     nodes.append(helper.make_node("Identity", [writer.names.get(result, result)], ["decided"]))
-    row = helper.make_tensor_value_info("row", TensorProto.FLOAT, [obs_size])
-    decided = helper.make_tensor_value_info("decided", TensorProto.FLOAT, [action_size])
+    info, kind = helper.make_tensor_value_info, TensorProto.FLOAT
+    row, decided = info("row", kind, [sum(inputs)]), info("decided", kind, [sum(outputs)])
     body = helper.make_graph(nodes, "one_observation", [row], [decided])
-    batch = [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", obs_size - base_size])]
-    before, rows = [], "obs"
-    if base_size:
-        batch.append(helper.make_tensor_value_info(BASE, TensorProto.FLOAT, ["n", base_size]))
-        before, rows = [helper.make_node("Concat", ["obs", BASE], ["seen"], axis=1)], "seen"
-    actions = helper.make_tensor_value_info("action", TensorProto.FLOAT, ["n", action_size])
+    batch = [info(name, kind, ["n", size]) for name, size in zip(INPUTS, inputs, strict=False)]
+    results = [info(name, kind, ["n", size]) for name, size in zip(OUTPUTS, outputs, strict=False)]
+    nodes = [
+        helper.make_node("Concat", INPUTS[: len(inputs)], ["rows"], axis=1),
+        helper.make_node("Scan", ["rows"], ["decisions"], body=body, num_scan_inputs=1),
+        helper.make_node("Split", ["decisions", writer.whole(outputs)], OUTPUTS[: len(outputs)], axis=1),
+    ]
     constants = {**traced.constants, **writer.constants}
-    graph = helper.make_graph(
-        [*before, helper.make_node("Scan", [rows], ["action"], body=body, num_scan_inputs=1)],
-        "decision",
-        batch,
-        [actions],
-        [numpy_helper.from_array(np.asarray(array, order="C"), name) for name, array in constants.items()],
-    )
+    stored = [numpy_helper.from_array(np.asarray(array, order="C"), name) for name, array in constants.items()]
+    graph = helper.make_graph(nodes, "decision", batch, results, stored)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="cuelearner")
     model.ir_version = IR_VERSION
     checker.check_model(model)

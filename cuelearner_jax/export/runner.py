@@ -4,6 +4,7 @@
     decide = Decision("folder")        # verifies every file against the contract
     action = decide(observation)       # (obs,) -> (action,); or (n, obs) -> (n, action)
     action = decide(observation, base_action)       # for a correction alone, which runs beside its base
+    action = decide(observation, *map(base, decide.base_observations(observation)))     # for any correction alone
 
 It needs Python and NumPy, neither cuelearner nor JAX. Decisions in ONNX also need onnxruntime, and those in StableHLO
 need JAX. Every row of a batch is processed by itself.
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 
 CONTRACT, GOLDEN = "contract.json", "golden.npz"
-VERSION = 1  # of contracts and graphs
+VERSION = 2  # of contracts and graphs
 DIGEST = "digest"  # the key of a contract's digest of its other values
 
 Values = dict[str, np.ndarray]
@@ -43,59 +44,69 @@ class Decision:
         """Read a folder. Raises ContractError if a file is missing, damaged or changed, or cannot be run here."""
         self.folder = Path(folder)
         self.contract = read_contract(self.folder)
-        self._base = self.contract.get("base", {}).get("size", 0)  # entries of the base's action of a correction alone
+        base = self.contract.get("base", {})  # of a correction alone
+        self._base, self._questions = base.get("size", 0), base.get("questions", 0)
+        self._calls = self._questions or int("size" in base)  # without questions the base sees what is met
+        self._size = self.contract["observation"]["size"] - self._base * self._calls
         artefact = self.contract["artefact"]
         self._decide = RUNNERS[artefact["format"]](self.folder / artefact["file"], self.contract)
 
-    def __call__(self, obs: Any, base_action: Any = None) -> np.ndarray:
+    def __call__(self, obs: Any, *base_actions: Any) -> np.ndarray:
         """Return the action for an observation (obs,), or for each of a batch (n, obs): (action,) or (n, action).
 
-        `base_action`, for a correction alone: the base's action for each observation. Raises ContractError for an
-        observation of another size or not finite in single precision, and for a decision that gives no valid action.
+        `base_actions`, for a correction alone: the base's action for each of `base_observations(obs)`. Raises
+        ContractError for an observation of another size or not finite in single precision, and for a decision that
+        gives no valid action.
         """
-        if (base_action is None) == bool(self._base):
-            content = "a correction alone: give the base's action, decide(obs, base_action)"
+        if len(base_actions) != self._calls:
+            alone = "correction alone: give the base's action about each of decide.base_observations(obs)"
             raise ContractError(
-                f"{self.folder} holds {content if self._base else 'a whole policy: leave out base_action'}"
+                f"{self.folder} holds a {alone if self._calls else 'whole policy: leave out base_action'}"
             )
-        parts = [_numbers(part) for part in (obs, base_action) if part is not None]
-        rows, sizes = parts[0].shape[:-1], (self.contract["observation"]["size"] - self._base, self._base)
-        for part, size in zip(parts, sizes, strict=False):
+        actions = self._outputs(obs, *base_actions)[..., : self.contract["action"]["size"]]
+        if not np.isfinite(actions).all() or ("angle" in self.contract["action"] and not actions.any(axis=-1).all()):
+            raise ContractError(f"{self.folder} gives numbers that are not finite, or zero, which is no direction")
+        return actions
+
+    def base_observations(self, obs: Any) -> list[np.ndarray]:
+        """Return the observations to ask the base about, each of the shape of `obs`.
+
+        `decide(obs, *map(base, decide.base_observations(obs)))` runs any decision: a correction that changes nothing of
+        what the base sees returns `obs` itself, a whole policy nothing. Raises ContractError as calls do.
+        """
+        if not self._questions:
+            return [np.asarray(obs)] * self._calls
+        anything = np.zeros((*np.shape(obs)[:-1], self._base))  # what is asked does not depend on the base
+        outputs = self._outputs(obs, *[anything] * self._calls)
+        return np.split(outputs[..., self.contract["action"]["size"] :], self._questions, -1)
+
+    def _outputs(self, obs: Any, *base_actions: Any) -> np.ndarray:
+        parts = [_numbers(part) for part in (obs, *base_actions)]
+        rows, sizes = parts[0].shape[:-1], (self._size, *[self._base] * self._calls)
+        for part, size in zip(parts, sizes, strict=True):
             if len(rows) > 1 or part.shape != (*rows, size):
                 raise ContractError(
-                    f"observations or base actions have shape {part.shape}: the contract says ({size},), or equally "
-                    f"many rows (n, {size})"
+                    f"observations or base actions have shape {part.shape}: give ({size},), or equally many (n, {size})"
                 )
         batch = [np.ascontiguousarray(part if rows else part[None]) for part in parts]
         if not all(np.isfinite(part).all() for part in batch):
             raise ContractError("an observation holds numbers that are not finite, or beyond single precision")
         if not len(batch[0]):
-            return np.zeros((0, self.contract["action"]["size"]), np.float32)
-        actions = self._decide(*batch)
-        if not np.isfinite(actions).all() or ("angle" in self.contract["action"] and not actions.any(axis=-1).all()):
-            raise ContractError(f"{self.folder} gives numbers that are not finite, or zero, which is no direction")
-        return actions if rows else actions[0]
-
-    def angle(self, obs: Any) -> np.ndarray:
-        """Return directions as angles [rad], counterclockwise positive, 0 along x: () or (n,).
-
-        Raises ContractError for a decision whose actions are not directions.
-        """
-        if "angle" not in self.contract["action"]:
-            raise ContractError(f"{self.folder} gives actions that are not directions: call it, and read its contract")
-        actions = self(obs)
-        return np.asarray(np.arctan2(actions[..., 1], actions[..., 0]))
+            return np.zeros((0, self.contract["action"]["size"] + self._questions * self._size), np.float32)
+        outputs = self._decide(*batch[:1], *([np.concatenate(batch[1:], -1)] if self._calls else []))
+        return outputs if rows else outputs[0]
 
     def check(self) -> float:
-        """Recompute the golden cases; return the largest difference of an entry from the recorded actions.
+        """Recompute the golden cases; return the largest difference of an entry, if above 1 as a share of the entry.
 
         Raises ContractError if the difference is larger than the contract allows.
         """
         with np.load(self.folder / GOLDEN, allow_pickle=False) as golden:
             obs, actions = golden["obs"], golden["actions"]
-        own = obs.shape[1] - self._base
-        result = self(obs[:, :own], obs[:, own:]) if self._base else self(obs)
-        difference, allowed = float(np.abs(result - actions).max()), self.contract["golden"]["tolerance"]
+        own, *bases = np.split(obs, [self._size + self._base * number for number in range(self._calls)], 1)
+        result = np.concatenate([self(own, *bases), *(self.base_observations(own) if self._questions else [])], -1)
+        difference = float((np.abs(result - actions) / np.maximum(np.abs(actions), 1)).max())
+        allowed = self.contract["golden"]["tolerance"]
         if not difference <= allowed:
             raise ContractError(
                 f"{self.folder} gives other actions here than where it was exported: golden cases differ by "
@@ -153,14 +164,13 @@ def _of_numpy(path: Path, contract: dict[str, Any]) -> Batch:
     run = compile_ops(graph["ops"])
 
     def decide(*batch: np.ndarray) -> np.ndarray:
-        rows = np.concatenate(batch, -1)
-        actions = np.empty((len(rows), contract["action"]["size"]), np.float32)
+        outputs = []
         with np.errstate(all="ignore"):  # JAX does not warn of floating-point errors either
-            for number, row in enumerate(rows):
+            for row in np.concatenate(batch, -1):
                 values = {**constants, source: row}
                 run(values)
-                actions[number] = values[result]
-        return actions
+                outputs.append(values[result])
+        return np.stack(outputs)
 
     return decide
 
@@ -175,7 +185,7 @@ def _of_onnx(path: Path, contract: dict[str, Any]) -> Batch:
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     names = [one.name for one in session.get_inputs()]
-    return lambda *batch: np.asarray(session.run(None, dict(zip(names, batch, strict=True)))[0])
+    return lambda *batch: np.hstack(session.run(None, dict(zip(names, batch, strict=True))))  # pyright: ignore
 
 
 def _of_stablehlo(path: Path, contract: dict[str, Any]) -> Batch:
@@ -184,14 +194,12 @@ def _of_stablehlo(path: Path, contract: dict[str, Any]) -> Batch:
         from jax import export
     except ImportError:
         raise ContractError("a decision in StableHLO needs JAX: pip install jax flatbuffers, or export NumPy") from None
+    if b"callback" in (contents := path.read_bytes()):  # leads out of the program; no export contains one
+        raise ContractError(f"{path} calls Python functions: export the policy anew")
     try:
-        exported = export.deserialize(bytearray(path.read_bytes()))
-        if b"callback" in exported.mlir_module_serialized:  # leads out of the program; no export contains one
-            raise ContractError(f"{path} calls Python functions: export the policy anew")
+        exported = export.deserialize(bytearray(contents))
         call = jax.jit(exported.call)
         call(*(np.zeros((1, each.shape[1]), np.float32) for each in exported.in_avals))
-    except ContractError:
-        raise
     except Exception:
         version = contract["artefact"]["jax"]
         raise ContractError(

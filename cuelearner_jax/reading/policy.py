@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, describe
+from cuelearner_jax.policies import PolicyNode, describe
 from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.families import Family, has_effects, unknowns_of
 from cuelearner_jax.reading.linear import Change, ObservationFrame
@@ -75,16 +75,18 @@ class ReadingPolicy(PolicyNode):
         return _bounded(self.space, self.family, self.correction, self.bound, obs, before, first, action)
 
     @property
-    def sees(self) -> bool:
-        """Whether the base is asked about other observations than are met."""
-        change = self.correction.change
-        return bool(np.any(np.asarray(change.theta)) or np.any(np.asarray(change.mix)))
+    def questions(self) -> int:
+        """Number of observations that matter, 0 if only as met: undone, and for a bound or a process also as met."""
+        own = self.correction
+        if not (np.any(np.asarray(own.change.theta)) or np.any(np.asarray(own.change.mix))):
+            return 0
+        bounded = np.any(np.asarray(self.bound) < np.asarray(self.space.from_unit(self.space.reach)))
+        return 1 + bool((bounded or np.any(np.asarray(own.alpha))) and not has_effects(self.family))
 
     @property
-    def axes(self) -> ReadingPolicy:
-        """Lane axes: each lane has its own base, and its own correction where there is more than one."""
-        lanes = SHARED if jnp.ndim(self.correction.scale) == 0 else BY_LANE
-        return self.replace(base=self.base.axes, correction=lanes, bound=lanes)
+    def LANES(self) -> tuple[str, ...]:
+        """Each lane has its own correction where there is more than one."""
+        return ("correction", "bound") if jnp.ndim(self.correction.scale) else ()
 
     def describe(self) -> dict[str, Any]:
         """Return the sizes of the correction's arrays, the family's unknowns with their values, and the base."""

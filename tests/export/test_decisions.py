@@ -3,10 +3,7 @@
 import dataclasses
 import hashlib
 import json
-import os
 import shutil
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -75,7 +72,7 @@ def test_numpy_and_onnx_decide_as_jax_does(name):
         values = {**traced.constants, "obs": obs}
         run(values)
         found.append(np.array(values[result]))
-    session = onnxruntime.InferenceSession(onnx_graph.serialize(traced, 2, 2))
+    session = onnxruntime.InferenceSession(onnx_graph.serialize(traced, [2], [2]))
     for actions in (np.stack(found), session.run(None, {"obs": DRAWN})[0]):
         apart = np.abs(actions - wanted).max(-1)
         assert (apart <= 1e-5).mean() >= 0.9, apart  # where two values tie, either is right
@@ -87,7 +84,6 @@ def test_a_batch_of_any_size_is_decided_row_by_row(folder):
         whole = decide(DRAWN)
         np.testing.assert_array_equal(decide(DRAWN[:7]), whole[:7])
         np.testing.assert_array_equal(decide(DRAWN[3]), whole[3])
-        np.testing.assert_allclose(decide.angle(DRAWN[3]), np.arctan2(whole[3, 1], whole[3, 0]))
         assert decide(DRAWN[:0]).shape == (0, 2)
     for wrong in (np.zeros(3), np.zeros((2, 2, 2)), [np.nan, 0.0], [1e39, 0.0], ["1.0", "0.0"], [1j, 0.0]):
         with pytest.raises(runner.ContractError, match="observation"):
@@ -96,9 +92,8 @@ def test_a_batch_of_any_size_is_decided_row_by_row(folder):
 
 def test_the_contract_says_what_goes_in_and_what_comes_out(folder):
     told = json.loads((folder / "numpy" / runner.CONTRACT).read_text())
-    assert told["observation"]["slices"] == [
-        {"name": "context", "from": 0, "to": 2, "size": 2, "unit": "1", "about": ""}
-    ]
+    (part,) = told["observation"]["slices"]
+    assert part == {"name": "context", "from": 0, "to": 2, "size": 2, "unit": "1", "about": ""}
     assert told["action"]["angle"].startswith("atan2(action[1], action[0]) [rad]")
     assert "positive counterclockwise" in told["action"]["angle"]
     assert told["action"]["clip_radius_deg"] == pytest.approx(7.0)
@@ -109,19 +104,6 @@ def test_the_contract_says_what_goes_in_and_what_comes_out(folder):
     for name, recorded in told["files"].items():
         assert hashlib.sha256((folder / "numpy" / name).read_bytes()).hexdigest() == recorded
     assert set(told["files"]) | {runner.CONTRACT} == {file.name for file in (folder / "numpy").glob("*.*")}
-
-
-def test_numpy_runs_without_jax_and_without_this_package(folder):
-    """In a process whose only module beside NumPy is the file that lies in the folder."""
-    program = (
-        "import sys; sys.path.insert(0, '.'); from decide import Decision; found = Decision('.').check();"
-        "assert not {'jax', 'cuelearner_jax'} & {name.split('.')[0] for name in sys.modules}; print(found)"
-    )
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    command, there = [sys.executable, "-c", program], folder / "numpy"
-    done = subprocess.run(command, cwd=there, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert float(done.stdout) <= 1e-5
 
 
 def copied(folder, tmp_path):
@@ -152,9 +134,7 @@ def test_a_folder_that_is_damaged_or_changed_is_refused(folder, tmp_path):
 def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_path):
     there = copied(folder / "stablehlo", tmp_path)
     exported = jax.export.deserialize(bytearray((there / "decision.stablehlo").read_bytes()))
-    called = (
-        exported.mlir_module_serialized + b"xla_ffi_python_cpu_callback"
-    )  # as a name of what is called stands there
+    called = exported.mlir_module_serialized + b"xla_ffi_python_cpu_callback"  # as names of what is called stand there
     changed = dataclasses.replace(exported, mlir_module_serialized=called)
     (there / "decision.stablehlo").write_bytes(changed.serialize())
     edit_contract(there)
@@ -218,11 +198,11 @@ def test_a_difference_that_no_episode_leads_to_is_noticed_when_the_file_is_writt
     with np.load(tmp_path / "sound" / runner.GOLDEN) as golden:
         extreme = golden["obs"][-told["golden"]["extreme"] :]
     assert {np.float32(1e10), np.float32(-1e10), np.float32(1e-30), np.float32(0)} <= set(extreme[:, 0].tolist())
-    plain = lambda builder, equation, given: [  # noqa: E731
-        builder.add(
-            "cast", given, given[0].shape, str(equation.params["new_dtype"]), dtype=str(equation.params["new_dtype"])
-        )
-    ]
+
+    def plain(builder, equation, given):
+        kind = str(equation.params["new_dtype"])
+        return [builder.add("cast", given, given[0].shape, kind, dtype=kind)]
+
     monkeypatch.setitem(RULES, "convert_element_type", plain)
     for format in ("numpy", "onnx"):
         with pytest.raises(UserError, match="golden cases differ by"):

@@ -64,7 +64,7 @@ def decided(traced, drawn, size):
         found.append(np.array(values[graph["outputs"][0]]))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(onnx_graph.serialize(traced, drawn.shape[1], size), options)
+    session = onnxruntime.InferenceSession(onnx_graph.serialize(traced, [drawn.shape[1]], [size]), options)
     return np.stack(found), session.run(None, {"obs": drawn})[0]
 
 
