@@ -3,10 +3,11 @@
     cuelearner export policies/arm --only-correction --format onnx --out exported/arm
     python examples/ros2_correction.py exported/arm
 
-It hears `observation` (std_msgs/Float32MultiArray, as the policy sees it) and `base_action` (the same type, what the
-base decided about it), and says `action` for each base action. Where the observation is older than a fifth of a second,
-or a number is not finite, it passes the base's action on as it is and says so once: a robot goes on without the
-correction, never without its base.
+It hears `observation` (std_msgs/Float32MultiArray, as the policy sees it), says `base_observation` (the same type, what
+to ask the base about), hears `base_action` (what the base decided about that), and says `action` for each base action.
+Where the base is to be asked twice, both observations stand one after the other, and so do its actions. Where the
+observation is older than a fifth of a second, or a number is not finite, it passes the base's last action on as it is
+and says so once: a robot goes on without the correction, never without its base.
 """
 
 # pyright: reportMissingImports=false
@@ -31,31 +32,37 @@ class Beside:
         contract = self.decide.contract
         if "base" not in contract:
             raise ValueError(f"{folder} holds a whole policy: export its correction alone, with --only-correction")
-        self.size = contract["observation"]["size"] - contract["base"]["size"]
-        self.entries = contract["base"]["size"]
+        self.calls = contract["base"].get("questions", 1)
+        self.entries = self.calls * contract["base"]["size"]
+        self.size = contract["observation"]["size"] - self.entries
         self.seen: Any = None  # (observation (size,), time)
         self.trouble = ""  # why the last action was the base's own; empty: it was corrected
 
     def hear(self, observation, now):
-        """An observation. Raises ValueError for one of another size."""
+        """What to ask the base about an observation. Raises ValueError for one of another size."""
         found = np.asarray(observation, np.float32)
         if found.shape != (self.size,):
             raise ValueError(f"an observation has {found.size} entries: the contract says {self.size}")
         self.seen = found, now
+        try:
+            return np.concatenate(self.decide.base_observations(found))
+        except ContractError:  # which `action` will meet too
+            return np.tile(found, self.calls)
 
     def action(self, base_action, now):
         """The corrected action; the base's own where there is nothing to correct it by, and `trouble` says why."""
         base = np.asarray(base_action, np.float32)
         if base.shape != (self.entries,):
             raise ValueError(f"a base action has {base.size} entries: the contract says {self.entries}")
+        actions = np.split(base, self.calls)
         if self.seen is None or now - self.seen[1] > STALE:
             self.trouble = "no fresh observation"
-            return base
+            return actions[-1]
         try:
-            found = self.decide(self.seen[0], base)
+            found = self.decide(self.seen[0], *actions)
         except ContractError as error:
             self.trouble = str(error)
-            return base
+            return actions[-1]
         self.trouble = ""
         return found
 
@@ -68,10 +75,13 @@ def main(folder):
 
     rclpy.init()
     node, beside = Node("cuelearner_correction"), Beside(folder)
-    said = node.create_publisher(Float32MultiArray, "action", 1)
+    said, asked = (node.create_publisher(Float32MultiArray, name, 1) for name in ("action", "base_observation"))
 
     def now():
         return node.get_clock().now().nanoseconds * 1e-9
+
+    def hear(message):
+        asked.publish(Float32MultiArray(data=beside.hear(message.data, now()).tolist()))
 
     def correct(message):
         before = beside.trouble
@@ -79,7 +89,7 @@ def main(folder):
         if beside.trouble and beside.trouble != before:
             node.get_logger().warning(f"the base acts alone: {beside.trouble}")
 
-    node.create_subscription(Float32MultiArray, "observation", lambda heard: beside.hear(heard.data, now()), 1)
+    node.create_subscription(Float32MultiArray, "observation", hear, 1)
     node.create_subscription(Float32MultiArray, "base_action", correct, 1)
     rclpy.spin(node)
 

@@ -44,7 +44,7 @@ def test_the_node_corrects_what_the_base_says_and_passes_it_on_in_doubt(made):
     base = logs_of_an_arm.arm(obs[None])[0]
     np.testing.assert_allclose(beside.action(base, 1.0), base, rtol=1e-6)
     assert beside.trouble == "no fresh observation"
-    beside.hear(obs, 1.0)
+    np.testing.assert_array_equal(beside.hear(obs, 1.0), np.concatenate(beside.decide.base_observations(obs)))
     found = beside.action(base, 1.1)
     assert beside.trouble == ""
     np.testing.assert_allclose(found, beside.decide(obs, base))
