@@ -19,6 +19,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import bound_scalars
 from cuelearner_jax.policies import Policy, best_actions, call_policy, policy_name
@@ -179,15 +180,16 @@ def fit(
     """Return the guide with a model of its labels. `times`: number of fits before this one."""
     key = jax.random.fold_in(lane_key, Stream.FIT)
     key = key if times is None else jax.random.fold_in(key, times)
-    labels = fitted_labels(key, guide.labels, scalars)
+    labels = fitted_labels(key, guide.labels, scalars, guidance.form)
     return guide.replace(model=guidance.fit(key, env, labels, guide.model, scalars))
 
 
-def fitted_labels(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> Label:
+def fitted_labels(key: PRNGKeyArray, labels: Label, scalars: GuideScalars, form: AnswerForm | None = None) -> Label:
     """Return the labels (slots, ...) to fit, or, where `scalars.answer` is shuffled, the control.
 
     In the control each valid label has the answer of another one. Situations, actions and answers keep their
-    frequencies, but no answer is about its action. `key`: of the fit.
+    frequencies, but no answer is about its action. Of a pair (`form`) the choices alone are exchanged. `key`: of the
+    fit.
     """
     if getattr(scalars, "answer", "best") != "shuffled":
         return labels
@@ -195,7 +197,8 @@ def fitted_labels(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> La
     order = jnp.argsort(jnp.where(labels.valid, order_keys, jnp.inf))  # valid labels first
     place, count = jnp.arange(len(order)), labels.valid.sum()
     after = jnp.where(place < count, (place + 1) % jnp.maximum(count, 1), place)
-    return labels.replace(answer=labels.answer.at[order].set(labels.answer[order[after]]))
+    answer = labels.answer if form is None else form.choice(labels.answer)
+    return labels.replace(answer=labels.answer.at[order, : answer.shape[-1]].set(answer[order[after]]))
 
 
 def ask(

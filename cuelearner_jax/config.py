@@ -268,13 +268,13 @@ class TeacherFaults:
     scalar_within_deg: Annotated[float, Bounds(0)] = 5.0
     """Scalar feedback calls an action good within this distance of the intended one [deg]."""
     mistake_probability: Annotated[float, SHARE] = 0.0
-    """Teacher's fault: with this probability a relative answer has the wrong sign, a demonstration is mirrored at the
-    action asked about, and a good action is called bad or a bad one good."""
+    """Teacher's fault: with this probability a relative answer or a preference has the wrong sign, a demonstration is
+    mirrored at the action asked about, and a good action is called bad or a bad one good."""
     silence_probability: Annotated[float, SHARE] = 0.0
     """Teacher's fault: no answer, of any form, with this probability (the question still counts as a label)."""
     indifference_deg: Annotated[float, Bounds(0)] = 0.0
     """Teacher's fault: errors up to this count as right (relative feedback implies at least eps / 2); the action asked
-    about is then demonstrated, and called good [deg]."""
+    about is then demonstrated, and called good. Errors of a pair that differ by less are no difference [deg]."""
     teacher_bias_deg: float = 0.0
     """Teacher's fault: constant error, counterclockwise, of the intended action, for every form of answers [deg]."""
 

@@ -40,7 +40,7 @@ EPS, BOUND = 0.08, 0.32  # of an answer, and of corrections: shares of the range
 LABELS = 60
 SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=1000, fit_batch_size=32, labels_per_round=10)
 TEACHERS = {"scalar": {"scalar_within_deg": 0.06}}  # a share of the range: how near an action is called good
-FEEDBACK = ("relative", "intent", "reading", "demonstration", "scalar", "dcoach", "bdcoach", "clic")
+FEEDBACK = ("relative", "intent", "reading", "demonstration", "scalar", "preference", "dcoach", "bdcoach", "clic")
 SHOWN = (*FEEDBACK, "clic_shown", "heuristic")
 
 
@@ -132,8 +132,8 @@ def answers(axes: Any, form: Any, labels: Any) -> None:
     """Draw each answer where its question lies."""
     keep = np.asarray(labels.valid, bool)
     where, action = labels.obs[keep, 0], labels.action[keep, 0]
-    said = np.asarray(labels.answer)[keep]
-    said = said[:, 0] if said.ndim > 1 else said
+    answer = np.asarray(labels.answer)[keep]
+    said = answer[:, 0]
     style: dict[str, Any] = {"linestyle": "", "markersize": 5.5, "alpha": 0.9, "zorder": 3}
     if form.name == "demonstration":
         axes.vlines(where, action, said, color=GREY, linewidth=0.8)
@@ -142,6 +142,11 @@ def answers(axes: Any, form: Any, labels: Any) -> None:
     if form.name == "scalar":
         axes.plot(where[said < 0.5], action[said < 0.5], marker="x", color=DOWN, **{**style, "markersize": 4})
         axes.plot(where[said > 0.5], action[said > 0.5], marker="o", color="#009E73", **style)
+        return
+    if form.name == "preference":
+        axes.vlines(where, action, answer[:, 1], color=GREY, linewidth=0.6)
+        better, clear = np.where(said < 0, action, answer[:, 1]), said != 0
+        axes.plot(where[clear], better[clear], marker="o", color="#009E73", **style)
         return
     for value, marker, colour in ((1, "^", UP), (-1, "v", DOWN), (0, "o", GREY)):
         axes.plot(where[said == value], action[said == value], marker=marker, color=colour, **style)

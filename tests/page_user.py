@@ -1,7 +1,11 @@
 """A page in a browser that is none; needs NiceGUI."""
 
 import asyncio
+import contextlib
+import re
 
+import numpy as np
+from nicegui import ui
 from nicegui.testing.user_simulation import user_simulation
 
 from cuelearner_jax.labelling.page import Page
@@ -31,3 +35,20 @@ async def press(user, name, moved):
         if moved():
             return
     raise AssertionError(f"{name} did nothing")
+
+
+@contextlib.contextmanager
+def told_browser(user):
+    """What the browser is told to run meanwhile."""
+    sent, run = [], ui.run_javascript
+    ui.run_javascript = lambda code, **how: sent.append(code)
+    try:
+        yield sent
+    finally:
+        ui.run_javascript = run
+
+
+def tip(svg, name):
+    """The tip of an arrow on the screen."""
+    corners = re.search(rf'class="arrow {name}">.*?points="([^"]*)"', svg)[1]
+    return np.array([float(part) for part in corners.split()[0].split(",")])

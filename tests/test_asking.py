@@ -12,6 +12,7 @@ import pytest
 
 from cuelearner_jax import asking
 from cuelearner_jax.adaptation import by_reading
+from cuelearner_jax.feedback.answers import PREFERENCE
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Heuristic, Uniform
@@ -139,5 +140,8 @@ def test_shuffled_answers_are_those_given_each_with_another_label():
     assert (found[valid] != answer[valid]).all()
     np.testing.assert_array_equal(by_reading._valid(LANE_KEY, labels, scalars)[2], found[valid])  # as readings get them
     np.testing.assert_array_equal(found[~valid], answer[~valid])
+    pairs = labels.replace(answer=jnp.concatenate([labels.answer, labels.answer + 0.5], -1))  # the second actions stay
+    exchanged = asking.fitted_labels(LANE_KEY, pairs, scalars, PREFERENCE).answer
+    np.testing.assert_array_equal(exchanged, np.concatenate([found, answer + 0.5], -1))
     other = asking.fitted_labels(jax.random.key(12), labels, scalars)
     assert (np.asarray(other.answer) != found).any()

@@ -44,7 +44,7 @@ ROWS = [
 ROW = {room: number for number, row in enumerate(ROWS) for room in row}
 FOR_TASKS = {"errors", "types", "spaces", "environment", "pictures", "devices"}  # what a task may know of the method
 # Of guidance; "heuristic" names a member and a policy too.
-KINDS = {"relative", "intent", "demonstration", "scalar", "dcoach", "bdcoach", "clic"}
+KINDS = {"relative", "intent", "demonstration", "scalar", "preference", "dcoach", "bdcoach", "clic"}
 
 
 @cache

@@ -124,7 +124,7 @@ def _facts(file: LabelFile) -> dict[str, str]:
     facts["labels"] = f"{len(file.seeds)}{several}"
     form = comparing.form_of(file)
     if form is not None and form.values is not None:
-        counts = Counter(np.asarray(file.labels.answer).ravel().tolist())
+        counts = Counter(form.choice(np.asarray(file.labels.answer)).ravel().tolist())
         names = {UNSAID: "not said"} if form.by_eps else {}
         values = form.values(file.space)
         facts["of each answer"] = ", ".join(f"{names.get(one, f'{one:g}')}: {counts.get(one, 0)}" for one in values)

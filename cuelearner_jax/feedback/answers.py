@@ -15,6 +15,8 @@ from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.spaces import UNSAID, Space
 from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
 
+SECOND = 2  # stream of a question's second action, beside the faults of the answer by the same key
+
 
 class AnswerForm(NamedTuple):
     """A form of answer. Label files hold its name; every guide with the same form can use them."""
@@ -30,6 +32,13 @@ class AnswerForm(NamedTuple):
     by_eps: bool = False  # True if an answer means a change by eps, which label files then record
     # (space, action, answer, eps) -> the action that the answer asks for; None: an answer names none
     correct: Callable[[Space, Array, Array, Array], Array] | None = None
+    # (key, space, action, scalars) -> the second action of a question about a pair; None: questions show one action.
+    # An answer is then (choice, *second action), and `answer` takes the second action of an earlier question too.
+    second: Callable[[PRNGKeyArray, Space, Array, Any], Array] | None = None
+
+    def choice(self, answer: Any) -> Any:
+        """Return what answers (..., answer) say, without the second action of a pair."""
+        return answer if self.second is None else answer[..., :1]
 
 
 def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
@@ -98,18 +107,15 @@ def relative_feedback(
     return jnp.where(jnp.abs(off) <= jnp.maximum(eps / 2, indifference), 0.0, jnp.sign(off))
 
 
-def relative_answer(
-    key: PRNGKeyArray,
-    env: Any,
-    teacher: Teacher,
-    state: EnvState,
-    obs: Float[Array, " obs"],
-    action: Float[Array, " action"],
-    scalars: Scalars,
-) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
-    """Return h of a teacher with the faults of `scalars`, and whether it answered."""
-    space = actions_of(env)
-    return human_answer(key, space, action, intended_action(space, teacher, state, obs, action, scalars), scalars)
+def _answer_by(respond: Callable[..., tuple[Array, Array]]) -> Callable[..., tuple[Array, Array]]:
+    """Return a form's `answer` from what a teacher says: (key, space, action, intended action, scalars, *second)."""
+
+    def answer(key: PRNGKeyArray, env: Any, teacher: Teacher, *question: Any) -> tuple[Array, Array]:
+        (state, obs, action, scalars, *second), space = question, actions_of(env)
+        best = intended_action(space, teacher, state, obs, action, scalars)
+        return respond(key, space, action, best, scalars, *second)
+
+    return answer
 
 
 def human_answer(
@@ -145,21 +151,14 @@ def _spoken_of(key: PRNGKeyArray, off: Float[Array, " cues"], says: str) -> Bool
 
 
 def demonstrate(
-    key: PRNGKeyArray,
-    env: Any,
-    teacher: Teacher,
-    state: EnvState,
-    obs: Float[Array, " obs"],
-    action: Float[Array, " action"],
-    scalars: Scalars,
+    key: PRNGKeyArray, space: Space, action: Float[Array, " action"], best: Float[Array, " action"], scalars: Scalars
 ) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
     """Return the action that a teacher with the faults of `scalars` shows, and whether it shows any.
 
     An indifferent teacher shows the given action where it is near enough. A mistaken teacher changes the action as far
     the other way: the mirror image of the intended action.
     """
-    space, (mistaken, answered) = actions_of(env), _slips(key, scalars)
-    best = intended_action(space, teacher, state, obs, action, scalars)
+    mistaken, answered = _slips(key, scalars)
     best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     right = space.distance(action, best) <= space.from_unit(scalars.indifference_deg)
     mirrored = space.exp(action, -space.log(action, best))
@@ -167,26 +166,61 @@ def demonstrate(
 
 
 def scalar_answer(
-    key: PRNGKeyArray,
-    env: Any,
-    teacher: Teacher,
-    state: EnvState,
-    obs: Float[Array, " obs"],
-    action: Float[Array, " action"],
-    scalars: Scalars,
+    key: PRNGKeyArray, space: Space, action: Float[Array, " action"], best: Float[Array, " action"], scalars: Scalars
 ) -> tuple[Float[Array, "1"], Bool[Array, ""]]:
     """Return 1 for a good action and 0 for another, by a teacher with the faults of `scalars`; and whether it answered.
 
     An action within `scalar_within_deg` of the intended action is good (paper, appendix).
     """
     mistaken, answered = _slips(key, scalars)
-    space = actions_of(env)
-    best = intended_action(space, teacher, state, obs, action, scalars)
     best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     within = jnp.maximum(space.from_unit(scalars.scalar_within_deg), space.from_unit(scalars.indifference_deg))
     good = space.distance(action, best) <= within
     label = jnp.where(jnp.isfinite(best).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
     return label[None], answered
+
+
+def draw_second(
+    key: PRNGKeyArray, space: Space, action: Float[Array, " action"], scalars: Any
+) -> Float[Array, " action"]:
+    """Return an action to compare with `action`: far or near, a change of `action` by a scale from eps to the reach.
+
+    The scale's logarithm is uniform, and each cue's change normal. So the first pairs already tell where good actions
+    lie, and later ones how near. Without cues the second action is any action.
+    """
+    if not space.cues:
+        return space.sample(jax.random.fold_in(key, SECOND))
+    k_scale, k_change = jax.random.split(jax.random.fold_in(key, SECOND))
+    eps, reach = space.from_unit(scalars.eps_deg), space.from_unit(space.reach)
+    scale = eps * (reach / eps) ** jax.random.uniform(k_scale)
+    return space.exp(action, scale * jax.random.normal(k_change, (len(space.cues),)))
+
+
+def preference(
+    key: PRNGKeyArray,
+    space: Space,
+    action: Float[Array, " action"],
+    best: Float[Array, " action"],
+    scalars: Scalars,
+    second: Float[Array, " action"] | None = None,
+) -> tuple[Float[Array, " answer"], Bool[Array, ""]]:
+    """Return (choice, *second action) of a teacher with the faults of `scalars`, and whether it answered.
+
+    The better action is the one nearer to the intended action: -1 `action`, 1 the second one. 0 says that there is no
+    difference: the two distances differ by eps / 2 at most, or by the indifference where that is larger. `second`: that
+    of an earlier question (default: a draw by `key`).
+
+    Source: the teachers of B-Pref (Lee, Smith, Dragan, Abbeel, 2021), which call segments equally preferable, are
+    mistaken, or skip a question. A pair here is two single actions in one situation, so no teacher is myopic.
+    """
+    mistaken, answered = _slips(key, scalars)
+    second = draw_second(key, space, action, scalars) if second is None else second
+    best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
+    gain = space.distance(action, best) - space.distance(second, best)
+    least = jnp.maximum(space.from_unit(scalars.eps_deg) / 2, space.from_unit(scalars.indifference_deg))
+    choice = jnp.where(jnp.abs(gain) <= least, 0.0, jnp.where(mistaken, -1.0, 1.0) * jnp.sign(gain))
+    choice = jnp.where(jnp.isfinite(best).all(), choice, jnp.nan)
+    return jnp.concatenate([choice[None], second]), answered
 
 
 def _slips(
@@ -212,7 +246,7 @@ RELATIVE = AnswerForm(
     name="relative",
     width=lambda space: len(space.cues),
     meaning=_way,
-    answer=relative_answer,
+    answer=_answer_by(human_answer),
     values=lambda space: (-1.0, 0.0, 1.0) if len(space.cues) == 1 else (-1.0, 0.0, 1.0, UNSAID),
     by_eps=True,
     correct=lambda space, action, answer, eps: space.toward(action, answer, eps),
@@ -221,7 +255,7 @@ DEMONSTRATION = AnswerForm(
     name="demonstration",
     width=lambda space: space.size,
     meaning=lambda space: f"what to do instead, an action ({space.name})",
-    answer=demonstrate,
+    answer=_answer_by(demonstrate),
     is_action=True,
     correct=lambda space, action, answer, eps: answer,
 )
@@ -229,6 +263,14 @@ SCALAR = AnswerForm(
     name="scalar",
     width=lambda space: 1,
     meaning=lambda space: "1 a good action, 0 another",
-    answer=scalar_answer,
+    answer=_answer_by(scalar_answer),
     values=lambda space: (0.0, 1.0),
+)
+PREFERENCE = AnswerForm(
+    name="preference",
+    width=lambda space: 1 + space.size,
+    meaning=lambda space: "-1 the action is better, 1 a second one, 0 no difference; then the second action",
+    answer=_answer_by(preference),
+    values=lambda space: (-1.0, 0.0, 1.0),
+    second=draw_second,
 )

@@ -36,15 +36,16 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, source: str = 
         if values.ndim != 2 or values.shape[1] != widths[name]:
             raise UserError(f"{source}: {name} have the shape {values.shape}: give (labels, {widths[name]})")
         _refuse(~np.isfinite(values), f"{source}: {name} hold numbers that are not finite", "leave these labels out")
-    for name in ("actions", "answers") if form is not None and form.is_action else ("actions",):
-        action = np.asarray(rows[name])
+    ends_in_action = form is not None and (form.is_action or form.second is not None)
+    for name in ("actions", "answers") if ends_in_action else ("actions",):
+        action = np.asarray(rows[name])[:, -spaces.actions.size :]
         off = np.abs(np.asarray(spaces.actions.retract(jnp.asarray(action))) - action) > ACTION_ERROR
         space = spaces.actions
         _refuse(off, f"{source}: {name} are no {space.about}", f"the space {space.name} gives the nearest by `retract`")
     if form is not None and form.values is not None:
         values = form.values(spaces.actions)
         names = ", ".join(f"{value:g}" for value in values)
-        wrong = ~np.isin(labels.answer, values)
+        wrong = ~np.isin(form.choice(labels.answer), values)
         _refuse(wrong, f"{source}: an answer is none of {names}", f"each means {form.meaning(spaces.actions)}")
 
 

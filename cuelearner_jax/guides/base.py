@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import jax
@@ -70,7 +70,7 @@ class Guide:
         if self.needs_cues and not self.spaces.actions.cues:
             raise UserError(
                 f"guidance {self.name!r} changes actions along cues, but the {self.spaces.actions.name} have no order: "
-                "give them one (`Choices(count, order)`), or guidance demonstration or scalar"
+                "give them one (`Choices(count, order)`), or guidance demonstration, scalar or preference"
             )
         if self.options is None and self.config is not None:
             object.__setattr__(self, "options", self.config())
@@ -106,7 +106,7 @@ class Guide:
         """Return an unfitted model."""
         return GuidanceModel(self.network.init(key), jnp.array(False))
 
-    def examples(self, labels: Label, scalars: GuideScalars) -> Example:
+    def examples(self, labels: Label, scalars: GuideScalars) -> Any:
         """Return labels (slots, ...) with their targets; a label that names no cue is not valid."""
         targets = jax.vmap(lambda label: self.target(label, scalars))(labels)
         # Rounded here: fused with later operations, the targets' last bits would depend on the compiler.
@@ -116,7 +116,7 @@ class Guide:
         cues = is_answered(labels.answer)
         return rows.replace(valid=labels.valid & cues.any(-1), cues=cues, space=self.spaces.actions)
 
-    def augmented(self, key: PRNGKeyArray, batch: Example) -> Example:
+    def augmented(self, key: PRNGKeyArray, batch: Any) -> Any:
         """Return the batch to train on in place of a batch (n, ...) of examples."""
         return batch
 
@@ -129,11 +129,13 @@ class Guide:
         answer in the mirror image is mostly not the mirror image of its answer.
         """
 
-        def losses(params: Params, rows: Example) -> Float[Array, " n"]:
-            return squared_errors(rows, self.predict(env, params, rows.obs, rows.action))
-
-        rows, init = self.examples(labels, scalars), self.network.init
+        rows, losses = self.examples(labels, scalars), partial(self.losses, env, scalars)
+        init = self.network.init
         return fit_model(key, rows, scalars, init=init, losses=losses, sizes=self.sizes, augment=self.augmented)
+
+    def losses(self, env: Any, scalars: GuideScalars, params: Params, rows: Any) -> Float[Array, " n"]:
+        """Return the loss of each row (n, ...) that `examples` gives."""
+        return squared_errors(rows, self.predict(env, params, rows.obs, rows.action))
 
     def question(
         self,

@@ -37,7 +37,6 @@ from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
-from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Box, is_answered, says_something
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -164,30 +163,20 @@ class Clic(Guide):
 
         return jax.vmap(one)(rows)
 
-    def contrasts(self, labels: Label) -> Contrast:
+    def examples(self, labels: Label, scalars: GuideScalars) -> Contrast:
         """Return labels (slots, ...) as contrasts; a label that names no cue is not valid."""
         numbers, base = jnp.arange(len(labels.valid)), labels.action if labels.base is None else labels.base
         return Contrast(
             labels.obs, labels.action, labels.answer, labels.valid & self.informative(labels), numbers, base
         )
 
+    def augmented(self, key: PRNGKeyArray, batch: Contrast) -> Contrast:
+        """Return the batch with new random streams for sampling."""
+        return batch.replace(draw=jax.random.randint(key, batch.draw.shape, 0, 2**30))
+
     def informative(self, labels: Label) -> Bool[Array, " slots"]:
         """Return which labels name any cue."""
         return says_something(labels.answer)
-
-    def fit(
-        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
-    ) -> GuidanceModel:
-        """Return the energy model of labels (slots, ...), fitted from scratch."""
-
-        def augment(key: PRNGKeyArray, batch: Contrast) -> Contrast:
-            return batch.replace(draw=jax.random.randint(key, batch.draw.shape, 0, 2**30))
-
-        def losses(params: Params, rows: Contrast) -> Array:
-            return self.losses(env, scalars, params, rows)
-
-        rows, sizes = self.contrasts(labels), self.sizes
-        return fit_model(key, rows, scalars, init=self.network.init, losses=losses, sizes=sizes, augment=augment)
 
     def minimise_energy(
         self, env: Any, params: Params, obs: Float[Array, " obs"], base: Float[Array, " action"], scalars: GuideScalars

@@ -20,13 +20,14 @@ from cuelearner_jax.guides.clic import Clic, ClicShown
 from cuelearner_jax.guides.dcoach import DeepCoach
 from cuelearner_jax.guides.demonstration import Demonstration
 from cuelearner_jax.guides.intent import Intent
+from cuelearner_jax.guides.preference import Preference
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.guides.scalar import Scalar
 
 ENTRY_POINTS = "cuelearner.guidances"
 BUILT_IN: tuple[type[Guide], ...] = (
     *(NoGuide, Relative, Intent, HeuristicGuide, AnyAim, Demonstration, Scalar),
-    *(DeepCoach, ReadingGuide, BatchCoach, Clic, ClicShown),
+    *(DeepCoach, ReadingGuide, BatchCoach, Clic, ClicShown, Preference),
 )
 
 

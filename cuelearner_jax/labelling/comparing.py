@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import config as configuration
@@ -63,9 +62,11 @@ def with_teacher(
         raise UserError("replaying gives other observations than the file: use the version of cuelearner that wrote it")
     scalars = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
     one = jax.jit(lambda env, teacher, *question: as_teacher(form, env, scalars, teacher, *question))
+    answers = np.asarray(file.labels.answer)
     guides = [(situations[item], items[item][1]) for item in file.people.item]
-    theirs = np.stack([one(env, teacher, guide.env, guide.obs, jnp.asarray(action)) for guide, action in guides])
-    return agreement(form, env, np.asarray(file.labels.answer), theirs)
+    about = zip(guides, answers, strict=True)
+    theirs = np.stack([one(env, teacher, guide.env, guide.obs, action, answer) for (guide, action), answer in about])
+    return agreement(form, env, answers, theirs)
 
 
 def between(one: LabelFile, other: LabelFile, env: Any) -> AnswerAgreement:
@@ -83,8 +84,10 @@ def between(one: LabelFile, other: LabelFile, env: Any) -> AnswerAgreement:
 
 
 def _questions(file: LabelFile) -> list[bytes]:
-    """Return each label's question, as the bytes of its observation and action."""
-    return [row.tobytes() for row in np.concatenate([file.labels.obs, file.labels.action], -1)]
+    """Return each label's question, as the bytes of its observation and action, and of the second action of a pair."""
+    form, labels = form_of(file), file.labels
+    second = np.asarray(labels.answer)[:, 1:] if form and form.second else np.zeros((len(labels.obs), 0))
+    return [row.tobytes() for row in np.concatenate([labels.obs, labels.action, second], -1, dtype=np.float32)]
 
 
 def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:

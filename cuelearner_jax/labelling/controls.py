@@ -51,6 +51,12 @@ FILM = Control("film", "film", ("f", "F", "v", "V"))
 CORRECTED = Control("film-refined", "film of the correction", ("x", "X"))
 HELP = Control("help", "help", ("h", "H", "?"))
 AS_IT_IS = Control("0", "already right", ("ArrowUp", "w", "W", " "), (0.0,), "asked")
+PAIR = (
+    Control("first", "A is better", ("a", "A", "ArrowLeft"), (-1.0,), "left"),
+    Control("same", "no difference", AS_IT_IS.keys, (0.0,)),
+    Control("second", "B is better", ("b", "B", "ArrowRight"), (1.0,), "right"),
+)
+FILMS = Control("film-left", "film of A", ("f", "F")), Control("film-right", "film of B", ("v", "V"))
 REST_UNSAID = Control("send", "send, nothing is said of the others", ("Enter",), (UNSAID,))
 REST_RIGHT = Control("rest", "send, the others are already right", (" ", "ArrowUp"), (0.0,))
 ALL_RIGHT = REST_RIGHT._replace(words="all already right", colour="asked")
@@ -101,6 +107,8 @@ def answers(form: AnswerForm, space: Space, one_cue: bool = False) -> tuple[Cont
         about_cues = (control for number in numbers for control in _of_cue(number, space, one_cue))
         whole = (ALL_RIGHT,) if one_cue else (REST_RIGHT, REST_UNSAID)
         return (*about_cues, *(control._replace(keys=_spare(space, control.keys)) for control in whole))
+    if form.second is not None:
+        return PAIR
     if form.values is None:
         return ()
     values = form.values(space)
@@ -121,7 +129,8 @@ def controls(
     """
     result = {control.name: control for control in answers(form, space, one_cue)}
     own_keys = {key for control in result.values() for key in control.keys}
-    for control in (UNSURE, UNDO, *[FILM] * films, *[CORRECTED] * (films and simulated), HELP):
+    of_actions = FILMS if form.second is not None else (FILM,)
+    for control in (UNSURE, UNDO, *of_actions * films, *[CORRECTED] * (films and simulated), HELP):
         result[control.name] = control._replace(keys=tuple(key for key in control.keys if key not in own_keys))
     return result
 
@@ -140,6 +149,8 @@ def check(form: AnswerForm, space: Space) -> None:
 def question(form: AnswerForm, space: Space) -> str:
     """Return the question that the page asks."""
     planar = space == DIRECTIONS
+    if form.second is not None:
+        return "Which is better, A or B?"
     if form.by_eps:
         return "Which way should the middle arrow turn?" if planar else "Which way should the action change?"
     if form.is_action:

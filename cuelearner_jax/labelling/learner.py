@@ -65,12 +65,17 @@ def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.nda
 
 
 def as_teacher(
-    form: AnswerForm, env: Environment, scalars: Scalars, teacher: Teacher, state: EnvState, obs: Array, action: Array
+    form: AnswerForm, env: Environment, scalars: Scalars, teacher: Teacher, state: EnvState, *label: Array
 ) -> Float[Array, " answer"]:
-    """Return the answer of a teacher without a simulated one's mistakes, silence, indifference and bias."""
+    """Return the answer of a teacher without a simulated one's mistakes, silence, indifference and bias.
+
+    `label`: the question's observation and action, and somebody's answer, which has the second action of a pair.
+    """
+    obs, action, answer = label
     none = {"mistake_probability": 0.0, "silence_probability": 0.0, "indifference_deg": 0.0, "teacher_bias_deg": 0.0}
     scalars = dataclasses.replace(scalars, answer="best", says="all", **none)
-    return form.answer(jax.random.key(0), env, teacher, state, obs, action, scalars)[0]
+    second = () if form.second is None else (answer[1:],)
+    return form.answer(jax.random.key(0), env, teacher, state, obs, action, scalars, *second)[0]
 
 
 @jax.jit
@@ -89,12 +94,12 @@ def refine_action(of: asking.Inquiry, model: Any, obs: Array, action: Array) -> 
 def answers(of: asking.Inquiry, model: Any, labels: Label) -> Array:
     """Return the answers that the model predicts (labels, width)."""
 
-    def one(obs: Array, action: Array) -> Array:
+    def one(obs: Array, action: Array, answer: Array) -> Array:
         best = refine_action(of, model, obs, action)
         teacher: Any = SimpleNamespace(best_action=lambda state, obs: best)
-        return as_teacher(of.guidance.form, of.env, of.scalars, teacher, None, obs, action)  # pyright: ignore[reportArgumentType]
+        return as_teacher(of.guidance.form, of.env, of.scalars, teacher, None, obs, action, answer)  # pyright: ignore[reportArgumentType]
 
-    return jax.vmap(one)(jnp.asarray(labels.obs), jnp.asarray(labels.action))
+    return jax.vmap(one)(*map(jnp.asarray, (labels.obs, labels.action, labels.answer)))
 
 
 class Fitted(NamedTuple):

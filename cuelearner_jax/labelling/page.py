@@ -107,13 +107,14 @@ class Page:
         with ui.element("div").classes("hide-small"):
             turns = [one for one in self.controls.values() if one.colour in ("left", "right") and one.cue is None]
             by_evidence = self.session.plan.guidance.by_evidence
-            swatches = {"asked": "the action in question", **{one.colour: one.words for one in turns}}
+            swatches = {} if self.form.second else {"asked": "the action in question"}
+            swatches |= {one.colour: one.words for one in turns}
             swatches["refined"] = "the corrected policy" if by_evidence else "the model's correction"
             for name, about in swatches.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
             ui.label(self.session.questions.pictures.legend).classes("text-caption")
         with ui.element("div").classes("tools"):
-            names = [name for name in ("undo", "film", "film-refined", "help") if name in self.controls]
+            names = [name for name in self.controls if name in ("undo", "help") or name.startswith("film")]
             self._tools = {name: self._button(self.controls[name], "flat dense") for name in names}
         self._path = ui.label().classes("text-caption")
         self._trouble = ui.label().classes("trouble")

@@ -19,7 +19,7 @@ from cuelearner_jax.types import Reel, Sketch
 
 
 class Item(NamedTuple):
-    """A question: a situation and an action in it."""
+    """A question: a situation and an action in it, or a pair of actions."""
 
     number: int  # from 0
     guide: GuideState  # the situation
@@ -28,6 +28,24 @@ class Item(NamedTuple):
     refined: np.ndarray | None = None  # the action refined by the newest model; None: no model yet
     # drawings of the `controls.outcomes`, as `Pictures.trails`; None: not drawn yet
     trails: dict[str, str] | None = None
+    second: np.ndarray | None = None  # the second action of a pair; None: not drawn yet, or no pair is asked about
+
+    @property
+    def pair(self) -> dict[str, np.ndarray]:
+        """The two actions as the page shows them, A "left" and B "right"; empty where no pair is asked about.
+
+        Questions with odd numbers show the second action as A, so that a habit of the person favours neither.
+        """
+        if self.second is None:
+            return {}
+        both = (self.second, self.action) if self.number % 2 else (self.action, self.second)
+        return dict(zip(("left", "right"), both, strict=True))
+
+    def in_form(self, answer: np.ndarray) -> np.ndarray:
+        """Return an answer of the page's controls in the form's encoding, (width,)."""
+        if self.second is None:
+            return answer
+        return np.concatenate([0.0 - answer if self.number % 2 else answer, self.second])
 
 
 class Questions:
@@ -54,6 +72,11 @@ class Questions:
 
     def draw(self, item: Item) -> Item:
         """Add what the page shows: the sketch, each answer's outcome, and the newest model's action."""
+        if self.plan.form.second is not None and item.second is None:
+            key, action = asking.question_keys(self.keys.session, item.number).answer, jnp.asarray(item.action)
+            item = item._replace(
+                second=np.asarray(self.plan.form.second(key, self.space, action, self.plan.config.scalars))
+            )
         if item.sketch is None:
             assert self.pictures.sketch is not None
             item = item._replace(sketch=self.pictures.sketch(self.env, item.guide.env))
@@ -78,8 +101,8 @@ class Questions:
         return item._replace(refined=refined, trails=trails)
 
     def outcomes(self, item: Item) -> dict[str, np.ndarray]:
-        """Return each answer's outcome for an item's action, see `controls.outcomes`."""
-        return controls.outcomes(self.plan.form, self.space, item.action, self.plan.config.scalars.eps_deg)
+        """Return each answer's outcome for an item's action, see `controls.outcomes`; of a pair its two actions."""
+        return item.pair or controls.outcomes(self.plan.form, self.space, item.action, self.plan.config.scalars.eps_deg)
 
     def film(self, item: Item, action: np.ndarray) -> Reel | None:
         """Film the outcome of an action in an item's situation; None where the task has no films."""

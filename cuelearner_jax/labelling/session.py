@@ -225,7 +225,8 @@ class Session:
     def answer(self, number: int, answer: np.ndarray | None, seconds: float | None = None) -> bool:
         """Save an answer and move on. Return False if another question is current: the answer came too late.
 
-        `number` is that of the item on the screen. `answer` has the form's encoding, (width,); None: "don't know".
+        `number` is that of the item on the screen. `answer` has the form's encoding, (width,), but of a pair it is the
+        choice alone: -1 for A, 1 for B, 0 for no difference. None: "don't know".
         `seconds` is the time since the question was shown (default: since it became the current question).
 
         Raises UserError if the answer could not be saved; it may be repeated.
@@ -236,7 +237,9 @@ class Session:
                     return False
                 took = time.monotonic() - self._since
                 took = took if seconds is None or not 0 <= seconds <= took else seconds
-                self.record.save(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
+                item = self._items[number]
+                answer = None if answer is None else item.in_form(answer)
+                self.record.save(item, UNSURE if answer is None else ANSWERED, answer, took)
             self._next.result()
             self._show(number + 1)
             if self._learner.is_due(self.record.count(ANSWERED)):

@@ -62,7 +62,7 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
     if planar:
         parts += _arrows(sketch, item, form, eps_deg)
     else:
-        parts += _cues(sketch, item, space, controls.answers(form, space, one_cue))
+        parts += _cues(sketch, item, space, controls.answers(form, space, one_cue) if form.by_eps else ())
     data = {
         "item": item.number,
         "foot": json.dumps(sketch.foot),
@@ -73,7 +73,8 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
     }
     attributes = " ".join(f'data-{name}="{html.escape(str(value))}"' for name, value in data.items())
     box = " ".join(f"{value:.4f}" for value in sketch.box)
-    about = "the arrow is the action in question" if planar else note(item, form, eps_deg, space)
+    about = "arrows A and B are the actions in question" if item.pair else "the arrow is the action in question"
+    about = about if planar else note(item, form, eps_deg, space)
     words = html.escape(f"{sketch.words}; {about}")
     return f'<svg class="scene" role="img" aria-label="{words}" viewBox="{box}" {attributes}>{"".join(parts)}</svg>'
 
@@ -81,7 +82,8 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
 def note(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS) -> str:
     """Return the note below the picture: the magnification or, where the action is no arrow, its words."""
     if space != DIRECTIONS:
-        words = f"the action: {space.words_of(item.action)}"
+        actions = zip("AB", item.pair.values(), strict=True) if item.pair else [("the action", item.action)]
+        words = ". ".join(f"{name}: {space.words_of(action)}" for name, action in actions)
         if item.refined is None:
             return words
         change = np.asarray(space.to_unit(space.log(item.action, item.refined)))
@@ -132,11 +134,14 @@ def _arrows(sketch: Sketch, item: Item, form: AnswerForm, eps_deg: float) -> lis
         for one in controls.answers(form, DIRECTIONS):
             if one.answer and one.answer[0]:
                 parts.append(arrow(sketch, angle + one.answer[0] * turn, one.colour, longer, one.first_key))
-    if sketch.aim and not item.trails:
+    for one in controls.PAIR if item.pair else ():
+        if one.colour:
+            parts.append(arrow(sketch, angle_of(item.pair[one.colour]), one.colour, TURNED_REACH[0], one.first_key))
+    if sketch.aim and not item.trails and not item.pair:
         hair, tip = sketch.box[2] * HAIR, sketch.reach[1]
         dashes = f' class="aim" stroke-dasharray="{4 * hair:.5f} {3 * hair:.5f}"'
         parts.append(_line(_point(sketch, angle, tip), _point(sketch, angle, tip + sketch.aim), 0.8 * hair, dashes))
-    parts.append(arrow(sketch, angle, "asked"))
+    parts += [] if item.pair else [arrow(sketch, angle, "asked")]
     if item.refined is not None:
         turn = (angle_of(item.refined) - angle + 180) % 360 - 180
         turn = math.copysign(min(times * abs(turn), max(WIDEST, abs(turn))), turn)
@@ -172,7 +177,7 @@ def _cues(sketch: Sketch, item: Item, space: Space, answers: Sequence[Control]) 
             angle = math.degrees(math.atan2(-sign * way[1], sign * way[0]))
             lane = lanes[round(angle)] = lanes.get(round(angle), -1) + 1  # several cues may point in one direction
             parts.append(_at_edge(sketch, angle, lane, control))
-    for name, action in (("asked", item.action), ("refined", item.refined)):
+    for name, action in ((item.pair or {"asked": item.action}) | {"refined": item.refined}).items():
         if action is not None and middle is not None and not item.trails:  # which show where actions lead
             shares = np.asarray(space.to_unit(space.log(middle, action))) / (space.reach / 2)
             parts.append(_from_foot(sketch, ways, shares, name))

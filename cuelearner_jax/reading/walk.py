@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.feedback.answers import relative_answer
+from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.reading.session import run_of
 from cuelearner_jax.types import EnvState, Teacher
 
@@ -73,7 +73,7 @@ def _step(env: Any, keys: Any, states: Any, actions: Any) -> Any:
 def _answers(env: Any, teacher: Any, scalars: Any, keys: Any, states: Any, obs: Any, actions: Any) -> Any:
     def one(row: Any) -> Any:
         key, state, own_obs, action = row
-        answer, answered = relative_answer(key, env, teacher, state, own_obs, action, scalars)
+        answer, answered = RELATIVE.answer(key, env, teacher, state, own_obs, action, scalars)
         return jnp.where(answered, answer, jnp.nan)
 
     return jax.lax.map(one, (keys, states, obs, actions), batch_size=min(len(obs), portions().states))

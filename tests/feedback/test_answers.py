@@ -13,14 +13,15 @@ from flax import struct
 
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR, check_teacher, human_answer
-from cuelearner_jax.spaces import UNSAID, directions
+from cuelearner_jax.feedback.answers import DEMONSTRATION, PREFERENCE, RELATIVE, SCALAR, check_teacher, human_answer
+from cuelearner_jax.spaces import DIRECTIONS, UNSAID, Choices, directions
 from cuelearner_jax.types import ValuesDirections
 
 FORMS = {"relative": RELATIVE, "demonstration": DEMONSTRATION, "scalar": SCALAR}
 ENV = probes.Window(half_width=math.radians(10.0), offset=math.radians(50.0))
 SCALARS = Scalars(eps_deg=10.0, nearest_aim_deg=0.0)
 X = jnp.array([1.0, 0.0])
+KEY = jax.random.key(3)
 
 
 @struct.dataclass
@@ -110,6 +111,48 @@ def test_faults_come_with_their_probabilities_and_independently_in_every_form():
         assert wrong.mean() == pytest.approx(0.3, abs=0.05)  # standard deviation 0.01
         assert answered.mean() == pytest.approx(0.8, abs=0.05)
         assert wrong[answered].mean() == pytest.approx(0.3, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("pair_deg", "faults", "choice"),
+    [
+        ((0, 80), {}, 1),  # 50 and 30 degrees from the best
+        ((80, 0), {}, -1),
+        ((46, 60), {}, -1),  # 4 and 10
+        ((46, 58), {}, 0),  # 4 and 8: they differ by less than eps / 2
+        ((20, 80), {}, 0),  # as far on either side
+        ((46, 60), {"indifference_deg": 7.0}, 0),
+        ((0, 80), {"mistake_probability": 1.0}, -1),
+        ((20, 80), {"mistake_probability": 1.0}, 0),
+        ((0, 80), {"teacher_bias_deg": -40.0}, -1),  # 10 is held for best
+        ((80, 100), {"answer": "nearest"}, 1),  # 95 is good, and nearer to 80 than 50 is
+    ],
+)
+def test_of_two_actions_the_nearer_one_is_preferred(pair_deg, faults, choice):
+    one, other = map(direction, pair_deg)
+    scalars = dataclasses.replace(SCALARS, **faults)
+    answer, answered = jax.jit(PREFERENCE.answer)(KEY, ENV, TwoWindows(), X, X, one, scalars, other)
+    np.testing.assert_allclose(answer, [choice, *other], atol=1e-6)
+    assert bool(answered)
+
+
+def test_a_pair_is_drawn_far_and_near_and_faults_come_with_their_probabilities():
+    scalars = dataclasses.replace(SCALARS, mistake_probability=0.3, silence_probability=0.2)
+    ask = lambda key: PREFERENCE.answer(key, ENV, TwoWindows(), X, X, X, scalars)  # noqa: E731
+    answers, answered = jax.jit(jax.vmap(ask))(jax.random.split(KEY, 2000))
+    second = np.asarray(answers)[:, 1:]
+    gain = 50 - np.degrees(DIRECTIONS.distance(second, direction(50)))
+    assert answered.mean() == pytest.approx(0.8, abs=0.05)
+    clear = np.abs(gain) > 5.1
+    away = np.degrees(DIRECTIONS.distance(X, second))
+    for rows in (clear & (away < 30), clear & (away > 30)):  # mistakes do not depend on the pair
+        assert (np.sign(gain) != answers[:, 0])[rows].mean() == pytest.approx(0.3, abs=0.07)  # standard deviation 0.02
+    np.testing.assert_array_equal(answers[:, 0][np.abs(gain) < 4.9], 0)
+    assert np.quantile(away, 0.25) < 20
+    assert np.quantile(away, 0.85) > 60
+    fruit = Choices(3)  # of choices without an order there is no near one
+    drawn = jax.vmap(lambda key: PREFERENCE.second(key, fruit, jnp.eye(3)[0], scalars))(jax.random.split(KEY, 300))
+    np.testing.assert_allclose(drawn.mean(0), 1 / 3, atol=0.12)  # standard deviation 0.027
 
 
 def test_who_knows_the_best_action_alone_cannot_tell_the_nearest_good_one():

@@ -1,7 +1,8 @@
-"""Demonstrations, scalar feedback and deep COACH on the bandit whose best direction is known."""
+"""Demonstrations, scalar feedback, preferences and deep COACH on the bandit whose best direction is known."""
 
 import dataclasses
 from functools import cache
+from types import SimpleNamespace
 
 import chex
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from scipy.stats import spearmanr
 
 from cuelearner_jax import asking
 from cuelearner_jax.guides import dcoach, registry, scalar
@@ -18,7 +20,7 @@ from cuelearner_jax.types import Label
 
 ENV = probes.Window()
 SIZES = probes.SIZES
-OPTIONS = {"scalar": scalar.ScalarConfig(guide_directions=36)}
+OPTIONS = dict.fromkeys(("scalar", "preference"), scalar.ScalarConfig(guide_directions=36))
 SCALARS = dataclasses.replace(probes.SCALARS, scalar_within_deg=20.0)
 OBS = directions.evenly_spaced(4)
 BEST = jax.jit(jax.vmap(ENV.best))(OBS)
@@ -84,6 +86,34 @@ def test_a_share_of_the_scalar_questions_explores():
         found = ask(keys)
         about_own = (np.abs(np.asarray(found) - np.asarray(own)).max(-1) < 1e-5).mean()
         assert about_own == pytest.approx((1 - explored) * refined, abs=0.08)  # standard deviation 0.025
+
+
+def test_the_loss_of_a_preference_is_the_likelihood_of_bradley_and_terry(monkeypatch):
+    """u is the first entry: u(b) - u(a) = 2, so P(b over a) = 1 / (1 + e^-2) = 0.8808; no difference: half of each."""
+    bundle, _, _ = compiled("preference")
+    utility = SimpleNamespace(predict=lambda env, params, obs, actions: params * actions[:, :1])
+    monkeypatch.setitem(vars(bundle), "network", utility)
+    a, b = jnp.tile(jnp.array([-1.0, 0.0]), (3, 1)), jnp.tile(jnp.array([1.0, 0.0]), (3, 1))
+    choices = jnp.array([[1.0], [-1.0], [0.0]])
+    rows = bundle.examples(labels(jnp.concatenate([choices, b], -1), OBS[:3], a), SCALARS)
+    found = bundle.losses(ENV, SCALARS, jnp.array(1.0), rows)
+    np.testing.assert_allclose(found, [0.126928, 2.126928, 1.126928], rtol=1e-5)  # log(1 + e^-2), and 2 and 1 more
+    slopes = jax.jacobian(lambda params: bundle.losses(ENV, SCALARS, params, rows))(jnp.array(1.0))
+    np.testing.assert_allclose(slopes, [-0.238406, 1.761594, 0.761594], rtol=1e-5)  # (P - p) (u(b) - u(a))
+
+
+def test_preferences_are_fitted_to_the_order_of_a_utility():
+    """Utility: the cosine of the angle to the best direction; of actions that no label is about too."""
+    bundle, fit, _ = compiled("preference")
+    (obs, one), other = drawn(300), directions.uniform(jax.random.key(8), (300,))
+    utility = lambda obs, actions: (jax.vmap(ENV.best)(obs) * actions).sum(-1)  # noqa: E731
+    choices = jnp.sign(utility(obs, other) - utility(obs, one))[:, None]
+    model = fit(KEY, ENV, labels(jnp.concatenate([choices, other], -1), obs, one), bundle.init(KEY), SCALARS)
+    around = directions.evenly_spaced(36)
+    for context in OBS:
+        fits = bundle.network.predict(ENV, model.params, context, around)[:, 0]
+        assert spearmanr(utility(jnp.tile(context, (36, 1)), around), fits).statistic > 0.95
+    assert errors("preference", model).max() < 20
 
 
 def corrections(count):

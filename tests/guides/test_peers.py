@@ -109,7 +109,8 @@ def test_what_was_shown_has_a_ball_whose_radius_is_a_share_of_the_way_there():
 
 def contrast(kind, action, answer):
     """One label as CLIC learns from it."""
-    return jax.tree.map(lambda leaf: leaf[0], jax.jit(made(kind).contrasts)(labels(action[None], answer[None])))
+    rows = jax.jit(made(kind).examples)(labels(action[None], answer[None]), SCALARS)
+    return jax.tree.map(lambda leaf: leaf[0], rows)
 
 
 def labels(action, answer, obs=None, base=None):
@@ -123,7 +124,7 @@ def test_the_loss_has_the_gradient_of_the_papers_divergence():
     """-log sum pi p has the gradient of KL(target || pi), target ~ pi p held fixed."""
     guide = made("clic")
     params = guide.network.init(KEY)
-    rows = guide.contrasts(labels(MIDDLE[None], jnp.array([[1.0, 0.0, UNSAID]])))
+    rows = guide.examples(labels(MIDDLE[None], jnp.array([[1.0, 0.0, UNSAID]])), SCALARS)
     k_pairs, k_sample = jax.random.split(jax.random.fold_in(jax.random.key(0), 0))
     row = jax.tree.map(lambda leaf: leaf[0], rows)
     actions = guide.sample_actions(k_sample, row, SCALARS)

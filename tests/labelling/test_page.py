@@ -1,6 +1,5 @@
 """The page without a browser: what it shows and what its buttons do, for each form of feedback."""
 
-import contextlib
 import html
 import json
 import math
@@ -14,8 +13,7 @@ from sessions import expert
 
 pytest.importorskip("nicegui")
 from fastapi import FastAPI
-from nicegui import ui
-from page_user import press, shown
+from page_user import press, shown, tip, told_browser
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR, AnswerForm
@@ -25,17 +23,6 @@ from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.storage import label_files
 
 pytestmark = pytest.mark.usefixtures("garbage_of_its_own")
-
-
-@contextlib.contextmanager
-def told_browser(user):
-    """What the browser is told to run meanwhile."""
-    sent, run = [], ui.run_javascript
-    ui.run_javascript = lambda code, **how: sent.append(code)
-    try:
-        yield sent
-    finally:
-        ui.run_javascript = run
 
 
 def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, tmp_path):
@@ -147,12 +134,6 @@ WAYS = ("left", "right")
 def turned_by(action, by_deg):
     """A direction turned counterclockwise."""
     return np.asarray(directions.rotate(action, math.radians(by_deg)))
-
-
-def tip(svg, name):
-    """The tip of an arrow on the screen."""
-    corners = re.search(rf'class="arrow {name}">.*?points="([^"]*)"', svg)[1]
-    return np.array([float(part) for part in corners.split()[0].split(",")])
 
 
 def test_arrows_point_where_actions_do(opened):
