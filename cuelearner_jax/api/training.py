@@ -121,6 +121,6 @@ def read_run(folder: str | os.PathLike[str]) -> pa.Table:
 
     `run.to_pandas()` is a data frame, where pandas is installed. Each column's field holds its meaning, as
     `run.field("reward").metadata[b"description"]`. `folder`: of a run, finished or not, of a sweep in pieces, or of
-    several runs of one task; else UserError.
+    several runs; else UserError.
     """
     return stored.read(folder)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain, pairwise, product
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -44,6 +45,7 @@ class TrainingOptions(Outside, RunParts, Order):
     grid: Settled = None
     split: Settled = "validation"
     shard: Settled = None
+    setting: Settled = ()
     config: Annotated[RunConfig[Kinds], unprefixed] = field(default_factory=lambda: RunConfig(Unnamed()))
     out: Path = Path("runs/NAME")
     """Folder for results and checkpoints."""
@@ -61,11 +63,6 @@ class TrainingOptions(Outside, RunParts, Order):
     """Tracker that also gets the curves, as means over seeds: tensorboard or wandb (offline), below the run's
     folder."""
 
-    def train(self, grid: Grid, shard: Shard | None = None) -> None:
-        """Train these lanes and print where they lie. Raises what `studies.train.run` raises."""
-        train.run(replace(self, grid=grid, shard=shard, split="tuning" if self.tuning else "validation"))
-        out.print(f"done: {self.out} (show it by: cuelearner report {self.out} --out {self.out}/report)")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Train(TrainingOptions):
@@ -82,16 +79,27 @@ class Train(TrainingOptions):
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
     usual = lambda grid: {"guidance": asking_kind(grid.guidance), "labels": grid.labels[0]}  # noqa: E731
-    options, _ = parse_training(arguments, "train", Train, usual)
-    options.train(Grid((options.guidance,), (options.seed,), (options.labels,)))
+    (options, *others), _ = parse_training(arguments, "train", Train, usual)
+    if others:
+        names = ", --".join(name for name, _ in options.setting)
+        raise UserError(f"--{names}: train takes one value; give one, or several to cuelearner sweep")
+    train_each([options], Grid((options.guidance,), (options.seed,), (options.labels,)))
+
+
+def train_each(options: Sequence[TrainingOptions], grid: Grid, shard: Shard | None = None) -> None:
+    """Train these lanes under each of the options and print where they lie. Raises what `studies.train.run` raises."""
+    split, place = "tuning" if options[0].tuning else "validation", options[0].out
+    train.run_each([replace(one, grid=grid, shard=shard, split=split) for one in options])
+    out.print(f"done: {place} (show it by: cuelearner report {place} --out {place}/report)")
 
 
 def parse_training(
     arguments: list[str], command: str, kind: type[TrainingT], usual: Callable[[Grid], dict[str, Any]]
-) -> tuple[TrainingT, Grid]:
+) -> tuple[list[TrainingT], Grid]:
     """Return the options of a training command, for the chosen robot, and the grid of its preset.
 
-    `usual`: from that grid, the default options that are not common to all training commands.
+    A number with several values gives options for each combination of such values, its `setting`. `usual`: from that
+    grid, the default options that are not common to all training commands.
     """
     ahead = look_ahead_of(arguments, command, kind)
     task = task_of(ahead)
@@ -105,10 +113,34 @@ def parse_training(
     guides = [guidances.resolve(word) for word in ahead.guidance or grid.guidance]
     kinds = {one.name: config.kinds.get(one.name) or one.config() for one in guides if one.config}
     default = kind(config=replace(config, kinds=kinds), out=Path("runs") / f"{task.name}-{name}", **usual(grid))
-    options = parse(kind, arguments, command, default, about(kind, task, preset=QUICKSTART))
-    if options.robot is not None and ":" in options.robot:
-        raise UserError(f"--robot is {options.robot}, but training takes no folder of a robot: give its name alone")
-    return replace(options, task=task.on(options.robot)), grid
+    names, lines = _each_line(arguments, default.config)
+    each = [parse(kind, line, command, default, about(kind, task, preset=QUICKSTART)) for line in lines]
+    settings = [tuple((name, float(_number(options.config, name))) for name in names) for options in each]
+    if len({*settings}) < len(settings):
+        raise UserError(f"--{', --'.join(names)}: give each value once")
+    if (robot := each[0].robot) is not None and ":" in robot:
+        raise UserError(f"--robot is {robot}, but training takes no folder of a robot: give its name alone")
+    pairs = zip(each, settings, strict=True)
+    return [replace(options, task=task.on(robot), setting=setting) for options, setting in pairs], grid
+
+
+def _each_line(arguments: list[str], config: RunConfig) -> tuple[list[str], list[list[str]]]:
+    """Return the numbers of a configuration that have several values, and a command line for each combination."""
+    names, choices = [], []
+    starts = [place for place, word in enumerate(arguments) if word.startswith("--")]
+    for words in (arguments[start:end] for start, end in pairwise([0, *starts, len(arguments)])):
+        name = words[0].removeprefix("--").replace("-", "_") if len(words) > 2 else ""
+        several = _number(config, name) is not None
+        names += [name] if several else []
+        choices.append([[words[0], value] for value in words[1:]] if several else [words])
+    return names, [[*chain(*line)] for line in product(*choices)]
+
+
+def _number(config: RunConfig, name: str) -> Any:
+    """Return the value of an option, as `part.field`; None unless it is a number."""
+    part, _, field = name.partition(".")
+    value = getattr(config.kinds.get(part, getattr(config, part, None)), field, None)
+    return value if type(value) in (int, float) else None
 
 
 def asking_kind(kinds: tuple[str, ...]) -> str:

@@ -106,7 +106,7 @@ def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from:
 
 def config_hash(contents: dict[str, Any]) -> str:
     """Return a short hash of what a lane's result depends on: a description without format and other lanes."""
-    apart = ("format", "grid", "shard")
+    apart = ("format", "grid", "shard", "setting")
     learned_from = {name: value for name, value in contents.items() if name not in apart}
     task = {name: value for name, value in contents["task"].items() if name != "from"}
     return configuration.digest({**learned_from, "task": task})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -20,6 +21,7 @@ from cuelearner_jax.runs.grid import Grid, check_grid, describe, with_control
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import label_files, tracking
 from cuelearner_jax.storage.folders import CONFIG, check_folder
+from cuelearner_jax.storage.results import setting_name
 from cuelearner_jax.task import Task, shape_of
 
 RequestT = TypeVar("RequestT", bound="TrainRequest")
@@ -45,6 +47,7 @@ class Order(TrainRequest):
     overwrite: bool = False
     shard: Shard | None = None  # train only this share of the seeds, in a folder of its own below `out`
     track: str | None = None  # tracker to write to, see `storage.tracking`
+    setting: tuple[tuple[str, float], ...] = ()  # in a grid of settings: the options that differ, as part.field
 
 
 class Plan(NamedTuple):
@@ -75,6 +78,22 @@ def labels_of(request: TrainRequest) -> label_files.LabelFile | None:
     return read_labels(request.labels_from, request.task, config.task, config.sizes, config.scalars, request.grid)
 
 
+def in_folders(orders: Sequence[Order]) -> list[Order]:
+    """Return the orders of a grid of settings, each in a folder of its own below `out`; a single order stays there.
+
+    Where some have begun, `resume` resumes these and begins the others.
+    """
+    if not all(order.setting for order in orders):
+        return list(orders)
+    if (out := orders[0].out / CONFIG).exists():
+        raise UserError(f"{out.parent} holds a run of one setting: give another --out")
+    folders = [order.out / setting_name(dict(order.setting)) for order in orders]
+    begun = [(folder / CONFIG).is_file() for folder in folders]
+    resumes = begun if any(begun) else [order.shard is None for order in orders]
+    each = zip(orders, folders, resumes, strict=True)
+    return [replace(order, out=folder, resume=order.resume and resume) for order, folder, resume in each]
+
+
 def make_plan(order: Order) -> Plan:
     """Check what `run` would refuse, except for memory; return the plan. Raises UserError."""
     tracking.check(order.track)
@@ -89,6 +108,7 @@ def make_plan(order: Order) -> Plan:
         order.config.guide_in(env, kind)
     labels = labels_of(order)
     contents = describe(order.task, order.config, order.grid, order.split, order.labels_from)
+    contents |= {"setting": dict(order.setting)} if order.setting else {}
     if shard:
         contents["shard"] = {**shard._asdict(), "seeds": list(sweep.grid.seeds)}
         shard.check_sweep(sweep.out, contents)

@@ -16,7 +16,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, load, run_key
 from cuelearner_jax.runs.training import restore_clock
-from cuelearner_jax.storage import formats
+from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.checkpoint import Checkpoints
 from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.task import Task, shape_of
@@ -57,6 +57,8 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
     folders = [folder]
     if not (folder / CONFIG).exists():
         folders = sorted(file.parent for file in folder.glob(f"shard-*-of-*/{CONFIG}")) or folders
+        if settings := sorted(folder.glob(results.SETTINGS)):
+            raise UserError(f"{folder} holds {len(settings)} runs of a grid of settings: give one, as {settings[0]}")
     task, config, grid = load(folders[0], find)
     first, of_seed, pieces = formats.read("config", folders[0] / CONFIG), {}, []
     for one in folders:

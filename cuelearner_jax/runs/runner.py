@@ -58,6 +58,7 @@ class Runner:
             about, order = {"run": self.key}, self.order
             constants = {"run": order.out.name, "task": order.task.name, "guidance": self.name, "split": order.split}
             constants |= {"config_hash": config_hash(self.contents), **provenance.provenance()}
+            constants |= self.contents.get("setting", {})
             with (
                 TableWriter(self.folder, results.SCHEMA, constants, about) as writer,
                 TableWriter(self.folder, results.GUIDES, constants, about) if asks else nullcontext() as guides,

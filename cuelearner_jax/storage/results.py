@@ -12,7 +12,7 @@ A run appends the rows of a step, or of a round, before it saves that checkpoint
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -41,6 +41,7 @@ MEANINGS = {  # of columns, by name or pattern; the first that fits
     "folder": "folder of the row's table; only in tables that were read",
     "asked": "labels asked for so far, answered or not: at most the budget",
     "round": "label rounds of the lanes trained with this lane so far",
+    "*.*": "value of an option that varies in a sweep, as `scalars.eps_deg`",
     "*_each": "means of a metric over up to 20 equal groups of the evaluation's episodes",
     "guide_*": "a metric of the guide alone, without the agent; null where the guide was not measured",
     "train_*": "mean over training since the last evaluation: of the loss, of the reward, ...",
@@ -66,6 +67,7 @@ GUIDES = tables.Schema(
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
 FAILED = "failed"  # column that marks the rows of failed lanes
 LANE = ("guidance", "labels", "seed")  # columns that identify a lane of a run
+SETTINGS = "*.*=*"  # pattern of folders of a sweep's settings, see `setting_name`
 
 
 def check_complete(folder: Path, step: int, count: int, run: str) -> None:
@@ -89,7 +91,7 @@ def check_complete(folder: Path, step: int, count: int, run: str) -> None:
 
 
 def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> pa.Table:
-    """Read the results of any number of runs of one task, finished or not, into one table.
+    """Read the results of any number of runs, finished or not, into one table.
 
     `paths`: results files, run folders, or folders at any height above them; a file that is given twice counts once.
     The table has the columns of `MEANINGS`. A column that a run lacks is null for that run.
@@ -109,8 +111,6 @@ def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
     table = pa.concat_tables(parts.values(), promote_options="permissive")
     if table.num_rows == 0:
         raise UserError(f"no rows yet in {', '.join(map(str, parts))}: wait for the first evaluation")
-    if len(tasks := sorted(set(table["task"].to_pylist()))) > 1:
-        raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: give folders of one of them")
     return table
 
 
@@ -123,8 +123,18 @@ def read_guides(paths: Sequence[PathLike]) -> pa.Table | None:
 
 def metrics(table: pa.Table) -> list[str]:
     """Return the names of a results table's metric columns."""
-    others = (*SCHEMA.strings, *SCHEMA.integers, "wall_s", FAILED)
+    others = (*SCHEMA.strings, *SCHEMA.integers, "wall_s", FAILED, *settings(table))
     return [name for name in table.column_names if name not in others and not SCHEMA.is_list(name)]
+
+
+def settings(table: pa.Table) -> list[str]:
+    """Return the columns of options that vary in a sweep."""
+    return sorted(name for name in table.column_names if "." in name)
+
+
+def setting_name(setting: Mapping[str, float]) -> str:
+    """Return the name of options' values, also of their folder: "scalars.eps_deg=2"."""
+    return ",".join(f"{name}={str(value).removesuffix('.0')}" for name, value in setting.items())
 
 
 def failures(table: pa.Table) -> dict[tuple[str, int, int], int]:

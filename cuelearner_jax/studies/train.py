@@ -9,7 +9,7 @@ Kinds are trained in turn; the lanes of a kind (seeds x label budgets) are train
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.runs.order import Order, TrainRequest, labels_of, make_plan, resolve_request
+from cuelearner_jax.runs.order import Order, TrainRequest, in_folders, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.storage import formats, results
@@ -87,6 +87,23 @@ def run(order: Order) -> None:
                 Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels, ahead)
     if words := failures.summary(results.read([order.out / group.guidance.name for group in groups])):
         raise NotFinite(f"{words}: their rows in {order.out} are marked and left out of reports; all else is finished")
+
+
+def run_each(orders: Sequence[Order]) -> None:
+    """Run the orders of a grid of settings in turn, see `in_folders`; another float compiles nothing anew.
+
+    Raises as `run`: UserError before anything is changed, and NotFinite after the last order.
+    """
+    orders, lost = in_folders(orders), []
+    for order in orders:
+        make_plan(order)
+    for order in orders:
+        try:
+            run(order)
+        except NotFinite as error:
+            lost.append(str(error))
+    if lost:
+        raise NotFinite("; ".join(lost))
 
 
 def in_memory(
