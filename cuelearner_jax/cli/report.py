@@ -44,4 +44,6 @@ def run(arguments: list[str]) -> None:
     tables = {"metric": options.metric, "split": options.split, "rows": contents.rows, "missing": contents.missing}
     if contents.efficiency:
         tables |= {"level": contents.efficiency.level, **contents.efficiency.tables}
+    if contents.over:
+        tables |= {"ends": contents.over.ends, **contents.over.tables}
     print(json.dumps(plain(tables), indent=1))

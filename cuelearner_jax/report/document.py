@@ -14,14 +14,14 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.report import extent, tables
+from cuelearner_jax.report import aggregates, extent, tables
 from cuelearner_jax.report.efficiency import Efficiency, Question, efficiency_of, section
 from cuelearner_jax.report.tables import code, markdown
 from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
 
-FILES = [f"{name}.{suffix}" for name in ("curves", "label_efficiency") for suffix in ("png", "svg")]
-FILES += [f"{name}.csv" for name in ("summary", "curves", "efficiency", "equal_area")]
+FILES = [f"{name}.{suffix}" for name in ("curves", "label_efficiency", "profiles") for suffix in ("png", "svg")]
+FILES += [f"{name}.csv" for name in ("summary", "curves", "efficiency", "equal_area", "aggregates", "profiles")]
 ORIGINS = {"command": "runs made by", "config_hash": "configuration", "commit": "commit"}
 ORIGINS |= {"versions": "versions", "hardware": "hardware"}
 NOTE = (
@@ -71,6 +71,7 @@ class Contents(NamedTuple):
     missing: list[str]  # a line for each thing that was planned and has no results, or that the figures leave out
     efficiency: Efficiency | None
     every: pa.Table  # all recorded rows of the split
+    over: aggregates.Aggregates | None  # several tasks
 
 
 def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Contents:
@@ -78,10 +79,17 @@ def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Co
     metric, split, lower_is_better = request.metric, request.split, request.lower_is_better
     groups = read_groups(folders, metric, split, request.by_run, guidance=request.guidance, labels=request.labels)
     variants = variants_of(groups, metric)
-    answer = efficiency_of(variants, request, lower_is_better) if request.asks else None
+    over = answer = None
+    if len({variant.task for variant in variants}) > 1:
+        if request.efficiency or (request.level_at, request.reference) != (None, None):
+            raise UserError("label efficiency is of one task: report each task by itself, or give --level alone")
+        over = None if request.by_run else aggregates.aggregates_of(variants, request.level, lower_is_better)
+    elif request.asks:
+        answer = efficiency_of(variants, request, lower_is_better)
     every = pa.concat_tables([group.every for group in groups], promote_options="permissive")  # of other metrics
     missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
-    return Contents(groups, variants, tables.summary(variants, lower_is_better), missing, answer, every)
+    missing += over.missing if over else []
+    return Contents(groups, variants, tables.summary(variants, lower_is_better), missing, answer, every, over)
 
 
 def report(
@@ -91,21 +99,26 @@ def report(
 
     `command` is the command line to record in the report.
     """
-    from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, save_figure  # loads Matplotlib
+    from cuelearner_jax.report import figures as drawing  # loads Matplotlib
 
     if in_use(out) and not overwrite:
         raise UserError(f"{out} exists already: give another --out, or --overwrite to replace it")
     contents, metric = contents_of(folders, request), request.metric
-    variants, efficiency = contents.variants, contents.efficiency
+    variants, efficiency, over = contents.variants, contents.efficiency, contents.over
     seeds = _range("seed", [len(variant.seeds) for variant in variants])
     if episodes := [variant.episodes for variant in variants if variant.episodes]:
         seeds += f" x {_range('episode', episodes)}"
-    title = f"{contents.groups[0].table['task'][0].as_py()}: {request.split} {metric.replace('_', ' ')}, {seeds}"
-    figures = {"curves": draw_curves(variants, title, metric)}
-    if len({variant.labels for variant in variants if variant.labels}) > 1:
-        figures["label_efficiency"] = draw_label_efficiency(variants, title, metric)
+    tasks = ", ".join(dict.fromkeys(group.task for group in contents.groups))
+    title = f"{tasks}: {request.split} {metric.replace('_', ' ')}, {seeds}"
+    figures = {"curves": drawing.draw_curves(variants, title, metric)}
+    alone = len({(variant.task, variant.run) for variant in variants}) == 1
+    if alone and len({variant.labels for variant in variants if variant.labels}) > 1:
+        figures["label_efficiency"] = drawing.draw_label_efficiency(variants, title, metric)
+    if over:
+        figures["profiles"] = drawing.draw_profiles(over)
     lines = [f"# {markdown(title)}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
     lines += [*tables.summary_lines(contents.rows), "", NOTE, *(section(efficiency) if efficiency else [])]
+    lines += aggregates.section(over, request.level) if over else []
     missing = contents.missing or ["nothing: all runs are complete"]
     lines += ["", "## Missing", "", *(f"- {markdown(line)}" for line in missing)]
     lines += ["", "## Where the numbers come from", "", *_origins(contents.every, command), ""]
@@ -113,9 +126,10 @@ def report(
     for name in FILES:  # also those of an earlier report
         (out / name).unlink(missing_ok=True)
     for name, figure in figures.items():
-        save_figure(figure, out / name)
+        drawing.save_figure(figure, out / name)
     own = {"summary": contents.rows, "curves": tables.curve_rows(variants)}
-    for name, each in (own | (efficiency.tables if efficiency else {})).items():
+    own |= (efficiency.tables if efficiency else {}) | (over.tables if over else {})
+    for name, each in own.items():
         tables.write_csv(out / f"{name}.csv", each)
     (out / "report.md").write_text("\n".join(lines), encoding="utf-8")
     return out / "report.md"

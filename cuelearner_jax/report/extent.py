@@ -75,20 +75,22 @@ def gaps(groups: Sequence[Group], variants: Sequence[Variant], metric: str, spli
     """Return one line for everything in the results that the figures do not show."""
     lines: list[str] = []
     for group in groups:
-        own = [variant for variant in variants if variant.run == group.name]
+        own = [one for one in variants if one.run == group.name and one.task in ("", group.task)]
+        where = "".join(f"{word}: " for word in (group.task if variants[0].task else "", group.name) if word)
         counts = {(variant.guidance, variant.labels): len(variant.seeds) for variant in own}
         for key, seeds in failures.describe_failed(group.failed).items():
             rest = f"curve and means are over the other {counts[key]}" if key in counts else "no lane is left"
-            lines.append(f"{failures.variant_name(*key)}: {seeds} failed, no longer finite: {rest}")
+            lines.append(f"{where}{failures.variant_name(*key)}: {seeds} failed, no longer finite: {rest}")
         lines += _short(group.every, own)
         if group.invalid:
-            lines.append(f"{group.invalid:,} {split} rows have no finite {metric}; their steps are left out")
-    ends = {int(variant.steps[-1]) for variant in variants}
-    if len(ends) > 1:
-        lines.append(
-            "curves end at different steps, so their final values cannot be compared; "
-            f"means over the curve are taken to step {min(ends):,}, shared by all"
-        )
+            lines.append(f"{where}{group.invalid:,} {split} rows have no finite {metric}; their steps are left out")
+    for task in dict.fromkeys(variant.task for variant in variants):
+        ends = {int(variant.steps[-1]) for variant in variants if variant.task == task}
+        if len(ends) > 1:
+            lines.append(
+                f"{task and f'{task}: '}curves end at different steps, so their final values cannot be compared; "
+                f"means over the curve are taken to step {min(ends):,}, shared by all"
+            )
     return lines
 
 

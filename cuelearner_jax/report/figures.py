@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 
 from cuelearner_jax.errors import one_line
 from cuelearner_jax.guides import registry
+from cuelearner_jax.report.aggregates import Aggregates
+from cuelearner_jax.report.statistics import Curve
 from cuelearner_jax.report.tables import unguided_of
 from cuelearner_jax.report.variants import Variant, guidance_name
 
@@ -39,18 +41,20 @@ STYLE: dict[Any, Any] = {
 def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
     """Draw learning curves: interquartile means over interval bands, named in the order of their ends.
 
-    More than four variants have a panel for each kind of guidance, beside the unguided agents.
+    More than four variants have a panel for each kind of guidance, beside the unguided agents. So has each of several
+    tasks, with steps and values of its own.
     """
-    groups = _panels(variants) if len(variants) > 4 else [list(variants)]
+    tasks = len({variant.task for variant in variants})
+    groups = _panels(variants) if len(variants) > 4 or tasks > 1 else [list(variants)]
     rows, columns = -(-len(groups) // 3), min(3, len(groups))
     colours = {id(variant): colour for variant, colour in zip(variants, colours_of(variants), strict=True)}
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5) if len(groups) == 1 else (4 * columns, 1 + 2.8 * rows), layout="constrained")
-        panels = [*figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat]
+        panels = [*figure.subplots(rows, columns, sharex=tasks == 1, sharey=tasks == 1, squeeze=False).flat]
         for axes, group in zip(panels, groups, strict=False):
             for place, variant in enumerate(group):
-                _draw_curve(axes, variant, colours[id(variant)], DASHES[place % len(DASHES)], 3 + 0.01 * place)
-            axes.set_xlim(0, max(1, *(int(variant.curve.steps[-1]) for variant in variants)))
+                _draw_curve(axes, variant.curve, variant.name, colours[id(variant)], place, variant.failed)
+            axes.set_xlim(0, max(1, *(int(one.curve.steps[-1]) for one in (variants if tasks == 1 else group))))
             axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
             axes.tick_params(labelbottom=True)  # also above an empty place
             names = [variant.name for variant in sorted(group, key=lambda variant: -variant.curve.estimate[-1])]
@@ -71,24 +75,24 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
 
 
 def _panels(variants: Sequence[Variant]) -> list[list[Variant]]:
-    """Return the variants of each kind and run, after the unguided ones that they are compared with."""
-    kinds: dict[tuple[str, str], list[Variant]] = {}
+    """Return the variants of each task, run and kind, after the unguided ones that they are compared with."""
+    kinds: dict[tuple[str, ...], list[Variant]] = {}
     for variant in variants:
         before = unguided_of(variant, variants)
         first = [] if before is None or before is variant else [before]
-        kinds.setdefault((variant.run, variant.guidance), first).append(variant)
+        kinds.setdefault((variant.task, variant.run, variant.guidance), first).append(variant)
     others = {id(group[0]) for group in kinds.values() if len(group) > 1}
     return [group for group in kinds.values() if len(group) > 1 or id(group[0]) not in others]
 
 
-def _draw_curve(axes: Any, variant: Variant, colour: Any, dashes: Any, height: float) -> None:
+def _draw_curve(axes: Any, curve: Curve, name: str, colour: Any, place: int, failed: Any = ()) -> None:
     """Draw a curve over all bands. Dashes show an equal line below; a cross marks where a failed seed ended."""
-    steps, estimate, lower, upper = variant.curve
+    steps, estimate, lower, upper = curve
     axes.fill_between(steps, lower, upper, color=colour, alpha=0.15, linewidth=0, zorder=2)
-    look: dict[str, Any] = {"color": colour, "zorder": height}
+    look: dict[str, Any] = {"color": colour, "zorder": 3 + 0.01 * place}
     marker = "o" if len(steps) == 1 else ""
-    axes.plot(steps, estimate, linewidth=1.8, linestyle=dashes, marker=marker, label=variant.name, **look)
-    if len(at := np.minimum(variant.failed, steps[-1])):
+    axes.plot(steps, estimate, linewidth=1.8, linestyle=DASHES[place % 4], marker=marker, label=name, **look)
+    if len(at := np.minimum(failed, steps[-1])):
         axes.plot(at, np.interp(at, steps, estimate), "x", markersize=8, clip_on=False, **look)
         axes.plot([], [], "x", color="#595959", label=FAILED)
 
@@ -117,6 +121,22 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
         axes.set_xlabel("labels")
         axes.set_ylabel(f"{axis_name(metric)}, mean over the curve")
         figure.legend(loc="outside lower center", ncols=5)
+        figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
+    return figure
+
+
+def draw_profiles(over: Aggregates) -> Figure:
+    """Draw the performance profile of each variant over tasks: the share of runs above each normalised score."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(8, 4.5), layout="constrained")
+        axes = figure.add_subplot()
+        colours = colours_of([variant for variant, *_ in over.each])
+        for place, (variant, profile, _) in enumerate(over.each):
+            _draw_curve(axes, profile, variant.name, colours[place], place)
+        axes.set_ylabel("share of runs above the score")
+        axes.set_xlabel("normalised score\nband: 95% bootstrap interval over seeds, drawn in each task", fontsize=9)
+        figure.legend(loc="outside right upper", fontsize=9)
+        title = f"{len(over.ends)} tasks: {', '.join(over.ends)}"
         figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
 

@@ -84,15 +84,15 @@ def _steps_to(variant: Variant, sign: float, level: float) -> Row:
 
 
 def unguided_of(variant: Variant, variants: Sequence[Variant]) -> Variant | None:
-    """Return the unguided variant to compare with: that of the variant's own run, or else the first one."""
-    unguided = [other for other in variants if other.guidance == "none"]
+    """Return the unguided variant to compare with: that of the variant's own run, or else the task's first one."""
+    unguided = [other for other in variants if other.guidance == "none" and other.task == variant.task]
     return next((other for other in unguided if other.run == variant.run), unguided[0] if unguided else None)
 
 
 def identity(variant: Variant) -> Row:
-    """Return the columns that identify a variant; `run` is among them where runs are reported separately."""
-    row: Row = {"run": variant.run} if variant.run else {}
-    return row | {"guidance": variant.guidance, "labels": variant.labels}
+    """Return the columns that identify a variant; `task` and `run` are among them where there are several."""
+    own = {"task": variant.task, "run": variant.run, "guidance": variant.guidance, "labels": variant.labels}
+    return {name: value for name, value in own.items() if value != ""}
 
 
 def curve_rows(variants: Sequence[Variant]) -> list[Row]:
@@ -121,10 +121,11 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> l
 
 def summary_lines(rows: Sequence[Row]) -> list[str]:
     """Return the summary as a table in Markdown."""
-    header = ["guidance", "labels", "seeds", "episodes", "last step", "final", "mean over the curve", "best (at step)"]
+    header = [name for name in ("task", "run") if name in rows[0]]
+    header += ["guidance", "labels", "seeds", "episodes", "last step", "final", "mean over the curve", "best (at step)"]
     header += ["stays at the unguided final from step", "above the unguided", "below the unguided"]
     header += ["probability of improvement"]
-    return markdown_table(["run"] * ("run" in rows[0]) + header, [_summary_cells(row) for row in rows])
+    return markdown_table(header, [_summary_cells(row) for row in rows])
 
 
 def _step(value: str | float) -> str:
@@ -135,7 +136,7 @@ def _summary_cells(row: Row) -> list[object]:
     reached, *ends = (_step(row[name]) for name in REACHES)
     failed = int(row["failed"])
     seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
-    cells: list[object] = [markdown(row[name]) for name in ("run", "guidance") if name in row]
+    cells: list[object] = [markdown(row[name]) for name in ("task", "run", "guidance") if name in row]
     cells += [f"{row['labels']:,}", seeds, _step(row["episodes"]), f"{row['last_step']:,}"]
     cells += [str(Interval(*(row[key + end] for end in ("", "_lower", "_upper")))) for key in ("final", "mean")]  # pyright: ignore[reportArgumentType]
     cells += [f"{row['best']:.3f} ({row['best_step']:,})", f"{reached} [{', '.join(ends)}]" if any(ends) else reached]

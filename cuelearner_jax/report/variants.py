@@ -23,7 +23,7 @@ from cuelearner_jax.runs import failures
 from cuelearner_jax.storage import results
 
 PathLike = str | os.PathLike[str]
-LONGEST_NAME = 40  # characters
+LONGEST_NAME = 60  # characters
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,12 @@ class Variant:
     values: Float[np.ndarray, "seeds steps"]
     # steps by which the failed lanes had failed; nothing else here is about these lanes
     failed: Int[np.ndarray, "lanes"] = field(default_factory=lambda: np.array([], int))
-    run: str = ""  # name of the group of runs, where groups are reported separately
+    run: str = ""  # name of the group of runs and of their setting, where groups are reported separately
     guide: Float[np.ndarray, "guides"] | None = None  # metric of each seed's guide alone, where it was measured
     episodes: int = 0  # of an evaluation, at least; 0: the runs, of an earlier version, keep none
     each: Float[np.ndarray, "seeds groups steps"] | None = None  # values of groups of episodes; None: of one group
-    until: int | None = None  # number of steps up to the last one that all variants share; None: all steps
+    until: int | None = None  # number of steps up to the last one that a task's variants share; None: all steps
+    task: str = ""  # where there are several
 
     @cached_property
     def curve(self) -> Curve:
@@ -50,7 +51,7 @@ class Variant:
 
     @cached_property
     def mean(self) -> Interval:
-        """The mean over the curve, up to the last step that all variants share."""
+        """The mean over the curve, up to the last step that the task's variants share."""
         return interval(self.area(self.values), self.area(self.groups))
 
     @property
@@ -59,7 +60,7 @@ class Variant:
         return self.values[:, None] if self.each is None else self.each
 
     def area(self, curves: Float[np.ndarray, "*seeds steps"]) -> Float[np.ndarray, "*seeds"]:
-        """Return the mean of each curve up to the last step that all variants share."""
+        """Return the mean of each curve up to the last step that the task's variants share."""
         return mean_over_curve(self.steps[: self.until], curves[..., : self.until])
 
     def samples(
@@ -69,9 +70,9 @@ class Variant:
     ) -> Float[np.ndarray, "samples *rest"]:
         """Return a quantity of the real seeds, and then of the draws of its bootstrap, see `statistics.resampled`.
 
-        Variants of equal seeds draw them together: their lanes start alike, so comparisons are paired by seed.
+        Variants of a task with equal seeds draw them together: their lanes start alike, so comparisons are paired.
         """
-        stream = zlib.crc32(np.asarray(self.seeds, np.int64).tobytes())
+        stream = zlib.crc32(self.task.encode() + np.asarray(self.seeds, np.int64).tobytes())
         own = mean(of(self.values), axis=0)
         return np.concatenate([own[None], statistics.resampled(self.groups, seed=stream, of=of, mean=mean)])
 
@@ -80,7 +81,7 @@ class Variant:
         """The variant's name in a legend."""
         name = guidance_name(self.guidance)
         name = f"{name}, {self.labels:,} labels" if self.labels else name
-        return (f"{self.run}: {name}" if self.run else name)[:LONGEST_NAME]
+        return ": ".join(filter(None, (self.task, self.run, name)))[:LONGEST_NAME]
 
 
 def guidance_name(guidance: str) -> str:
@@ -90,9 +91,10 @@ def guidance_name(guidance: str) -> str:
 
 
 class Group(NamedTuple):
-    """Results that are reported together."""
+    """Results that are reported together: of one task and one setting of a sweep."""
 
-    name: str  # empty for a single group
+    task: str
+    name: str  # of the folder, where folders are reported separately, and of the setting; may be empty
     table: pa.Table  # the rows to report
     failed: pa.Table  # all rows of failed lanes
     invalid: int  # number of rows left out since the metric is not finite
@@ -110,8 +112,7 @@ def read_groups(
     folders_of = {Path(os.path.abspath(folder)).name: [folder] for folder in folders} if by_run else {"": folders}
     if by_run and len(folders_of) < len(folders):
         raise UserError("--by-run: several folders have the same name: give them different names")
-    groups = [_group(name, own, metric, split) for name, own in folders_of.items()]
-    tasks = sorted({group.table["task"][0].as_py() for group in groups})
+    groups = [group for name, own in folders_of.items() for group in _groups(name, own, metric, split)]
     for column, values in choice.items():
         there = {value for group in groups for value in group.every[column].to_pylist()}
         if absent := [str(value) for value in values if value not in there]:
@@ -120,37 +121,55 @@ def read_groups(
         if values:
             fits = pc.field(column).isin([*values, *([0] if column == "labels" else [])])
             groups = [one._replace(table=one.table.filter(fits), failed=one.failed.filter(fits)) for one in groups]
-    if not (groups := [group for group in groups if group.table.num_rows]):
+    if not any(group.table.num_rows for group in groups):
         raise UserError("no results of these kinds have one of these label budgets: give other --guidance or --labels")
-    if len(tasks) > 1:
-        raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: give folders of one of them")
-    return groups
+    return [group for group in groups if group.table.num_rows or group.failed.num_rows or group.invalid]
 
 
-def _group(name: str, folders: Sequence[PathLike], metric: str, split: str) -> Group:
-    """Read the results of folders, without failed lanes and without rows whose metric is not finite."""
-    every = results.read(folders)
+def _groups(name: str, folders: Sequence[PathLike], metric: str, split: str) -> list[Group]:
+    """Read the results of folders, a group for each task and setting."""
+    every, guides = results.read(folders), results.read_guides(folders)
     if metric not in results.metrics(every):
         raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(every))}")
     splits = sorted(set(every["split"].to_pylist()))
     if split not in splits:
         raise UserError(f"no {split} rows in the results: there are {', '.join(splits)} rows")
-    every, guides = every.filter(pc.field("split") == split), results.read_guides(folders)
+    every = every.filter(pc.field("split") == split)
+    keys = every.group_by(["task", *results.settings(every)]).aggregate([]).to_pylist()
+    keys = sorted(keys, key=lambda key: [(value is not None, value) for value in key.values()])
+    groups = [_group(name, metric, key, _rows(every, key), guides) for key in keys]
+    if any(group.table.num_rows for group in groups):
+        return groups
+    if lost := "; ".join(words for group in groups if (words := failures.summary(group.failed))):
+        raise UserError(f"nothing to report, {lost}: train again with other settings")
+    raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
+
+
+def _rows(table: pa.Table, key: dict[str, Any]) -> pa.Table:
+    """Return the rows with these columns' values; a column that the table lacks is null."""
+    for column, value in key.items():
+        if column in table.column_names:
+            table = table.filter(pc.field(column).is_null() if value is None else pc.field(column) == value)
+        elif value is not None:
+            table = table.slice(0, 0)
+    return table
+
+
+def _group(name: str, metric: str, key: dict[str, Any], every: pa.Table, guides: pa.Table | None) -> Group:
+    """Return a task's and setting's results, without failed lanes and without rows whose metric is not finite."""
+    setting = {option: "-" if value is None else value for option, value in key.items() if option != "task"}
+    name = ", ".join(dict.fromkeys(filter(None, (name, results.setting_name(setting)))))
     lost, lanes = results.failures(every), zip(*(every[name].to_pylist() for name in results.LANE), strict=True)
     of_failed = np.array([lane in lost for lane in lanes], bool)
     rows, failed = every.filter(pa.array(~of_failed)), every.filter(pa.array(of_failed))
-    if not rows.num_rows:
-        raise UserError(f"nothing to report, {failures.summary(failed)}: train again with other settings")
     table = rows.filter(pc.field(metric).is_valid())
-    if table.num_rows == 0:
-        raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
-    guides = None if guides is None else guides.filter(pc.field("split") == split)
-    return Group(name, table, failed, rows.num_rows - table.num_rows, every, guides)
+    guides = guides and _rows(guides, {**key, "split": every["split"][0].as_py()})
+    return Group(key["task"], name, table, failed, rows.num_rows - table.num_rows, every, guides)
 
 
 def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
     """Return the variants in the legend's order: for each group unguided first, then by guidance and label budget."""
-    variants = []
+    variants, several = [], len({group.task for group in groups}) > 1
     for group in groups:
         failed = results.failures(group.failed)
         keys = group.table.group_by(["guidance", "labels"]).aggregate([]).to_pylist()
@@ -161,9 +180,10 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
             lost = np.array([step for lane, step in failed.items() if lane[:2] == (kind, labels)], int)
             guide = _guides(rows, metric, None if group.guides is None else group.guides.filter(of_variant))
             episodes = 0 if each is None else min(rows["episodes"].to_pylist())
-            variants.append(Variant(kind, labels, seeds, steps, values, lost, group.name, guide, episodes, each))
-    shared = min(variant.steps[-1] for variant in variants)
-    ends = [int(np.searchsorted(variant.steps, shared, side="right")) for variant in variants]
+            own = Variant(kind, labels, seeds, steps, values, lost, group.name, guide, episodes, each)
+            variants.append(replace(own, task=group.task if several else ""))
+    shared = {one.task: min(other.steps[-1] for other in variants if other.task == one.task) for one in variants}
+    ends = [int(np.searchsorted(variant.steps, shared[variant.task], side="right")) for variant in variants]
     return [replace(variant, until=max(1, end)) for variant, end in zip(variants, ends, strict=True)]
 
 

@@ -132,7 +132,7 @@ def settings(table: pa.Table) -> list[str]:
     return sorted(name for name in table.column_names if "." in name)
 
 
-def setting_name(setting: Mapping[str, float]) -> str:
+def setting_name(setting: Mapping[str, float | str]) -> str:
     """Return the name of options' values, also of their folder: "scalars.eps_deg=2"."""
     return ",".join(f"{name}={str(value).removesuffix('.0')}" for name, value in setting.items())
 
