@@ -20,7 +20,7 @@ class Report(ReportRequest):
     """Write curves and tables with intervals from recorded results."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Run folders, or folders that contain run folders."""
+    """Run folders, or folders that contain run folders; of several tasks: with aggregates over tasks."""
     out: Path | None = None
     """Folder for the report."""
     json: bool = False

@@ -1,7 +1,7 @@
 """Write the folder of `cuelearner report`: figures and tables of recorded results. Equal results give equal bytes.
 
 `report.md` has the figures, the tables, what is missing, and the provenance. Beside it are `summary.csv`, `curves.csv`,
-the figures, and the tables of a question about label efficiency.
+the figures, and the tables of a question about label efficiency, or of several tasks.
 """
 
 from __future__ import annotations

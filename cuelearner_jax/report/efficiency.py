@@ -28,7 +28,8 @@ class Question:
     """Question that is asked about label budgets."""
 
     level: float | None = None
-    """Value of the metric to be reached (default: see --level-at)."""
+    """Value of the metric to be reached (default: see --level-at). Of several tasks: the value whose normalised score
+    is 1 (default: the best variant's mean over the curve)."""
     level_at: int | None = None
     """Without --level: step of the unguided agents whose value is the level (default: the last one of all curves)."""
     reference: str | None = None

@@ -13,13 +13,13 @@ from cuelearner_jax.report.variants import Variant
 from cuelearner_jax.storage import results
 from cuelearner_jax.storage.table import TableWriter
 
-STEPS = (0, 10, 20)
+STEPS = (0, 10)
 
 
-def write(folder, task, guidance, values, labels=0, **constants):
+def write(folder, task, guidance, values, labels=0, constants=None):
     """Seeds that stand at a value of their own at all steps, in two groups of equal episodes."""
-    known = {"run": folder.name, "task": task, "guidance": guidance, "config_hash": "0f", "labels": labels, **constants}
-    with TableWriter(folder, results.SCHEMA, known) as writer:
+    known = {"run": folder.name, "task": task, "guidance": guidance, "config_hash": "0f", "labels": labels}
+    with TableWriter(folder, results.SCHEMA, known | (constants or {})) as writer:
         for step in STEPS:
             each = np.array(values)[:, None] + [0.0, 0.0]
             row = {"reward": values, "reward_each": each, "episodes": 2, "failed": [float(np.isnan(v)) for v in values]}
@@ -95,8 +95,8 @@ def test_tasks_without_a_control_or_a_variant_in_common_are_refused(tasks, tmp_p
 
 def test_settings_are_groups_and_one_that_failed_leaves_the_others(tmp_path):
     for eps, level in ((2.0, 0.3), (10.0, np.nan), (5.0, 0.1)):
-        write(tmp_path / "runs" / str(eps), "one", "none", [0.2] * 2, **{"scalars.eps_deg": eps})
-        write(tmp_path / "runs" / f"{eps}-r", "one", "relative", [level] * 2, 100, **{"scalars.eps_deg": eps})
+        write(tmp_path / "runs" / str(eps), "one", "none", [0.2] * 2, constants={"scalars.eps_deg": eps})
+        write(tmp_path / "runs" / f"{eps}-r", "one", "relative", [level] * 2, 100, constants={"scalars.eps_deg": eps})
     text = report([tmp_path / "runs"], tmp_path / "report", ReportRequest(guidance=("relative", "none"))).read_text()
     found = {(row["run"], row["guidance"]): row for row in table(tmp_path / "report" / "summary.csv")}
     names = [f"scalars.eps_deg={eps}" for eps in (2, 2, 5, 5, 10)]  # in the order of the numbers

@@ -70,4 +70,4 @@ def test_errors_are_one_clear_line(tmp_path):
     assert "no rows yet" in message(tmp_path / "empty")
     write(tmp_path / "a")
     write(tmp_path / "b", task="easy")
-    assert "easy, one_ball" in message(tmp_path)
+    assert set(results.read(tmp_path)["task"].to_pylist()) == {"easy", "one_ball"}  # no error: the rows tell them apart
