@@ -1,43 +1,38 @@
-"""Soft actor-critic here over brax's, Stable-Baselines3's and sbx's: return over steps, and steps over seconds.
+"""Soft actor-critic here over that of sbx: return over steps, and steps over seconds, on tasks of Gymnasium.
 
-    python benchmarks/sac_speed.py --peer-python peers/bin/python --out benchmarks/results/sac_speed.json
-    python benchmarks/sac_speed.py --environments halfcheetah --seeds 64 --ways brax --out sac_speed_h200.json
+    python benchmarks/sac_speed.py --environments Hopper-v5 Ant-v5 --peer-python peers/bin/python --out sac.json
+    python benchmarks/sac_speed.py --environments pendulum --seeds 64 --steps 20000 --out sac.json
+    python benchmarks/sac_speed.py --table sac.json
 
-All ways have the same networks, minibatches, updates a step, learning rates, discount and target entropy (-0.5 an
-entry, which brax fixes), and as many steps before the first update: uniform actions here and in Stable-Baselines3,
-brax's untrained actor there. brax's SAC runs in brax's environments and in the pendulum (`_brax_pendulum.py`). The
-packages of Gymnasium run in Gymnasium's Pendulum-v1, which `pendulum.py` is step for step.
+Ways: `sac` and `xqc` (the same with `--agent.bins`) here, all seeds side by side; sbx's `SAC` and `CrossQ`, a process
+a seed, one after another or `--at-once` some. SAC has the same networks, minibatches, updates a step, rates, discount,
+target entropy and random steps here and there; CrossQ has its own defaults. `pendulum` is Gymnasium's Pendulum-v1,
+which `pendulum.py` is step for step. Seconds are of training alone, without a training's first stretch, which compiles.
 
-Ways take turns within one run: each turn is a whole training with a seed of its own. Seconds are of training alone,
-without evaluations, and without each training's first stretch, which compiles. `--seeds 64` trains as many seeds here
-side by side, against one of the peer; its steps a second are then those of all seeds.
-
-A peer that is not installed is skipped with a line. Give `--peer-python` a Python with sbx (`pip install sbx-rl`).
+Every evaluation is written when all seeds have it; a way that is in `--out` in full is not repeated.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
-import importlib.util
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _brax_pendulum import BraxPendulum, wrap
 from _measuring import timed
 from pendulum import STEPS, Pendulum
 
+import cuelearner_jax as cl
 from cuelearner_jax.agents import sac
-from cuelearner_jax.bridges.brax import from_brax, supply_device_put_replicated
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.loop import start_clock
@@ -47,24 +42,21 @@ from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage.provenance import provenance
 
 PENDULUM = "pendulum"
-ENVIRONMENTS = (PENDULUM, "inverted_pendulum", "reacher", "halfcheetah")
-PEERS = ("brax", "sb3", "sbx")
-OURS = "ours"
-LENGTH = 1000  # of an episode in brax's environments
-Rows = list[dict[str, float]]  # of one training: step, return, seconds of the stretch before, steps of that stretch
-Way = Callable[[int], Rows]  # by the seed
+OURS, PEERS = ("sac", "xqc"), ("SAC", "CrossQ")
+LENGTH = 1000  # of the longest episode
+Tell = Callable[[dict[str, Any]], None]  # takes an evaluation: step, returns (seeds), seconds of the stretch before it
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Settings that all implementations share."""
+    """Settings that all implementations of SAC share."""
 
-    layers: tuple[int, ...] = (256, 256)
-    batch_size: int = 256
-    updates_per_step: int = 1
-    prefill: int = 1_000
-    steps: int = 20_000
-    evaluations: int = 10
+    layers: tuple[int, ...]
+    batch_size: int
+    updates_per_step: int
+    prefill: int
+    steps: int
+    evaluations: int
     episodes: int = 10
     discount: float = 0.99
     rate: float = 3e-4
@@ -76,28 +68,18 @@ class Setting:
         return self.steps // self.evaluations
 
 
-def environment_of(name: str, backend: str) -> tuple[Any, Any, int]:
-    """Return this package's environment, brax's, and the steps of an episode."""
-    supply_device_put_replicated()
-    if name == PENDULUM:
-        return Pendulum(jnp.array(STEPS)), BraxPendulum(), STEPS
-    from brax import envs
-
-    env = envs.get_environment(name, backend=backend)
-    return from_brax(env, max_steps=LENGTH), env, LENGTH
-
-
-def configuration(setting: Setting) -> RunConfig:
+def configuration(setting: Setting, way: str) -> RunConfig:
     """Return this package's options."""
     agent = sac.SACConfig(
         actor_layers=setting.layers,
         critic_layers=setting.layers,
+        bins=way == "xqc",
         batch_size=setting.batch_size,
         updates_per_step=setting.updates_per_step,
         replay_capacity=setting.steps,
         actor_rate=setting.rate,
         critic_rate=setting.rate,
-        target_entropy=-0.5,
+        temperature_rate=setting.rate,
         polyak=setting.polyak,
     )
     schedule = Schedule(random_steps=setting.prefill, learn_after=setting.prefill, guidance_until=0)
@@ -105,198 +87,133 @@ def configuration(setting: Setting) -> RunConfig:
     return RunConfig(None, Sizes(num_envs=1), scalars, schedule, agent)
 
 
-def ours(env: Any, setting: Setting, seeds: int, length: int) -> Way:
-    """Return this package's loop, that of `cuelearner sweep`, with several seeds side by side."""
-    mesh, config = lane_mesh(), configuration(setting)
+def evaluation(env: Any, functions: Any, setting: Setting, length: int) -> Callable[[Any], jax.Array]:
+    """Return a function of lanes' parameters: the mean return of deterministic episodes of each."""
+
+    def one(params: Any) -> jax.Array:
+        state, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), setting.episodes))
+
+        def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
+            state, obs, running, total = carry
+            actions = functions.act(env, params, obs, key)
+            state, found = jax.vmap(env.step)(jax.random.split(key, setting.episodes), state, actions)
+            total = total + jnp.where(running, found.reward, 0.0)
+            return (state, found.obs, running & ~(found.terminated | found.truncated), total), None
+
+        start = (state, obs, jnp.ones(setting.episodes, bool), jnp.zeros(setting.episodes))
+        return jax.lax.scan(step, start, jax.random.split(jax.random.key(2), length))[0][3].mean()
+
+    return jax.jit(lambda params: jax.lax.map(one, params, batch_size=16))
+
+
+def ours(name: str, way: str, setting: Setting, seeds: int, tell: Tell) -> None:
+    """Train with this package's loop, that of `cuelearner sweep`, all seeds side by side."""
+    env: Any = Pendulum(jnp.array(STEPS)) if name == PENDULUM else cl.from_gymnasium(name, processes=1).env
+    mesh, config = lane_mesh(), configuration(setting, way)
     env = place(mesh, env, SHARED)
     functions, guide = config.agent_in(env), config.guide_in(env, "none")
-
-    @jax.jit
-    def returned(params: Any) -> jax.Array:
-        def one(params: Any) -> jax.Array:
-            state, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), setting.episodes))
-
-            def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
-                state, obs, running, total = carry
-                actions = functions.act(env, params, obs, key)
-                state, found = jax.vmap(env.step)(jax.random.split(key, setting.episodes), state, actions)
-                total = total + jnp.where(running, found.reward, 0.0)
-                return (state, found.obs, running & ~(found.terminated | found.truncated), total), None
-
-            start = (state, obs, jnp.ones(setting.episodes, bool), jnp.zeros(setting.episodes))
-            return jax.lax.scan(step, start, jax.random.split(jax.random.key(2), length))[0][3].mean()
-
-        return jax.lax.map(one, params, batch_size=16)
-
-    def train(seed: int) -> Rows:
-        grid = Grid(("none",), tuple(range(seed * seeds, (seed + 1) * seeds)), (0,))
-        group = LaneGroup(config, env, guide, grid, mesh)
-        clock, blocks, rows = place(mesh, start_clock(), SHARED), group.start(), []
-        for number in range(setting.evaluations):
-            seconds, (clock, blocks, _) = timed(lambda c=clock, b=blocks: group.train(c, b, setting.every))
-            earned = np.mean([np.mean(returned(block.agent.params)) for block in blocks])
-            own = {"step": (number + 1) * setting.every, "return": float(earned)}
-            rows.append({**own, "seconds": seconds, "steps": setting.every})
-        return rows
-
-    return train
+    returned = evaluation(env, functions, setting, STEPS if name == PENDULUM else LENGTH)
+    group = LaneGroup(config, env, guide, Grid(("none",), tuple(range(seeds)), (0,)), mesh)
+    clock, blocks = place(mesh, start_clock(), SHARED), group.start()
+    for number in range(setting.evaluations):
+        seconds, (clock, blocks, _) = timed(lambda c=clock, b=blocks: group.train(c, b, setting.every))
+        earned = np.concatenate([np.asarray(returned(block.agent.params)) for block in blocks])[:seeds]
+        tell({"step": (number + 1) * setting.every, "returns": earned.tolist(), "seconds": seconds})
 
 
-def of_brax(env: Any, setting: Setting, length: int, own: bool) -> Way:
-    """brax's SAC; `own`: the environment is our pendulum."""
-    from brax.training.agents.sac import networks, train
+def peers(name: str, way: str, setting: Setting, seeds: int, python: str, at_once: int, tell: Tell) -> None:
+    """Train with sbx in another Python, a process a seed."""
+    ends: dict[int, dict[int, dict[str, float]]] = {}  # by step and seed
 
-    factory: Any = functools.partial(networks.make_sac_networks, hidden_layer_sizes=setting.layers)
-    steps = -(-(setting.steps - setting.prefill) // setting.evaluations)  # between two evaluations
+    def run(seed: int) -> None:
+        told = json.dumps({**asdict(setting), "seed": seed, "name": "Pendulum-v1" if name == PENDULUM else name})
+        command = [python, str(Path(__file__).parent / "_sac_peers.py"), way, told]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            for line in process.stdout or ():
+                if not line.startswith("{"):
+                    continue
+                row = json.loads(line)
+                at = ends.setdefault(row["step"], {})
+                at[seed] = row
+                if len(at) == seeds:
+                    of = {end: [at[seed][end] for seed in range(seeds)] for end in ("return", "seconds")}
+                    tell({"step": row["step"], "returns": of["return"], "seconds": sum(of["seconds"])})
+        if process.returncode:
+            raise SystemExit(f"sbx failed on {name}: is it installed (pip install sbx-rl) in {python}?")
 
-    def run(seed: int) -> Rows:
-        rows: Rows = []
-
-        def progress(step: int, metrics: Any) -> None:
-            if step:
-                own = {"step": step, "return": float(metrics["eval/episode_reward"])}
-                rows.append({**own, "seconds": steps / float(metrics["training/sps"]), "steps": steps})
-
-        train.train(
-            env,
-            num_timesteps=setting.steps,
-            episode_length=length,
-            wrap_env_fn=wrap if own else None,
-            num_envs=1,
-            num_eval_envs=setting.episodes,
-            learning_rate=setting.rate,
-            discounting=setting.discount,
-            seed=seed,
-            batch_size=setting.batch_size,
-            num_evals=setting.evaluations + 1,
-            tau=setting.polyak,
-            min_replay_size=setting.prefill,
-            max_replay_size=setting.steps,
-            grad_updates_per_step=setting.updates_per_step,
-            deterministic_eval=True,
-            max_devices_per_host=1,
-            network_factory=factory,
-            progress_fn=progress,
-        )
-        return rows
-
-    return run
+    with ThreadPoolExecutor(at_once) as pool:
+        list(pool.map(run, range(seeds)))
 
 
-def of_gymnasium(library: str, python: str, setting: Setting) -> Way | None:
-    """A package of Gymnasium in another Python; None, with a line, where it is not installed there."""
-    package = {"sb3": "stable_baselines3", "sbx": "sbx"}[library]
-    told = f"import importlib.util as i; raise SystemExit(not i.find_spec({package!r}))"
-    found = subprocess.run([python, "-c", told], capture_output=True, check=False)
-    if found.returncode:
-        print(f"skipped: {python} has no {package}; give --peer-python one that has", flush=True)
-        return None
-
-    def run(seed: int) -> Rows:
-        told = json.dumps({**asdict(setting), "seed": seed})
-        command = [python, str(Path(__file__).parent / "_sac_peers.py"), library, told]
-        lines = subprocess.run(command, capture_output=True, text=True, check=False)
-        if lines.returncode:
-            raise SystemExit(f"{library} failed: {lines.stderr.strip().splitlines()[-1:]}")
-        return [json.loads(line) for line in lines.stdout.splitlines() if line.startswith("{")]
-
-    return run
-
-
-def ways_of(name: str, asked: argparse.Namespace, setting: Setting) -> dict[str, Way]:
-    """Return this package's implementation, and those of the peers asked for that are installed."""
-    env, its, length = environment_of(name, asked.backend)
-    ways: dict[str, Way] = {OURS: ours(env, setting, asked.seeds, length)}
-    if "brax" in asked.ways:
-        ways["brax"] = of_brax(its, setting, length, own=name == PENDULUM)
-    for library in ("sb3", "sbx"):
-        if library in asked.ways and name == PENDULUM:
-            here = importlib.util.find_spec("stable_baselines3") is not None and library == "sb3"
-            way = of_gymnasium(library, sys.executable if here else asked.peer_python, setting)
-            ways |= {} if way is None else {library: way}
-    return ways
-
-
-def summary(trainings: dict[str, list[Rows]], seeds: int) -> dict[str, Any]:
-    """Medians over turns of steps a second and of returns, and ours over each peer's.
-
-    A training's first stretch, which compiles and has the random steps, counts for no speed.
-    """
-    rates = {}
-    for way, turns in trainings.items():
-        at_once = seeds if way == OURS else 1
-        each = [at_once * row["steps"] / row["seconds"] for rows in turns for row in rows[1:]]
-        rates[way] = float(np.median(each))
-    curves = {
-        way: np.median([[row["return"] for row in rows] for rows in turns], 0).round(1).tolist()
-        for way, turns in trainings.items()
-    }
-    return {
-        "steps_a_second": {way: round(rate, 1) for way, rate in rates.items()},
-        "ratio": {way: round(rates[OURS] / rate, 3) for way, rate in rates.items() if way != OURS},
-        "steps": {way: [int(row["step"]) for row in turns[0]] for way, turns in trainings.items()},
-        "median_return": curves,
-    }
-
-
-def measured(name: str, asked: argparse.Namespace, setting: Setting) -> dict[str, Any]:
-    """Return the measurements of all implementations, taken in turns on one environment."""
-    ways = ways_of(name, asked, setting)
-    trainings: dict[str, list[Rows]] = {way: [] for way in ways}
-    for turn in range(asked.turns):
-        for way, train in ways.items():
-            trainings[way].append(train(turn))
-            last = trainings[way][-1][-1]
-            print(f"{name}, turn {turn + 1}: {way} returns {last['return']:.1f} at step {last['step']:,}", flush=True)
-    found = summary(trainings, asked.seeds)
-    return {"environment": name, "seeds": asked.seeds, **found, "trainings": trainings}
+def show(rows: list[dict[str, Any]]) -> None:
+    """Print a table: returns of every way at the last common step, over sbx's SAC, and steps a second of all seeds."""
+    print("environment       way       step   return, mean [seeds' least, most]    over sbx's SAC   steps/s, all seeds")
+    for name in dict.fromkeys(row["environment"] for row in rows):
+        own = [row for row in rows if row["environment"] == name and row["rows"]]
+        step = min(row["rows"][-1]["step"] for row in own)
+        at = {row["way"]: next(r["returns"] for r in row["rows"] if r["step"] == step) for row in own}
+        for row in own:
+            returns, later = at[row["way"]], row["rows"][1:]
+            over = f"{np.mean(returns) / np.mean(at['SAC']):.2f}" if "SAC" in at else "-"
+            stretch = row["rows"][0]["step"] * len(returns) * len(later)
+            rate = stretch / sum(r["seconds"] for r in later) * row["at_once"] if later else np.nan
+            spread = f"{np.mean(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
+            print(f"{name:<18}{row['way']:<8}{step:>8,}   {spread:<36}{over:>14}   {rate:>12,.0f}")
 
 
 def arguments() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--environments", nargs="+", default=list(ENVIRONMENTS), choices=list(ENVIRONMENTS))
-    parser.add_argument("--ways", nargs="*", default=list(PEERS), choices=list(PEERS), help="peers (default: all)")
-    parser.add_argument("--backend", default="generalized", help="brax's physics (default: generalized)")
-    parser.add_argument("--peer-python", default=sys.executable, help="a Python with sbx or stable_baselines3")
-    parser.add_argument("--seeds", type=int, default=1, help="trained here side by side (default: 1)")
-    parser.add_argument("--turns", type=int, default=3, help="trainings of each way (default: 3)")
-    parser.add_argument("--steps", type=int, default=20_000, help="of each training (default: 20,000)")
-    parser.add_argument("--evaluations", type=int, default=10, help="of each training (default: 10)")
-    parser.add_argument("--prefill", type=int, default=1_000, help="steps before the first update (default: 1,000)")
+    parser.add_argument("--environments", nargs="+", default=[PENDULUM], help="of Gymnasium (default: its pendulum)")
+    parser.add_argument("--ways", nargs="+", default=[*OURS, *PEERS], choices=(*OURS, *PEERS))
+    parser.add_argument("--peer-python", default=sys.executable, help="a Python with sbx")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--at-once", type=int, default=1, help="seeds of a peer that run side by side (default: 1)")
+    parser.add_argument("--steps", type=int, default=300_000, help="of each training (default: 300,000)")
+    parser.add_argument("--evaluations", type=int, default=6, help="of each training (default: 6)")
+    parser.add_argument("--prefill", type=int, default=5_000, help="random steps before the first update")
     parser.add_argument("--layers", type=int, nargs="+", default=[256, 256])
     parser.add_argument("--batch-size", type=int, default=256)
     parser.add_argument("--updates-per-step", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="JSON file to write")
+    parser.add_argument("--out", type=Path, help="JSON file to write, or to go on with")
+    parser.add_argument("--table", type=Path, nargs="+", help="print the table of these files, and measure nothing")
     return parser.parse_args()
 
 
 def main() -> None:
     """Measure, print and write."""
     asked = arguments()
-    setting = replace(
-        Setting(),
-        layers=tuple(asked.layers),
-        batch_size=asked.batch_size,
-        updates_per_step=asked.updates_per_step,
-        prefill=asked.prefill,
-        steps=asked.steps,
-        evaluations=asked.evaluations,
+    if asked.table:
+        show([row for file in asked.table for row in json.loads(file.read_text())["rows"]])
+        return
+    if asked.evaluations < 2 or asked.steps % asked.evaluations:
+        raise SystemExit("give at least two evaluations that divide --steps")
+    setting = Setting(
+        tuple(asked.layers), asked.batch_size, asked.updates_per_step, asked.prefill, asked.steps, asked.evaluations
     )
-    if asked.evaluations < 2 or asked.steps % asked.evaluations or asked.prefill >= setting.every:
-        raise SystemExit(
-            "give at least two evaluations that divide --steps, and less --prefill than steps between them"
-        )
-    rows = []
+    rows = json.loads(asked.out.read_text())["rows"] if asked.out and asked.out.exists() else []
+    rows = [row for row in rows if len(row["rows"]) == asked.evaluations]
     for name in asked.environments:
-        rows.append(measured(name, asked, setting))
-        told = {key: value for key, value in rows[-1].items() if key != "trainings"}
-        print(json.dumps(told, indent=1), flush=True)
-        for way, ratio in rows[-1]["ratio"].items():
-            print(f"{name}: {ratio:.2f} times {way}'s steps a second, with {asked.seeds} seeds", flush=True)
-        if asked.out:
-            about = {**provenance(), "processors": os.cpu_count(), "setting": asdict(setting), "rows": rows}
-            asked.out.write_text(json.dumps(about, indent=1) + "\n")
+        for way in asked.ways:
+            if any((row["environment"], row["way"]) == (name, way) for row in rows):
+                continue
+            at_once = 1 if way in OURS else min(asked.at_once, asked.seeds)
+            entry: dict[str, Any] = {"environment": name, "way": way, "at_once": at_once, "rows": []}
+            rows.append(entry)
+
+            def tell(row: dict[str, Any], entry: dict[str, Any] = entry) -> None:
+                entry["rows"].append(row)
+                mean = f"{np.mean(row['returns']):.1f} at step {row['step']:,}, {row['seconds']:.0f} s"
+                print(f"{entry['environment']}, {entry['way']}: {mean}", flush=True)
+                if asked.out:
+                    about = {**provenance(), "processors": os.cpu_count(), "setting": asdict(setting), "rows": rows}
+                    asked.out.write_text(json.dumps(about, indent=1) + "\n")
+
+            if way in OURS:
+                ours(name, way, setting, asked.seeds, tell)
+            else:
+                peers(name, way, setting, asked.seeds, asked.peer_python, asked.at_once, tell)
+    show(rows)
 
 
 if __name__ == "__main__":

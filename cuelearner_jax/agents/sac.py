@@ -3,7 +3,7 @@
 Source: Haarnoja et al., "Soft actor-critic algorithms and applications", 2018, with the temperature tuned (Eq. 18).
 More critics, of which each target takes a random subset: Chen et al., "Randomized ensembled double Q-learning", ICLR
 2021. Layer normalisation, and as many guided as own steps in a minibatch: Ball et al., "Efficient online reinforcement
-learning with offline data" (RLPD), ICML 2023.
+learning with offline data" (RLPD), ICML 2023. Critics over bins of value: `categorical`.
 
 Networks see actions in unit coordinates: -1 is each entry's lower bound, 1 its upper bound.
 """
@@ -11,7 +11,7 @@ Networks see actions in unit coordinates: -1 is each entry's lower bound, 1 its 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -22,6 +22,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from cuelearner_jax.agents import categorical
+from cuelearner_jax.agents.categorical import CategoricalCritic
 from cuelearner_jax.agents.ddqn import optimizer
 from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.agents.replay import Memory, Transition
@@ -53,6 +55,8 @@ class SACConfig:
     their mean, else their smallest value."""
     layer_norm: bool = False
     """Normalise the critics' hidden layers, which keeps the values of untried actions from growing."""
+    bins: bool = False
+    """Critics of XQC: a distribution over bins of value, by batch and weight normalisation and cross-entropy."""
     batch_size: Annotated[int, POSITIVE] = 256
     """Transitions in a minibatch."""
     updates_per_step: Annotated[int, POSITIVE] = 1
@@ -148,7 +152,8 @@ class SoftActorCritic:
         k_actor, k_critics = jax.random.split(key)
         obs, action = jnp.zeros(self.spaces.obs_size), jnp.zeros(space.size)
         actor = self._actor.init(k_actor, obs)
-        critics = jax.vmap(lambda k: self._critic.init(k, obs, action))(jax.random.split(k_critics, own.critics))
+        first = self._critic.start if isinstance(self._critic, CategoricalCritic) else self._critic.init
+        critics = jax.vmap(lambda k: first(k, obs, action))(jax.random.split(k_critics, own.critics))
         log_temperature = jnp.zeros(())
         opt_states = (optimizer("adam", 0.0, 0.0).init(leaf) for leaf in (actor, critics, log_temperature))
         copy = jax.tree.map(jnp.copy, critics) if self.bootstraps else None
@@ -189,8 +194,10 @@ class SoftActorCritic:
         self, critics: Params, obs: Float[Array, "*n obs"], unit: Float[Array, "*m action"]
     ) -> Float[Array, "critics *m"]:
         """Return the values by each critic of actions in unit coordinates."""
-        one = lambda params: jnp.asarray(self._critic.apply(params, obs, unit))[..., 0]  # noqa: E731
-        return jax.vmap(one)(critics)
+        network = self._critic
+        if isinstance(network, CategoricalCritic):
+            return jax.vmap(lambda critic: categorical.values_of(critic, network.logits(critic, obs, unit)))(critics)
+        return jax.vmap(lambda critic: jnp.asarray(network.apply(critic, obs, unit))[..., 0])(critics)
 
     def update(
         self,
@@ -215,11 +222,11 @@ class SoftActorCritic:
             critics, opt_state, target_critics, _ = carry
             k_batch, k_target = jax.random.split(key)
             (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
-            targets = self.targets(scalars.discount, actor, target_critics, temperature, batch, k_target)
-            unit = self.in_unit(batch.action)
-            error = lambda critics: jnp.mean(jnp.square(self.values(critics, batch.obs, unit) - targets[None]))  # noqa: E731
-            loss, gradient = jax.value_and_grad(error)(critics)
+            behind = scalars.discount, actor, target_critics, temperature, batch, k_target
+            error = self._binned_error(*behind, critics, count) if own.bins else self._squared_error(*behind)
+            (loss, news), gradient = jax.value_and_grad(error, has_aux=True)(critics)
             critics, opt_state = optimizer_step(options.critic_rate, most, gradient, opt_state, critics)
+            critics = categorical.with_unit_weights({**critics, **news}) if own.bins else critics
             if self.bootstraps:
                 target_critics = optax.incremental_update(critics, target_critics, options.polyak)
             return (critics, opt_state, target_critics, batch.obs), (loss, optax.tree.norm(gradient))
@@ -275,6 +282,50 @@ class SoftActorCritic:
         value = own - temperature * draws.log_density if self.options.entropy_in_targets else own
         return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
 
+    def _squared_error(self, *behind: Any) -> Callable[[Params], tuple[Array, dict[str, Any]]]:
+        """Return the critics' mean squared error as a function of them; `behind`: see `targets`."""
+        batch, targets = behind[4], self.targets(*behind)
+        unit = self.in_unit(batch.action)
+        return lambda critics: (jnp.mean(jnp.square(self.values(critics, batch.obs, unit) - targets[None])), {})
+
+    def _binned_error(
+        self,
+        discount: Array | float,
+        actor: Params,
+        target_critics: Params,
+        temperature: Array | float,
+        batch: Transition,
+        key: PRNGKeyArray,
+        before: Params,
+        count: Int[Array, ""],
+    ) -> Callable[[Params], tuple[Array, dict[str, Any]]]:
+        """Return the critics' cross-entropy as a function of them, with what else of them changes.
+
+        The target is the distribution of the next value by the critic that expects least.
+        """
+        network, obs, unit = self._critic, batch.obs, self.in_unit(batch.action)
+        assert isinstance(network, CategoricalCritic)
+        size = categorical.next_unit(before["unit"], batch.reward, discount, count)
+        atoms, weights = batch.reward[:, None], jnp.ones((len(batch.reward), 1))
+        if self.bootstraps:
+            k_act, k_critics = jax.random.split(key)
+            draws, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
+            logits = jax.vmap(network.logits, (0, None, None))(judges, batch.next_obs, draws.unit)
+            least = (jax.nn.softmax(logits) @ categorical.BINS).argmin(0)
+            weights = jax.nn.softmax(jnp.take_along_axis(logits, least[None, :, None], 0)[0])
+            future = jnp.broadcast_to(categorical.BINS * judges["unit"][0], weights.shape)
+            future = future - temperature * draws.log_density[:, None] * self.options.entropy_in_targets
+            atoms = atoms + discount * batch.discount[:, None] * future
+            obs, unit = jnp.concatenate([obs, batch.next_obs]), jnp.concatenate([unit, draws.unit])
+        target = categorical.project(atoms / size[0], weights)
+        obs, unit, target = jax.lax.stop_gradient((obs, unit, target))
+
+        def error(critics: Params) -> tuple[Array, dict[str, Any]]:
+            losses, statistics = jax.vmap(network.loss, (0, None, None, None))(critics, obs, unit, target)
+            return losses.mean(), {"batch_stats": statistics, "unit": size}
+
+        return error
+
     def _judges(self, target_critics: Params, key: PRNGKeyArray) -> Params:
         """Return the target critics of one batch, a random subset where the options ask for fewer."""
         own = self.options
@@ -293,6 +344,8 @@ class SoftActorCritic:
 
     @property
     def _critic(self) -> nn.Module:
+        if self.options.bins:
+            return CategoricalCritic(self.options.critic_layers)
         return q_network(self.options.critic_layers, layer_norm=self.options.layer_norm)
 
     @property

@@ -1,0 +1,99 @@
+"""Critics that predict a distribution over bins of value: batch and weight normalisation, cross-entropy.
+
+Source: Palenicek et al., "XQC: Well-conditioned optimization accelerates deep reinforcement learning",
+arXiv:2509.25174, 2025. The projection onto bins: Bellemare et al., "A distributional perspective on reinforcement
+learning", ICML 2017. One batch for steps and next steps: Bhatt et al., "CrossQ", ICLR 2024.
+
+Bins are in units of rms(reward) / (1 - discount) / `ROOM`, so that no option depends on the scale of rewards. XQC
+divides rewards by a running deviation of returns instead, which a minibatch of steps does not show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.types import Params
+
+BINS = jnp.linspace(-5.0, 5.0, 101)
+ROOM = 2.0  # a value of rms(reward) / (1 - discount) lies at this bin; 2.5 times that is the largest
+RATE = 1e-3  # at which the unit follows rewards, after as many batches
+
+
+class CategoricalCritic(nn.Module):
+    """Logits of value's bins: normalised inputs, then dense layers without bias, each normalised before its ReLU."""
+
+    layers: Sequence[int]
+
+    @nn.compact
+    def __call__(
+        self, obs: Float[Array, "... obs"], action: Float[Array, "... action"], train: bool = False
+    ) -> Float[Array, "... bins"]:
+        """Leading axes of `obs` and `action` must broadcast. `train`: normalise by this batch, and count it."""
+        lead = jnp.broadcast_shapes(obs.shape[:-1], action.shape[:-1])
+        x = jnp.concatenate([jnp.broadcast_to(part, (*lead, part.shape[-1])) for part in (obs, action)], -1)
+        x = nn.BatchNorm(not train, name="BatchNorm_in")(x)
+        for width in self.layers:
+            x = nn.relu(nn.BatchNorm(not train)(nn.Dense(width, use_bias=False)(x)))
+        return nn.Dense(BINS.size, kernel_init=nn.initializers.zeros, name="bins")(x)
+
+    def start(self, key: PRNGKeyArray, obs: Float[Array, " obs"], action: Float[Array, " action"]) -> Params:
+        """Return a critic's random parameters, running statistics, and the unit of its bins in reward."""
+        return with_unit_weights({**self.init(key, obs, action), "unit": jnp.ones(())})
+
+    def logits(self, critic: Params, obs: Array, action: Array) -> Float[Array, "... bins"]:
+        """Return logits by the running statistics."""
+        return jnp.asarray(self.apply(_variables(critic), obs, action))
+
+    def loss(
+        self, critic: Params, obs: Float[Array, "n obs"], action: Array, target: Float[Array, "batch bins"]
+    ) -> tuple[Float[Array, ""], Any]:
+        """Return the cross-entropy of the first rows and the new statistics, which all rows enter.
+
+        The rows are a batch's steps, and after them its next steps where there are any.
+        """
+        logits, changed = self.apply(_variables(critic), obs, action, train=True, mutable="batch_stats")
+        logs = jax.nn.log_softmax(jnp.asarray(logits)[: len(target)])
+        return -jnp.sum(target * logs, -1).mean(), changed["batch_stats"]
+
+
+def _variables(critic: Params) -> Params:
+    return {name: critic[name] for name in ("params", "batch_stats")}
+
+
+def values_of(critic: Params, logits: Float[Array, "... bins"]) -> Float[Array, "..."]:
+    """Return the expected values of distributions over the bins, in reward."""
+    return jax.nn.softmax(logits) @ BINS * critic["unit"]
+
+
+def next_unit(
+    unit: Array, rewards: Float[Array, " n"], discount: Array | float, count: Int[Array, ""]
+) -> Float[Array, "..."]:
+    """Return the unit of the bins after batch number `count` (from 1): a running root mean square."""
+    square = jnp.mean(jnp.square(rewards / jnp.maximum(1 - discount, 1e-3) / ROOM))
+    rate = jnp.maximum(1 / count, RATE)
+    return jnp.sqrt(jnp.square(unit) + rate * (square - jnp.square(unit)) + 1e-12)
+
+
+def with_unit_weights(critic: Params) -> Params:
+    """Return a critic whose hidden units each have incoming weights of length 1."""
+    shorten = lambda kernel: kernel / (jnp.linalg.norm(kernel, axis=-2, keepdims=True) + 1e-8)  # noqa: E731
+    layers = {
+        name: {"kernel": shorten(layer["kernel"])} if name.startswith("Dense") else layer
+        for name, layer in critic["params"].items()
+    }
+    return {**critic, "params": layers}
+
+
+def project(values: Float[Array, "n atoms"], weights: Float[Array, "n atoms"]) -> Float[Array, "n bins"]:
+    """Return a distribution over the bins: each atom's weight goes to its two nearest bins, by closeness."""
+    places = (jnp.clip(values, BINS[0], BINS[-1]) - BINS[0]) / (BINS[1] - BINS[0])
+    lower = jnp.clip(jnp.floor(places), 0, BINS.size - 2).astype(jnp.int32)
+    upward = weights * (places - lower)
+    rows, empty = jnp.arange(len(values))[:, None], jnp.zeros((len(values), BINS.size))
+    return empty.at[rows, lower].add(weights - upward).at[rows, lower + 1].add(upward)
