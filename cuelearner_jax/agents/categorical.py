@@ -92,7 +92,7 @@ def with_unit_weights(critic: Params) -> Params:
 
 def project(values: Float[Array, "n atoms"], weights: Float[Array, "n atoms"]) -> Float[Array, "n bins"]:
     """Return a distribution over the bins: each atom's weight goes to its two nearest bins, by closeness."""
-    places = (jnp.clip(values, BINS[0], BINS[-1]) - BINS[0]) / (BINS[1] - BINS[0])
+    places = (jnp.clip(values, BINS[0], BINS[-1]) - BINS[0]) * (BINS.size - 1) / (BINS[-1] - BINS[0])
     lower = jnp.clip(jnp.floor(places), 0, BINS.size - 2).astype(jnp.int32)
     upward = weights * (places - lower)
     rows, empty = jnp.arange(len(values))[:, None], jnp.zeros((len(values), BINS.size))

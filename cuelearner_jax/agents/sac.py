@@ -96,6 +96,8 @@ class SACConfig:
         """Raise UserError for options that do not work together."""
         if self.target_critics > self.critics:
             raise UserError(f"agent.target_critics is {self.target_critics}: give up to agent.critics ({self.critics})")
+        if self.bins and self.layer_norm:
+            raise UserError("agent.bins normalises by batches already: give it without agent.layer_norm")
 
 
 class Actor(nn.Module):

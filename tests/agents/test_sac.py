@@ -12,6 +12,7 @@ import pytest
 from walk_task import BOX, SMALL, Walk
 
 from cuelearner_jax.agents import sac
+from cuelearner_jax.agents.categorical import BINS, ROOM, next_unit, project
 from cuelearner_jax.agents.replay import Memory, Transition, buffer_for, count_guided, stored_step
 from cuelearner_jax.config import static
 from cuelearner_jax.environment import Spaces, spaces_of
@@ -20,6 +21,7 @@ from cuelearner_jax.spaces import DIRECTIONS, Choices
 
 ENV, KEY = Walk(), jax.random.key(0)
 SPACES = spaces_of(ENV)
+BINNED = dataclasses.replace(SMALL, bins=True)
 THREE = dataclasses.replace(SMALL, critics=3, target_critics=2)
 
 
@@ -216,6 +218,54 @@ def test_at_discount_zero_targets_are_rewards():
     batch = batch_of()
     found = agent.targets(0.0, params["actor"], None, 1.0, batch.replace(next_obs=jnp.zeros((6, 0))), KEY)
     np.testing.assert_array_equal(found, batch.reward)
+
+
+# Critics over bins of value.
+
+
+def test_a_value_goes_to_its_two_nearest_bins():
+    found = np.asarray(project(jnp.array([[0.25, 7.0]]), jnp.array([[0.4, 0.6]])))[0]
+    # 0.25 lies between bins 52 and 53 of width 0.1 from -5 on; 7 is beyond the last.
+    np.testing.assert_allclose(found[[52, 53, 100]], [0.2, 0.2, 0.6], atol=1e-5)
+    assert found.sum() == pytest.approx(1, abs=1e-6)
+
+
+def test_the_unit_is_a_running_root_mean_square_of_rewards_by_their_horizon():
+    rewards = jnp.array([3.0, -4.0])
+    first = next_unit(jnp.float32(1), rewards, 0.9, jnp.array(1))
+    assert float(first) == pytest.approx(np.sqrt(12.5) / 0.1 / ROOM, rel=1e-5)
+    later = next_unit(first, 0 * rewards, 0.9, jnp.array(10_000))
+    assert float(later / first) == pytest.approx(np.sqrt(1 - 1e-3), rel=1e-5)
+
+
+@pytest.mark.parametrize("discount", [0.0, 0.9])
+def test_distributions_to_learn_are_those_counted_by_hand(discount):
+    """New critics predict every bin alike, so the bias of a bin falls by 1 / bins less the targets' mean there."""
+    agent, batch, temperature = BINNED.make("raw", SPACES, discount > 0), batch_of(), 0.3
+    params, rest = agent.init(KEY)
+    behind = discount, params["actor"], rest.target_critics, temperature, batch, KEY
+    error = agent._binned_error(*behind, params["critics"], jnp.array(1))
+    (loss, _), gradient = jax.value_and_grad(error, has_aux=True)(params["critics"])
+    assert float(loss) == pytest.approx(np.log(BINS.size), rel=1e-5)
+    found = 1 / BINS.size - 2 * np.asarray(gradient["params"]["bins"]["bias"][0])  # the loss is the mean of two critics
+    unit = float(next_unit(jnp.float32(1), batch.reward, discount, jnp.array(1)))
+    drawn = agent.draw(params["actor"], batch.next_obs, jax.random.split(KEY)[0])
+    next_values = np.asarray(BINS)[None] * 1.0 - temperature * np.asarray(drawn.log_density)[:, None]
+    values = np.asarray(batch.reward)[:, None] + discount * np.asarray(batch.discount)[:, None] * next_values
+    expected = np.zeros(BINS.size)
+    for value in np.clip(values / unit, -5, 5).ravel():
+        closeness = np.clip(1 - np.abs((value + 5) / 0.1 - np.arange(BINS.size)), 0, 1)
+        expected += closeness / values.size
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_an_update_keeps_weights_at_length_one_and_counts_the_batch():
+    (before, _), (after, *_) = updated(BINNED)
+    for critics in (before["critics"], after["critics"]):
+        np.testing.assert_allclose(np.linalg.norm(critics["params"]["Dense_0"]["kernel"], axis=-2), 1, rtol=1e-5)
+    for name in ("batch_stats", "unit"):
+        old, new = (jax.tree.leaves(critics[name]) for critics in (before["critics"], after["critics"]))
+        assert all((one != other).any() for one, other in zip(old, new, strict=True))
 
 
 # What is refused.
