@@ -57,9 +57,9 @@ class CategoricalCritic(nn.Module):
 
         The rows are a batch's steps, and after them its next steps where there are any.
         """
-        logits, changed = self.apply(_variables(critic), obs, action, train=True, mutable="batch_stats")
+        logits, state = self.apply(_variables(critic), obs, action, train=True, mutable="batch_stats")
         logs = jax.nn.log_softmax(jnp.asarray(logits)[: len(target)])
-        return -jnp.sum(target * logs, -1).mean(), changed["batch_stats"]
+        return -jnp.sum(target * logs, -1).mean(), state["batch_stats"]
 
 
 def _variables(critic: Params) -> Params:
