@@ -14,13 +14,16 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 Params = Any  # a Flax parameter pytree
 EnvState = Any  # the pytree that an environment carries from step to step
+Observation = Float[Array, " obs"]
+Action = Float[Array, " action"]
+Number = Float[Array, ""] | float
 
 
 class Step(struct.PyTreeNode):
     """The result of one environment step."""
 
-    obs: Float[Array, " obs"]  # the next observation: after the automatic reset where the episode ended
-    final_obs: Float[Array, " obs"]  # the action's result: before the automatic reset
+    obs: Observation  # the next observation: after the automatic reset where the episode ended
+    final_obs: Observation  # the action's result: before the automatic reset
     aftermath: Float[Array, " aftermath"]  # what replay stores of `final_obs`, see `Environment.recall_next`
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]  # the task ended: no value follows
@@ -33,7 +36,7 @@ class Step(struct.PyTreeNode):
 class Teacher(Protocol):
     """A teacher: it returns an action that it holds for the best. A pytree, like an environment."""
 
-    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
+    def best_action(self, state: EnvState, obs: Observation) -> Action:
         """Return the action that the teacher would choose."""
         ...
 
@@ -42,14 +45,7 @@ class Teacher(Protocol):
 class ValuesDirections(Protocol):
     """A teacher that values all directions, and so can name the nearest good one."""
 
-    def nearest_good(
-        self,
-        state: EnvState,
-        obs: Float[Array, " obs"],
-        action: Float[Array, " action"],
-        spread: Float[Array, ""] | float,
-        share: Float[Array, ""] | float,
-    ) -> Float[Array, " action"]:
+    def nearest_good(self, state: EnvState, obs: Observation, action: Action, spread: Number, share: Number) -> Action:
         """Return the good action nearest to `action`: its value is at least a `share` of the best.
 
         `spread` is the standard deviation of the aim [rad]; see `spaces.directions.nearest_direction`.
@@ -69,11 +65,11 @@ class Policy(Protocol):
 class Label(struct.PyTreeNode):
     """One answer of a teacher as given, not a network's target (`Guide.target`)."""
 
-    obs: Float[Array, " obs"]
-    action: Float[Array, " action"]  # the action asked about
+    obs: Observation
+    action: Action  # the action asked about
     answer: Float[Array, " answer"]  # by its form; relative: h in {-1, 0, +1}, see `feedback.answers`
     valid: Bool[Array, ""]  # False: padding, past this lane's budget, or no answer
-    base: Float[Array, " action"] | None = None  # the uncorrected action; None: no model uses it
+    base: Action | None = None  # the uncorrected action; None: no model uses it
 
 
 class GuidanceModel(struct.PyTreeNode):

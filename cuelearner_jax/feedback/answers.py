@@ -13,7 +13,7 @@ from cuelearner_jax.config import Scalars, TeacherFaults
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.spaces import UNSAID, Space
-from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
+from cuelearner_jax.types import Action, EnvState, Number, Observation, Teacher, ValuesDirections
 
 SECOND = 2  # stream of a question's second action, beside the faults of the answer by the same key
 
@@ -51,13 +51,8 @@ def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
 
 
 def intended_action(
-    space: Space,
-    teacher: Teacher,
-    state: EnvState,
-    obs: Float[Array, " obs"],
-    action: Float[Array, " action"],
-    scalars: Scalars,
-) -> Float[Array, " action"]:
+    space: Space, teacher: Teacher, state: EnvState, obs: Observation, action: Action, scalars: Scalars
+) -> Action:
     """Return the action that a teacher intends in place of `action`, apart from its bias.
 
     The intended action is the teacher's best one or, with `scalars.answer` "nearest", the nearest good one.
@@ -73,12 +68,12 @@ def intended_action(
     return _taught(space, teacher, teacher.nearest_good(state, obs, perceived, spread, scalars.nearest_share), action)
 
 
-def add_bias(space: Space, action: Float[Array, " action"], bias: Float[Array, ""]) -> Float[Array, " action"]:
+def add_bias(space: Space, action: Action, bias: Float[Array, ""]) -> Action:
     """Return an action changed by a constant error along every cue."""
     return space.toward(action, jnp.ones(len(space.cues)), bias)
 
 
-def _taught(space: Space, teacher: Any, value: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
+def _taught(space: Space, teacher: Any, value: Any, action: Action) -> Action:
     """Return a teacher's action; NaN where it is not an action. Raises UserError for another shape."""
     advice = f"give an action of shape {action.shape}, of real numbers"
     try:
@@ -93,11 +88,7 @@ def _taught(space: Space, teacher: Any, value: Any, action: Float[Array, " actio
 
 
 def relative_feedback(
-    space: Space,
-    action: Float[Array, " action"],
-    best: Float[Array, " action"],
-    eps: Float[Array, ""] | float,
-    indifference: Float[Array, ""] | float = 0.0,
+    space: Space, action: Action, best: Action, eps: Number, indifference: Number = 0.0
 ) -> Float[Array, " cues"]:
     """Return h of each cue in {-1, 0, +1}: the change by -eps, 0 or +eps that brings `action` nearest to `best`.
 
@@ -108,18 +99,19 @@ def relative_feedback(
 
 
 def _answer_by(respond: Callable[..., tuple[Array, Array]]) -> Callable[..., tuple[Array, Array]]:
-    """Return a form's `answer` from what a teacher says: (key, space, action, intended action, scalars, *second)."""
+    """Return a form's `answer`; `respond`: (key, space, action, best with the bias, scalars, *second) -> the same."""
 
     def answer(key: PRNGKeyArray, env: Any, teacher: Teacher, *question: Any) -> tuple[Array, Array]:
         (state, obs, action, scalars, *second), space = question, actions_of(env)
         best = intended_action(space, teacher, state, obs, action, scalars)
+        best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
         return respond(key, space, action, best, scalars, *second)
 
     return answer
 
 
 def human_answer(
-    key: PRNGKeyArray, space: Space, action: Float[Array, " action"], best: Float[Array, " action"], scalars: Scalars
+    key: PRNGKeyArray, space: Space, action: Action, best: Action, scalars: Scalars
 ) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
     """Return (h of each cue, answered) of a person with the faults of `scalars` who intends `best`.
 
@@ -127,13 +119,12 @@ def human_answer(
     `UNSAID` for the others. An answer that names no cue counts as not answered.
     """
     mistaken, spoken = _slips(key, scalars, (len(space.cues),))
-    believed = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     eps, indifference = space.from_unit(scalars.eps_deg), space.from_unit(scalars.indifference_deg)
-    h = relative_feedback(space, action, believed, eps, indifference)
+    h = relative_feedback(space, action, best, eps, indifference)
     h = jnp.where(mistaken, -h, h)
     if len(space.cues) == 1:  # with one cue, silence about it is no answer
         return h, spoken[0]
-    spoken = spoken & _spoken_of(key, space.log(action, believed), scalars.says)
+    spoken = spoken & _spoken_of(key, space.log(action, best), scalars.says)
     return jnp.where(spoken | ~jnp.isfinite(h), h, UNSAID), spoken.any()
 
 
@@ -151,38 +142,34 @@ def _spoken_of(key: PRNGKeyArray, off: Float[Array, " cues"], says: str) -> Bool
 
 
 def demonstrate(
-    key: PRNGKeyArray, space: Space, action: Float[Array, " action"], best: Float[Array, " action"], scalars: Scalars
-) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
+    key: PRNGKeyArray, space: Space, action: Action, best: Action, scalars: Scalars
+) -> tuple[Action, Bool[Array, ""]]:
     """Return the action that a teacher with the faults of `scalars` shows, and whether it shows any.
 
     An indifferent teacher shows the given action where it is near enough. A mistaken teacher changes the action as far
     the other way: the mirror image of the intended action.
     """
     mistaken, answered = _slips(key, scalars)
-    best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     right = space.distance(action, best) <= space.from_unit(scalars.indifference_deg)
     mirrored = space.exp(action, -space.log(action, best))
     return jnp.where(right, action, jnp.where(mistaken, mirrored, best)), answered
 
 
 def scalar_answer(
-    key: PRNGKeyArray, space: Space, action: Float[Array, " action"], best: Float[Array, " action"], scalars: Scalars
+    key: PRNGKeyArray, space: Space, action: Action, best: Action, scalars: Scalars
 ) -> tuple[Float[Array, "1"], Bool[Array, ""]]:
     """Return 1 for a good action and 0 for another, by a teacher with the faults of `scalars`; and whether it answered.
 
     An action within `scalar_within_deg` of the intended action is good (paper, appendix).
     """
     mistaken, answered = _slips(key, scalars)
-    best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     within = jnp.maximum(space.from_unit(scalars.scalar_within_deg), space.from_unit(scalars.indifference_deg))
     good = space.distance(action, best) <= within
     label = jnp.where(jnp.isfinite(best).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
     return label[None], answered
 
 
-def draw_second(
-    key: PRNGKeyArray, space: Space, action: Float[Array, " action"], scalars: Any
-) -> Float[Array, " action"]:
+def draw_second(key: PRNGKeyArray, space: Space, action: Action, scalars: Any) -> Action:
     """Return an action to compare with `action`: far or near, a change of `action` by a scale from eps to the reach.
 
     The scale's logarithm is uniform, and each cue's change normal. So the first pairs already tell where good actions
@@ -197,12 +184,7 @@ def draw_second(
 
 
 def preference(
-    key: PRNGKeyArray,
-    space: Space,
-    action: Float[Array, " action"],
-    best: Float[Array, " action"],
-    scalars: Scalars,
-    second: Float[Array, " action"] | None = None,
+    key: PRNGKeyArray, space: Space, action: Action, best: Action, scalars: Scalars, second: Action | None = None
 ) -> tuple[Float[Array, " answer"], Bool[Array, ""]]:
     """Return (choice, *second action) of a teacher with the faults of `scalars`, and whether it answered.
 
@@ -215,7 +197,6 @@ def preference(
     """
     mistaken, answered = _slips(key, scalars)
     second = draw_second(key, space, action, scalars) if second is None else second
-    best = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     gain = space.distance(action, best) - space.distance(second, best)
     least = jnp.maximum(space.from_unit(scalars.eps_deg) / 2, space.from_unit(scalars.indifference_deg))
     choice = jnp.where(jnp.abs(gain) <= least, 0.0, jnp.where(mistaken, -1.0, 1.0) * jnp.sign(gain))

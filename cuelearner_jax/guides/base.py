@@ -21,7 +21,7 @@ from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
 from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, squared_errors
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
 
 Observations = Float[Array, "n obs"]
 Actions = Float[Array, "n action"]
@@ -128,9 +128,7 @@ class Guide:
         Examples are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
         answer in the mirror image is mostly not the mirror image of its answer.
         """
-
-        rows, losses = self.examples(labels, scalars), partial(self.losses, env, scalars)
-        init = self.network.init
+        rows, losses, init = self.examples(labels, scalars), partial(self.losses, env, scalars), self.network.init
         return fit_model(key, rows, scalars, init=init, losses=losses, sizes=self.sizes, augment=self.augmented)
 
     def losses(self, env: Any, scalars: GuideScalars, params: Params, rows: Any) -> Float[Array, " n"]:
@@ -138,14 +136,8 @@ class Guide:
         return squared_errors(rows, self.predict(env, params, rows.obs, rows.action))
 
     def question(
-        self,
-        key: PRNGKeyArray,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, " obs"],
-        base: Float[Array, " action"],
-        scalars: GuideScalars,
-    ) -> Float[Array, " action"]:
+        self, key: PRNGKeyArray, model: GuidanceModel, env: Any, obs: Observation, base: Action, scalars: GuideScalars
+    ) -> Action:
         """Return the action to ask about: refined from `base` in a share `refined_fraction` of questions, else `base`.
 
         Source: DAgger (Ross, Gordon, Bagnell, 2011): what is asked about follows what will be met.

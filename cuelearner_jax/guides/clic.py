@@ -39,7 +39,7 @@ from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Box, is_answered, says_something
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
 
 SHARPNESS = 10.0  # weight of the observation model against the policy
 SOFTNESS = 0.5  # softness of a set's edge, in units of eps: 0.1 in actions from -1 to 1, where eps is 0.2
@@ -58,12 +58,12 @@ RADIUS = 0.5  # of the set around a demonstration, as a share of the way there f
 class Contrast(struct.PyTreeNode):
     """One label as the energy learns from it."""
 
-    obs: Float[Array, " obs"]
-    action: Float[Array, " action"]
+    obs: Observation
+    action: Action
     answer: Float[Array, " answer"]
     valid: Bool[Array, ""]
     draw: Int[Array, ""]  # number of its random stream for sampling
-    base: Float[Array, " action"]  # the finished policy's action, where labels keep it; else the action asked about
+    base: Action  # the finished policy's action, where labels keep it; else the action asked about
 
 
 def log_nearer(apart: Float[Array, "..."], closer: Float[Array, "..."], softness: float) -> Float[Array, "..."]:
@@ -120,15 +120,15 @@ class Clic(Guide):
         self,
         env: Any,
         params: Params,
-        obs: Float[Array, " obs"],
+        obs: Observation,
         actions: Float[Array, "m action"],
-        base: Float[Array, " action"] | None,
+        base: Action | None,
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
         """Return E of actions in one situation; `base`, the policy's own action, is ignored."""
         return -self.network.predict(env, params, obs, actions)[:, 0]
 
-    def target_action(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
+    def target_action(self, row: Contrast, scalars: GuideScalars) -> Action:
         """Return the action that a label calls better than the one asked about."""
         space = self.spaces.actions
         return space.toward(row.action, row.answer, space.from_unit(scalars.eps_deg))
@@ -179,13 +179,13 @@ class Clic(Guide):
         return says_something(labels.answer)
 
     def minimise_energy(
-        self, env: Any, params: Params, obs: Float[Array, " obs"], base: Float[Array, " action"], scalars: GuideScalars
-    ) -> Float[Array, " action"]:
+        self, env: Any, params: Params, obs: Observation, base: Action, scalars: GuideScalars
+    ) -> Action:
         """Return the action of least energy within tau_max of `base`, by a deterministic search."""
         space, cues = self.spaces.actions, len(self.spaces.actions.cues)
         bound = jnp.minimum(space.from_unit(scalars.tau_max_deg), space.from_unit(space.reach))
 
-        def best(actions: Float[Array, "m action"]) -> Float[Array, " action"]:
+        def best(actions: Float[Array, "m action"]) -> Action:
             actions = space.clip(actions, jnp.broadcast_to(base, actions.shape), bound)
             return actions[jnp.argmin(self.energy(env, params, obs, actions, base, scalars))]
 
@@ -221,7 +221,7 @@ class ClicShown(Clic):
     about = "an energy over actions, low around what the teacher shows"
     form, colour, by_cues = DEMONSTRATION, "#44AA99", True
 
-    def target_action(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
+    def target_action(self, row: Contrast, scalars: GuideScalars) -> Action:
         """Return the demonstrated action."""
         return row.answer
 

@@ -30,7 +30,7 @@ from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows
 from cuelearner_jax.guides.fitting import GuideModel, ensemble, fit_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Space, is_answered
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.types import Action, GuidanceModel, Label, Params
 
 ELSEWHERE = 360  # evenly spaced actions that stand for "the teacher means none of the aims"
 SPREAD = 1 / 180  # distance of a meant action from its aim, as a share of the space's reach
@@ -76,11 +76,7 @@ class Evidence(struct.PyTreeNode):
 
 
 def likelihood(
-    space: Space,
-    action: Float[Array, " action"],
-    goals: Float[Array, "goals action"],
-    h: Float[Array, " cues"],
-    eps: Float[Array, ""],
+    space: Space, action: Action, goals: Float[Array, "goals action"], h: Float[Array, " cues"], eps: Float[Array, ""]
 ) -> Float[Array, " goals"]:
     """Return the probability of the answer h about `action`, if the teacher means each of the goals.
 
@@ -103,12 +99,8 @@ def evidence_of(aims: Aims, space: Space, label: Label, scalars: GuideScalars) -
 
 
 def choose_aim(
-    space: Space,
-    share: Float[Array, " aims_and_none"],
-    aims: Float[Array, "aims action"],
-    action: Float[Array, " action"],
-    doubt: float,
-) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
+    space: Space, share: Float[Array, " aims_and_none"], aims: Float[Array, "aims action"], action: Action, doubt: float
+) -> tuple[Action, Bool[Array, ""]]:
     """Return the nearest of the likeliest aims, and whether the aim is likely enough to be followed."""
     most = share[:-1].max()
     goal = aims[jnp.argmin(jnp.where(share[:-1] >= most, space.distance(action[None], aims), jnp.inf))]

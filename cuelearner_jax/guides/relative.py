@@ -15,14 +15,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from jaxtyping import Array, Bool, Float
-
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows
 from cuelearner_jax.guides.fitting import Example
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.types import GuidanceModel, Label
+from cuelearner_jax.types import Action, GuidanceModel, Label
 
 
 class Relative(Guide):
@@ -31,7 +29,7 @@ class Relative(Guide):
     name, about = "relative", "a model of the teacher's relative feedback"
     form, colour = RELATIVE, "#0072B2"
 
-    def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
+    def target(self, label: Label, scalars: GuideScalars) -> Action:
         """Return eps * h of Eq. 3 as a vector: the action changed by h * eps along each cue, less the action."""
         space = self.spaces.actions
         return space.toward(label.action, label.answer, space.from_unit(scalars.eps_deg)) - label.action
@@ -42,18 +40,12 @@ class Relative(Guide):
         return rows.replace(target=rows.target / self.spaces.actions.from_unit(scalars.eps_deg))
 
     def act(
-        self,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
-        scalars: GuideScalars,
+        self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Refine active rows with a fitted model by Eq. 4: a <- a + phi(s, a)."""
         eps = self.spaces.actions.from_unit(scalars.eps_deg)
 
-        def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+        def phi(current: Actions) -> Actions:
             return eps * self.predict(env, model.params, obs, current)
 
         return self.refined(phi, actions, active & model.fitted, scalars)

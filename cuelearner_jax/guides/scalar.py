@@ -18,14 +18,14 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.agents.choice import best_of
 from cuelearner_jax.config import POSITIVE, SHARE, GuideScalars, part
 from cuelearner_jax.feedback.answers import SCALAR
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.types import GuidanceModel
+from cuelearner_jax.types import Action, GuidanceModel, Observation
 
 
 @part
@@ -56,14 +56,8 @@ class Scalar(Guide):
         return replaced(best, actions, guided)
 
     def question(
-        self,
-        key: PRNGKeyArray,
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, " obs"],
-        base: Float[Array, " action"],
-        scalars: GuideScalars,
-    ) -> Float[Array, " action"]:
+        self, key: PRNGKeyArray, model: GuidanceModel, env: Any, obs: Observation, base: Action, scalars: GuideScalars
+    ) -> Action:
         """Return the base action in a share `explored_fraction` of questions, the guide's own action in the others."""
         k_explore, k_refined = jax.random.split(key)
         explores = jax.random.bernoulli(k_explore, self.options.explored_fraction)

@@ -91,7 +91,8 @@ def _aggregate(
         return (variant.samples(variant.area, lambda values, axis: values) - zero) / (one - zero)
 
     def spread(samples: np.ndarray) -> Interval:
-        return Interval(samples[0], *np.quantile(samples[1:], [0.025, 0.975], axis=0))
+        ends = np.quantile(samples[1:], [0.025, 0.975], axis=0)
+        return Interval(samples[0], *(ends if min(len(one.seeds) for one in own) > 1 else ends + np.nan))
 
     tasks = [scores(one) for one in own]
     numbers = {name: spread(of(tasks)) for name, of in STATISTICS.items()}
@@ -99,7 +100,11 @@ def _aggregate(
         pairs = zip(tasks, (scores(unguided_of(one, variants) or one) for one in own), strict=True)
         numbers[IMPROVEMENT] = spread(np.mean([improvement(*pair) for pair in pairs], axis=0))
     above = [(np.concatenate(tasks, axis=1) > score).mean(axis=1) for score in THRESHOLDS]
-    return replace(own[0], task=""), Curve(THRESHOLDS, *spread(np.stack(above, axis=-1))), numbers
+    return (
+        replace(own[0], task="", failed=own[0].failed[:0]),
+        Curve(THRESHOLDS, *spread(np.stack(above, axis=-1))),
+        numbers,
+    )
 
 
 def section(over: Aggregates, level: float | None) -> list[str]:

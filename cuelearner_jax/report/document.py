@@ -7,7 +7,7 @@ the figures, and the tables of a question about label efficiency, or of several 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,7 +81,7 @@ def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Co
     variants = variants_of(groups, metric)
     over = answer = None
     if len({variant.task for variant in variants}) > 1:
-        if request.efficiency or (request.level_at, request.reference) != (None, None):
+        if (request if request.by_run else replace(request, level=None)).asks:
             raise UserError("label efficiency is of one task: report each task by itself, or give --level alone")
         over = None if request.by_run else aggregates.aggregates_of(variants, request.level, lower_is_better)
     elif request.asks:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -44,34 +45,58 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
     More than four variants have a panel for each kind of guidance, beside the unguided agents. So has each of several
     tasks, with steps and values of its own.
     """
-    tasks = len({variant.task for variant in variants})
-    groups = _panels(variants) if len(variants) > 4 or tasks > 1 else [list(variants)]
+    alike = len({variant.task for variant in variants}) == 1
+    groups = [list(variants)] if len(variants) <= 4 and alike else _panels(variants)
+    note = "interquartile mean over seeds, band: its 95% bootstrap interval over seeds"
+    note += " and episodes" if all(variant.episodes for variant in variants) else ""
+    words = f"environment steps of a seed\n{note}", axis_name(metric)
+    curves = [(variant, variant.curve) for variant in variants]
+    return _draw_panels(groups, curves, title, words, ticker.EngFormatter(sep=""), alike)
+
+
+def _draw_panels(
+    groups: list[list[Variant]],
+    curves: Sequence[tuple[Variant, Curve]],
+    title: str,
+    words: tuple[str, str],
+    ticks: ticker.Formatter,
+    alike: bool = True,
+) -> Figure:
+    """Draw a panel for each group of variants; `words` name the axes, which are `alike` in all panels or not."""
     rows, columns = -(-len(groups) // 3), min(3, len(groups))
-    colours = {id(variant): colour for variant, colour in zip(variants, colours_of(variants), strict=True)}
+    colours, all_curves = colours_of([variant for variant, _ in curves]), [curve for _, curve in curves]
+    looks = {id(variant): (curve, colour) for (variant, curve), colour in zip(curves, colours, strict=True)}
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5) if len(groups) == 1 else (4 * columns, 1 + 2.8 * rows), layout="constrained")
-        panels = [*figure.subplots(rows, columns, sharex=tasks == 1, sharey=tasks == 1, squeeze=False).flat]
+        panels = [*figure.subplots(rows, columns, sharex=alike, sharey=alike, squeeze=False).flat]
         for axes, group in zip(panels, groups, strict=False):
-            for place, variant in enumerate(group):
-                _draw_curve(axes, variant.curve, variant.name, colours[id(variant)], place, variant.failed)
-            axes.set_xlim(0, max(1, *(int(one.curve.steps[-1]) for one in (variants if tasks == 1 else group))))
-            axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
+            place = group[-1].place if len(groups) > 1 else ""
+            axes.set_title(_wrapped(place), fontsize=8)
+            for number, variant in enumerate(group):
+                curve, colour = looks[id(variant)]
+                name = _wrapped(variant.name if variant.place != place else variant.short_name)
+                _draw_curve(axes, curve, name, colour, number, variant.failed)
+            there = all_curves if alike else [looks[id(variant)][0] for variant in group]
+            axes.set_xlim(min(0, *(one.steps[0] for one in there)), max(1, *(one.steps[-1] for one in there)))
+            axes.xaxis.set_major_formatter(ticks)
             axes.tick_params(labelbottom=True)  # also above an empty place
-            names = [variant.name for variant in sorted(group, key=lambda variant: -variant.curve.estimate[-1])]
             lines = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-            names += [FAILED] * (FAILED in lines)
+            ends = {name: -line.get_ydata()[-1] for name, line in lines.items() if name != FAILED}
+            names = [*sorted(ends, key=lambda name: ends[name]), *[FAILED] * (FAILED in lines)]
             if len(groups) == 1:
                 figure.legend([lines[name] for name in names], names, loc="outside right upper", fontsize=9)
             else:
                 axes.legend([lines[name] for name in names], names, fontsize=7, frameon=True, edgecolor="none")
         for axes in panels[len(groups) :]:
             axes.remove()
-        note = "interquartile mean over seeds, band: its 95% bootstrap interval over seeds"
-        note += " and episodes" if all(variant.episodes for variant in variants) else ""
-        figure.supxlabel(f"environment steps of a seed\n{note}", fontsize=9)
-        figure.supylabel(axis_name(metric), fontsize=10)
+        figure.supxlabel(words[0], fontsize=9)
+        figure.supylabel(words[1], fontsize=10)
         figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
+
+
+def _wrapped(name: str) -> str:
+    return textwrap.fill(name.replace(",", ", ").replace(",  ", ", "), 44)
 
 
 def _panels(variants: Sequence[Variant]) -> list[list[Variant]]:
@@ -126,19 +151,16 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
 
 
 def draw_profiles(over: Aggregates) -> Figure:
-    """Draw the performance profile of each variant over tasks: the share of runs above each normalised score."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(8, 4.5), layout="constrained")
-        axes = figure.add_subplot()
-        colours = colours_of([variant for variant, *_ in over.each])
-        for place, (variant, profile, _) in enumerate(over.each):
-            _draw_curve(axes, profile, variant.name, colours[place], place)
-        axes.set_ylabel("share of runs above the score")
-        axes.set_xlabel("normalised score\nband: 95% bootstrap interval over seeds, drawn in each task", fontsize=9)
-        figure.legend(loc="outside right upper", fontsize=9)
-        title = f"{len(over.ends)} tasks: {', '.join(over.ends)}"
-        figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
-    return figure
+    """Draw the performance profile of each variant over tasks, a panel for each setting of a sweep.
+
+    A profile is the share of runs above each normalised score.
+    """
+    curves = [(variant, profile) for variant, profile, _ in over.each]
+    runs = dict.fromkeys(variant.run for variant, _ in curves)
+    groups = [[variant for variant, _ in curves if variant.run == run] for run in runs]
+    words = "normalised score\nband: 95% bootstrap interval over seeds and episodes, drawn in each task"
+    title = f"{len(over.ends)} tasks: {', '.join(over.ends)}"
+    return _draw_panels(groups, curves, title, (words, "share of runs above the score"), ticker.ScalarFormatter())
 
 
 def save_figure(figure: Figure, stem: Path) -> None:

@@ -34,12 +34,12 @@ class Interval(NamedTuple):
     def __str__(self) -> str:
         """Format the interval of a single number for tables, with digits enough to show its width."""
         if np.isnan(self.lower):
-            return f"{self.estimate:.3f}"
+            return f"{self.estimate:z.3f}"
         for digits in (3, 4, 5, 6):
-            estimate, lower, upper = (f"{value:.{digits}f}" for value in self)
+            estimate, lower, upper = (f"{value:z.{digits}f}" for value in self)
             if lower != upper:
                 return f"{estimate} [{lower}, {upper}]"
-        return f"{self.estimate:.3f} [no spread]"
+        return f"{self.estimate:z.3f} [no spread]"
 
 
 class Curve(NamedTuple):

@@ -23,7 +23,6 @@ from cuelearner_jax.runs import failures
 from cuelearner_jax.storage import results
 
 PathLike = str | os.PathLike[str]
-LONGEST_NAME = 60  # characters
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +78,18 @@ class Variant:
     @property
     def name(self) -> str:
         """The variant's name in a legend."""
+        return ": ".join(filter(None, (self.place, self.short_name)))
+
+    @property
+    def place(self) -> str:
+        """The task and the run, where there are several."""
+        return ": ".join(filter(None, (self.task, self.run)))
+
+    @property
+    def short_name(self) -> str:
+        """The guidance and the labels."""
         name = guidance_name(self.guidance)
-        name = f"{name}, {self.labels:,} labels" if self.labels else name
-        return ": ".join(filter(None, (self.task, self.run, name)))[:LONGEST_NAME]
+        return f"{name}, {self.labels:,} labels" if self.labels else name
 
 
 def guidance_name(guidance: str) -> str:
