@@ -23,7 +23,7 @@ from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.checkpoint import Checkpoints
-from cuelearner_jax.types import Params
+from cuelearner_jax.types import Number, Observation, Params
 
 ABOUT = "teacher.json"
 TRAIN = "python experiments/train_teacher.py"  # folder of the repository, for messages
@@ -35,7 +35,7 @@ def init_params(layers: tuple[int, ...], env: Any, key: PRNGKeyArray) -> Params:
 
 
 def expected_reward(
-    layers: tuple[int, ...], env: Any, params: Params, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]
+    layers: tuple[int, ...], env: Any, params: Params, obs: Observation, actions: Float[Array, "*n 2"]
 ) -> Float[Array, "*n"]:
     """Return the reward that a teacher's network expects of actions in one situation."""
     return as_function(q_network(layers))(params, *network_inputs("action", env, obs, actions))[..., 0]
@@ -47,26 +47,21 @@ class LearnedTeacher(struct.PyTreeNode):
     env: Any  # the environment or view whose features the network sees
     params: Params
     aim_error: Float[Array, ""] | float  # standard deviation of the error of a player's aim [rad]
-    habit: Float[Array, ""] | float  # settles near-ties, see `actions.best_direction`
+    habit: Number  # settles near-ties, see `actions.best_direction`
     layers: tuple[int, ...] = struct.field(pytree_node=False)
     directions: int = struct.field(pytree_node=False)
 
-    def values(self, obs: Float[Array, " obs"], options: Float[Array, "n 2"]) -> Float[Array, " n"]:
+    def values(self, obs: Observation, options: Float[Array, "n 2"]) -> Float[Array, " n"]:
         """Return the expected reward of each direction."""
         return expected_reward(self.layers, self.env, self.params, obs, options)
 
-    def best_action(self, state: Any, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
+    def best_action(self, state: Any, obs: Observation) -> Float[Array, "2"]:
         """Return the direction with the largest value."""
         values = self.values(obs, geometry.evenly_spaced(self.directions))
         return geometry.best_direction(values, self.aim_error, self.habit)
 
     def nearest_good(
-        self,
-        state: Any,
-        obs: Float[Array, " obs"],
-        action: Float[Array, "2"],
-        spread: Float[Array, ""] | float,
-        share: Float[Array, ""] | float,
+        self, state: Any, obs: Observation, action: Float[Array, "2"], spread: Number, share: Number
     ) -> Float[Array, "2"]:
         """Return the nearest good direction (`cuelearner_jax.types.ValuesDirections`)."""
         values = self.values(obs, geometry.evenly_spaced(self.directions))

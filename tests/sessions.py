@@ -10,8 +10,9 @@ import numpy as np
 import page_task
 import probes
 
+from cuelearner_jax import asking
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.labelling.plan import Base, SessionPlan
+from cuelearner_jax.labelling.plan import Base, SessionPlan, keys_of
 from cuelearner_jax.policies import Uniform
 
 TESTS = Path(__file__).resolve().parent
@@ -40,6 +41,14 @@ def give(session, count, eps_deg=probes.SCALARS.eps_deg):
         items.append(session.item)
         assert session.answer(session.number, expert(session.item, eps_deg))
     return items
+
+
+def taught(kind):
+    """A kind of guidance, its guide at the start, and that after the first round of a simulated teacher."""
+    guidance, keys = guidances.make(kind, probes.SIZES, ENV), keys_of(0)
+    guide = asking.start(guidance, ENV, 20, 20, keys.model, keys.start)
+    round_of = probes.label_rounds(guidance, probes.SIZES)
+    return guidance, guide, round_of(ENV, probes.Expert(ENV), probes.SCALARS, Uniform(), guide, keys.session)
 
 
 def settled(session, fits):

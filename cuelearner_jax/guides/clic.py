@@ -117,14 +117,8 @@ class Clic(Guide):
     form, colour, outputs = RELATIVE, "#117733", 1  # minus the energy of an action
 
     def energy(
-        self,
-        env: Any,
-        params: Params,
-        obs: Observation,
-        actions: Float[Array, "m action"],
-        base: Action | None,
-        scalars: GuideScalars,
-    ) -> Float[Array, " m"]:
+        self, env: Any, params: Params, obs: Observation, actions: Actions, base: Action | None, scalars: GuideScalars
+    ) -> Float[Array, " n"]:
         """Return E of actions in one situation; `base`, the policy's own action, is ignored."""
         return -self.network.predict(env, params, obs, actions)[:, 0]
 
@@ -134,8 +128,8 @@ class Clic(Guide):
         return space.toward(row.action, row.answer, space.from_unit(scalars.eps_deg))
 
     def membership(
-        self, key: PRNGKeyArray, row: Contrast, actions: Float[Array, "m action"], scalars: GuideScalars
-    ) -> Float[Array, " m"]:
+        self, key: PRNGKeyArray, row: Contrast, actions: Actions, scalars: GuideScalars
+    ) -> Float[Array, " n"]:
         """Return log p(b in A) of actions b, where A is the desired set of one label."""
         space = self.spaces.actions
         x = space.log(jnp.broadcast_to(row.action, actions.shape), actions) / space.from_unit(scalars.eps_deg)
@@ -143,7 +137,7 @@ class Clic(Guide):
         implicit = jax.vmap(lambda key: direction_at(key, row.answer, angle))(keys)
         return SHARPNESS * jax.vmap(lambda x: log_desired(x, row.answer, implicit, GAMMA))(x)
 
-    def sample_actions(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Float[Array, "m action"]:
+    def sample_actions(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Actions:
         """Return the sampled actions of one label: two known ones, uniform ones, and ones near a."""
         space, count = self.spaces.actions, SAMPLED - 2
         k_any, k_near = jax.random.split(key)
@@ -165,10 +159,9 @@ class Clic(Guide):
 
     def examples(self, labels: Label, scalars: GuideScalars) -> Contrast:
         """Return labels (slots, ...) as contrasts; a label that names no cue is not valid."""
-        numbers, base = jnp.arange(len(labels.valid)), labels.action if labels.base is None else labels.base
-        return Contrast(
-            labels.obs, labels.action, labels.answer, labels.valid & self.informative(labels), numbers, base
-        )
+        numbers, valid = jnp.arange(len(labels.valid)), labels.valid & self.informative(labels)
+        base = labels.action if labels.base is None else labels.base
+        return Contrast(labels.obs, labels.action, labels.answer, valid, numbers, base)
 
     def augmented(self, key: PRNGKeyArray, batch: Contrast) -> Contrast:
         """Return the batch with new random streams for sampling."""
@@ -185,7 +178,7 @@ class Clic(Guide):
         space, cues = self.spaces.actions, len(self.spaces.actions.cues)
         bound = jnp.minimum(space.from_unit(scalars.tau_max_deg), space.from_unit(space.reach))
 
-        def best(actions: Float[Array, "m action"]) -> Action:
+        def best(actions: Actions) -> Action:
             actions = space.clip(actions, jnp.broadcast_to(base, actions.shape), bound)
             return actions[jnp.argmin(self.energy(env, params, obs, actions, base, scalars))]
 
@@ -230,8 +223,8 @@ class ClicShown(Clic):
         return jnp.ones_like(labels.valid)
 
     def membership(
-        self, key: PRNGKeyArray, row: Contrast, actions: Float[Array, "m action"], scalars: GuideScalars
-    ) -> Float[Array, " m"]:
+        self, key: PRNGKeyArray, row: Contrast, actions: Actions, scalars: GuideScalars
+    ) -> Float[Array, " n"]:
         """Return log p(b in A) of actions b, where A is the ball around the demonstration."""
         space = self.spaces.actions
         eps = space.from_unit(scalars.eps_deg)

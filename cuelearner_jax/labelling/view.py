@@ -134,9 +134,8 @@ def _arrows(sketch: Sketch, item: Item, form: AnswerForm, eps_deg: float) -> lis
         for one in controls.answers(form, DIRECTIONS):
             if one.answer and one.answer[0]:
                 parts.append(arrow(sketch, angle + one.answer[0] * turn, one.colour, longer, one.first_key))
-    for one in controls.PAIR if item.pair else ():
-        if one.colour:
-            parts.append(arrow(sketch, angle_of(item.pair[one.colour]), one.colour, TURNED_REACH[0], one.first_key))
+    for name, key, longer in (("left", "A", BESIDE_TRAILS), ("right", "B", TURNED_REACH[0])) if item.pair else ():
+        parts.append(arrow(sketch, angle_of(item.pair[name]), name, longer, key))  # A shows where B lies upon it
     if sketch.aim and not item.trails and not item.pair:
         hair, tip = sketch.box[2] * HAIR, sketch.reach[1]
         dashes = f' class="aim" stroke-dasharray="{4 * hair:.5f} {3 * hair:.5f}"'

@@ -1,7 +1,7 @@
 """Aggregates over tasks, as Agarwal et al. (2021, arXiv 2108.13264) recommend: profiles and interquartile means.
 
 A run's score is its mean over the curve, normalised by task: 0 for the interquartile mean of the unguided agents, 1
-for that of the task's best variant, or for `--level`. Both are held fixed. Intervals draw the seeds of each task apart.
+for that of the task's best variant, or for `--level`. Both are held fixed. Intervals draw each task's seeds apart.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Scores = Float[np.ndarray, "samples runs"]  # of the real seeds, then of the dra
 THRESHOLDS = np.linspace(-0.25, 1.25, 61)
 NOTE = (
     "A run's score is its mean over the curve. In each task 0 is the unguided agents' interquartile mean, 1 is {}. All "
-    "runs of all tasks count alike. In brackets: 95% bootstrap intervals over seeds and episodes, drawn in each task, "
-    "with 0 and 1 held fixed. The median is that of the tasks' means. The optimality gap is the mean shortfall from 1. "
-    "The probability of improvement over the unguided agents is a mean over tasks."
+    "runs have equal weight. In brackets: 95% bootstrap intervals over seeds and episodes, drawn in each task, with 0 "
+    "and 1 held fixed. The median is that of the tasks' means. The optimality gap is the mean shortfall from 1. The "
+    "probability of improvement over the unguided agents is a mean over tasks."
 )
 STATISTICS: dict[str, Callable[[list[Scores]], np.ndarray]] = {
     "interquartile mean": lambda tasks: interquartile_mean(np.concatenate(tasks, axis=1), axis=1),

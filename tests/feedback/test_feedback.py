@@ -1,4 +1,4 @@
-"""Relative feedback by hand and against brute force; the teacher's faults; the laws of fitting."""
+"""Relative feedback against brute force; the teacher's faults; the laws of fitting."""
 
 import dataclasses
 import math
@@ -20,22 +20,6 @@ DEG = math.pi / 180
 
 def direction(degrees):
     return directions.from_angle(jnp.array(degrees * DEG))
-
-
-@pytest.mark.parametrize(
-    ("action", "best", "h"),
-    [
-        (0, 30, 1),
-        (30, 0, -1),
-        (0, 4.9, 0),
-        (0, 5.1, 1),
-        (175, -178, 1),  # 7 deg counterclockwise, over the wrap
-        (-178, 175, -1),
-        (0, -179, -1),
-    ],
-)
-def test_relative_feedback_by_hand(action, best, h):
-    assert float(relative_feedback(DIRECTIONS, direction(action), direction(best), jnp.array(10 * DEG))[0]) == h
 
 
 def test_an_error_of_exactly_half_eps_is_right():

@@ -10,11 +10,10 @@ import numpy as np
 import page_task
 import probes
 import pytest
-from sessions import ENV, expert, give, plan, settled
+from sessions import ENV, expert, give, plan, settled, taught
 
 from cuelearner_jax import asking
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.labelling.plan import Base, keys_of
 from cuelearner_jax.labelling.session import Session
@@ -52,16 +51,15 @@ def test_the_first_round_is_that_of_a_simulated_teacher(opened, tmp_path):
     session = opened()
     give(session, 10)
     status = settled(session, fits=1)
-    guidance, keys = guidances.make("relative", probes.SIZES, ENV), keys_of(0)
-    guide = asking.start(guidance, ENV, 20, 20, keys.model, keys.start)
-    round_of = probes.label_rounds(guidance, probes.SIZES)
-    taught = round_of(ENV, probes.Expert(ENV), probes.SCALARS, Uniform(), guide, keys.session)
+    guidance, guide, after = taught("relative")
     file = label_files.read(tmp_path / "labels")
     for name in ("obs", "action", "answer"):
-        np.testing.assert_allclose(getattr(file.labels, name), getattr(taught.labels, name)[:10], atol=1e-6)
+        np.testing.assert_allclose(getattr(file.labels, name), getattr(after.labels, name)[:10], atol=1e-6)
     # The same labels and the same step of the same stream, though the fit after the first has another number there.
-    told = guide.replace(labels=taught.labels)
-    refit = jax.jit(asking.fit, static_argnums=0)(guidance, ENV, probes.SCALARS, told, keys.session, jnp.asarray(1))
+    told = guide.replace(labels=after.labels)
+    refit = jax.jit(asking.fit, static_argnums=0)(
+        guidance, ENV, probes.SCALARS, told, keys_of(0).session, jnp.asarray(1)
+    )
     chex.assert_trees_all_close(status.newest.model, refit.model, atol=1e-4)
     assert (status.newest.labels, status.newest.number, status.newest.quality.count) == (10, 1, 2)
 

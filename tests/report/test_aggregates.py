@@ -63,8 +63,6 @@ def test_scores_are_normalised_by_task_and_pooled(tasks, tmp_path):
     assert "scalar, 100 labels: not in all tasks, so not among the aggregates" in text
     assert "| large | none |" in text
     assert (tmp_path / "report" / "profiles.png").exists()
-    report([tasks / "small-none"], tmp_path / "report", overwrite=True)
-    assert not list((tmp_path / "report").glob("profiles.*"))
 
 
 def test_equal_seeds_are_drawn_together_within_a_task_alone():

@@ -156,7 +156,3 @@ def test_the_command_writes_tables_and_a_section(runs, tmp_path):
     summary = rows(out / "summary.csv")
     assert [float(row["mean"]) for row in summary] == [float(row["mean"]) for row in table.values()]
     assert "differ in more than" not in text  # each run has one configuration
-    assert main(["report", str(runs / "raw"), "--out", str(out), "--overwrite"]) == 0
-    left = {path.name for path in out.iterdir()}
-    assert not left & {"efficiency.csv", "equal_area.csv"}
-    assert "Label efficiency" not in (out / "report.md").read_text()
