@@ -72,11 +72,10 @@ class Questions:
 
     def draw(self, item: Item) -> Item:
         """Add what the page shows: the sketch, each answer's outcome, and the newest model's action."""
-        if self.plan.form.second is not None and item.second is None:
-            key, action = asking.question_keys(self.keys.session, item.number).answer, jnp.asarray(item.action)
-            item = item._replace(
-                second=np.asarray(self.plan.form.second(key, self.space, action, self.plan.config.scalars))
-            )
+        if (draw := self.plan.form.second) is not None and item.second is None:
+            key = asking.question_keys(self.keys.session, item.number).answer
+            second = draw(key, self.space, jnp.asarray(item.action), self.plan.config.scalars)
+            item = item._replace(second=np.asarray(second))
         if item.sketch is None:
             assert self.pictures.sketch is not None
             item = item._replace(sketch=self.pictures.sketch(self.env, item.guide.env))

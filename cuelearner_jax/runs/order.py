@@ -83,15 +83,15 @@ def in_folders(orders: Sequence[Order]) -> list[Order]:
 
     Where some have begun, `resume` resumes these and begins the others.
     """
-    if not all(order.setting for order in orders):
+    if not orders[0].setting:
         return list(orders)
     if (out := orders[0].out / CONFIG).exists():
         raise UserError(f"{out.parent} holds a run of one setting: give another --out")
     folders = [order.out / setting_name(dict(order.setting)) for order in orders]
     begun = [(folder / CONFIG).is_file() for folder in folders]
-    resumes = begun if any(begun) else [order.shard is None for order in orders]
-    each = zip(orders, folders, resumes, strict=True)
-    return [replace(order, out=folder, resume=order.resume and resume) for order, folder, resume in each]
+    none = not any(begun) and orders[0].shard is None  # then each order says so; a shard resumes by itself
+    each = zip(orders, folders, begun, strict=True)
+    return [replace(order, out=folder, resume=order.resume and (none or old)) for order, folder, old in each]
 
 
 def make_plan(order: Order) -> Plan:

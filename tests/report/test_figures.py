@@ -1,4 +1,4 @@
-"""What figures show: points on their ticks, names in the order of the curves."""
+"""What figures show: a panel a kind and a setting, and names in the order of the curves."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency
+from cuelearner_jax.report.figures import draw_curves
 from cuelearner_jax.report.variants import Variant
 
 
@@ -19,18 +19,6 @@ def variant(guidance, labels, level, *, first=0.8, steps=11, spread=0.002):
 
 def legend(axes):
     return [text.get_text() for text in axes.get_legend().get_texts()]
-
-
-def test_points_stand_on_their_ticks():
-    variants = [variant(kind, labels, 0.3) for kind in ("relative", "scalar") for labels in (100, 350, 500)]
-    figure = draw_label_efficiency([variant("none", 0, 0.2), *variants], "title", "reward")
-    for axes in figure.axes:
-        ticks = axes.get_xticks().tolist()
-        assert ticks == [100, 350, 500]
-        drawn = [container[0].get_xdata() for container in axes.containers]
-        assert len(drawn) == 2
-        for labels in drawn:
-            np.testing.assert_array_equal(labels, ticks)
 
 
 def test_more_than_four_variants_have_a_panel_a_kind_where_equal_curves_have_other_dashes():
