@@ -62,7 +62,9 @@ def _check_shapes(laws: Laws, env: Environment) -> None:
         for name, value in values.items():
             fits = value.dtype == kind and value.shape == shape
             laws.hold(fits, f"{name} is {value.dtype} of shape {value.shape}: make it {kind} of shape {shape}")
-    names = sorted({"reward", "finished"} & {*step.metrics, *step.outcome} | {*step.metrics} & {*step.outcome})
+    every = {*step.metrics, *step.outcome}
+    dotted = {name for name in every if "." in name}  # as settings of sweeps are called
+    names = sorted({"reward", "finished"} & every | {*step.metrics} & {*step.outcome} | dotted)
     laws.hold(not names, f"a metric or outcome is called {names[:1]}, which results have already: give another name")
     one, other = (re.sub("0x[0-9a-f]+", "", str(program)) for program in programs)  # without memory addresses
     laws.hold(one == other, "two traces give two programs: draw all random numbers from the key alone")
