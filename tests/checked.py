@@ -22,7 +22,10 @@ LOOSE_RANKS = ("bridges", "cli/test_anymal.py", "envs/anymal", "examples")
 # An int is a float, as pyright has it. What damaged files hold is a TypeError, as it is without checks.
 _conf = BeartypeConf(is_pep484_tower=True, violation_type=jaxtyping.TypeCheckError)
 _with_dimensions = jaxtyping.jaxtyped
-_named = re.compile(r"\b(Float|Int|UInt|Bool|Shaped|Num|Integer|Key|PyTree|PRNGKeyArray)\b")  # of jaxtyping
+# Of jaxtyping, and the package's aliases of such.
+_named = re.compile(
+    r"\b(Float|Int|UInt|Bool|Shaped|Num|Integer|Key|PyTree|PRNGKeyArray|Observations?|Actions?|Rows|Number)\b"
+)
 
 
 def install() -> None:

@@ -75,26 +75,33 @@ class Decision:
         what the base sees returns `obs` itself, a whole policy nothing. Raises ContractError as calls do.
         """
         if not self._questions:
+            self._checked(obs)
             return [np.asarray(obs)] * self._calls
         anything = np.zeros((*np.shape(obs)[:-1], self._base))  # what is asked does not depend on the base
         outputs = self._outputs(obs, *[anything] * self._calls)
         return np.split(outputs[..., self.contract["action"]["size"] :], self._questions, -1)
 
     def _outputs(self, obs: Any, *base_actions: Any) -> np.ndarray:
-        parts = [_numbers(part) for part in (obs, *base_actions)]
+        parts = self._checked(obs, *base_actions)
+        if not parts[0].size:
+            return np.zeros((0, self.contract["action"]["size"] + self._questions * self._size), np.float32)
+        rows = parts[0].ndim > 1
+        batch = [np.ascontiguousarray(part if rows else part[None]) for part in parts]
+        outputs = self._decide(*batch[:1], *([np.concatenate(batch[1:], -1)] if self._calls else []))
+        return outputs if rows else outputs[0]
+
+    def _checked(self, *arrays: Any) -> list[np.ndarray]:
+        """Return an observation, or a batch, and base actions in single precision. Raises ContractError."""
+        parts = [_numbers(part) for part in arrays]
         rows, sizes = parts[0].shape[:-1], (self._size, *[self._base] * self._calls)
-        for part, size in zip(parts, sizes, strict=True):
+        for part, size in zip(parts, sizes, strict=False):
             if len(rows) > 1 or part.shape != (*rows, size):
                 raise ContractError(
                     f"observations or base actions have shape {part.shape}: give ({size},), or equally many (n, {size})"
                 )
-        batch = [np.ascontiguousarray(part if rows else part[None]) for part in parts]
-        if not all(np.isfinite(part).all() for part in batch):
+        if not all(np.isfinite(part).all() for part in parts):
             raise ContractError("an observation holds numbers that are not finite, or beyond single precision")
-        if not len(batch[0]):
-            return np.zeros((0, self.contract["action"]["size"] + self._questions * self._size), np.float32)
-        outputs = self._decide(*batch[:1], *([np.concatenate(batch[1:], -1)] if self._calls else []))
-        return outputs if rows else outputs[0]
+        return parts
 
     def check(self) -> float:
         """Recompute the golden cases; return the largest difference of an entry, if above 1 as a share of the entry.

@@ -77,7 +77,8 @@ def _ends(variants: list[Variant], level: float | None, sign: float) -> tuple[fl
         raise UserError(f"{task} has no unguided agents, whose score would be 0: add a run with --guidance none")
     zero, best = float(unguided.mean.estimate), sign * max(sign * float(one.mean.estimate) for one in variants)
     if sign * ((one := best if level is None else level) - zero) <= 0:
-        raise UserError(f"{one:.3g} in {task} is no better than its unguided agents, {zero:.3g}: give a better --level")
+        no_better = f"{one:.3g} in {task} is no better than its unguided agents, {zero:.3g}"
+        raise UserError(f"{no_better}: give a better --level, another --metric, or report each task by itself")
     return zero, one
 
 

@@ -69,6 +69,8 @@ def test_of_a_saved_policy_it_needs_no_base_and_does_beside_it_what_the_policy_d
     ):
         with pytest.raises(ContractError, match=told):
             decide(*given)
+    with pytest.raises(ContractError, match="or equally many"):  # before the base is asked
+        decide.base_observations(OTHERS[:, :2])
     with pytest.raises(cl.UserError, match="is not empty"):
         cl.export_correction(better, tmp_path / "out")
 
