@@ -62,6 +62,12 @@ def interruptible(what: str = "this stretch of steps") -> Iterator[threading.Eve
             signal.signal(number, handler)
 
 
+def finish_work() -> None:
+    """Ask the innermost work that can be finished and saved to end, as a signal does; without such do nothing."""
+    if _works:
+        _works[-1].set()
+
+
 def listen() -> None:
     """Make a signal end this process at once with one line and status 128 plus its number, except in `interruptible`.
 

@@ -31,6 +31,7 @@ COMMANDS = {  # each a file beside this one with `run(arguments)`
     "sweep": "Train seeds x label budgets x kinds of guidance in one process.",
     "adapt": "Correct a finished policy by labels about what the policy does in a changed world.",
     "evaluate": "Measure a policy on validation episodes, or compare two; in any changed world.",
+    "suite": "Run the benchmark: tasks x kinds of guidance x label budgets x teachers.",
     "report": "Write curves and tables with intervals from recorded results.",
     "render": "Draw a still and a film of a policy at work, or the picture of a question.",
     "label": "Label actions in a browser: uniform ones, a policy's, or recorded ones.",

@@ -121,7 +121,7 @@ def report(
     lines += aggregates.section(over, request.level) if over else []
     missing = contents.missing or ["nothing: all runs are complete"]
     lines += ["", "## Missing", "", *(f"- {markdown(line)}" for line in missing)]
-    lines += ["", "## Where the numbers come from", "", *_origins(contents.every, command), ""]
+    lines += ["", "## Where the numbers come from", "", *origins(contents.every, command), ""]
     out.mkdir(parents=True, exist_ok=True)
     for name in FILES:  # also those of an earlier report
         (out / name).unlink(missing_ok=True)
@@ -141,10 +141,10 @@ def _range(name: str, counts: Sequence[int]) -> str:
     return f"{least:,}{f' to {most:,}' if most > least else ''} {name}{'s' * (most > 1)}"
 
 
-def _origins(table: pa.Table, command: str) -> list[str]:
+def origins(table: pa.Table, command: str) -> list[str]:
     """Return lines about where the numbers come from."""
-    origins = [("report made by", command)] if command else []
+    lines = [("report made by", command)] if command else []
     for column, name in ORIGINS.items():
         values = set(table[column].to_pylist()) if column in table.column_names else set()
-        origins += [(name, value) for value in sorted(filter(None, values))] or [(name, "not recorded")]
-    return [f"- {name}: {code(value)}" for name, value in origins]
+        lines += [(name, value) for value in sorted(filter(None, values))] or [(name, "not recorded")]
+    return [f"- {name}: {code(value)}" for name, value in lines]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from cuelearner_jax.errors import one_line
 from cuelearner_jax.guides import registry
 from cuelearner_jax.report.aggregates import Aggregates
-from cuelearner_jax.report.statistics import Curve
+from cuelearner_jax.report.statistics import Curve, Interval
 from cuelearner_jax.report.tables import unguided_of
 from cuelearner_jax.report.variants import Variant, guidance_name
 
@@ -127,27 +127,32 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7, 4.2), layout="constrained")
         axes = figure.add_subplot()
-        for place, kind in enumerate(dict.fromkeys(variant.guidance for variant in variants)):
-            look: dict[str, Any] = {"color": colour_of(kind), "label": guidance_name(kind)}
-            points = np.array([(one.labels, *one.mean) for one in variants if one.guidance == kind], float)
-            for _, estimate, lower, upper in points[points[:, 0] == 0]:
-                axes.axhspan(lower, upper, color=look["color"], alpha=0.12, linewidth=0)
-                axes.axhline(estimate, linewidth=1.5, linestyle=(3 * place, (3, 6)), **look)
-            if len(points := points[points[:, 0] > 0]):
-                labels, estimate, lower, upper = points.T
-                bars = np.nan_to_num([estimate - lower, upper - estimate])
-                # Points stand on their budget's tick; caps and dots of other sizes tell equal ones apart.
-                look |= {"markersize": max(3, 9 - place), "linewidth": max(1, 2.8 - 0.3 * place)}
-                axes.errorbar(labels, estimate, bars, marker="o", capsize=3 + 2 * place, **look)
-        budgets = sorted({variant.labels for variant in variants if variant.labels})
-        axes.set_xscale("log")
-        axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets], rotation=45)
-        axes.minorticks_off()
-        axes.set_xlabel("labels")
+        _draw_budgets(axes, [(one, one.mean) for one in variants])
         axes.set_ylabel(f"{axis_name(metric)}, mean over the curve")
         figure.legend(loc="outside lower center", ncols=5)
         figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
+
+
+def _draw_budgets(axes: Any, means: Sequence[tuple[Variant, Interval]]) -> None:
+    """Draw variants' intervals over their label budgets."""
+    for place, kind in enumerate(dict.fromkeys(variant.guidance for variant, _ in means)):
+        look: dict[str, Any] = {"color": colour_of(kind), "label": guidance_name(kind)}
+        points = np.array([(one.labels, *mean) for one, mean in means if one.guidance == kind], float)
+        for _, estimate, lower, upper in points[points[:, 0] == 0]:
+            axes.axhspan(lower, upper, color=look["color"], alpha=0.12, linewidth=0)
+            axes.axhline(estimate, linewidth=1.5, linestyle=(3 * place, (3, 6)), **look)
+        if len(points := points[points[:, 0] > 0]):
+            labels, estimate, lower, upper = points.T
+            bars = np.nan_to_num([estimate - lower, upper - estimate])
+            # Points stand on their budget's tick; caps and dots of other sizes tell equal ones apart.
+            look |= {"markersize": max(3, 9 - place), "linewidth": max(1, 2.8 - 0.3 * place)}
+            axes.errorbar(labels, estimate, bars, marker="o", capsize=3 + 2 * place, **look)
+    budgets = sorted({variant.labels for variant, _ in means if variant.labels})
+    axes.set_xscale("log")
+    axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets], rotation=45)
+    axes.minorticks_off()
+    axes.set_xlabel("labels")
 
 
 def draw_profiles(over: Aggregates) -> Figure:
@@ -161,6 +166,30 @@ def draw_profiles(over: Aggregates) -> Figure:
     words = "normalised score\nband: 95% bootstrap interval over seeds and episodes, drawn in each task"
     title = f"{len(over.ends)} tasks: {', '.join(over.ends)}"
     return _draw_panels(groups, curves, title, (words, "share of runs above the score"), ticker.ScalarFormatter())
+
+
+def _draw_profiles(axes: Any, over: Aggregates) -> None:
+    colours = colours_of([variant for variant, *_ in over.each])
+    for place, (variant, profile, _) in enumerate(over.each):
+        _draw_curve(axes, profile, variant.name, colours[place], place)
+    axes.set_ylabel("share of runs above the score")
+    axes.set_xlabel("normalised score\nband: 95% bootstrap interval over seeds, drawn in each task", fontsize=9)
+
+
+def draw_suite(overs: Mapping[str, Aggregates], title: str) -> Figure:
+    """Draw a row for each part of a suite: scores over label budgets, and profiles at the largest budget."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(11, 0.8 + 3.6 * len(overs)), layout="constrained")
+        panels = figure.subplots(len(overs), 2, squeeze=False)
+        for (left, right), (name, over) in zip(panels, overs.items(), strict=True):
+            _draw_budgets(left, [(variant, numbers["interquartile mean"]) for variant, _, numbers in over.each])
+            left.set_ylabel("normalised score")
+            left.set_title(f"{name}: {len(over.ends)} task{'s' * (len(over.ends) > 1)}", fontsize=10)
+            most = max(variant.labels for variant, *_ in over.each)
+            _draw_profiles(right, over._replace(each=[one for one in over.each if one[0].labels in (0, most)]))
+            right.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
+        figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
+    return figure
 
 
 def save_figure(figure: Figure, stem: Path) -> None:

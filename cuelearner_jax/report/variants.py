@@ -145,7 +145,7 @@ def _groups(name: str, folders: Sequence[PathLike], metric: str, split: str) -> 
     every = every.filter(pc.field("split") == split)
     keys = every.group_by(["task", *results.settings(every)]).aggregate([]).to_pylist()
     keys = sorted(keys, key=lambda key: [(value is not None, value) for value in key.values()])
-    groups = [_group(name, metric, key, _rows(every, key), guides) for key in keys]
+    groups = [group_of(name, metric, key, _rows(every, key), guides) for key in keys]
     if any(group.table.num_rows for group in groups):
         return groups
     if lost := "; ".join(words for group in groups if (words := failures.summary(group.failed))):
@@ -163,7 +163,7 @@ def _rows(table: pa.Table, key: dict[str, Any]) -> pa.Table:
     return table
 
 
-def _group(name: str, metric: str, key: dict[str, Any], every: pa.Table, guides: pa.Table | None) -> Group:
+def group_of(name: str, metric: str, key: dict[str, Any], every: pa.Table, guides: pa.Table | None) -> Group:
     """Return a task's and setting's results, without failed lanes and without rows whose metric is not finite."""
     setting = {option: "-" if value is None else value for option, value in key.items() if option != "task"}
     name = ", ".join(dict.fromkeys(filter(None, (name, results.setting_name(setting)))))

@@ -30,11 +30,16 @@ def read(name: str, config: Any, space: Space = DIRECTIONS) -> dict[str, Any]:
     for key, own in tables["presets"].items():
         start = Preset("", RunConfig(config, scalars=plain_scalars(space)))
         start = presets.get(own.pop("like", None), start)
-        groups = {group: _group(start.config, group, own.pop(group)) for group in GROUPS if group in own}
-        presets[key] = _replace(start, own | {"config": dataclasses.replace(start.config, **groups)})
+        groups = {group: own.pop(group) for group in GROUPS if group in own}
+        presets[key] = _replace(start, own | {"config": with_groups(start.config, groups)})
     for key, own in tables.get("scenarios", {}).items():
         scenarios[key] = _replace(scenarios.get(own.pop("like", None), Scenario("", {})), own)
     return {"presets": presets, "scenarios": scenarios}
+
+
+def with_groups(config: RunConfig, groups: dict[str, dict[str, Any]]) -> RunConfig:
+    """Return a configuration with the fields of its groups that differ, as a TOML file gives these."""
+    return dataclasses.replace(config, **{name: _group(config, name, values) for name, values in groups.items()})
 
 
 def _group(start: RunConfig, name: str, values: dict[str, Any]) -> Any:

@@ -1,0 +1,182 @@
+"""The suite: worlds x kinds of guidance x label budgets x teachers; each cell is a request in a folder of its own.
+
+`suite.toml` beside this file says what is run. A cell holds all label budgets and seeds of one kind and one teacher.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.adaptation import by_model, by_reading
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import actions_of, offers, view_of
+from cuelearner_jax.evaluate import group_means
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.base import HeuristicGuide, NoGuide
+from cuelearner_jax.policies import Common
+from cuelearner_jax.run_config import RunConfig
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.order import Order
+from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
+from cuelearner_jax.runs.run_folders import Block
+from cuelearner_jax.storage import results
+from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage.folders import CONFIG
+from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.studies import evaluate, train
+from cuelearner_jax.studies.adapt import AdaptRequest, subject_of
+from cuelearner_jax.task import shape_of
+
+TABLE = Path(__file__).with_suffix(".toml")
+USES = BOOTSTRAP, ADAPT = "bootstrap", "adapt"
+RIGHT = "right"  # the teacher without faults
+
+
+class World(NamedTuple):
+    """A world of the suite."""
+
+    name: str
+    use: str  # of labels, one of `USES`
+    start: str  # preset of the training, or changed world
+    metric: str
+    config: RunConfig
+    source: PolicySource  # the policy to adapt; to bootstrap, the task alone
+    sizes: Mapping[str, Any]  # to adapt: sizes of the guide, other than the defaults of `cuelearner adapt`
+    bound: float | None  # to adapt: the largest correction, in the space's unit; None: the default
+
+
+class Cell(NamedTuple):
+    """All lanes of a world under one kind of guidance and one teacher."""
+
+    world: World
+    teacher: str
+    faults: dict[str, Any]  # fields of `TeacherFaults`; the bias is in eps
+    kind: str
+    labels: tuple[int, ...]
+    seeds: int
+
+    @property
+    def name(self) -> str:
+        """The folder of the cell, below the suite's."""
+        return f"{self.world.use}/{self.world.name}/{self.teacher}/{self.kind}"
+
+    def obstacle(self) -> str | None:
+        """Return the rule by which the cell is left out, in words; None: the cell makes sense."""
+        guide, world = guidances.find(self.kind), self.world
+        env = shape_of(world.source.task, world.config.task)
+        cues, is_adapted = actions_of(env).cues, world.use == ADAPT
+        if guide.adapts_only and not is_adapted:
+            return f"{self.kind} corrects finished policies only"
+        if guide.needs_cues and not cues:
+            return f"{self.kind} needs actions with cues"
+        if absent := [need for need in guide.needs if not offers(env, need)]:
+            return f"{self.kind} needs worlds with `{absent[0]}`"
+        if is_adapted and not guide.asks and guide not in (NoGuide, HeuristicGuide):
+            return f"{self.kind} asks nothing about a finished policy"
+        if is_adapted and guide is HeuristicGuide and world.source.default_policy == HeuristicGuide.name:
+            return f"the policy to adapt is {self.kind} itself"
+        if self.faults and not guide.asks:
+            return "kinds without labels meet no teacher, so they run once"
+        if "says" in self.faults and (len(cues) < 2 or (guide.form and not guide.form.by_eps)):
+            return "one cue at a time is all that a teacher of one cue says, and no fault where answers name no cues"
+        return None
+
+    def config(self) -> RunConfig:
+        """Return the configuration with the teacher's faults."""
+        scalars = self.world.config.scalars
+        bias = {name: value * scalars.eps_deg for name, value in self.faults.items() if name == "teacher_bias_deg"}
+        return replace(self.world.config, scalars=replace(scalars, **self.faults | bias))
+
+    def run(self, out: Path) -> None:
+        """Run the cell in its folder below `out`, or go on where it stopped. Raises what `train.run` raises."""
+        if self.world.use == BOOTSTRAP:
+            grid = Grid((self.kind,), tuple(range(self.seeds)), self.labels)
+            folder = out / self.name
+            train.run(Order(self.world.source.task, self.config(), grid, folder, resume=(folder / CONFIG).exists()))
+        else:
+            tables.write(out / self.name / results.PARQUET, self._adapted(), fresh=True)
+
+    def _adapted(self) -> pa.Table:
+        """Return the rows of adapted policies on validation episodes, or of policies that no label corrects."""
+        source, config, guide = self.world.source, self.config(), guidances.find(self.kind)
+        subject = subject_of(source, config.task, LaneChoice())._replace(origin={})
+        env = source.task.environment(config.task, "validation")
+        none = np.zeros(self.seeds, int)
+        block, spent = Block(self.kind, np.arange(self.seeds), none, none, 0, subject.bases, none > 0), none
+        if guide is HeuristicGuide:
+            block = block._replace(policy=Common(source.alone(HeuristicGuide.name, view_of(env))))
+        elif guide.asks:
+            result = self._request(config).run(subject).result
+            lanes, spent = result.lanes, result.judgement.rewarded_steps
+            bounds = np.zeros(lanes.number)
+            block = Block(self.kind, lanes.seed, lanes.budget, bounds, 0, result.policy(view_of(env)), result.failed)
+        rows = []
+        for one in evaluate.run(source, evaluate.EvaluateRequest(task=config.task), ready=(env, [block])):
+            own = block.budgets == one.labels
+            columns = {"labels": block.budgets[own], "seed": one.seeds, "step": none, "rewarded_steps": spent[own]}
+            columns |= {results.FAILED: block.failed[own], **one.metrics}
+            columns |= {f"{name}_each": group_means(each) for name, each in one.each.items()}
+            rows += [{name: column[lane].tolist() for name, column in columns.items()} for lane in range(self.seeds)]
+        described = {"cell": self.name, "task": configuration.to_json(config.task), "scalars": vars(config.scalars)}
+        constants = {"run": self.world.name, "task": source.task.name, "guidance": self.kind, "split": "validation"}
+        constants |= {"config_hash": configuration.digest(described), **provenance()}
+        constants["episodes"] = len(next(iter(one.each.values()))[0])
+        rows = [constants | tables.plain(row) for row in rows]
+        return results.SCHEMA.table({name: [row[name] for row in rows] for name in rows[0]})
+
+    def _request(self, config: RunConfig) -> AdaptRequest:
+        kind, sizes = self.kind, replace(by_model.SIZES, frame=config.sizes.frame, **self.world.sizes)
+        by = None if guidances.find(kind).by_evidence else self.world.metric
+        scalars = by_model.settling(config.scalars, None)
+        request = AdaptRequest.of(self.world.source.task, config, None, kind, by, scalars=scalars)
+        bound = () if self.world.bound is None else (self.world.bound,)
+        return replace(request, labels=self.labels, bound_deg=bound, seeds=f"0:{self.seeds}", sizes=sizes)
+
+
+def cells_of(table: dict[str, Any], scale: dict[str, Any], worlds: list[World], kinds: list[str]) -> list[Cell]:
+    """Return all cells of a scale, also those that make no sense (`Cell.obstacle`), the cheapest comparisons first."""
+    return [
+        Cell(world, teacher, faults, kind, tuple(scale["fault_labels"] if faults else scale["labels"]), scale["seeds"])
+        for teacher, faults in table["teachers"].items()
+        if teacher in scale["teachers"]
+        for world in worlds
+        for kind in kinds
+    ]
+
+
+def is_done(out: Path, cell: Cell) -> bool:
+    """Whether all results of a cell are there."""
+    return next((out / cell.name).rglob(results.PARQUET), None) is not None
+
+
+def collect(out: Path, worlds: list[World]) -> pa.Table:
+    """Return the rows of all finished cells below `out`, also of kinds that this call does not run.
+
+    A row is a lane and evaluation. `score` is its world's metric; `rewarded_steps` are those of the training so far, or
+    of judging a correction.
+    """
+    return pa.concat_tables(_collected(out, worlds), promote_options="permissive")
+
+
+def _collected(out: Path, worlds: list[World]) -> Iterator[pa.Table]:
+    for world in worlds:
+        for file in sorted((out / world.use / world.name).rglob(results.PARQUET)):
+            rows = results.read(file).drop_columns(["folder", "command"])
+            columns = {"task": world.name, "preset": world.start, "use": world.use, "metric": world.metric}
+            columns["teacher"] = file.relative_to(out / world.use / world.name).parts[0]
+            for name, value in columns.items():
+                rows = rows.drop_columns([name] if name in rows.column_names else [])
+                rows = rows.append_column(name, pa.repeat(pa.scalar(value), rows.num_rows))
+            if world.use == BOOTSTRAP:
+                rows = rows.append_column("rewarded_steps", pc.cast(rows["step"], pa.float64()))
+            for end in ("", "_each"):
+                rows = rows.append_column(f"score{end}", rows[world.metric + end])
+            yield rows
