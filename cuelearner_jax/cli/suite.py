@@ -15,6 +15,7 @@ from typing import Any
 from cuelearner_jax import signals
 from cuelearner_jax.cli.options import look_ahead, out, parse
 from cuelearner_jax.cli.sources import preset_of, source_of
+from cuelearner_jax.config import plain
 from cuelearner_jax.errors import NotFinite, UserError, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.report import suite as page
@@ -76,7 +77,9 @@ def run(arguments: list[str]) -> None:
                 if not is_over():
                     raise
     done = sum(suite.is_done(options.out, cell) for cell in sensible)
-    out.print(f"{done} of {len(sensible)} cells are done{'' if done == len(sensible) else '; the same command goes on'}")
+    out.print(
+        f"{done} of {len(sensible)} cells are done{'' if done == len(sensible) else '; the same command goes on'}"
+    )
     if done:
         rows = suite.collect(options.out, worlds)
         tables.write(options.out / "suite.parquet", rows)
@@ -109,13 +112,12 @@ def _world(name: str, values: dict[str, Any]) -> World:
     if values["use"] == ADAPT:
         changes = source.task.scenario(start).changes if start else {}
         config = replace(config, task=replace(config.task, **changes))
-        sizes = groups.pop("sizes", {})
+        sizes = {key: plain(value) for key, value in groups.pop("sizes", {}).items()}
     else:
         start, preset = preset_of(source.task, values.get("preset"), QUICKSTART)
         config, sizes = preset.config, {}
     config = with_groups(config, groups)
-    sizes = {key: tuple(value) if isinstance(value, list) else value for key, value in sizes.items()}
-    start = start or ", ".join(f"{key}={value}" for key, value in groups["task"].items())
+    start = start or ", ".join(f"{key}={value}" for key, value in groups.get("task", {}).items())
     return World(name, values["use"], start, values["metric"], config, source, sizes, values.get("bound"))
 
 

@@ -20,8 +20,8 @@ from cuelearner_jax.report.variants import Variant, group_of, guidance_name, var
 SCORE, LEVEL = "score", 0.8  # the level of label efficiency
 NOTE = (
     "Interquartile means over the runs of all tasks with the most labels that all tasks share, with 95% bootstrap "
-    "intervals over seeds and episodes. A run's score is its mean over the curve: 0 is without labels, 1 is all episodes "
-    "(shots) a success. Rewarded steps are of training, or spent on judging corrections, a lane."
+    "intervals over seeds and episodes. A run's score is its mean over the curve: 0 is without labels, 1 is success "
+    "in all episodes (shots). Rewarded steps are of training, or spent on judging corrections, a lane."
 )
 MOST_ROWS = 12
 
@@ -101,5 +101,7 @@ def _table(overs: dict[str, Aggregates], table: pa.Table) -> list[str]:
                 lanes = own.group_by(["task", "teacher", "labels", "seed"]).aggregate([("rewarded_steps", "max")])
                 row[f"rewarded steps, {use}"] = f"{np.mean(lanes['rewarded_steps_max'].to_numpy()):,.0f}"
     header = list(dict.fromkeys(name for row in cells.values() for name in row))
-    rows = [[tables.markdown(guidance_name(kind)), *(row.get(name, "") for name in header)] for kind, row in cells.items()]
+    rows = [
+        [tables.markdown(guidance_name(kind)), *(row.get(name, "") for name in header)] for kind, row in cells.items()
+    ]
     return tables.markdown_table(["guidance (labels)", *header], rows[:MOST_ROWS])

@@ -15,8 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import by_model, by_reading
-from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.environment import actions_of, offers, view_of
 from cuelearner_jax.evaluate import group_means
 from cuelearner_jax.guides import registry as guidances
@@ -37,6 +36,7 @@ from cuelearner_jax.task import shape_of
 
 TABLE = Path(__file__).with_suffix(".toml")
 USES = BOOTSTRAP, ADAPT = "bootstrap", "adapt"
+ACTS = NoGuide, HeuristicGuide  # kinds without labels that act in place of a finished policy, or as it does
 RIGHT = "right"  # the teacher without faults
 
 
@@ -73,21 +73,20 @@ class Cell(NamedTuple):
         guide, world = guidances.find(self.kind), self.world
         env = shape_of(world.source.task, world.config.task)
         cues, is_adapted = actions_of(env).cues, world.use == ADAPT
-        if guide.adapts_only and not is_adapted:
-            return f"{self.kind} corrects finished policies only"
-        if guide.needs_cues and not cues:
-            return f"{self.kind} needs actions with cues"
-        if absent := [need for need in guide.needs if not offers(env, need)]:
-            return f"{self.kind} needs worlds with `{absent[0]}`"
-        if is_adapted and not guide.asks and guide not in (NoGuide, HeuristicGuide):
-            return f"{self.kind} asks nothing about a finished policy"
-        if is_adapted and guide is HeuristicGuide and world.source.default_policy == HeuristicGuide.name:
-            return f"the policy to adapt is {self.kind} itself"
-        if self.faults and not guide.asks:
-            return "kinds without labels meet no teacher, so they run once"
-        if "says" in self.faults and (len(cues) < 2 or (guide.form and not guide.form.by_eps)):
-            return "one cue at a time is all that a teacher of one cue says, and no fault where answers name no cues"
-        return None
+        absent = [need for need in guide.needs if not offers(env, need)]
+        is_base = guide is HeuristicGuide and world.source.default_policy == HeuristicGuide.name
+        names_cues = len(cues) > 1 and (guide.form is None or guide.form.by_eps)
+        rules = {
+            f"{self.kind} corrects finished policies only": guide.adapts_only and not is_adapted,
+            f"{self.kind} needs actions with cues": guide.needs_cues and not cues,
+            f"{self.kind} needs worlds with {', '.join(absent)}": absent,
+            f"{self.kind} asks nothing about a finished policy": is_adapted and not guide.asks and guide not in ACTS,
+            f"the policy to adapt is {self.kind} itself": is_adapted and is_base,
+            "kinds without labels meet no teacher, so they run once": self.faults and not guide.asks,
+            "one cue at a time is no fault where actions have one, or answers name none": "says" in self.faults
+            and not names_cues,
+        }
+        return next((words for words, holds in rules.items() if holds), None)
 
     def config(self) -> RunConfig:
         """Return the configuration with the teacher's faults."""
@@ -142,13 +141,13 @@ class Cell(NamedTuple):
 
 
 def cells_of(table: dict[str, Any], scale: dict[str, Any], worlds: list[World], kinds: list[str]) -> list[Cell]:
-    """Return all cells of a scale, also those that make no sense (`Cell.obstacle`), the cheapest comparisons first."""
+    """Return all cells of a scale, also those that make no sense (`Cell.obstacle`)."""
     return [
         Cell(world, teacher, faults, kind, tuple(scale["fault_labels"] if faults else scale["labels"]), scale["seeds"])
-        for teacher, faults in table["teachers"].items()
-        if teacher in scale["teachers"]
         for world in worlds
         for kind in kinds
+        for teacher, faults in table["teachers"].items()  # innermost, since another teacher mostly compiles nothing
+        if teacher in scale["teachers"]
     ]
 
 
@@ -169,7 +168,7 @@ def collect(out: Path, worlds: list[World]) -> pa.Table:
 def _collected(out: Path, worlds: list[World]) -> Iterator[pa.Table]:
     for world in worlds:
         for file in sorted((out / world.use / world.name).rglob(results.PARQUET)):
-            rows = results.read(file).drop_columns(["folder", "command"])
+            rows = results.read(file).drop_columns(["folder"])
             columns = {"task": world.name, "preset": world.start, "use": world.use, "metric": world.metric}
             columns["teacher"] = file.relative_to(out / world.use / world.name).parts[0]
             for name, value in columns.items():

@@ -1,0 +1,97 @@
+"""`cuelearner suite`: cells that make sense, a tiny suite with a kind of one's own, and bad input."""
+
+import tomllib
+
+import pyarrow.parquet as pq
+import pytest
+from small_runs import BANDIT, listing
+
+from cuelearner_jax.cli import main
+from cuelearner_jax.cli import suite as command
+from cuelearner_jax.studies import suite
+
+TINY = f"""
+kinds = ["none", "reading"]
+[teachers]
+right = {{}}
+one_cue = {{ says = "one" }}
+[worlds.train]
+use = "bootstrap"
+subject = "{BANDIT}"
+metric = "reward"
+[worlds.correct]
+use = "adapt"
+subject = "page_task:left_of --task {BANDIT}"
+metric = "reward"
+bound = 90.0
+scalars = {{ eps_deg = 10.0 }}
+sizes = {{ feedback_layers = [16], fit_steps = 20 }}
+[scales.tiny]
+labels = [20]
+fault_labels = [20]
+seeds = 2
+teachers = ["right", "one_cue"]
+worlds = {{ train = {{}}, correct = {{}} }}
+"""
+CLONE = "examples.clone:Clone"
+
+
+def test_the_cells_of_every_scale_make_sense_for_their_worlds():
+    table = tomllib.loads(suite.TABLE.read_text())
+    assert {"smoke", "quick", "paper"} == set(table["scales"])
+    scale = table["scales"]["paper"]
+    assert set(scale["worlds"]) == set(table["worlds"])
+    for name in ("billiards_one_ball", "arm_reach_turned_camera", "zoo_region"):
+        world = command._world(name, table["worlds"][name])
+        cells = {cell.name: cell.obstacle() for cell in suite.cells_of(table, scale, [world], table["kinds"])}
+        place, has_cues = f"{world.use}/{name}", not name.startswith("billiards")
+        assert (cells[f"{place}/right/reading"] is None) == (world.use == suite.ADAPT)
+        assert (cells[f"{place}/right/heuristic"] is None) == (name != "zoo_region")
+        assert (cells[f"{place}/one_cue/relative"] is None) == has_cues
+        assert cells[f"{place}/one_cue/scalar"]
+        assert cells[f"{place}/wrong/none"]
+        biased = suite.Cell(world, "biased", table["teachers"]["biased"], "relative", (25,), 1).config().scalars
+        assert biased.teacher_bias_deg == biased.eps_deg > 0
+        assert cells[f"{place}/wrong/scalar"] is None
+
+
+def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys):
+    (table := tmp_path / "tiny.toml").write_text(TINY)
+    words = ["suite", "--scale", "tiny", "--table", str(table), "--out", str(tmp_path / "out")]
+    assert main([*words, "--shard", "1/2"]) == 0
+    assert "2 of 3 cells are done; the same command goes on" in capsys.readouterr().out
+    assert main([*words, "--guidance", CLONE]) == 0
+    rows = pq.read_table(tmp_path / "out" / "suite.parquet")
+    lanes = rows.group_by(["use", "teacher", "guidance", "labels", "seed", "step"]).aggregate([]).num_rows
+    assert lanes == rows.num_rows
+    of_use = {use: [row for row in rows.to_pylist() if row["use"] == use] for use in suite.USES}
+    assert {row["guidance"] for row in of_use["bootstrap"]} == {"none", "clone"}
+    assert {row["guidance"] for row in of_use["adapt"]} == {"none", "reading", "clone"}
+    assert all(row["rewarded_steps"] == row["step"] for row in of_use["bootstrap"])
+    assert all((row["rewarded_steps"] > 0) == (row["guidance"] == "clone") for row in of_use["adapt"])
+    page = (tmp_path / "out" / "suite.md").read_text()
+    assert "reading corrects finished policies only" in page
+    assert (tmp_path / "out" / "suite.png").exists()
+    before = {name: of for name, of in listing(tmp_path / "out").items() if "/bootstrap/" in name or "/adapt/" in name}
+    assert main(words) == 0  # nothing is run again, and the own kind's rows stay
+    assert {name: listing(tmp_path / "out")[name] for name in before} == before
+    assert pq.read_table(tmp_path / "out" / "suite.parquet").equals(rows)
+    table.write_text(TINY.replace("90.0", "60.0"))
+    assert main(words) == 2
+    assert "holds a suite of another scale or table" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--scale", "smok"], "unknown scale 'smok'"),
+        (["--shard", "3/2"], "--shard is '3/2'"),
+        (["--minutes", "0"], "--minutes is 0"),
+        (["--guidance", "nothing:HERE"], "nothing"),
+        (["--table", "none.toml"], "--table none.toml cannot be read"),
+    ],
+)
+def test_bad_input_is_one_line_and_changes_nothing(tmp_path, capsys, words, message):
+    assert main(["suite", "--out", str(tmp_path / "out"), *words]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
