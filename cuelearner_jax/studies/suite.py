@@ -117,18 +117,18 @@ class Cell(NamedTuple):
             lanes, spent = result.lanes, result.judgement.rewarded_steps
             bounds = np.zeros(lanes.number)
             block = Block(self.kind, lanes.seed, lanes.budget, bounds, 0, result.policy(view_of(env)), result.failed)
-        rows = []
+        rows, episodes = [], 0
         for one in evaluate.run(source, evaluate.EvaluateRequest(task=config.task), ready=(env, [block])):
             own = block.budgets == one.labels
             columns = {"labels": block.budgets[own], "seed": one.seeds, "step": none, "rewarded_steps": spent[own]}
             columns |= {results.FAILED: block.failed[own], **one.metrics}
             columns |= {f"{name}_each": group_means(each) for name, each in one.each.items()}
+            episodes = next(iter(one.each.values())).shape[-1]
             rows += [{name: column[lane].tolist() for name, column in columns.items()} for lane in range(self.seeds)]
         described = {"cell": self.name, "task": configuration.to_json(config.task), "scalars": vars(config.scalars)}
         constants = {"run": self.world.name, "task": source.task.name, "guidance": self.kind, "split": "validation"}
         constants |= {"config_hash": configuration.digest(described), **provenance()}
-        constants["episodes"] = len(next(iter(one.each.values()))[0])
-        rows = [constants | tables.plain(row) for row in rows]
+        rows = [{"episodes": episodes, **constants, **tables.plain(row)} for row in rows]
         return results.SCHEMA.table({name: [row[name] for row in rows] for name in rows[0]})
 
     def _request(self, config: RunConfig) -> AdaptRequest:
