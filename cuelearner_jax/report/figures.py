@@ -183,6 +183,7 @@ def draw_suite(overs: Mapping[str, Aggregates], title: str) -> Figure:
         panels = figure.subplots(len(overs), 2, squeeze=False)
         for (left, right), (name, over) in zip(panels, overs.items(), strict=True):
             _draw_budgets(left, [(variant, numbers["interquartile mean"]) for variant, _, numbers in over.each])
+            left.set_ylim(min(-0.05, left.get_ylim()[0]), max(1.05, left.get_ylim()[1]))
             left.set_ylabel("normalised score")
             left.set_title(f"{name}: {len(over.ends)} task{'s' * (len(over.ends) > 1)}", fontsize=10)
             most = max(variant.labels for variant, *_ in over.each)
