@@ -57,8 +57,11 @@ def run(arguments: list[str]) -> None:
         raise UserError(f"--minutes is {options.minutes:g}: give a number above 0")
     scale, shard = table["scales"][options.scale], Shard.parse(options.shard or "1/1")
     kinds = [guidances.resolve(kind).name for kind in (*scale.get("kinds", table["kinds"]), *options.guidance)]
-    worlds = [_world(name, table["worlds"][name] | own) for name, own in scale["worlds"].items()]
-    cells = suite.cells_of(table, scale, worlds, list(dict.fromkeys(kinds)))
+    try:
+        worlds = [_world(name, table["worlds"][name] | own) for name, own in scale["worlds"].items()]
+        cells = suite.cells_of(table, scale, worlds, list(dict.fromkeys(kinds)))
+    except KeyError as error:
+        raise UserError(f"--table {options.table} has no {error}, which {options.scale} needs") from error
     obstacles = [cell.obstacle() for cell in cells]
     sensible = [cell for cell, obstacle in zip(cells, obstacles, strict=True) if obstacle is None]
     _claim(options.out, f"# {options.scale}\n{options.table.read_text(encoding='utf-8')}")
