@@ -96,9 +96,9 @@ def evaluation(env: Any, functions: Any, setting: Setting, length: int) -> Calla
         def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
             state, obs, running, total = carry
             actions = functions.act(env, params, obs, key)
-            state, found = jax.vmap(env.step)(jax.random.split(key, setting.episodes), state, actions)
-            total = total + jnp.where(running, found.reward, 0.0)
-            return (state, found.obs, running & ~(found.terminated | found.truncated), total), None
+            state, after = jax.vmap(env.step)(jax.random.split(key, setting.episodes), state, actions)
+            total = total + jnp.where(running, after.reward, 0.0)
+            return (state, after.obs, running & ~(after.terminated | after.truncated), total), None
 
         start = (state, obs, jnp.ones(setting.episodes, bool), jnp.zeros(setting.episodes))
         return jax.lax.scan(step, start, jax.random.split(jax.random.key(2), length))[0][3].mean()
@@ -126,8 +126,8 @@ def peers(name: str, way: str, setting: Setting, seeds: int, python: str, at_onc
     ends: dict[int, dict[int, dict[str, float]]] = {}  # by step and seed
 
     def run(seed: int) -> None:
-        told = json.dumps({**asdict(setting), "seed": seed, "name": "Pendulum-v1" if name == PENDULUM else name})
-        command = [python, str(Path(__file__).parent / "_sac_peers.py"), way, told]
+        values = json.dumps({**asdict(setting), "seed": seed, "name": "Pendulum-v1" if name == PENDULUM else name})
+        command = [python, str(Path(__file__).parent / "_sac_peers.py"), way, values]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             for line in process.stdout or ():
                 if not line.startswith("{"):
@@ -182,22 +182,27 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     """Measure, print and write."""
-    asked = arguments()
-    if asked.table:
-        show([row for file in asked.table for row in json.loads(file.read_text())["rows"]])
+    options = arguments()
+    if options.table:
+        show([row for file in options.table for row in json.loads(file.read_text())["rows"]])
         return
-    if asked.evaluations < 2 or asked.steps % asked.evaluations:
+    if options.evaluations < 2 or options.steps % options.evaluations:
         raise SystemExit("give at least two evaluations that divide --steps")
     setting = Setting(
-        tuple(asked.layers), asked.batch_size, asked.updates_per_step, asked.prefill, asked.steps, asked.evaluations
+        tuple(options.layers),
+        options.batch_size,
+        options.updates_per_step,
+        options.prefill,
+        options.steps,
+        options.evaluations,
     )
-    rows = json.loads(asked.out.read_text())["rows"] if asked.out and asked.out.exists() else []
-    rows = [row for row in rows if len(row["rows"]) == asked.evaluations]
-    for name in asked.environments:
-        for way in asked.ways:
+    rows = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
+    rows = [row for row in rows if len(row["rows"]) == options.evaluations]
+    for name in options.environments:
+        for way in options.ways:
             if any((row["environment"], row["way"]) == (name, way) for row in rows):
                 continue
-            at_once = 1 if way in OURS else min(asked.at_once, asked.seeds)
+            at_once = 1 if way in OURS else min(options.at_once, options.seeds)
             entry: dict[str, Any] = {"environment": name, "way": way, "at_once": at_once, "rows": []}
             rows.append(entry)
 
@@ -205,14 +210,14 @@ def main() -> None:
                 entry["rows"].append(row)
                 mean = f"{np.mean(row['returns']):.1f} at step {row['step']:,}, {row['seconds']:.0f} s"
                 print(f"{entry['environment']}, {entry['way']}: {mean}", flush=True)
-                if asked.out:
+                if options.out:
                     about = {**provenance(), "processors": os.cpu_count(), "setting": asdict(setting), "rows": rows}
-                    asked.out.write_text(json.dumps(about, indent=1) + "\n")
+                    options.out.write_text(json.dumps(about, indent=1) + "\n")
 
             if way in OURS:
-                ours(name, way, setting, asked.seeds, tell)
+                ours(name, way, setting, options.seeds, tell)
             else:
-                peers(name, way, setting, asked.seeds, asked.peer_python, asked.at_once, tell)
+                peers(name, way, setting, options.seeds, options.peer_python, options.at_once, tell)
     show(rows)
 
 

@@ -89,8 +89,8 @@ def main(folder="runs/arm", situations=200, rounds=(0.2, 0.08, 0.04)):
     better.save(folder / "policy")
     cl.export_correction(better, folder / "correction", format="numpy")
     decide = cl.load_exported(folder / "correction")  # on the robot: the decide.py beside it, with NumPy alone
-    found = decide(others, *map(arm, decide.base_observations(others)))
-    assert np.allclose(found, better(others), atol=1e-4)
+    actions = decide(others, *map(arm, decide.base_observations(others)))
+    assert np.allclose(actions, better(others), atol=1e-4)
     return errors
 
 

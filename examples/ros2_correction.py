@@ -39,18 +39,18 @@ class Beside:
         self.trouble = ""  # why the last action was the base's own; empty: it was corrected
 
     def hear(self, observation, now):
-        """What to ask the base about an observation. Raises ValueError for one of another size."""
-        found = np.asarray(observation, np.float32)
-        if found.shape != (self.size,):
-            raise ValueError(f"an observation has {found.size} entries: the contract says {self.size}")
-        self.seen = found, now
+        """Return what to ask the base about an observation. Raises ValueError for one of another size."""
+        obs = np.asarray(observation, np.float32)
+        if obs.shape != (self.size,):
+            raise ValueError(f"an observation has {obs.size} entries: the contract says {self.size}")
+        self.seen = obs, now
         try:
-            return np.concatenate(self.decide.base_observations(found))
+            return np.concatenate(self.decide.base_observations(obs))
         except ContractError:  # which `action` will meet too
-            return np.tile(found, self.calls)
+            return np.tile(obs, self.calls)
 
     def action(self, base_action, now):
-        """The corrected action; the base's own where there is nothing to correct it by, and `trouble` says why."""
+        """Return the corrected action, or the base's own where nothing corrects it; then `trouble` says why."""
         base = np.asarray(base_action, np.float32)
         if base.shape != (self.entries,):
             raise ValueError(f"a base action has {base.size} entries: the contract says {self.entries}")
@@ -59,12 +59,12 @@ class Beside:
             self.trouble = "no fresh observation"
             return actions[-1]
         try:
-            found = self.decide(self.seen[0], *actions)
+            result = self.decide(self.seen[0], *actions)
         except ContractError as error:
             self.trouble = str(error)
             return actions[-1]
         self.trouble = ""
-        return found
+        return result
 
 
 def main(folder):
@@ -75,17 +75,17 @@ def main(folder):
 
     rclpy.init()
     node, beside = Node("cuelearner_correction"), Beside(folder)
-    said, asked = (node.create_publisher(Float32MultiArray, name, 1) for name in ("action", "base_observation"))
+    actions, questions = (node.create_publisher(Float32MultiArray, name, 1) for name in ("action", "base_observation"))
 
     def now():
         return node.get_clock().now().nanoseconds * 1e-9
 
     def hear(message):
-        asked.publish(Float32MultiArray(data=beside.hear(message.data, now()).tolist()))
+        questions.publish(Float32MultiArray(data=beside.hear(message.data, now()).tolist()))
 
     def correct(message):
         before = beside.trouble
-        said.publish(Float32MultiArray(data=beside.action(message.data, now()).tolist()))
+        actions.publish(Float32MultiArray(data=beside.action(message.data, now()).tolist()))
         if beside.trouble and beside.trouble != before:
             node.get_logger().warning(f"the base acts alone: {beside.trouble}")
 

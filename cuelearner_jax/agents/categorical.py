@@ -16,13 +16,14 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.types import Params
 
-BINS = jnp.linspace(-5.0, 5.0, 101)
-ROOM = 2.0  # a value of rms(reward) / (1 - discount) lies at this bin; 2.5 times that is the largest
-RATE = 1e-3  # at which the unit follows rewards, after as many batches
+BINS = np.linspace(-5.0, 5.0, 101, dtype=np.float32)  # their values, in units
+ROOM = 2.0  # the bin of a value of rms(reward) / (1 - discount); the largest bin is 2.5 times that
+RATE = 1e-3  # share of a new batch in the mean square of rewards; the first 1 / RATE batches count alike
 
 
 class CategoricalCritic(nn.Module):
@@ -74,7 +75,7 @@ def values_of(critic: Params, logits: Float[Array, "... bins"]) -> Float[Array, 
 def next_unit(
     unit: Array, rewards: Float[Array, " n"], discount: Array | float, count: Int[Array, ""]
 ) -> Float[Array, "..."]:
-    """Return the unit of the bins after batch number `count` (from 1): a running root mean square."""
+    """Return the unit of the bins [reward] after batch number `count` (from 1): a running root mean square."""
     square = jnp.mean(jnp.square(rewards / jnp.maximum(1 - discount, 1e-3) / ROOM))
     rate = jnp.maximum(1 / count, RATE)
     return jnp.sqrt(jnp.square(unit) + rate * (square - jnp.square(unit)) + 1e-12)
@@ -91,7 +92,10 @@ def with_unit_weights(critic: Params) -> Params:
 
 
 def project(values: Float[Array, "n atoms"], weights: Float[Array, "n atoms"]) -> Float[Array, "n bins"]:
-    """Return a distribution over the bins: each atom's weight goes to its two nearest bins, by closeness."""
+    """Return distributions over the bins: each atom's weight goes to its two nearest bins, by closeness.
+
+    `values` are in units of the bins; those beyond the last bin count as the last bin.
+    """
     places = (jnp.clip(values, BINS[0], BINS[-1]) - BINS[0]) * (BINS.size - 1) / (BINS[-1] - BINS[0])
     lower = jnp.clip(jnp.floor(places), 0, BINS.size - 2).astype(jnp.int32)
     upward = weights * (places - lower)

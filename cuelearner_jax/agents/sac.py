@@ -225,7 +225,10 @@ class SoftActorCritic:
             k_batch, k_target = jax.random.split(key)
             (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
             behind = scalars.discount, actor, target_critics, temperature, batch, k_target
-            error = self._binned_error(*behind, critics, count) if own.bins else self._squared_error(*behind)
+            if own.bins:
+                error = self._binned_error(*behind, critics, count)
+            else:
+                error = self._squared_error(batch, self.targets(*behind))
             (loss, news), gradient = jax.value_and_grad(error, has_aux=True)(critics)
             critics, opt_state = optimizer_step(options.critic_rate, most, gradient, opt_state, critics)
             critics = categorical.with_unit_weights({**critics, **news}) if own.bins else critics
@@ -284,9 +287,10 @@ class SoftActorCritic:
         value = own - temperature * draws.log_density if self.options.entropy_in_targets else own
         return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
 
-    def _squared_error(self, *behind: Any) -> Callable[[Params], tuple[Array, dict[str, Any]]]:
-        """Return the critics' mean squared error as a function of them; `behind`: see `targets`."""
-        batch, targets = behind[4], self.targets(*behind)
+    def _squared_error(
+        self, batch: Transition, targets: Float[Array, " batch"]
+    ) -> Callable[[Params], tuple[Array, dict[str, Any]]]:
+        """Return the critics' mean squared error as a function of them, with nothing else that changes."""
         unit = self.in_unit(batch.action)
         return lambda critics: (jnp.mean(jnp.square(self.values(critics, batch.obs, unit) - targets[None])), {})
 

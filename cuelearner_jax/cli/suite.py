@@ -76,8 +76,9 @@ def run(arguments: list[str]) -> None:
                 cell.run(options.out)
             except NotFinite as error:
                 out.print(str(error))
-            except signals.Interrupted:
+            except signals.Interrupted as end:
                 if not is_over():
+                    end.args = ("stopped, with all work saved; the same command goes on",)
                     raise
     done = sum(suite.is_done(options.out, cell) for cell in sensible)
     out.print(

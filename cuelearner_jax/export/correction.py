@@ -73,7 +73,11 @@ def _over(policy: Any, base: Any) -> Any:
 
 
 def _calls(policy: Any) -> tuple[int, ...]:
-    """Return which action each call of the innermost base returns; a reading's two calls one, unless both matter."""
+    """Return, for each call that a correction makes of its innermost base, the number of the action that answers it.
+
+    A reading calls its base twice, about what is met and about what is met with the change undone. Where one of them
+    does not matter, the same action answers both.
+    """
     if getattr(policy, "base", None) is None:
         return (0,)
     calls, questions = _calls(policy.base), getattr(policy, "questions", None)  # None: of no reading, which calls once

@@ -50,6 +50,11 @@ class Range(NamedTuple):
     lower: Samples
     upper: Samples
 
+    @classmethod
+    def exact(cls, samples: Samples) -> Range:
+        """Return the range of a quantity that is known exactly."""
+        return cls(samples, samples)
+
 
 class Sampled(NamedTuple):
     """A variant with the samples of its mean over the curve and of its steps to the level."""
@@ -154,9 +159,12 @@ def _row(own: Sampled, unguided: Sampled | None) -> Row:
     if unguided is None:
         return row
     row["against"] = unguided.variant.name
-    ratio = ratio_bounds(*(Range(one.areas, one.areas) for one in (own, unguided)))
-    comparisons = {"mean_difference": Range(*[own.areas - unguided.areas] * 2), "mean_ratio": ratio}
-    for name, bounds in (comparisons | {"steps_ratio": ratio_bounds(own.steps, unguided.steps)}).items():
+    comparisons = {
+        "mean_difference": Range.exact(own.areas - unguided.areas),
+        "mean_ratio": ratio_bounds(Range.exact(own.areas), Range.exact(unguided.areas)),
+        "steps_ratio": ratio_bounds(own.steps, unguided.steps),
+    }
+    for name, bounds in comparisons.items():
         row |= _columns(name, bounds, own, unguided)
     return row
 
@@ -221,8 +229,7 @@ def section(efficiency: Efficiency) -> list[str]:
         keys = [key for key in ("run", "reference", "reference_labels", "guidance") if key in table[0]]
         keys += ["labels"] if name == "efficiency" else []
         header = [key.replace("_", " ") for key in keys] + [*forms[name]]
-        cells = (
-            [*(markdown(row[key]) for key in keys), *(cell(row, *of) for of in forms[name].values())] for row in table
-        )
+        columns = forms[name].values()
+        cells = [[*(markdown(row[key]) for key in keys), *(cell(row, *of) for of in columns)] for row in table]
         lines += ["", *markdown_table(header, cells)]
     return lines

@@ -173,7 +173,9 @@ def _draw_profiles(axes: Any, over: Aggregates) -> None:
     for place, (variant, profile, _) in enumerate(over.each):
         _draw_curve(axes, profile, variant.name, colours[place], place)
     axes.set_ylabel("share of runs above the score")
-    axes.set_xlabel("normalised score\nband: 95% bootstrap interval over seeds, drawn in each task", fontsize=9)
+    axes.set_xlabel(
+        "normalised score\nband: 95% bootstrap interval over seeds and episodes, drawn in each task", fontsize=9
+    )
 
 
 def draw_suite(overs: Mapping[str, Aggregates], title: str) -> Figure:

@@ -23,7 +23,6 @@ NOTE = (
     "intervals over seeds and episodes. A run's score is its mean over the curve: 0 is without labels, 1 is success "
     "in all episodes (shots). Rewarded steps are of training, or spent on judging corrections, a lane."
 )
-MOST_ROWS = 12
 
 
 def variants(table: pa.Table, use: str, teacher: str, right: str) -> list[Variant]:
@@ -104,4 +103,4 @@ def _table(overs: dict[str, Aggregates], table: pa.Table) -> list[str]:
     rows = [
         [tables.markdown(guidance_name(kind)), *(row.get(name, "") for name in header)] for kind, row in cells.items()
     ]
-    return tables.markdown_table(["guidance (labels)", *header], rows[:MOST_ROWS])
+    return tables.markdown_table(["guidance (labels)", *header], rows)

@@ -224,10 +224,10 @@ def test_at_discount_zero_targets_are_rewards():
 
 
 def test_a_value_goes_to_its_two_nearest_bins():
-    found = np.asarray(project(jnp.array([[0.25, 7.0]]), jnp.array([[0.4, 0.6]])))[0]
+    result = np.asarray(project(jnp.array([[0.25, 7.0]]), jnp.array([[0.4, 0.6]])))[0]
     # 0.25 lies between bins 52 and 53 of width 0.1 from -5 on; 7 is beyond the last.
-    np.testing.assert_allclose(found[[52, 53, 100]], [0.2, 0.2, 0.6], atol=1e-5)
-    assert found.sum() == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(result[[52, 53, 100]], [0.2, 0.2, 0.6], atol=1e-5)
+    assert result.sum() == pytest.approx(1, abs=1e-6)
 
 
 def test_the_unit_is_a_running_root_mean_square_of_rewards_by_their_horizon():
@@ -247,7 +247,9 @@ def test_distributions_to_learn_are_those_counted_by_hand(discount):
     error = agent._binned_error(*behind, params["critics"], jnp.array(1))
     (loss, _), gradient = jax.value_and_grad(error, has_aux=True)(params["critics"])
     assert float(loss) == pytest.approx(np.log(BINS.size), rel=1e-5)
-    found = 1 / BINS.size - 2 * np.asarray(gradient["params"]["bins"]["bias"][0])  # the loss is the mean of two critics
+    result = 1 / BINS.size - 2 * np.asarray(
+        gradient["params"]["bins"]["bias"][0]
+    )  # the loss is the mean of two critics
     unit = float(next_unit(jnp.float32(1), batch.reward, discount, jnp.array(1)))
     drawn = agent.draw(params["actor"], batch.next_obs, jax.random.split(KEY)[0])
     next_values = np.asarray(BINS)[None] * 1.0 - temperature * np.asarray(drawn.log_density)[:, None]
@@ -256,7 +258,7 @@ def test_distributions_to_learn_are_those_counted_by_hand(discount):
     for value in np.clip(values / unit, -5, 5).ravel():
         closeness = np.clip(1 - np.abs((value + 5) / 0.1 - np.arange(BINS.size)), 0, 1)
         expected += closeness / values.size
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose(result, expected, atol=1e-4)
 
 
 def test_an_update_keeps_weights_at_length_one_and_counts_the_batch():

@@ -57,10 +57,10 @@ def test_of_a_saved_policy_it_needs_no_base_and_does_beside_it_what_the_policy_d
     assert [written["artefact"][name] for name in ("input", "base_input", "output")] == ["obs", "base_action", "action"]
     assert [part["name"] for part in written["observation"]["slices"]] == ["observation", "base action"]
     decide = cl.load_exported(tmp_path / "out")
-    found = decide(OTHERS, *map(base, decide.base_observations(OTHERS)))
-    np.testing.assert_allclose(found, better(OTHERS), atol=1e-5)
-    assert np.abs(found - base(OTHERS)).max() > 0.01
-    np.testing.assert_allclose(decide(OTHERS[0], base(OTHERS)[0]), found[0], atol=1e-6)
+    actions = decide(OTHERS, *map(base, decide.base_observations(OTHERS)))
+    np.testing.assert_allclose(actions, better(OTHERS), atol=1e-5)
+    assert np.abs(actions - base(OTHERS)).max() > 0.01
+    np.testing.assert_allclose(decide(OTHERS[0], base(OTHERS)[0]), actions[0], atol=1e-6)
     for given, told in (
         ((OTHERS,), "give the base's action about each of decide.base_observations"),
         ((OTHERS, base(OTHERS)[:3]), "or equally many"),
@@ -111,16 +111,16 @@ def test_a_base_elsewhere_is_asked_about_what_it_would_have_seen(format, shifts,
     policy = base
     for shift in shifts:
         policy = reading(better, policy, *shift)
-    wanted = dataclasses.replace(better, policy=policy)
-    told = cl.export_correction(wanted, tmp_path / "out", format=format)
-    assert (told["base"]["questions"], told["golden"]["steady"] > 64) == (questions, True)
+    nested = dataclasses.replace(better, policy=policy)
+    contract = cl.export_correction(nested, tmp_path / "out", format=format)
+    assert (contract["base"]["questions"], contract["golden"]["steady"] > 64) == (questions, True)
     decide = cl.load_exported(tmp_path / "out")
-    asked = decide.base_observations(OTHERS)
-    np.testing.assert_allclose(asked[-1], OTHERS - 0.3, atol=1e-4)
-    np.testing.assert_allclose(decide(OTHERS, *map(base, asked)), wanted(OTHERS), atol=1e-5)
-    assert np.abs(decide(OTHERS, *[base(OTHERS)] * questions) - wanted(OTHERS)).max() > 1e-3
+    base_obs = decide.base_observations(OTHERS)
+    np.testing.assert_allclose(base_obs[-1], OTHERS - 0.3, atol=1e-4)
+    np.testing.assert_allclose(decide(OTHERS, *map(base, base_obs)), nested(OTHERS), atol=1e-5)
+    assert np.abs(decide(OTHERS, *[base(OTHERS)] * questions) - nested(OTHERS)).max() > 1e-3
     if format != "stablehlo":
         np.save(tmp_path / "out/obs.npy", OTHERS)
         subprocess.run([sys.executable, "-I", "-c", ROBOT], check=True, cwd=tmp_path / "out")
         with np.load(tmp_path / "out/done.npz") as done:
-            np.testing.assert_allclose(done["actions"], wanted(OTHERS), atol=1e-5)
+            np.testing.assert_allclose(done["actions"], nested(OTHERS), atol=1e-5)

@@ -96,8 +96,8 @@ def test_the_loss_of_a_preference_is_the_likelihood_of_bradley_and_terry(monkeyp
     a, b = jnp.tile(jnp.array([-1.0, 0.0]), (3, 1)), jnp.tile(jnp.array([1.0, 0.0]), (3, 1))
     choices = jnp.array([[1.0], [-1.0], [0.0]])
     rows = bundle.examples(labels(jnp.concatenate([choices, b], -1), OBS[:3], a), SCALARS)
-    found = bundle.losses(ENV, SCALARS, jnp.array(1.0), rows)
-    np.testing.assert_allclose(found, [0.126928, 2.126928, 1.126928], rtol=1e-5)  # log(1 + e^-2), and 2 and 1 more
+    losses = bundle.losses(ENV, SCALARS, jnp.array(1.0), rows)
+    np.testing.assert_allclose(losses, [0.126928, 2.126928, 1.126928], rtol=1e-5)  # log(1 + e^-2), and 2 and 1 more
     slopes = jax.jacobian(lambda params: bundle.losses(ENV, SCALARS, params, rows))(jnp.array(1.0))
     np.testing.assert_allclose(slopes, [-0.238406, 1.761594, 0.761594], rtol=1e-5)  # (P - p) (u(b) - u(a))
 

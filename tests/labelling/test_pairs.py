@@ -87,10 +87,10 @@ def test_pairs_of_a_page_are_those_of_a_simulated_teacher_and_train_an_agent(ope
     assert main([*train, "relative", "--out", str(tmp_path / "no")]) == 2
     assert "holds preference answers, but guidance relative needs relative answers" in capsys.readouterr().err
     assert main(["labels", "inspect", labels, "--teacher"]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     counts = [int((file.labels.answer[:, 0] == choice).sum()) for choice in (-1, 0, 1)]
     for words in ("100% of 10", f"-1: {counts[0]}, 0: {counts[1]}, 1: {counts[2]}"):
-        assert words in told, told
+        assert words in printed, printed
     spaces = registry.spaces_of(ENV)
     for answer, words in (([2.0, 1.0, 0.0], "none of -1, 0, 1"), ([1.0, 2.0, 0.0], "answers are no unit vectors")):
         wrong = file.labels.replace(answer=np.tile(np.float32(answer), (10, 1)))

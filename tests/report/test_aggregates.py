@@ -18,8 +18,8 @@ STEPS = (0, 10)
 
 def write(folder, task, guidance, values, labels=0, constants=None):
     """Seeds that stand at a value of their own at all steps, in two groups of equal episodes."""
-    known = {"run": folder.name, "task": task, "guidance": guidance, "config_hash": "0f", "labels": labels}
-    with TableWriter(folder, results.SCHEMA, known | (constants or {})) as writer:
+    columns = {"run": folder.name, "task": task, "guidance": guidance, "config_hash": "0f", "labels": labels}
+    with TableWriter(folder, results.SCHEMA, columns | (constants or {})) as writer:
         for step in STEPS:
             each = np.array(values)[:, None] + [0.0, 0.0]
             row = {"reward": values, "reward_each": each, "episodes": 2, "failed": [float(np.isnan(v)) for v in values]}
@@ -74,8 +74,8 @@ def test_equal_seeds_are_drawn_together_within_a_task_alone():
 
 def test_the_command_takes_a_level_for_the_score_1(tasks, capsys):
     assert main(["report", str(tasks), "--level", "60", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["ends"] == {"large": [10.0, 60.0], "small": [pytest.approx(0.1), 60.0]}
+    tables = json.loads(capsys.readouterr().out)
+    assert tables["ends"] == {"large": [10.0, 60.0], "small": [pytest.approx(0.1), 60.0]}
     assert main(["report", str(tasks), "--level", "5", "--json"]) == 2
     assert "5 in large is no better than its unguided agents, 10: give a better --level" in capsys.readouterr().err
     assert main(["report", str(tasks), "--efficiency", "--json"]) == 2
@@ -96,9 +96,9 @@ def test_settings_are_groups_and_one_that_failed_leaves_the_others(tmp_path):
         write(tmp_path / "runs" / str(eps), "one", "none", [0.2] * 2, constants={"scalars.eps_deg": eps})
         write(tmp_path / "runs" / f"{eps}-r", "one", "relative", [level] * 2, 100, constants={"scalars.eps_deg": eps})
     text = report([tmp_path / "runs"], tmp_path / "report", ReportRequest(guidance=("relative", "none"))).read_text()
-    found = {(row["run"], row["guidance"]): row for row in table(tmp_path / "report" / "summary.csv")}
+    rows = {(row["run"], row["guidance"]): row for row in table(tmp_path / "report" / "summary.csv")}
     names = [f"scalars.eps_deg={eps}" for eps in (2, 2, 5, 5, 10)]  # in the order of the numbers
-    assert [run for run, _ in found] == names
-    assert float(found["scalars.eps_deg=2", "relative"]["final"]) == 0.3
-    assert found["scalars.eps_deg=5", "relative"]["improvement"] == "0.0"
+    assert [run for run, _ in rows] == names
+    assert float(rows["scalars.eps_deg=2", "relative"]["final"]) == 0.3
+    assert rows["scalars.eps_deg=5", "relative"]["improvement"] == "0.0"
     assert "scalars.eps_deg=10: relative, 100 labels: seeds 0 (by step 0), 1 (by step 0) failed" in text
