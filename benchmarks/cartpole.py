@@ -1,7 +1,8 @@
-"""Cart and pole as an environment with a planar action: the task of the peers' speed comparison.
+"""Gymnasium's CartPole-v1 as an environment of JAX: keep a pole upright by pushing its cart left or right.
 
-Source: Barto, Sutton, Anderson, "Neuronlike adaptive elements that can solve difficult learning control problems"
-(1983); constants as in common benchmarks: force 10 N, steps of 0.02 s, ends at 2.4 m or 12 degrees, 500 steps.
+Constants and reward are those of Gymnasium 1.4: 10 N, steps of 0.02 s, ends at 2.4 m or 12 degrees; at most 500 steps,
+each with reward 1. Source: Barto, Sutton, Anderson, "Neuronlike adaptive elements that can solve difficult learning
+control problems" (1983).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.spaces import Choices
 from cuelearner_jax.types import Step
 
 GRAVITY, CART, POLE, HALF_LENGTH, FORCE, SECONDS = 9.8, 1.0, 0.1, 0.5, 10.0, 0.02
@@ -24,10 +26,9 @@ class CartState(struct.PyTreeNode):
 
 
 class CartPole(WholeObservations, struct.PyTreeNode):
-    """The force points along x with the sign of the direction's first entry."""
+    """A pole on a cart; the first choice pushes left, the second right."""
 
-    force: float = FORCE
-
+    actions = Choices(2)
     observation = (
         Quantity("cart", 2, "m, m/s", "position, velocity"),
         Quantity("pole", 2, "rad, rad/s", "angle, angular velocity"),
@@ -41,7 +42,7 @@ class CartPole(WholeObservations, struct.PyTreeNode):
     def step(self, key: jax.Array, state: CartState, action: jax.Array) -> tuple[CartState, Step]:
         """Take one Euler step; the reward is 1."""
         _, speed, angle, turning = state.obs
-        push = self.force * jnp.sign(action[0])
+        push = FORCE * (action[1] - action[0])
         total, sin, cos = CART + POLE, jnp.sin(angle), jnp.cos(angle)
         pushed = (push + POLE * HALF_LENGTH * turning**2 * sin) / total
         angular = (GRAVITY * sin - cos * pushed) / (HALF_LENGTH * (4.0 / 3.0 - POLE * cos**2 / total))

@@ -1,0 +1,162 @@
+"""Agents here beside those of other projects: train, evaluate, print and write, for `sac_speed.py` and `dqn_speed.py`.
+
+Here all seeds train side by side. A peer is a process a seed, one after another or `--at-once` some, or one process of
+all seeds. Seconds are of training alone, without a training's first stretch, which compiles.
+
+Every evaluation is written when all seeds have it; a way that is in `--out` in full is not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _measuring import Timed
+from cartpole import CartPole
+from pendulum import STEPS, Pendulum
+
+import cuelearner_jax as cl
+from cuelearner_jax.run_config import RunConfig
+from cuelearner_jax.storage.provenance import provenance
+
+EPISODES, LONGEST = 10, 1000  # of an evaluation; steps of the longest episode
+IN_JAX = {"Pendulum-v1": Pendulum(jnp.array(STEPS)), "CartPole-v1": CartPole()}
+Tell = Callable[[dict[str, Any]], None]  # takes an evaluation: step, returns (seeds), seconds of the stretch before it
+
+
+def evaluation(env: Any, functions: Any) -> Callable[[Any], jax.Array]:
+    """Return a function of lanes' parameters: the mean return of deterministic episodes of each."""
+
+    def one(params: Any) -> jax.Array:
+        state, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), EPISODES))
+
+        def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
+            state, obs, running, total = carry
+            actions = functions.act(env, params, obs, key)
+            state, after = jax.vmap(env.step)(jax.random.split(key, EPISODES), state, actions)
+            total = total + jnp.where(running, after.reward, 0.0)
+            return (state, after.obs, running & ~(after.terminated | after.truncated), total), None
+
+        start = (state, obs, jnp.ones(EPISODES, bool), jnp.zeros(EPISODES))
+        return jax.lax.scan(step, start, jax.random.split(jax.random.key(2), LONGEST))[0][3].mean()
+
+    return jax.jit(lambda params: jax.lax.map(one, params, batch_size=16))
+
+
+def train_here(name: str, config: RunConfig, options: argparse.Namespace, tell: Tell) -> None:
+    """Train with this package's loop, that of `cuelearner sweep`, all seeds side by side."""
+    env: Any = IN_JAX[name] if name in IN_JAX else cl.from_gymnasium(name, processes=1).env
+    lanes, returned = Timed(config, env, "none", options.seeds), evaluation(env, config.agent_in(env))
+    every = options.steps // options.evaluations
+    for number in range(options.evaluations):
+        seconds = lanes.train(every)
+        earned = np.concatenate([np.asarray(returned(block.agent.params)) for block in lanes.blocks])
+        tell({"step": (number + 1) * every, "returns": earned[: options.seeds].tolist(), "seconds": seconds})
+
+
+def train_elsewhere(way: str, values: dict[str, Any], options: argparse.Namespace, at_once: int, tell: Tell) -> None:
+    """Train a peer in its own Python: a process a seed, or one of all seeds where `values` say "together"."""
+    ends: dict[int, dict[int, dict[str, Any]]] = {}  # by step and process
+    seeds = list(range(options.seeds))
+    parts = [seeds] if values.get("together") else [[seed] for seed in seeds]
+
+    def run(number: int) -> None:
+        setting = json.dumps({**values, "seeds": parts[number]})
+        command = [options.peer_python, str(Path(__file__).parent / "_peers.py"), way, setting]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            for line in process.stdout or ():
+                if not line.startswith("{"):
+                    continue
+                row = json.loads(line)
+                at = ends.setdefault(row["step"], {})
+                at[number] = row
+                if len(at) == len(parts):
+                    returns = [earned for part in range(len(parts)) for earned in at[part]["returns"]]
+                    seconds = sum(row["seconds"] for row in at.values())
+                    tell({"step": row["step"], "returns": returns, "seconds": seconds})
+        if process.returncode:
+            raise SystemExit(f"{way} failed on {values['name']}: is it installed in {options.peer_python}?")
+
+    with ThreadPoolExecutor(at_once) as pool:
+        list(pool.map(run, range(len(parts))))
+
+
+def show(rows: list[dict[str, Any]], base: str) -> None:
+    """Print a table: returns of every way at the last common step, over the base's, and steps a second of all seeds."""
+    print(f"environment    way            step   return, mean [seeds' least, most]   over {base}   steps/s, all seeds")
+    for name in dict.fromkeys(row["environment"] for row in rows):
+        own = [row for row in rows if row["environment"] == name and row["rows"]]
+        step = min(row["rows"][-1]["step"] for row in own)
+        at = {row["way"]: next(r["returns"] for r in row["rows"] if r["step"] == step) for row in own}
+        for row in own:
+            returns, later = at[row["way"]], row["rows"][1:]
+            over = f"{np.mean(returns) / np.mean(at[base]):.2f}" if base in at else "-"
+            stretch = row["rows"][0]["step"] * len(returns) * len(later)
+            rate = stretch / sum(r["seconds"] for r in later) * row["at_once"] if later else np.nan
+            spread = f"{np.mean(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
+            print(f"{name:<15}{row['way']:<10}{step:>9,}   {spread:<32}{over:>10}   {rate:>16,.0f}")
+
+
+def parser_of(about: str | None, environments: list[str], ways: list[str], seeds: int) -> argparse.ArgumentParser:
+    """Return a command line with the options that every comparison has."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--environments", nargs="+", default=environments, help="of Gymnasium")
+    parser.add_argument("--ways", nargs="+", default=ways, choices=ways)
+    parser.add_argument("--peer-python", default=sys.executable, help="a Python with the peers")
+    parser.add_argument("--seeds", type=int, default=seeds)
+    parser.add_argument("--at-once", type=int, default=1, help="seeds of a peer that run side by side (default: 1)")
+    parser.add_argument("--steps", type=int, default=500_000, help="of each training (default: 500,000)")
+    parser.add_argument("--evaluations", type=int, default=5, help="of each training (default: 5)")
+    parser.add_argument("--out", type=Path, help="JSON file to write, or to go on with")
+    parser.add_argument("--table", type=Path, nargs="+", help="print the table of these files, and measure nothing")
+    return parser
+
+
+def compare(
+    options: argparse.Namespace,
+    setting: dict[str, Any],
+    here: dict[str, RunConfig],
+    elsewhere: dict[str, dict[str, Any]],
+    base: str,
+) -> None:
+    """Measure, print and write. `elsewhere`: by way, what its process gets beside the environment and the sizes."""
+    if options.table:
+        show([row for file in options.table for row in json.loads(file.read_text())["rows"]], base)
+        return
+    if options.evaluations < 2 or options.steps % options.evaluations:
+        raise SystemExit("give at least two evaluations that divide --steps")
+    rows = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
+    rows = [row for row in rows if len(row["rows"]) == options.evaluations]
+    setting = {**setting, "steps": options.steps, "evaluations": options.evaluations, "episodes": EPISODES}
+    for name in options.environments:
+        for way in options.ways:
+            if any((row["environment"], row["way"]) == (name, way) for row in rows):
+                continue
+            alone = way in here or elsewhere[way].get("together")
+            at_once = 1 if alone else min(options.at_once, options.seeds)
+            entry: dict[str, Any] = {"environment": name, "way": way, "at_once": at_once, "rows": []}
+            rows.append(entry)
+
+            def tell(row: dict[str, Any], entry: dict[str, Any] = entry) -> None:
+                entry["rows"].append(row)
+                mean = f"{np.mean(row['returns']):.1f} at step {row['step']:,}, {row['seconds']:.0f} s"
+                print(f"{entry['environment']}, {entry['way']}: {mean}", flush=True)
+                if options.out:
+                    about = {**provenance(), "processors": os.cpu_count(), "setting": setting, "rows": rows}
+                    options.out.write_text(json.dumps(about, indent=1) + "\n")
+
+            if way in here:
+                train_here(name, here[way], options, tell)
+            else:
+                train_elsewhere(way, {**setting, **elsewhere[way], "name": name}, options, at_once, tell)
+    show(rows, base)

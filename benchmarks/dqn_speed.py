@@ -1,0 +1,50 @@
+"""Double DQN here over CleanRL's DQN and PureJaxQL's PQN: return over steps, and steps over seconds.
+
+    python benchmarks/dqn_speed.py --environments CartPole-v1 Acrobot-v1 --peer-python peers/bin/python \
+        --cleanrl peers/cleanrl --purejaxql peers/purejaxql --out dqn.json
+    python benchmarks/dqn_speed.py --table dqn.json
+
+Ways: `ddqn` here; `CleanRL`, the `cleanrl/dqn_jax.py` of a checkout with its own defaults, a process a seed;
+`PureJaxQL`, its `pqn_cartpole.yaml`, all seeds in one process. `ddqn` has CleanRL's layers, minibatches, Adam and its
+rate, discount, replay, random steps before the first update, and a target network that is copied every 500 steps. Not
+equal: `ddqn` makes one gradient step an environment step (CleanRL: one in ten), its later actions are greedy (CleanRL:
+random ones fall from all to 5% over the first half), its targets are double, and the action is an input of its network.
+PQN has neither replay nor target network. `CartPole-v1` is `cartpole.py` here, which is step for step Gymnasium's.
+"""
+
+from __future__ import annotations
+
+from _comparing import compare, parser_of
+
+from cuelearner_jax.agents.ddqn import DDQNConfig
+from cuelearner_jax.config import Scalars, Schedule, Sizes
+from cuelearner_jax.run_config import RunConfig
+
+# CleanRL's defaults
+AGENT = DDQNConfig(
+    q_layers=(120, 84),
+    batch_size=128,
+    replay_capacity=10_000,
+    optimizer="adam",
+    learning_rate=2.5e-4,
+    polyak=1.0,
+    target_every=500,
+)
+PREFILL, DISCOUNT = 10_000, 0.99
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = parser_of(__doc__, ["CartPole-v1"], ["ddqn", "CleanRL", "PureJaxQL"], seeds=4)
+    parser.add_argument("--cleanrl", help="folder of a checkout of CleanRL")
+    parser.add_argument("--purejaxql", help="folder of a checkout of PureJaxQL")
+    options = parser.parse_args()
+    schedule = Schedule(random_steps=PREFILL, learn_after=PREFILL, guidance_until=0)
+    scalars = Scalars(discount=DISCOUNT, max_grad_norm=1e9)  # CleanRL does not clip
+    here = {"ddqn": RunConfig(None, Sizes(num_envs=1), scalars, schedule, AGENT)}
+    elsewhere = {"CleanRL": {"folder": options.cleanrl}, "PureJaxQL": {"folder": options.purejaxql, "together": True}}
+    compare(options, {}, here, elsewhere, base="CleanRL")
+
+
+if __name__ == "__main__":
+    main()
