@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 from _flops import step_operations
-from jax.sharding import Mesh
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment, spaces_of
@@ -23,7 +22,6 @@ from cuelearner_jax.loop import start_clock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.task import Task
 from cuelearner_jax.types import Teacher
 
 FEWEST_STRETCHES = 3
@@ -42,10 +40,8 @@ def timed(work: Callable[[], T]) -> tuple[float, T]:
 class Timed:
     """Lanes of one kind of guidance, ready to be timed."""
 
-    def __init__(
-        self, config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0, mesh: Mesh | None = None
-    ) -> None:
-        mesh = mesh or lane_mesh()
+    def __init__(self, config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0) -> None:
+        mesh = lane_mesh()
         env, grid = place(mesh, env, SHARED), Grid((kind,), tuple(range(seeds)), (labels,))
         self.group = LaneGroup(config, env, config.guide_in(env, kind), grid, mesh)
         self.clock, self.blocks = place(mesh, start_clock(), SHARED), self.group.start()
@@ -74,26 +70,24 @@ class Labelled(Timed):
         return seconds
 
 
-def learning(config: RunConfig, *, guided: bool = False) -> RunConfig:
-    """Return the configuration with greedy actions and learning from the first step; always guided, or never."""
-    until = 2**30 if guided else 0
-    schedule = dataclasses.replace(config.schedule, random_steps=0, learn_after=0, guidance_until=until)
+def learning(config: RunConfig) -> RunConfig:
+    """Return the configuration with greedy actions and learning from the first step, without guidance."""
+    schedule = dataclasses.replace(config.schedule, random_steps=0, learn_after=0, guidance_until=0)
     return dataclasses.replace(config, schedule=schedule)
 
 
-def measure_training(
-    config: RunConfig, env: Callable[[], Environment], seeds: int, seconds: float, mesh: Mesh | None = None
-) -> dict[str, Any]:
-    """Measure the training of `seeds` unguided lanes for `seconds` after compilation, over all devices of a mesh.
+def measure(env: Callable[[], Environment], config: RunConfig, seeds: int, seconds: float) -> dict[str, Any]:
+    """Measure the training of `seeds` unguided lanes for `seconds` after compilation, over all devices.
 
     Returns:
         `steps_a_second` (environment steps of all seeds), `ms_a_step` (one step of every seed), `mb_a_seed` (at rest)
         and `peak_gb` (of the first device in this process so far; None where unknown). Further `first_step_s`
         (environment, compilation and first step, without imports), `seeds`, `devices`, `stretches` and `spread`
-        (slowest less fastest stretch, over their median).
+        (slowest less fastest stretch, over their median). Of operations `gflops`, `matmul_gflops` of the machine in
+        the same run, and `share_of_matmul`.
     """
-    began, mesh = time.perf_counter(), mesh or lane_mesh()
-    group = Timed(learning(config), env(), "none", seeds, mesh=mesh)
+    began = time.perf_counter()
+    group = Timed(learning(config), env(), "none", seeds)
     iterations = max(1, STEPS_A_STRETCH[jax.default_backend()] // config.sizes.num_envs)
     group.train(iterations)
     first = time.perf_counter() - began
@@ -104,9 +98,12 @@ def measure_training(
     typical = statistics.median(stretches)
     step = typical / iterations / config.sizes.num_envs
     memory = jax.local_devices()[0].memory_stats() or {}
+    devices = group.group.mesh.size
+    peak = matmul_rate() * (devices if jax.default_backend() != "cpu" else 1)
+    flops = seeds / step * step_operations(config, spaces_of(group.group.env)).total
     return {
         "seeds": seeds,
-        "devices": mesh.size,
+        "devices": devices,
         "steps_a_second": seeds / step,
         "ms_a_step": 1e3 * step,
         "mb_a_seed": at_rest / 1e6,
@@ -114,6 +111,9 @@ def measure_training(
         "first_step_s": first - (iterations - 1) / iterations * typical,
         "stretches": len(stretches),
         "spread": (max(stretches) - min(stretches)) / typical,
+        "gflops": flops / 1e9,
+        "matmul_gflops": peak / 1e9,
+        "share_of_matmul": flops / peak,
     }
 
 
@@ -122,29 +122,14 @@ def state_bytes(tree: Any) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-def matmul_rate(dtype: str = "float32", repeats: int = 5) -> float:
-    """Large matrix products on one device [operations/s], best of `repeats`; a CPU is one device with all its cores.
+def matmul_rate() -> float:
+    """Large matrix products on one device [operations/s], best of three; a CPU is one device with all its cores.
 
     Float32 is computed as JAX does by default, as in training.
     """
     size, queued = (2048, 1) if jax.default_backend() == "cpu" else (8192, 10)
-    a, b = (jax.random.normal(jax.random.key(k), (size, size), dtype) for k in (0, 1))
+    a, b = (jax.random.normal(jax.random.key(k), (size, size)) for k in (0, 1))
     product = jax.jit(jnp.matmul)
     product(a, b).block_until_ready()
-    best = min(timed(lambda: [product(a, b) for _ in range(queued)])[0] for _ in range(repeats))
+    best = min(timed(lambda: [product(a, b) for _ in range(queued)])[0] for _ in range(3))
     return queued * 2 * size**3 / best
-
-
-def measure(task: Task, config: RunConfig, seeds: int, seconds: float, mesh: Any = None) -> dict[str, Any]:
-    """Return a row of `measure_training` with what the networks reach of the machine's matmul rate in the same run."""
-    row = measure_training(config, lambda: task.environment(config.task), seeds, seconds, mesh)
-    rate = matmul_rate(repeats=3) * (row["devices"] if jax.default_backend() != "cpu" else 1)
-    spaces = spaces_of(task.environment(config.task))
-    flops = row["steps_a_second"] * step_operations(config, spaces).total
-    return {
-        **row,
-        "task": task.name,
-        "gflops": flops / 1e9,
-        "matmul_gflops": rate / 1e9,
-        "share_of_matmul": flops / rate,
-    }

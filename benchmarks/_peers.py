@@ -3,10 +3,9 @@
     PYTHON benchmarks/_peers.py WAY SETTING
 
 WAY is `SAC` or `CrossQ` (sbx), `CleanRL` or `PureJaxQL`. SETTING is a JSON object: name (of the environment), seeds
-(a list), steps, evaluations, episodes; further layers, batch_size, updates_per_step, prefill, discount, rate and polyak
-for sbx, and folder, that of a checkout, for the others. One JSON object a line comes out for each evaluation: step,
-returns (of seeds, mean over episodes), seconds (of the training since the evaluation before). This file imports nothing
-of this project.
+(a list), steps, evaluations, episodes; further layers, batch_size, prefill, discount, rate and polyak for sbx, and
+folder, that of a checkout, for the others. One JSON object a line comes out for each evaluation: step, returns (of
+seeds, mean over episodes), seconds (of the training since the evaluation before). Nothing of this project is imported.
 """
 
 # Peers are installed by whoever compares with them.
@@ -51,8 +50,6 @@ def sbx(way: str, setting: dict[str, Any]) -> None:
     own = {
         "learning_rate": setting["rate"],
         "batch_size": setting["batch_size"],
-        "gradient_steps": setting["updates_per_step"],
-        "train_freq": 1,
         "gamma": setting["discount"],
         "tau": setting["polyak"],
         "policy_kwargs": {"net_arch": list(setting["layers"])},

@@ -4,7 +4,6 @@
 
 All contenders play the same scenes, half of them racked and half scattered, in random directions. Rounds are
 interleaved, so that other work on the machine meets all alike; figures are medians over rounds, compile time apart.
-"Stepping alone" bounds any program on that engine: each shot's duration is known beforehand and nothing is read.
 """
 
 import argparse
@@ -51,16 +50,9 @@ def main() -> None:
         for place, angle in zip(places[:few], angles[:few], strict=True):
             worlds[threads].play(place, angle)
 
-    durations = [worlds[0].play(place, angle)[2] for place, angle in zip(places[:few], angles[:few], strict=True)]
-
-    def stepping() -> None:
-        for place, angle, duration in zip(places[:few], angles[:few], durations, strict=True):
-            worlds[0].step_only(place, angle, duration)
-
     contenders: dict[str, tuple[int, Callable[[], object]]] = {
         "pymunk, no threads": (few, lambda: chipmunk(0)),
         "pymunk, 2 threads": (few, lambda: chipmunk(2)),
-        "pymunk, stepping alone": (few, stepping),
         "vmap(simulate)": (len(angles), lambda: together(table, *scene)),
         "simulate_many": (len(angles), lambda: blocks(table, *scene)),
         "simulate_many, tilted": (len(angles), lambda: blocks(tilted, *scene)),
@@ -72,22 +64,18 @@ def main() -> None:
             times[name].append(timed(play)[0])
 
     rate = {name: shots / float(np.median(times[name])) for name, (shots, _) in contenders.items()}
-    peers = max(rate["pymunk, no threads"], rate["pymunk, 2 threads"]), rate["pymunk, stepping alone"]
+    peer = max(rate["pymunk, no threads"], rate["pymunk, 2 threads"])
     shot, device = blocks(table, *scene), jax.devices()[0].device_kind
     print(
         f"{os.cpu_count()} cores, JAX on {device}; {float(shot.events.mean()):.1f} events a shot, "
         f"{int(shot.events.max())} at most, {int(shot.exhausted.sum())} exhausted"
     )
-    print(f"{'':24}{'shots/s':>10}{'times faster pymunk':>21}{'times stepping alone':>22}{'first call [s]':>16}")
+    print(f"{'':24}{'shots/s':>10}{'times faster pymunk':>21}{'first call [s]':>16}")
     for name, value in rate.items():
-        print(f"{name:24}{value:10,.0f}{value / peers[0]:21.1f}{value / peers[1]:22.1f}{first[name]:16.1f}")
+        print(f"{name:24}{value:10,.0f}{value / peer:21.1f}{first[name]:16.1f}")
     if arguments.out:
-        ratio = {"playing": peers[0], "stepping alone": peers[1]}
-        figures = {
-            "shots_per_s": rate,
-            "times_pymunk": {peer: {name: value / r for name, value in rate.items()} for peer, r in ratio.items()},
-            "first_call_s": first,
-        }
+        times_pymunk = {name: value / peer for name, value in rate.items()}
+        figures = {"shots_per_s": rate, "times_pymunk": times_pymunk, "first_call_s": first}
         arguments.out.write_text(json.dumps({"device": device, "cores": os.cpu_count(), **figures}, indent=2))
 
 

@@ -5,16 +5,10 @@
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart
     python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --more="--task.table regulation"
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart --guidance demonstration scalar
-    python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --called small \\
-        --more="--task.table regulation --scalars.eps-deg 0.1"
-    python benchmarks/labelling_page.py pictures --task examples.reach:TASK --preset quickstart
-    python benchmarks/labelling_page.py pictures --task navigation --preset quickstart --called anymal \\
-        --more="--robot anymal --task.worlds 16"
     python benchmarks/labelling_page.py paced --task pictures --labels 300 --out paced_pictures.json
     MUJOCO_GL=osmesa python benchmarks/labelling_page.py paced --task gymnasium:FetchReach-v4 --labels 300
     python benchmarks/labelling_page.py kills --task pictures
     python benchmarks/labelling_page.py pictures --task pictures
-    python benchmarks/labelling_page.py pictures --task pictures --called one_cue --more=--one-cue
     MUJOCO_GL=osmesa python benchmarks/labelling_page.py pictures --task gymnasium:FetchReach-v4
 
 The task `pictures` is a folder of plain pictures, written anew; a script that knows what they show answers about three
@@ -226,9 +220,7 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
     for task in asked.task:
         for kind in asked.guidance or [""]:
             more = ("--guidance", kind) if kind else ()
-            called = "_".join(
-                part for part in (task.rpartition(":")[0].rpartition(".")[2] or task, kind, asked.called) if part
-            )
+            called = (task.rpartition(":")[0].rpartition(".")[2] or task) + (f"_{kind}" if kind else "")
             with served(asked, task, work / called, "--labels", "500", *more) as (_, address):
                 page = entered(browser, address)
                 rng, wanted = random.Random(2), 0 if kind else 12
@@ -239,7 +231,7 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
                 if wanted:
                     page.wait_for_function("() => document.body.innerText.includes('model 1')", timeout=300_000)
                 page.close()
-                for name, look in LOOKS.items() if not (kind or asked.called) else [("light", LOOKS["light"])]:
+                for name, look in LOOKS.items() if not kind else [("light", LOOKS["light"])]:
                     page = entered(browser, address, **look)
                     time.sleep(1.0)
                     page.screenshot(path=asked.to / f"label_{called}_{name}.png")
@@ -253,14 +245,12 @@ def main() -> None:
     parser.add_argument("what", choices=("paced", "kills", "pictures"))
     parser.add_argument("--task", nargs="+", default=["navigation"])
     parser.add_argument("--preset", default="", help="(default: paper, of a folder or an environment its own)")
-    parser.add_argument("--situations", type=int, default=200, help="of the task pictures: how many are written")
     parser.add_argument("--guidance", nargs="*", help="pictures: of these kinds instead of the task's own")
     parser.add_argument("--more", default="", help="further options of cuelearner label, in one word")
     parser.add_argument("--labels", type=int, default=500)
     parser.add_argument("--rate", type=float, default=5.0, help="presses a second")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--to", type=Path, default=Path("docs/figures"), help="folder for pictures")
-    parser.add_argument("--called", default="", help="pictures: a word for their names, of a page with further options")
     parser.add_argument("--browser", default=shutil.which("chromium"), help="a Chromium")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
@@ -268,7 +258,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as work, sync_playwright() as driver:
         if PHOTOS in asked.task:
             asked.photos = Path(work) / "situations"
-            asked.seen, _ = _photos.write(asked.photos, asked.situations)
+            asked.seen, _ = _photos.write(asked.photos, count=200)
         browser = driver.chromium.launch(executable_path=asked.browser, args=["--no-sandbox"])
         found = {"paced": paced, "kills": kills, "pictures": pictures}[asked.what](asked, browser, Path(work))
         browser.close()

@@ -81,14 +81,6 @@ class PymunkTable:
         pocketed = np.array([ball not in playing for ball in balls])
         return np.array([body.position for body, _ in balls]), pocketed, steps * self.step
 
-    def step_only(self, positions: np.ndarray, angle: float, duration: float) -> None:
-        """The engine's share of a shot of known duration [s]: no pockets, no test for the end."""
-        self._place(positions, angle)
-        for _ in range(round(duration / self.step)):
-            self.space.step(self.step)
-        for ball in self.balls:
-            self.space.remove(*ball)
-
 
 def scenes(table: Table, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Random places of all balls inside the cushions, none overlapping (count, balls, 2) [m], and directions [rad]."""

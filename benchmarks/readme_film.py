@@ -245,12 +245,11 @@ def run() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--labels", type=int, default=60)
     parser.add_argument("--browser", default=shutil.which("chromium"), help="a Chromium")
-    parser.add_argument("--keep", type=Path, help="folder for labels, policy and films (default: one that is removed)")
     parser.add_argument("--out", type=Path, default=Path("docs/figures/labels_correct_an_arm.gif"))
     asked = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "osmesa")
     with tempfile.TemporaryDirectory() as temporary:
-        film(asked, asked.keep or Path(temporary))
+        film(asked, Path(temporary))
 
 
 if __name__ == "__main__":

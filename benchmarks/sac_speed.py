@@ -19,34 +19,30 @@ from cuelearner_jax.agents.sac import SACConfig
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.run_config import RunConfig
 
-DISCOUNT, RATE, POLYAK = 0.99, 3e-4, 0.005
+LAYERS = (256, 256)
+SETTING: dict[str, Any] = {"layers": LAYERS, "batch_size": 256, "discount": 0.99, "rate": 3e-4, "polyak": 0.005}
 
 
 def main() -> None:
     """Measure, print and write."""
     parser = parser_of(__doc__, ["Pendulum-v1"], ["sac", "xqc", "SAC", "CrossQ"], seeds=5)
     parser.add_argument("--prefill", type=int, default=5_000, help="random steps before the first update")
-    parser.add_argument("--layers", type=int, nargs="+", default=[256, 256])
-    parser.add_argument("--batch-size", type=int, default=256)
-    parser.add_argument("--updates-per-step", type=int, default=1)
     options = parser.parse_args()
-    own = {name: getattr(options, name) for name in ("layers", "batch_size", "updates_per_step", "prefill")}
-    setting = {**own, "discount": DISCOUNT, "rate": RATE, "polyak": POLYAK}
+    setting = {**SETTING, "prefill": options.prefill}
     schedule = Schedule(random_steps=options.prefill, learn_after=options.prefill, guidance_until=0)
-    scalars = Scalars(discount=DISCOUNT, max_grad_norm=1e9)  # the peers do not clip
+    scalars = Scalars(discount=SETTING["discount"], max_grad_norm=1e9)  # the peers do not clip
 
     def config(bins: bool) -> RunConfig:
         agent = SACConfig(
-            actor_layers=tuple(options.layers),
-            critic_layers=tuple(options.layers),
+            actor_layers=LAYERS,
+            critic_layers=LAYERS,
             bins=bins,
-            batch_size=options.batch_size,
-            updates_per_step=options.updates_per_step,
+            batch_size=SETTING["batch_size"],
             replay_capacity=options.steps,
-            actor_rate=RATE,
-            critic_rate=RATE,
-            temperature_rate=RATE,
-            polyak=POLYAK,
+            polyak=SETTING["polyak"],
+            actor_rate=SETTING["rate"],
+            critic_rate=SETTING["rate"],
+            temperature_rate=SETTING["rate"],
         )
         return RunConfig(None, Sizes(num_envs=1), scalars, schedule, agent)
 

@@ -7,7 +7,7 @@
 One thing is varied at a time, from the preset's own sizes with `--base-seeds` seeds. Training is unguided, from the
 first step on; labels are measured by rounds of questions with their fit, and by the fit alone. Replay is cut to 100,000
 steps a seed, which changes memory alone. Every point is written when it is measured: the same command goes on where it
-was stopped, and `--stop-after` bounds one call.
+was stopped.
 """
 
 from __future__ import annotations
@@ -60,11 +60,7 @@ def main() -> int:
             raise SystemExit(f"{asked.out} holds measurements of another setting: give another --out")
     agent = dataclasses.replace(preset.config.agent, replay_capacity=min(REPLAY, preset.config.agent.replay_capacity))
     task, config = registry.find(asked.task), dataclasses.replace(preset.config, agent=agent)
-    began = time.perf_counter()
     for axis, value in _points(asked, contents["rows"]):
-        if asked.stop_after and time.perf_counter() - began > asked.stop_after:
-            print(f"stopped after {asked.stop_after:g} s: the same command goes on")
-            return 0
         print(f"{axis} {value} ...", flush=True)
         figures = (
             _labels(task, config, asked.base_seeds, value)
@@ -91,7 +87,6 @@ def _arguments() -> argparse.Namespace:
         "--widths", type=int, nargs="*", default=[64, 128, 256], help="of the first layer; others scale"
     )
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement of training")
-    parser.add_argument("--stop-after", type=float, default=0.0, help="seconds after which no new point begins")
     parser.add_argument("--out", type=Path, default=Path("scaling.json"))
     parser.add_argument("--draw", type=Path, nargs="+", help="draw these files instead of measuring")
     parser.add_argument("--figure", type=Path, default=Path("scaling"), help="name of the figure without its ending")
@@ -123,7 +118,8 @@ def _training(task: Task, config: RunConfig, asked: argparse.Namespace, axis: st
     else:
         layers = tuple(max(1, width * value // agent.q_layers[0]) for width in agent.q_layers)
         agent = dataclasses.replace(agent, q_layers=layers)
-    return measure(task, dataclasses.replace(config, agent=agent), seeds, asked.seconds)
+    config = dataclasses.replace(config, agent=agent)
+    return measure(lambda: task.environment(config.task), config, seeds, asked.seconds)
 
 
 def _labels(task: Task, config: RunConfig, seeds: int, budget: int) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import argparse
 import dataclasses
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,14 +70,14 @@ class World(NamedTuple):
     teacher: Any
 
 
-def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, faults: dict[str, float]) -> World:
-    """The world of a scene, its teacher, and answers as its scenario has them; `faults`: of the teacher."""
+def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str) -> World:
+    """The world of a scene, its teacher, and answers as its scenario has them."""
     scenario, more = SCENES.get(name, (LIKE[task.name], {}))
     rules = task.scenario(scenario)
     applied = dataclasses.replace(rules.apply(own), **more)
     config = dataclasses.replace(own, **({"teacher": applied.teacher} if task.name == "billiards" else {}))
     config = config if name == UNCHANGED else applied
-    scalars = dataclasses.replace(settling(scalars, rules.eps_deg), **{**rules.scalars, **faults})
+    scalars = dataclasses.replace(settling(scalars, rules.eps_deg), **rules.scalars)
     env = task.environment(config)
     return World(config, env, task.environment(config, split), scalars, task.make_teacher(config, env))
 
@@ -132,13 +132,7 @@ class Study(NamedTuple):
         """A world and what may have changed in it."""
         if name in self.made:
             return self.made[name]
-        faults: dict[str, Any] = {
-            "mistake_probability": self.asked.mistakes,
-            "teacher_bias_deg": self.asked.bias_deg,
-        }
-        if self.asked.eps_deg:
-            faults["eps_deg"] = self.asked.eps_deg
-        world = world_of(self.task, name, self.own, self.scalars, self.asked.split, faults)
+        world = world_of(self.task, name, self.own, self.scalars, self.asked.split)
         self.made[name] = world, declared_distortions(world.env)
         return self.made[name]
 
@@ -164,20 +158,12 @@ class Study(NamedTuple):
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """Yield a row for each world and base as it is, then for each seed and number of labels."""
-        number, of = self.asked.shard
-        seeds = range(self.asked.first_seed, self.asked.first_seed + self.asked.seeds)
-        each = list(product(self.bases, seeds))[number - 1 :: of]
-        for name in self.worlds:
-            for base in dict.fromkeys(base for base, _ in each):
+        for name in self.asked.worlds or WORLDS[self.task.name]:
+            for base in self.bases:
                 earned = worth(self.world(name)[0], self.bases[base], self.asked.split, self.asked.steps)
                 yield {"world": name, "base": base, "labels": 0, "worth": earned}
-            for base, seed in each:
+            for base, seed in product(self.bases, range(self.asked.seeds)):
                 yield from (self.row(name, base, seed, labels) for labels in self.asked.labels)
-
-    @property
-    def worlds(self) -> Sequence[str]:
-        """Return the worlds that the command line asks for."""
-        return self.asked.worlds or WORLDS[self.task.name]
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -188,12 +174,6 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--worlds", nargs="+", help="these alone")
     parser.add_argument("--labels", nargs="+", type=int, default=LABELS)
     parser.add_argument("--seeds", type=int, default=1, help="of labels, for each base")
-    parser.add_argument("--most-bases", type=int, default=8)
-    parser.add_argument("--eps-deg", type=float, default=0.0, help="strength of an answer (default: the scenario's)")
-    parser.add_argument("--mistakes", type=float, default=0.0, help="that an answer is reversed; 0.5: a control")
-    parser.add_argument("--bias-deg", type=float, default=0.0, help="of everything that the teacher means")
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--shard", type=int, nargs=2, default=(1, 1), metavar=("K", "N"), help="the K-th of N shares")
     parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation")
     parser.add_argument("--split", choices=("tuning", "validation"), default="tuning", help="of its episodes")
     parser.add_argument("--out", type=Path, help="write all rows to this JSON file")
@@ -202,14 +182,10 @@ def arguments() -> argparse.ArgumentParser:
 
 def main() -> None:
     """Correct each base in each world with each number of labels; prints a line each, then the table."""
-    parser = arguments()
-    given = parser.parse_args()
-    number, of = given.shard
-    if not 1 <= number <= of:
-        parser.error(f"--shard {number} {of}: give the number of a share, from 1 on, and how many there are")
+    given = arguments().parse_args()
     task = registry.find(given.task)
     own, scalars, bases = bases_of(task, given.bases)
-    study = Study(task, own, scalars, dict(list(bases.items())[: given.most_bases]), given, {})
+    study = Study(task, own, scalars, bases, given, {})
     rows: list[dict[str, Any]] = []
     for row in study.rows():
         rows.append(row)
