@@ -185,6 +185,7 @@ def digest(values: dict[str, Any]) -> str:
 
 
 Frame = Literal["raw", "action"]
+Start = Literal["xavier", "torch"]
 
 
 @dataclass(frozen=True)
@@ -196,6 +197,8 @@ class GuideSizes:
     then predicts a turn from there)."""
     feedback_layers: Layers = (400, 400, 300, 300)
     """Hidden layers of the guidance model."""
+    feedback_start: Start = "xavier"
+    """Initial weights of the guidance model: as for agent.q_start."""
     labels_per_round: Annotated[int, Bounds(1, 1 << 30)] = 10
     """New labels after which the guidance model is fitted again from scratch."""
     fit_steps: Annotated[int, POSITIVE] = 2000

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from cuelearner_jax.agents.choice import best_near_peaks, best_of
 from cuelearner_jax.agents.networks import as_function, network_inputs, q_network, widen_layers, widths
 from cuelearner_jax.agents.replay import Memory, Transition
-from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers, Scalars, Sizes, part
+from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers, Scalars, Sizes, Start, part
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS
@@ -37,6 +37,9 @@ class DDQNConfig:
 
     q_layers: Layers = (400, 400, 400, 300, 300, 300)
     """Hidden layers of the action-value network."""
+    q_start: Start = "xavier"
+    """Initial weights of the action-value network: xavier, biases zero; torch, as PyTorch's layers start: weights and
+    biases uniform within 1 / sqrt(inputs), as in the paper's public code."""
     directions: Annotated[int, POSITIVE] = 3600
     """Directions over which the agent takes its argmax (3600: every 0.1 deg)."""
     coarse_directions: Annotated[int, Bounds(0)] = 0
@@ -113,7 +116,8 @@ class DoubleDQN:
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, DDQNState]:
         """Return random parameters, and a target network that is a copy of them."""
-        params = q_network(self.options.q_layers).init(key, *map(jnp.zeros, widths(self.frame, self.spaces)))
+        network = q_network(self.options.q_layers).clone(start=self.options.q_start)
+        params = network.init(key, *map(jnp.zeros, widths(self.frame, self.spaces)))
         copy = jax.tree.map(jnp.copy, params) if self.bootstraps else None
         return params, DDQNState(copy, optimizer(self.options.optimizer, 0.0, 0.0).init(params))
 

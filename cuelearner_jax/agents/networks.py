@@ -9,6 +9,7 @@ all of them. This is equivariance by the input (Wang, Walters, Platt, "SO(2)-equ
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from cuelearner_jax.config import Frame
+from cuelearner_jax.config import Frame, Start
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Params
@@ -32,13 +33,14 @@ class Joined(nn.Module):
 
     width: int
     dtype: DTypeLike = jnp.float32
+    start: Start = "xavier"
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... action"]) -> Float[Array, "... width"]:
         """Leading axes of `obs` and `action` must broadcast."""
         shape = (obs.shape[-1] + action.shape[-1], self.width)
-        kernel = self.param("kernel", nn.initializers.xavier_uniform(), shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.width,))
+        of_kernel, of_bias = initializers(self.start, shape[0])
+        kernel, bias = self.param("kernel", of_kernel, shape), self.param("bias", of_bias, (self.width,))
         obs, action, kernel, bias = (jnp.asarray(x, self.dtype) for x in (obs, action, kernel, bias))
         from_obs, from_action = obs @ kernel[: obs.shape[-1]], action @ kernel[obs.shape[-1] :]
         rank = max(from_obs.ndim, from_action.ndim)
@@ -47,26 +49,36 @@ class Joined(nn.Module):
 
 
 class MLP(nn.Module):
-    """ReLU layers on the concatenation of observation and action; Xavier-uniform weights, zero biases."""
+    """ReLU layers on the concatenation of observation and action."""
 
     layers: Sequence[int]
     outputs: int
     dtype: DTypeLike = jnp.float32  # dtype of the hidden layers' arithmetic; parameters and outputs are float32
     layer_norm: bool = False  # whether hidden layers are normalised before their ReLU
+    start: Start = "xavier"
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... action"]) -> Float[Array, "... outputs"]:
         """Leading axes of `obs` and `action` must broadcast."""
-        x = nn.relu(self._normed(Joined(self.layers[0], self.dtype, name="Dense_0")(obs, action), 0))
+        x = nn.relu(self._normed(Joined(self.layers[0], self.dtype, self.start, name="Dense_0")(obs, action), 0))
         for place, width in enumerate(self.layers[1:], start=1):
-            x = nn.relu(self._normed(self._dense(width, place, self.dtype)(x), place))
-        return self._dense(self.outputs, len(self.layers), jnp.float32)(x)
+            x = nn.relu(self._normed(self._dense(x, width, place, self.dtype), place))
+        return self._dense(x, self.outputs, len(self.layers), jnp.float32)
 
     def _normed(self, x: Float[Array, "... width"], place: int) -> Float[Array, "... width"]:
         return nn.LayerNorm(dtype=self.dtype, name=f"LayerNorm_{place}")(x) if self.layer_norm else x
 
-    def _dense(self, width: int, place: int, dtype: DTypeLike) -> nn.Dense:
-        return nn.Dense(width, dtype=dtype, kernel_init=nn.initializers.xavier_uniform(), name=f"Dense_{place}")
+    def _dense(self, x: jax.Array, width: int, place: int, dtype: DTypeLike) -> jax.Array:
+        kernel, bias = initializers(self.start, x.shape[-1])
+        return nn.Dense(width, dtype=dtype, kernel_init=kernel, bias_init=bias, name=f"Dense_{place}")(x)
+
+
+def initializers(start: Start, inputs: int) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
+    """Return the initialisers of a layer's weights and biases."""
+    if start == "xavier":
+        return nn.initializers.xavier_uniform(), nn.initializers.zeros
+    within = partial(jax.random.uniform, minval=-(inputs**-0.5), maxval=inputs**-0.5)
+    return within, within
 
 
 def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm: bool = False) -> MLP:

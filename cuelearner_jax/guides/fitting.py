@@ -60,7 +60,7 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     it is seen in. `beside`: entries of actions, at their end, that the networks see beside observation and action.
     """
     size = spaces.actions.size
-    network = networks.MLP(sizes.feedback_layers, size if outputs is None else outputs)
+    network = networks.MLP(sizes.feedback_layers, size if outputs is None else outputs, start=sizes.feedback_start)
     own, turned = networks.widths(sizes.frame, spaces)
 
     def init(key: PRNGKeyArray) -> Params:

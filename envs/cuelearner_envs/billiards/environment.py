@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.billiards.aims import aims_of
-from cuelearner_envs.billiards.physics import Shot, Trajectory, simulate, trace
+from cuelearner_envs.billiards.physics import Trajectory, simulate, trace
 from cuelearner_envs.billiards.table import Table, parking, rack
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
 from cuelearner_jax.spaces.directions import retract, rotate, to_angle
@@ -71,7 +71,7 @@ class Billiards(WholeObservations, struct.PyTreeNode):
     def step(self, key: PRNGKeyArray, state: Balls, action: Float[Array, "2"]) -> tuple[Balls, Step]:
         """Play one shot; a new rack follows the last one of an episode."""
         k_place, k_reset = jax.random.split(key)
-        shot = self.simulate(state, to_angle(action) + self.action_turn)
+        shot = simulate(self.table, state.positions, state.pocketed, to_angle(action) + self.action_turn)
         foul = shot.pocketed[0]
         reward = jnp.where(foul, 0, (shot.pocketed & ~state.pocketed)[1:].sum()).astype(jnp.float32)
         replaced = state.positions.at[0].set(_free_place(k_place, self.table, state))
@@ -99,10 +99,6 @@ class Billiards(WholeObservations, struct.PyTreeNode):
             outcome={},
         )
         return jax.tree.map(lambda new, old: jnp.where(ended, new, old), racked, after), step
-
-    def simulate(self, balls: Balls, angle: Float[Array, ""]) -> Shot:
-        """Play one shot in the direction `angle` [rad]."""
-        return simulate(self.table, balls.positions, balls.pocketed, angle)
 
     def path(self, balls: Balls, action: Float[Array, "2"]) -> Trajectory:
         """Simulate the shot of an action event by event, for drawing."""
