@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
+import signal
+import subprocess
+import sys
 import threading
 import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cuelearner_jax import signals
+import jax
+
+from cuelearner_jax import devices, signals
 from cuelearner_jax.cli.options import look_ahead, out, parse
 from cuelearner_jax.cli.sources import preset_of, source_of
 from cuelearner_jax.config import plain
@@ -22,9 +29,11 @@ from cuelearner_jax.report import suite as page
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.studies import suite
-from cuelearner_jax.studies.suite import ADAPT, RIGHT, TABLE, World
+from cuelearner_jax.studies.suite import ADAPT, RIGHT, TABLE, Cell, World
 from cuelearner_jax.task import QUICKSTART
 from cuelearner_jax.tasks.presets import GROUPS, with_groups
+
+STOPPED = "stopped, with all work saved; the same command goes on"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +51,9 @@ class Suite:
     minutes: float | None = None
     """Stop after so many minutes, with all work saved."""
     shard: str | None = None
-    """Run only the cells of shard i of n, given as i/n."""
+    """Run only the cells of shard i of n, given as i/n; cells of one world and kind stay together."""
+    processes: int = 0
+    """Processes that divide the cells (0: on a CPU one a core, on an accelerator one)."""
     table: Path = TABLE
     """Another table of worlds, teachers and scales, in TOML."""
 
@@ -55,6 +66,8 @@ def run(arguments: list[str]) -> None:
         raise UserError(f"unknown scale {options.scale!r}{suggestion(options.scale, table['scales'])}")
     if options.minutes is not None and not options.minutes > 0:
         raise UserError(f"--minutes is {options.minutes:g}: give a number above 0")
+    if options.processes < 0:
+        raise UserError(f"--processes is {options.processes}: give a positive number, or 0")
     scale, shard = table["scales"][options.scale], Shard.parse(options.shard or "1/1")
     kinds = [guidances.resolve(kind).name for kind in (*scale.get("kinds", table["kinds"]), *options.guidance)]
     try:
@@ -65,21 +78,14 @@ def run(arguments: list[str]) -> None:
     obstacles = [cell.obstacle() for cell in cells]
     sensible = [cell for cell, obstacle in zip(cells, obstacles, strict=True) if obstacle is None]
     _claim(options.out, f"# {options.scale}\n{options.table.read_text(encoding='utf-8')}")
-    with _deadline(options.minutes) as is_over:
-        for number, cell in enumerate(sensible):
-            if number % shard.count != shard.index - 1 or suite.is_done(options.out, cell):
-                continue
-            if is_over():
-                break
-            out.print(f"{number + 1} of {len(sensible)}: {cell.name}")
-            try:
-                cell.run(options.out)
-            except NotFinite as error:
-                out.print(str(error))
-            except signals.Interrupted as end:
-                if not is_over():
-                    end.args = ("stopped, with all work saved; the same command goes on",)
-                    raise
+    groups = list(dict.fromkeys((cell.world.name, cell.kind) for cell in sensible))
+    own = [c for c in sensible if groups.index((c.world.name, c.kind)) % shard.count == shard.index - 1]
+    left = {(cell.world.name, cell.kind) for cell in own if not suite.is_done(options.out, cell)}
+    count = min(len(left), options.processes or (devices.CORES if jax.default_backend() == "cpu" else 1))
+    if count > 1:
+        _run_in_processes(count, shard, arguments, options.out)
+    else:
+        _run_cells(own, options)
     done = sum(suite.is_done(options.out, cell) for cell in sensible)
     out.print(
         f"{done} of {len(sensible)} cells are done{'' if done == len(sensible) else '; the same command goes on'}"
@@ -96,6 +102,51 @@ def run(arguments: list[str]) -> None:
         ]
         command = shlex.join(["cuelearner", "suite", *arguments])
         out.print(f"wrote {page.write(options.out, rows, RIGHT, lines, command)}")
+
+
+def _run_cells(cells: list[Cell], options: Suite) -> None:
+    """Run cells that are not done, until the time is over."""
+    with _deadline(options.minutes) as is_over:
+        for number, cell in enumerate(cells):
+            if suite.is_done(options.out, cell):
+                continue
+            if is_over():
+                break
+            out.print(f"{number + 1} of {len(cells)}: {cell.name}")
+            try:
+                cell.run(options.out)
+            except NotFinite as error:
+                out.print(str(error))
+            except signals.Interrupted as end:
+                if not is_over():
+                    end.args = (STOPPED,)
+                    raise
+
+
+def _run_in_processes(count: int, shard: Shard, arguments: list[str], folder: Path) -> None:
+    """Run the command in processes that divide a shard; each writes a log into the folder.
+
+    Raises Interrupted after a signal, and UserError if a process failed.
+    """
+    command = [sys.executable, "-m", "cuelearner_jax.cli", "suite", *arguments, "--processes", "1", "--shard"]
+    logs = [folder / f"process_{number}.log" for number in range(1, count + 1)]
+    with contextlib.ExitStack() as files, signals.interruptible("the work of all processes") as stopping:
+        shards = [f"{shard.index + number * shard.count}/{shard.count * count}" for number in range(count)]
+        writers = [files.enter_context(log.open("w", encoding="utf-8")) for log in logs]
+        start = partial(subprocess.Popen[bytes], stderr=subprocess.STDOUT, start_new_session=True)
+        workers = [start([*command, one], stdout=file) for one, file in zip(shards, writers, strict=True)]
+        out.print(f"{count} processes run the cells: {logs[0]} ...")
+        while not stopping.is_set() and any(worker.poll() is None for worker in workers):
+            time.sleep(0.5)
+        for worker in workers:
+            if worker.poll() is None:
+                worker.send_signal(signal.SIGINT)
+        statuses = [worker.wait() for worker in workers]
+        if stopping.is_set():
+            raise signals.Interrupted(STOPPED)
+    for log, status in zip(logs, statuses, strict=True):
+        if status:
+            raise UserError(f"a process ended with status {status}: see the end of {log}; the same command goes on")
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """`cuelearner suite`: cells that make sense, a tiny suite with a kind of one's own, and bad input."""
 
+import os
+import sys
 import tomllib
 
 import pyarrow.parquet as pq
@@ -55,12 +57,15 @@ def test_the_cells_of_every_scale_make_sense_for_their_worlds():
         assert cells[f"{place}/wrong/scalar"] is None
 
 
-def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys):
+def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys, monkeypatch):
     (table := tmp_path / "tiny.toml").write_text(TINY)
     words = ["suite", "--scale", "tiny", "--table", str(table), "--out", str(tmp_path / "out")]
-    assert main([*words, "--shard", "1/2"]) == 0
-    assert "2 of 3 cells are done; the same command goes on" in capsys.readouterr().out
-    assert main([*words, "--guidance", CLONE]) == 0
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # of the processes
+    assert main([*words, "--shard", "1/2", "--processes", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert "2 processes run the cells" in printed
+    assert "2 of 3 cells are done; the same command goes on" in printed
+    assert main([*words, "--guidance", CLONE, "--processes", "1"]) == 0
     rows = pq.read_table(tmp_path / "out" / "suite.parquet")
     lanes = rows.group_by(["use", "teacher", "guidance", "labels", "seed", "step"]).aggregate([]).num_rows
     assert lanes == rows.num_rows
@@ -87,6 +92,7 @@ def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys):
         (["--scale", "smok"], "unknown scale 'smok'"),
         (["--shard", "3/2"], "--shard is '3/2'"),
         (["--minutes", "0"], "--minutes is 0"),
+        (["--processes", "-1"], "--processes is -1"),
         (["--guidance", "nothing:HERE"], "nothing"),
         (["--table", "none.toml"], "--table none.toml cannot be read"),
     ],
