@@ -43,7 +43,7 @@ class Suite:
     The same command goes on where it stopped."""
 
     scale: str = "smoke"
-    """What to run: smoke (minutes), quick (two hours on 2 cores), paper (an accelerator, in pieces)."""
+    """What to run: smoke (minutes), quick (hours on 2 cores), paper (an accelerator, in pieces)."""
     out: Path = Path("runs/suite")
     """Folder for cells, suite.parquet and the page."""
     guidance: tuple[str, ...] = ()
