@@ -198,7 +198,7 @@ class GuideSizes:
     feedback_layers: Layers = (400, 400, 300, 300)
     """Hidden layers of the guidance model."""
     feedback_start: Start = "xavier"
-    """Initial weights of the guidance model: as for agent.q_start."""
+    """Initial weights of the guidance model: xavier, biases zero; torch, all uniform within 1 / sqrt(inputs)."""
     labels_per_round: Annotated[int, Bounds(1, 1 << 30)] = 10
     """New labels after which the guidance model is fitted again from scratch."""
     fit_steps: Annotated[int, POSITIVE] = 2000

@@ -35,7 +35,7 @@ class Beside:
         self.calls = contract["base"].get("questions", 1)
         self.entries = self.calls * contract["base"]["size"]
         self.size = contract["observation"]["size"] - self.entries
-        self.seen: Any = None  # (observation (size,), time)
+        self.latest: Any = None  # (observation (size,), time)
         self.trouble = ""  # why the last action was the base's own; empty: it was corrected
 
     def hear(self, observation, now):
@@ -43,7 +43,7 @@ class Beside:
         obs = np.asarray(observation, np.float32)
         if obs.shape != (self.size,):
             raise ValueError(f"an observation has {obs.size} entries: the contract says {self.size}")
-        self.seen = obs, now
+        self.latest = obs, now
         try:
             return np.concatenate(self.decide.base_observations(obs))
         except ContractError:  # which `action` will meet too
@@ -55,11 +55,11 @@ class Beside:
         if base.shape != (self.entries,):
             raise ValueError(f"a base action has {base.size} entries: the contract says {self.entries}")
         actions = np.split(base, self.calls)
-        if self.seen is None or now - self.seen[1] > STALE:
+        if self.latest is None or now - self.latest[1] > STALE:
             self.trouble = "no fresh observation"
             return actions[-1]
         try:
-            result = self.decide(self.seen[0], *actions)
+            result = self.decide(self.latest[0], *actions)
         except ContractError as error:
             self.trouble = str(error)
             return actions[-1]

@@ -182,16 +182,16 @@ def arguments() -> argparse.ArgumentParser:
 
 def main() -> None:
     """Correct each base in each world with each number of labels; prints a line each, then the table."""
-    given = arguments().parse_args()
-    task = registry.find(given.task)
-    own, scalars, bases = bases_of(task, given.bases)
-    study = Study(task, own, scalars, bases, given, {})
+    options = arguments().parse_args()
+    task = registry.find(options.task)
+    own, scalars, bases = bases_of(task, options.bases)
+    study = Study(task, own, scalars, bases, options, {})
     rows: list[dict[str, Any]] = []
     for row in study.rows():
         rows.append(row)
         print(json.dumps(row), flush=True)
-        if given.out:
-            given.out.write_text(json.dumps({**provenance(), "task": given.task, "rows": rows}, indent=1) + "\n")
+        if options.out:
+            options.out.write_text(json.dumps({**provenance(), "task": options.task, "rows": rows}, indent=1) + "\n")
     table(rows)
 
 

@@ -55,7 +55,7 @@ class MLP(nn.Module):
     outputs: int
     dtype: DTypeLike = jnp.float32  # dtype of the hidden layers' arithmetic; parameters and outputs are float32
     layer_norm: bool = False  # whether hidden layers are normalised before their ReLU
-    start: Start = "xavier"
+    start: Start = "xavier"  # initial weights, see `initializers`
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... action"]) -> Float[Array, "... outputs"]:
@@ -74,7 +74,10 @@ class MLP(nn.Module):
 
 
 def initializers(start: Start, inputs: int) -> tuple[nn.initializers.Initializer, nn.initializers.Initializer]:
-    """Return the initialisers of a layer's weights and biases."""
+    """Return the initialisers of weights and biases of a layer with so many inputs.
+
+    xavier: Xavier-uniform weights, zero biases. torch: both uniform within 1 / sqrt(inputs), as `torch.nn.Linear`.
+    """
     if start == "xavier":
         return nn.initializers.xavier_uniform(), nn.initializers.zeros
     within = partial(jax.random.uniform, minval=-(inputs**-0.5), maxval=inputs**-0.5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
 import signal
 import subprocess
@@ -11,7 +10,7 @@ import threading
 import time
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -130,7 +129,7 @@ def _run_in_processes(count: int, shard: Shard, arguments: list[str], folder: Pa
     """
     command = [sys.executable, "-m", "cuelearner_jax.cli", "suite", *arguments, "--processes", "1", "--shard"]
     logs = [folder / f"process_{number}.log" for number in range(1, count + 1)]
-    with contextlib.ExitStack() as files, signals.interruptible("the work of all processes") as stopping:
+    with ExitStack() as files, signals.interruptible("the work of all processes") as stopping:
         shards = [f"{shard.index + number * shard.count}/{shard.count * count}" for number in range(count)]
         writers = [files.enter_context(log.open("w", encoding="utf-8")) for log in logs]
         start = partial(subprocess.Popen[bytes], stderr=subprocess.STDOUT, start_new_session=True)
