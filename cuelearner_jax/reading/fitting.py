@@ -301,14 +301,20 @@ _unread = jax.jit(jax.vmap(posterior.unread))
 def _update(
     rows: Data, frame: ObservationFrame, hypothesis: Hypothesis, posteriors: Posterior
 ) -> tuple[Posterior, Hypothesis]:
-    """Infer each hypothesis, and move its estimate."""
+    """Infer each hypothesis, and move its estimate.
 
-    def one(rows: Data, hypothesis: Hypothesis, posteriors: Posterior) -> tuple[Posterior, Hypothesis]:
-        posteriors = posterior.infer(rows, hypothesis.parts, jnp.float32(1 / SCALE), posteriors)
+    A hypothesis stays as it was where the result is not finite: in single precision a process of large amplitude has no
+    Cholesky factor at hundreds of answers, and the policy cannot be asked about observations that are not finite.
+    """
+
+    def one(rows: Data, hypothesis: Hypothesis, before: Posterior) -> tuple[Posterior, Hypothesis]:
+        posteriors = posterior.infer(rows, hypothesis.parts, jnp.float32(1 / SCALE), before)
         at = linear.weights_of(frame, hypothesis.change)
         weights = hypothesis.parts.weights * (at + jnp.clip(posteriors.mean - at, -TRUST, TRUST))
         change = linear.change_of(frame, weights, hypothesis.change)
-        return posteriors, Hypothesis(hypothesis.parts, change, posteriors.hyper)
+        after = posteriors, Hypothesis(hypothesis.parts, change, posteriors.hyper)
+        is_finite = jnp.isfinite(jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(after)])).all()
+        return jax.tree.map(partial(jnp.where, is_finite), after, (before, hypothesis))
 
     return each_lane(one)(rows, hypothesis, posteriors)
 

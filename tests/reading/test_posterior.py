@@ -1,11 +1,12 @@
-"""The posterior of one weight, against its integral."""
+"""The posterior of one weight, against its integral, and where there is none."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.reading import posterior
+from cuelearner_jax.reading import fitting, posterior
 from cuelearner_jax.reading.likelihood import intervals, log_likelihood
-from cuelearner_jax.reading.linear import SCALE
+from cuelearner_jax.reading.linear import SCALE, Change, ObservationFrame
 from cuelearner_jax.reading.posterior import SIZE, TAU, Data, Hyper, ModelParts
 
 EPS, COUNT, TRUTH = 1 / SCALE, 24, 0.6
@@ -37,3 +38,13 @@ def test_one_weight_has_the_posterior_of_its_integral_and_a_bound_below_its_evid
     np.testing.assert_allclose(abs(found.root[0, 0]), spread, rtol=0.2)
     evidence = np.log(volume) + float(posterior._log_prior(found.hyper, PARTS))
     assert evidence - 0.3 < found.bound < evidence + 0.01
+
+
+def test_a_hypothesis_without_a_finite_posterior_stays_as_it_was():
+    data, zero, one = answered(), jnp.zeros(()), jnp.ones(1)
+    frame = ObservationFrame(jnp.zeros(1), one, one, one, jnp.zeros(0, int))
+    hyper = Hyper(jnp.zeros(1), jnp.zeros(1), jnp.zeros(1), zero + 60, zero, jnp.zeros(1), zero, zero, 0)
+    change = Change(0.3 * one, jnp.zeros((0, 0)), jnp.zeros(1), jnp.zeros((1, 0)))
+    alone = data, fitting.Hypothesis(ModelParts(one, True), change, hyper), posterior.unread(data, hyper)
+    rows, hypothesis, before = jax.tree.map(lambda leaf: leaf[None], alone)
+    jax.tree.map(np.testing.assert_array_equal, fitting._update(rows, frame, hypothesis, before), (before, hypothesis))
