@@ -44,21 +44,14 @@ def sums(arrays):
     return len(flat), flat[flat > 0].sum(), flat[flat < 0].sum(), (flat**2).sum()
 
 
-SHARED = ["none", "relative", "heuristic", "demonstration", "scalar", "dcoach", "bdcoach", "clic", "clic_shown"]
-KINDS = {"flat": [*SHARED, "intent", "any_aim"], "boxed": SHARED}
+KINDS = {  # those for whose parts no other kind stands
+    "flat": ["none", "relative", "scalar", "dcoach", "bdcoach", "intent"],
+    "boxed": ["none", "relative", "demonstration", "clic"],
+}
 ANGLES = np.linspace(0, 6, 40, dtype=np.float32)
 SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1)
 USED = ("flat", "relative")  # by the test of label files
-# Kinds for whose parts another kind stands: only in `make test-all`.
-LONG = {
-    "flat": ("heuristic", "demonstration", "clic", "clic_shown", "any_aim"),
-    "boxed": ("heuristic", "scalar", "dcoach", "bdcoach", "clic_shown"),
-}
-CASES = [
-    pytest.param(world, kind, marks=[pytest.mark.long] if kind in LONG.get(world, ()) else [])
-    for world, kinds in {**KINDS, "billiards": ["relative"]}.items()
-    for kind in kinds
-]
+CASES = [(world, kind) for world, kinds in {**KINDS, "billiards": ["relative"]}.items() for kind in kinds]
 
 
 def checkpoint(folder, item):

@@ -301,10 +301,9 @@ _unread = jax.jit(jax.vmap(posterior.unread))
 def _update(
     rows: Data, frame: ObservationFrame, hypothesis: Hypothesis, posteriors: Posterior
 ) -> tuple[Posterior, Hypothesis]:
-    """Infer each hypothesis, and move its estimate.
+    """Infer each hypothesis, and move its estimate. Where the result is not finite, a hypothesis stays as it was.
 
-    A hypothesis stays as it was where the result is not finite: in single precision a process of large amplitude has no
-    Cholesky factor at hundreds of answers, and the policy cannot be asked about observations that are not finite.
+    In single precision a process of large amplitude has no Cholesky factor at hundreds of answers.
     """
 
     def one(rows: Data, hypothesis: Hypothesis, before: Posterior) -> tuple[Posterior, Hypothesis]:

@@ -113,7 +113,7 @@ class Reading:
             return
         reader = self._reader_of(new[0])
         if self.fits is not None:
-            self.evidence += float(reader.ratio(self.fits, _padded(new, self._batch(len(new[0])))))
+            self.evidence += float(reader.ratio(self.fits, _padded(new, max(len(new[0]), -(-self.slots // BATCHES)))))
         if self.rows is not None:
             new = [np.concatenate(both) for both in zip(self.rows[:3], new, strict=True)]
         self.rows = RelativeLabels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]
@@ -163,10 +163,6 @@ class Reading:
     def act(self, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return actions of the policy as corrected so far."""
         return self._acts(obs) if self.fit is None or self._reader is None else self._reader.act(self.fit, obs)
-
-    def _batch(self, count: int) -> int:
-        """Return the number of slots for a batch, so that few programs are compiled."""
-        return max(count, -(-self.slots // BATCHES))
 
     def _reader_of(self, obs: np.ndarray) -> Reader:
         if self._reader is None:

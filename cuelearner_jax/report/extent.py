@@ -21,7 +21,9 @@ def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[
     """Return one line for everything planned that the table lacks, or whose plan is unknown."""
     ends = table.group_by("folder").aggregate([("step", "max")]).to_pylist()
     last = {row["folder"]: row["step_max"] for row in ends}
-    configurations = {folder: _configuration(Path(folder)) for folder in last}
+    # A run's lies above the folders of its kinds of guidance.
+    places = {folder: (Path(folder) / CONFIG, Path(folder).parent / CONFIG) for folder in last}
+    configurations = {folder: next((file for file in files if file.exists()), None) for folder, files in places.items()}
     files = {file for folder in folders for file in Path(folder).rglob(CONFIG)} | set(configurations.values())
     plans: dict[Path, dict[str, Any]] = {}
     lines = []
@@ -42,11 +44,6 @@ def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[
     for file, plan in plans.items():
         lines += _absent(file.parent, plan.get("grid", {}), table)
     return lines
-
-
-def _configuration(folder: Path) -> Path | None:
-    """Return the config.json of a folder with results; a run's lies above the folders of its kinds of guidance."""
-    return next((place / CONFIG for place in (folder, folder.parent) if (place / CONFIG).exists()), None)
 
 
 def _absent(run: Path, grid: dict[str, Any], table: pa.Table) -> list[str]:
