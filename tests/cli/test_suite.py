@@ -32,6 +32,7 @@ sizes = {{ feedback_layers = [16], fit_steps = 20 }}
 labels = [20]
 fault_labels = [20]
 seeds = 2
+is_short = true
 teachers = ["right", "one_cue"]
 worlds = {{ train = {{}}, correct = {{}} }}
 """
