@@ -184,7 +184,7 @@ def parse(kind: Any, arguments: list[str], command: str, default: Any = None, ab
     return options
 
 
-def check_numbers(options: Any, **bounds: tuple[int, int]) -> None:
+def check_numbers(options: Any, **bounds: tuple[float, float]) -> None:
     """Raise UserError for the first option, by its field, that is outside its bounds (least, most)."""
     for name, (least, most) in bounds.items():
         if not least <= (value := getattr(options, name)) <= most:

@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jaxlib.version
 
 from cuelearner_jax import devices, signals
-from cuelearner_jax.cli.options import look_ahead, out, parse
+from cuelearner_jax.cli.options import check_numbers, look_ahead, out, parse
 from cuelearner_jax.cli.sources import preset_of, source_of
 from cuelearner_jax.config import plain
 from cuelearner_jax.errors import NotFinite, UserError, suggestion
@@ -49,7 +48,7 @@ class Suite:
     """Folder for cells, suite.parquet and the page."""
     guidance: tuple[str, ...] = ()
     """Kinds of guidance beside those of the scale; your own as package.module:NAME."""
-    minutes: float | None = None
+    minutes: float = float("inf")
     """Stop after so many minutes, with all work saved."""
     shard: str | None = None
     """Run only the cells of shard i of n, given as i/n; cells of one world and kind stay together."""
@@ -65,6 +64,7 @@ def run(arguments: list[str]) -> None:
     table = _read(options.table)
     if options.scale not in table["scales"]:
         raise UserError(f"unknown scale {options.scale!r}{suggestion(options.scale, table['scales'])}")
+    check_numbers(options, minutes=(0.1, float("inf")), processes=(0, 1_000))
     scale, shard = table["scales"][options.scale], Shard.parse(options.shard or "1/1")
     kinds = [guidances.resolve(kind).name for kind in (*scale.get("kinds", table["kinds"]), *options.guidance)]
     try:
@@ -80,7 +80,7 @@ def run(arguments: list[str]) -> None:
     left = {(cell.world.name, cell.kind) for cell in own if not suite.is_done(options.out, cell)}
     count = min(len(left), options.processes or (devices.CORES if jax.default_backend() == "cpu" else 1))
     if count > 1:
-        _run_in_processes(count, shard, arguments, options.out, os.environ | _compiled(scale))
+        _run_in_processes(count, shard, arguments, options.out, os.environ | _compile_options(scale))
     else:
         _run_cells(own, options)
     done = sum(suite.is_done(options.out, cell) for cell in sensible)
@@ -119,10 +119,10 @@ def _run_cells(cells: list[Cell], options: Suite) -> None:
                     raise
 
 
-def _compiled(scale: dict[str, Any]) -> dict[str, str]:
-    """Return variables by which a scale that is mostly compiling takes half the time, and its programs longer."""
+def _compile_options(scale: dict[str, Any]) -> dict[str, str]:
+    """Return variables of processes: a short scale compiles in half the time, and its programs run slower."""
     flags = ["--xla_backend_optimization_level=0"]
-    if jaxlib.version.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
+    if jax.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
         flags.append("--xla_cpu_use_fusion_emitters=false")
     return {"XLA_FLAGS": " ".join([*flags, os.environ.get("XLA_FLAGS", "")])} if scale.get("is_short") else {}
 
@@ -143,8 +143,7 @@ def _run_in_processes(count: int, shard: Shard, arguments: list[str], folder: Pa
         while not stopping.is_set() and any(worker.poll() is None for worker in workers):
             time.sleep(0.5)
         for worker in workers:
-            if worker.poll() is None:
-                worker.send_signal(signal.SIGINT)
+            worker.send_signal(signal.SIGINT)  # nothing happens to one that has ended
         statuses = [worker.wait() for worker in workers]
         if stopping.is_set():
             raise signals.Interrupted(STOPPED)
@@ -190,9 +189,9 @@ def _claim(folder: Path, text: str) -> None:
 
 
 @contextmanager
-def _deadline(minutes: float | None) -> Iterator[Any]:
+def _deadline(minutes: float) -> Iterator[Any]:
     """Yield whether the time is over; work in progress that can be saved is then asked to end."""
-    end, closed = time.monotonic() + 60 * (float("inf") if minutes is None else minutes), threading.Event()
+    end, closed = time.monotonic() + 60 * minutes, threading.Event()
     is_over = lambda: time.monotonic() > end  # noqa: E731
 
     def watch() -> None:

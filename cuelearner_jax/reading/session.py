@@ -113,7 +113,8 @@ class Reading:
             return
         reader = self._reader_of(new[0])
         if self.fits is not None:
-            self.evidence += float(reader.ratio(self.fits, _padded(new, max(len(new[0]), -(-self.slots // BATCHES)))))
+            slots = max(len(new[0]), -(-self.slots // BATCHES))  # as for other batches: few programs are compiled
+            self.evidence += float(reader.ratio(self.fits, _padded(new, slots)))
         if self.rows is not None:
             new = [np.concatenate(both) for both in zip(self.rows[:3], new, strict=True)]
         self.rows = RelativeLabels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]

@@ -21,9 +21,9 @@ def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[
     """Return one line for everything planned that the table lacks, or whose plan is unknown."""
     ends = table.group_by("folder").aggregate([("step", "max")]).to_pylist()
     last = {row["folder"]: row["step_max"] for row in ends}
-    # A run's lies above the folders of its kinds of guidance.
+    # The config.json of a run lies above the folders of its kinds of guidance.
     places = {folder: (Path(folder) / CONFIG, Path(folder).parent / CONFIG) for folder in last}
-    configurations = {folder: next((file for file in files if file.exists()), None) for folder, files in places.items()}
+    configurations = {folder: next(filter(Path.exists, own), None) for folder, own in places.items()}
     files = {file for folder in folders for file in Path(folder).rglob(CONFIG)} | set(configurations.values())
     plans: dict[Path, dict[str, Any]] = {}
     lines = []

@@ -92,6 +92,8 @@ def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys, monkeyp
     [
         (["--scale", "smok"], "unknown scale 'smok'"),
         (["--shard", "3/2"], "--shard is '3/2'"),
+        (["--minutes", "0"], "--minutes is 0"),
+        (["--processes", "-1"], "--processes is -1"),
         (["--guidance", "nothing:HERE"], "nothing"),
         (["--table", "none.toml"], "--table none.toml cannot be read"),
     ],
