@@ -60,7 +60,7 @@ def test_the_page_asks_about_each_cue_and_the_file_keeps_what_was_said(tmp_path)
             await asyncio.sleep(0.1)
             chosen = [control.name for control, button in page._picks.items() if "picked" in button.classes]
             assert chosen == ["pick-0-less", "pick-1-unsaid", "pick-2-more"]
-            await press(user, "rest", lambda: session.number == 1)
+            await press(user, "rest", lambda: page._parts_of == 1)
             assert page._parts == {}  # of the next question nothing is said yet
             user.find(marker="pick-1-more").click()
             await asyncio.sleep(0.1)

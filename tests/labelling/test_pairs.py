@@ -47,7 +47,7 @@ def test_the_page_shows_both_actions_and_the_file_has_the_choice_and_the_second(
                 np.testing.assert_allclose(direction, [action[0], -action[1]], atol=1e-3)
             assert 'class="arrow asked"' not in page._scene.content
             chosen.append((item, nearer(item)))
-            await press(user, names[float(chosen[-1][1][0])], lambda n=number: session.number == n + 1)
+            await press(user, names[float(chosen[-1][1][0])], lambda n=number: page._parts_of == n + 1)
         with told_browser(user) as films:
             for side in ("left", "right"):
                 await page._act(f"film-{side}", 4, {"item": 4})
