@@ -22,15 +22,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _measuring import Timed
-from cartpole import CartPole
-from pendulum import STEPS, Pendulum
+from classic_control import TASKS
 
 import cuelearner_jax as cl
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.provenance import provenance
 
 EPISODES, LONGEST = 10, 1000  # of an evaluation; steps of the longest episode
-IN_JAX = {"Pendulum-v1": Pendulum(jnp.array(STEPS)), "CartPole-v1": CartPole()}
 Tell = Callable[[dict[str, Any]], None]  # takes an evaluation: step, returns (seeds), seconds of the stretch before it
 
 
@@ -55,7 +53,7 @@ def evaluation(env: Any, functions: Any) -> Callable[[Any], jax.Array]:
 
 def train_here(name: str, config: RunConfig, options: argparse.Namespace, tell: Tell) -> None:
     """Train with this package's loop, that of `cuelearner sweep`, all seeds side by side."""
-    env: Any = IN_JAX[name] if name in IN_JAX else cl.from_gymnasium(name, processes=1).env
+    env: Any = TASKS[name] if name in TASKS else cl.from_gymnasium(name, processes=1).env
     lanes, returned = Timed(config, env, "none", options.seeds), evaluation(env, config.agent_in(env))
     every = options.steps // options.evaluations
     for number in range(options.evaluations):

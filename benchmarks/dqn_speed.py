@@ -1,6 +1,6 @@
 """Double DQN here over CleanRL's DQN and PureJaxQL's PQN: return over steps, and steps over seconds.
 
-    python benchmarks/dqn_speed.py --environments CartPole-v1 Acrobot-v1 --peer-python peers/bin/python \
+    python benchmarks/dqn_speed.py --environments CartPole-v1 Acrobot-v1 MountainCar-v0 --peer-python peers/bin/python \
         --cleanrl peers/cleanrl --purejaxql peers/purejaxql --out dqn.json
     python benchmarks/dqn_speed.py --table dqn.json
 
@@ -9,7 +9,8 @@ Ways: `ddqn` here; `CleanRL`, the `cleanrl/dqn_jax.py` of a checkout with its ow
 rate, discount, replay, random steps before the first update, and a target network that is copied every 500 steps. Not
 equal: `ddqn` makes one gradient step an environment step (CleanRL: one in ten), its later actions are greedy (CleanRL:
 random ones fall from all to 5% over the first half), its targets are double, and the action is an input of its network.
-PQN has neither replay nor target network. `CartPole-v1` is `cartpole.py` here, which is step for step Gymnasium's.
+PQN has neither replay nor target network. Environments here are those of `classic_control.py`, step for step
+Gymnasium's.
 """
 
 from __future__ import annotations

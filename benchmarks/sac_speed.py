@@ -6,7 +6,7 @@
 
 Ways: `sac` and `xqc` (the same with `--agent.bins`) here; sbx's `SAC` and `CrossQ`. SAC has the same networks,
 minibatches, updates a step, rates, discount, target entropy and random steps here and there; CrossQ has its own
-defaults. `Pendulum-v1` is `pendulum.py` here, which is step for step Gymnasium's.
+defaults. `Pendulum-v1` is that of `classic_control.py`, step for step Gymnasium's.
 """
 
 from __future__ import annotations

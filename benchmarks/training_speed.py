@@ -17,7 +17,7 @@ from pathlib import Path
 
 import jax
 from _measuring import measure
-from cartpole import CartPole
+from classic_control import CartPole
 
 from cuelearner_jax.agents.ddqn import DDQNConfig
 from cuelearner_jax.config import Scalars, Sizes

@@ -5,8 +5,8 @@
     python experiments/navigation_bootstrapping.py --out FOLDER --report
 
 The sweeps are data below: every piece has a folder of its own and is resumed. After the pieces, or alone with --report,
-there is a report of each world (FOLDER/clutter/report). At the scale `cpu` a piece takes ten minutes on one core, at
-`smoke` seconds. Collisions: `cuelearner report FOLDER/long/raw --metric collision --lower-is-better --out COLLISIONS`.
+there is a report of each world (FOLDER/clutter/report). At the scale `smoke` a piece takes seconds.
+Collisions: `cuelearner report FOLDER/long/raw --metric collision --lower-is-better --out COLLISIONS`.
 """
 
 from __future__ import annotations
@@ -71,28 +71,6 @@ SCALES = {
             "agent.directions": 12,
             "agent.target-directions": 6,
             "agent.n-step": 3,
-        },
-    ),
-    "cpu": Scale(
-        "ten minutes a piece on one core, 45 for five models: the networks of the preset quickstart, 12,000 steps",
-        seeds=8,
-        labels={100: 100, 500: 500},
-        options={
-            "agent.q-layers": (128, 128),
-            "sizes.feedback-layers": (128, 128),
-            "agent.directions": 36,
-            "agent.target-directions": 12,
-            "agent.batch-size": 64,
-            "agent.replay-capacity": 50_000,
-            "sizes.fit-steps": 400,
-            "sizes.fit-batch-size": 64,
-            "agent.learning-rate": 0.003,
-            "schedule.total-steps": 12_000,
-            "schedule.guidance-until": 12_000,
-            "schedule.eval-every": 2_000,
-            "schedule.eval-envs": 30,
-            "schedule.eval-steps": 6_000,
-            "schedule.checkpoint-every": 12_000,
         },
     ),
     "paper": Scale("half an hour a piece on an accelerator"),

@@ -1,4 +1,4 @@
-"""The benchmarks' pendulum and cart are Gymnasium's, and soft actor-critic learns to swing the pendulum up."""
+"""The benchmarks' classic control tasks are Gymnasium's, and soft actor-critic learns to swing the pendulum up."""
 
 import dataclasses
 
@@ -9,37 +9,41 @@ import numpy as np
 import pytest
 from _comparing import evaluation
 from _measuring import Timed
-from cartpole import CartPole, CartState
-from pendulum import STEPS, Pendulum, Swing
+from classic_control import TASKS, Episode
 
 from cuelearner_jax.agents import sac
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.run_config import RunConfig
 
-ENV = Pendulum(jnp.array(STEPS))
-
-
-def cart_push(obs, number):
-    """Push so that the pole falls in the first episode, and stays up in the second."""
-    return int(number >= 500 and obs @ np.array([0.1, 0.5, 10.0, 2.0]) > 0)
+PENDULUM = TASKS["Pendulum-v1"]
+# of the second episode; in the first the action is 0
+POLICIES = {
+    "CartPole-v1": lambda obs: int(obs @ np.array([0.1, 0.5, 10.0, 2.0]) > 0),
+    "MountainCar-v0": lambda obs: 2 * int(obs[1] > 0),
+    "Acrobot-v1": lambda obs: 2 * int(obs[5] > 0),
+    "Pendulum-v1": lambda obs: 6 * obs[1:2],
+}
 
 
 @pytest.mark.parametrize(
-    ("name", "env", "state_at", "action_at", "as_ours"),
+    ("name", "ends"),
     [
-        ("Pendulum-v1", ENV, lambda s, n: Swing(*s, n), lambda _, n: np.array([6 * np.sin(n)], np.float32), np.array),
-        ("CartPole-v1", CartPole(), CartState, cart_push, lambda push: np.eye(2)[push]),
+        ("CartPole-v1", [(9, False), (500, True)]),
+        ("MountainCar-v0", [(200, True), (153, False)]),
+        ("Acrobot-v1", [(500, True), (82, False)]),
+        ("Pendulum-v1", [(200, True), (200, True)]),
     ],
 )
-def test_steps_are_gymnasiums(name, env, state_at, action_at, as_ours):
-    other, step, lengths = gymnasium.make(name), jax.jit(env.step), []
-    for episode in (0, 1):
+def test_steps_are_gymnasiums(name, ends):
+    other, step, lengths = gymnasium.make(name), jax.jit(TASKS[name].step), []
+    is_box = isinstance(other.action_space, gymnasium.spaces.Box)
+    for chosen in (lambda _: np.zeros(1, np.float32) if is_box else 0, POLICIES[name]):
         obs, _ = other.reset(seed=3)
         for number in range(500):
-            action = action_at(obs, 500 * episode + number)
-            state = state_at(np.float32(other.unwrapped.state), jnp.int32(number))
+            action = chosen(obs)
+            state = Episode(np.float32(other.unwrapped.state), jnp.int32(number))
             obs, reward, terminated, truncated, _ = other.step(action)
-            state, ours = step(jax.random.key(number), state, as_ours(action))
+            state, ours = step(jax.random.key(number), state, action if is_box else np.eye(3)[action])
             np.testing.assert_allclose(ours.final_obs, obs, atol=1e-5)
             assert float(ours.reward) == pytest.approx(reward, abs=1e-4)
             assert (bool(ours.terminated), bool(ours.truncated)) == (terminated, truncated)
@@ -47,7 +51,7 @@ def test_steps_are_gymnasiums(name, env, state_at, action_at, as_ours):
             if terminated or truncated:
                 lengths.append((number + 1, truncated))
                 break
-    assert lengths in ([(200, True), (200, True)], [(9, False), (500, True)])
+    assert lengths == ends
 
 
 RATES = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
@@ -62,7 +66,7 @@ def test_soft_actor_critic_swings_it_up(changes, steps):
     schedule = Schedule(random_steps=500, learn_after=500, guidance_until=0)
     scalars = Scalars(discount=0.99, max_grad_norm=1e6)
     config = RunConfig(None, Sizes(num_envs=1), scalars, schedule, dataclasses.replace(AGENT, **changes))
-    timed = Timed(config, ENV, "none", 2)
+    timed = Timed(config, PENDULUM, "none", 2)
     timed.train(steps)
-    returned = evaluation(ENV, config.agent_in(ENV))
+    returned = evaluation(PENDULUM, config.agent_in(PENDULUM))
     assert all((returned(block.agent.params) > -300).all() for block in timed.blocks)
