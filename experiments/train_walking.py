@@ -14,16 +14,17 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import jax
 import tyro
-from jaxtyping import PRNGKeyArray
 
+from cuelearner_envs.anymal import policy, tracking
+from cuelearner_envs.anymal.locomotion import Locomotion
 from cuelearner_jax import config as configuration
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.bridges.brax import supply_device_put_replicated
@@ -36,17 +37,6 @@ from cuelearner_jax.terminal import Interrupted, interruptible
 COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history
 VALUE_LAYERS = (256, 256, 256, 256)
 Tell = Callable[[str], None]
-
-
-class Walker(NamedTuple):
-    """A robot that learns to walk, as training uses it. Figures are numbers by name."""
-
-    environment: Any  # brax.envs.Env: velocity commands are to be tracked
-    policy: Callable[[Any], Any]  # brax's parameters -> a policy
-    measure: Callable[[Any, PRNGKeyArray, int], dict[str, float]]  # (policy, key, robots) -> figures while it learns
-    examine: Callable[[Any, PRNGKeyArray, int], Iterator[tuple[str, dict[str, float]]]]  # of a finished one, by trial
-    save: Callable[[Path, Any, dict[str, Any]], None]  # (folder, policy, what is to be known of it)
-    load: Callable[..., Any]  # (folder) -> the policy; the shipped one without a folder
 
 
 Positive = Bounds(0, math.inf, above=True)
@@ -118,7 +108,7 @@ class _Enough(Exception):
     """The time is over, or somebody asked to stop."""
 
 
-def train(robot: Walker, config: Training, out: Path, seed: int, command: str, tell: Tell = print) -> dict[str, Any]:
+def train(config: Training, out: Path, seed: int, command: str, tell: Tell = print) -> dict[str, Any]:
     """Train a walking policy, measure it and write it.
 
     Returns:
@@ -146,8 +136,8 @@ def train(robot: Walker, config: Training, out: Path, seed: int, command: str, t
                 f"the walking policy is no longer finite by step {steps:,}, and was not written; {out} {held}: train "
                 "with a smaller --train.learning-rate and another --out"
             )
-        policy = robot.policy(params)
-        found = robot.measure(policy, jax.random.fold_in(key, 0), config.measured_robots)
+        walk, k_measure = policy.from_brax(params), jax.random.fold_in(key, 0)
+        found = tracking.measure(walk, "mjx", tracking.TRIALS["clean"], k_measure, config.measured_robots)
         wall = time.perf_counter() - began
         rows.append([steps, round(wall, 1), *(round(found[name], 4) for name in COLUMNS[2:])])
         tell(
@@ -155,47 +145,47 @@ def train(robot: Walker, config: Training, out: Path, seed: int, command: str, t
             f"turning {found['turning_error']:.3f} rad/s, falls {found['falls']:.1%}"
         )
         if steps:  # what is still untrained is not worth keeping
-            robot.save(out, jax.device_get(policy), {**about, "finished": False})
+            policy.save(out, jax.device_get(walk), {**about, "finished": False})
         if stopping.is_set() or (steps and config.seconds and wall > config.seconds):
             raise _Enough
 
     tell(f"{jax.devices()[0].device_kind}: compiling takes a minute or so")
     with claimed(out), interruptible("the next measurement") as stopping:
         try:
-            _ppo(robot, config, seed, look)
+            _ppo(config, seed, look)
         except _Enough:
             if stopping.is_set():
                 held = f"{out} holds the policy of the last measurement" if rows[-1][0] else "nothing was learned yet"
                 raise Interrupted(f"stopped; {held}") from None
         trained = {"trained_steps": rows[-1][0], "training_s": round(time.perf_counter() - began, 1)}
-        figures = _examined(robot, robot.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
+        figures = _examined(policy.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
         about |= {"finished": True, **trained, "figures": figures}
-        robot.save(out, robot.load(out), about)
+        policy.save(out, policy.load(out), about)
     return about
 
 
-def evaluate(robot: Walker, asked: Evaluate, command: str) -> None:
+def evaluate(asked: Evaluate, command: str) -> None:
     """Measure a policy trial by trial; write the figures to `asked.out`, if given. Raises UserError if that exists."""
     if asked.robots < 1:
         raise UserError(f"--robots is {asked.robots}: give a positive number")
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")
-    policy = robot.load(asked.policy) if asked.policy else robot.load()
-    figures = _examined(robot, policy, jax.random.key(asked.seed), asked.robots, print)
+    walk = policy.load(asked.policy) if asked.policy else policy.load()
+    figures = _examined(walk, jax.random.key(asked.seed), asked.robots, print)
     if asked.out:
         asked.out.parent.mkdir(parents=True, exist_ok=True)
         contents = {"seed": asked.seed, **provenance(), "command": command, "figures": figures}
         asked.out.write_text(json.dumps(contents, indent=1) + "\n")
 
 
-def _ppo(robot: Walker, config: Training, seed: int, look: Callable[[int, Any, Any], None]) -> None:
+def _ppo(config: Training, seed: int, look: Callable[[int, Any, Any], None]) -> None:
     """brax's PPO with the settings; `look` is called now and then with (steps, _, parameters)."""
     from brax.training.agents.ppo import networks  # takes seconds to load
     from brax.training.agents.ppo import train as ppo
 
     supply_device_put_replicated()
     ppo.train(
-        environment=robot.environment,
+        environment=Locomotion(),
         num_timesteps=config.steps,
         max_devices_per_host=1,
         num_envs=config.robots,
@@ -222,29 +212,14 @@ def _ppo(robot: Walker, config: Training, seed: int, look: Callable[[int, Any, A
     )
 
 
-def _examined(robot: Walker, policy: Any, key: jax.Array, robots: int, tell: Tell) -> dict[str, dict[str, float]]:
+def _examined(walk: Any, key: jax.Array, robots: int, tell: Tell) -> dict[str, dict[str, float]]:
     """Figures of a policy by trial, each told as soon as it is measured."""
     figures = {}
     tell(f"{robots} robots walk for 20 s, trial by trial")
-    for name, found in robot.examine(policy, key, robots):
+    for name, found in tracking.examine(walk, key, robots):
         figures[name] = {figure: round(value, 5) for figure, value in found.items()}
         tell(f"{name:20}" + ", ".join(f"{figure} {value:.4g}" for figure, value in figures[name].items()))
     return figures
-
-
-def anymal() -> Walker:
-    """The quadruped."""
-    from cuelearner_envs.anymal import policy, tracking
-    from cuelearner_envs.anymal.locomotion import Locomotion
-
-    return Walker(
-        environment=Locomotion(),
-        policy=policy.from_brax,
-        measure=lambda policy, key, robots: tracking.measure(policy, "mjx", tracking.TRIALS["clean"], key, robots),
-        examine=tracking.examine,
-        save=policy.save,
-        load=policy.load,
-    )
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -254,9 +229,9 @@ def main(arguments: list[str] | None = None) -> int:
     command = shlex.join(["python", f"experiments/{Path(__file__).name}", *arguments])
     try:
         if isinstance(asked, Train):
-            train(anymal(), asked.train, asked.out, asked.seed, command)
+            train(asked.train, asked.out, asked.seed, command)
         else:
-            evaluate(anymal(), asked, command)
+            evaluate(asked, command)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
