@@ -132,7 +132,7 @@ def _run_in_processes(count: int, shard: Shard, arguments: list[str], folder: Pa
 
     Raises Interrupted after a signal, and UserError if a process failed.
     """
-    command = [sys.executable, "-m", "cuelearner_jax.cli", "suite", *arguments, "--processes", "1", "--shard"]
+    command = [sys.executable, "-u", "-m", "cuelearner_jax.cli", "suite", *arguments, "--processes", "1", "--shard"]
     logs = [folder / f"process_{number}.log" for number in range(1, count + 1)]
     with ExitStack() as files, signals.interruptible("the work of all processes") as stopping:
         shards = [f"{shard.index + number * shard.count}/{shard.count * count}" for number in range(count)]
