@@ -96,9 +96,10 @@ def show(rows: list[dict[str, Any]], base: str) -> None:
         own = [row for row in rows if row["environment"] == name and row["rows"]]
         step = min(row["rows"][-1]["step"] for row in own)
         at = {row["way"]: next(r["returns"] for r in row["rows"] if r["step"] == step) for row in own}
+        own_base = np.mean(at.get(base, 0.0))  # a share of a negative return says nothing
         for row in own:
             returns, later = at[row["way"]], row["rows"][1:]
-            over = f"{np.mean(returns) / np.mean(at[base]):.2f}" if base in at and np.mean(at[base]) > 0 else "-"
+            over = f"{np.mean(returns) / own_base:.2f}" if own_base > 0 else "-"
             stretch = row["rows"][0]["step"] * len(returns) * len(later)
             rate = stretch / sum(r["seconds"] for r in later) * row["at_once"] if later else np.nan
             spread = f"{np.mean(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"

@@ -15,11 +15,11 @@ from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.spaces import Box, Choices, Cue
 from cuelearner_jax.types import Step
 
-Moved = tuple[jax.Array, jax.Array, jax.Array]  # the state after a step, its reward, and whether it is terminal
+Transition = tuple[jax.Array, jax.Array, jax.Array]  # the next state (n,), its reward (), whether it is terminal ()
 
 
 class Episode(struct.PyTreeNode):
-    """The state of a task, and the steps taken."""
+    """The state (n,) of a task, in the units of its class, and the steps taken ()."""
 
     state: jax.Array
     steps: jax.Array
@@ -34,28 +34,28 @@ class Task(WholeObservations, struct.PyTreeNode):
     longest = 500
     middle = spread = (0.0,)
 
-    def move(self, state: jax.Array, action: jax.Array) -> Moved:
-        """Take one step."""
+    def move(self, state: jax.Array, action: jax.Array) -> Transition:
+        """Take one step from a state (n,) by an action (entries,)."""
         raise NotImplementedError
 
-    def seen(self, state: jax.Array) -> jax.Array:
-        """Return the observation of a state."""
+    def observe(self, state: jax.Array) -> jax.Array:
+        """Return the observation (obs,) of a state."""
         return state
 
     def reset(self, key: jax.Array) -> tuple[Episode, jax.Array]:
         """Start an episode."""
         middle = jnp.array(self.middle)
         state = middle + jnp.array(self.spread) * jax.random.uniform(key, middle.shape, minval=-1.0)
-        return Episode(state, jnp.zeros((), jnp.int32)), self.seen(state)
+        return Episode(state, jnp.zeros((), jnp.int32)), self.observe(state)
 
     def step(self, key: jax.Array, state: Episode, action: jax.Array) -> tuple[Episode, Step]:
         """Take one step, and start the next episode if that was the end."""
-        moved, reward, terminated = self.move(state.state, action)
-        after, final = Episode(moved, state.steps + 1), self.seen(moved)
+        following, reward, terminated = self.move(state.state, action)
+        after, final = Episode(following, state.steps + 1), self.observe(following)
         truncated = (after.steps >= self.longest) & ~terminated
         fresh, _ = self.reset(key)
         after = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
-        return after, Step(self.seen(after.state), final, final, reward, terminated, truncated, {}, {})
+        return after, Step(self.observe(after.state), final, final, reward, terminated, truncated, {}, {})
 
 
 class CartPole(Task):
@@ -68,15 +68,15 @@ class CartPole(Task):
         Quantity("pole", 2, "rad, rad/s", "angle, angular velocity"),
     )
 
-    def move(self, state: jax.Array, action: jax.Array) -> Moved:
-        """One Euler step of 0.02 s; the reward is 1. It ends at 2.4 m or 12 degrees."""
+    def move(self, state: jax.Array, action: jax.Array) -> Transition:
+        """Take one Euler step of 0.02 s; the reward is 1. It ends at 2.4 m or 12 degrees."""
         gravity, cart, pole, half_length = 9.8, 1.0, 0.1, 0.5
         _, speed, angle, turning = state
         push = 10.0 * (action[1] - action[0])
         total, sin, cos = cart + pole, jnp.sin(angle), jnp.cos(angle)
-        pushed = (push + pole * half_length * turning**2 * sin) / total
-        angular = (gravity * sin - cos * pushed) / (half_length * (4.0 / 3.0 - pole * cos**2 / total))
-        linear = pushed - pole * half_length * angular * cos / total
+        thrust = (push + pole * half_length * turning**2 * sin) / total
+        angular = (gravity * sin - cos * thrust) / (half_length * (4.0 / 3.0 - pole * cos**2 / total))
+        linear = thrust - pole * half_length * angular * cos / total
         after = state + 0.02 * jnp.stack([speed, linear, turning, angular])
         return after, jnp.ones(()), (jnp.abs(after[0]) > 2.4) | (jnp.abs(after[2]) > jnp.deg2rad(12.0))
 
@@ -89,8 +89,8 @@ class MountainCar(Task):
     actions = Choices(3)
     observation = (Quantity("car", 2, "1, 1/step", "position, velocity"),)
 
-    def move(self, state: jax.Array, action: jax.Array) -> Moved:
-        """One step; the reward is -1. It ends at 0.5."""
+    def move(self, state: jax.Array, action: jax.Array) -> Transition:
+        """Take one step; the reward is -1. It ends at 0.5."""
         position, speed = state
         pull = 0.001 * (action[2] - action[0]) - 0.0025 * jnp.cos(3 * position)
         speed = jnp.clip(speed + pull, -0.07, 0.07)
@@ -109,13 +109,13 @@ class Acrobot(Task):
         Quantity("turning", 2, "rad/s", "their angular velocities"),
     )
 
-    def seen(self, state: jax.Array) -> jax.Array:
-        """Cosine and sine of both angles, and the velocities."""
+    def observe(self, state: jax.Array) -> jax.Array:
+        """Return the observation (6,) of both angles [rad] and their velocities [rad/s]."""
         first, second = state[0], state[1]
         return jnp.stack([jnp.cos(first), jnp.sin(first), jnp.cos(second), jnp.sin(second), state[2], state[3]])
 
-    def move(self, state: jax.Array, action: jax.Array) -> Moved:
-        """One Runge-Kutta step of 0.2 s; the reward is -1, and 0 for the step that ends it."""
+    def move(self, state: jax.Array, action: jax.Array) -> Transition:
+        """Take one Runge-Kutta step of 0.2 s; the reward is -1, and 0 for the step that ends it."""
         rate, seconds = lambda at: self._rate(at, action[2] - action[0]), 0.2
         k1 = rate(state)
         k2 = rate(state + seconds / 2 * k1)
@@ -128,15 +128,15 @@ class Acrobot(Task):
         return jnp.concatenate([angles, jnp.clip(after[2:], -fastest, fastest)]), is_up - 1.0, is_up
 
     def _rate(self, state: jax.Array, torque: jax.Array) -> jax.Array:
-        """The state's rate of change, of links of 1 kg, 1 m and 1 kg m^2 whose centres of mass lie halfway."""
+        """Return the state's rate of change (4,): links of 1 kg, 1 m and 1 kg m^2, centres of mass halfway."""
         first, second, turning, bending = state
         cos, sin, gravity = jnp.cos(second), jnp.sin(second), 9.8
         inertia, coupling = 3.5 + cos, 1.25 + 0.5 * cos
         pull = 0.5 * gravity * jnp.sin(first + second)
         pulls = -0.5 * bending * (bending + 2 * turning) * sin + 1.5 * gravity * jnp.sin(first) + pull
-        bent = torque + coupling / inertia * pulls - 0.5 * turning**2 * sin - pull
-        bent = bent / (1.25 - coupling**2 / inertia)
-        return jnp.stack([turning, bending, -(coupling * bent + pulls) / inertia, bent])
+        bend = torque + coupling / inertia * pulls - 0.5 * turning**2 * sin - pull
+        bend = bend / (1.25 - coupling**2 / inertia)
+        return jnp.stack([turning, bending, -(coupling * bend + pulls) / inertia, bend])
 
 
 class Pendulum(Task):
@@ -151,12 +151,12 @@ class Pendulum(Task):
     actions = Box((-2.0,), (2.0,), (Cue("torque", ("left", "right"), ("ArrowLeft", "ArrowRight"), "shares"),))
     action = Quantity("torque", 1, "N m", "torque of the motor")
 
-    def seen(self, state: jax.Array) -> jax.Array:
-        """Cosine and sine of the angle, and the velocity."""
+    def observe(self, state: jax.Array) -> jax.Array:
+        """Return the observation (3,) of the angle from upright [rad] and its velocity [rad/s]."""
         return jnp.stack([jnp.cos(state[0]), jnp.sin(state[0]), state[1]])
 
-    def move(self, state: jax.Array, action: jax.Array) -> Moved:
-        """One Euler step of 0.05 s; the reward is the negative cost of the state before it and the torque."""
+    def move(self, state: jax.Array, action: jax.Array) -> Transition:
+        """Take one Euler step of 0.05 s; the reward is the negative cost of the state before it and the torque."""
         angle, speed = state
         torque = jnp.clip(action[0], -2.0, 2.0)
         off = jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi

@@ -5,8 +5,8 @@
     python experiments/navigation_bootstrapping.py --out FOLDER --report
 
 The sweeps are data below: every piece has a folder of its own and is resumed. After the pieces, or alone with --report,
-there is a report of each world (FOLDER/clutter/report). At the scale `smoke` a piece takes seconds.
-Collisions: `cuelearner report FOLDER/long/raw --metric collision --lower-is-better --out COLLISIONS`.
+there is a report of each world (FOLDER/clutter/report). At the scale `smoke` a piece takes seconds. Collisions:
+`cuelearner report FOLDER/long/raw --metric collision --lower-is-better --out COLLISIONS`.
 """
 
 from __future__ import annotations

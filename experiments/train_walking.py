@@ -105,7 +105,7 @@ class Evaluate:
 
 
 class _Enough(Exception):
-    """The time is over, or somebody asked to stop."""
+    """The time is over, or somebody options to stop."""
 
 
 def train(config: Training, out: Path, seed: int, command: str, tell: Tell = print) -> dict[str, Any]:
@@ -137,12 +137,12 @@ def train(config: Training, out: Path, seed: int, command: str, tell: Tell = pri
                 "with a smaller --train.learning-rate and another --out"
             )
         walk, k_measure = policy.from_brax(params), jax.random.fold_in(key, 0)
-        found = tracking.measure(walk, "mjx", tracking.TRIALS["clean"], k_measure, config.measured_robots)
+        figures = tracking.measure(walk, "mjx", tracking.TRIALS["clean"], k_measure, config.measured_robots)
         wall = time.perf_counter() - began
-        rows.append([steps, round(wall, 1), *(round(found[name], 4) for name in COLUMNS[2:])])
+        rows.append([steps, round(wall, 1), *(round(figures[name], 4) for name in COLUMNS[2:])])
         tell(
-            f"{wall:6.0f} s {steps / 1e6:7.1f}M steps   error {found['error']:.3f} m/s, "
-            f"turning {found['turning_error']:.3f} rad/s, falls {found['falls']:.1%}"
+            f"{wall:6.0f} s {steps / 1e6:7.1f}M steps   error {figures['error']:.3f} m/s, "
+            f"turning {figures['turning_error']:.3f} rad/s, falls {figures['falls']:.1%}"
         )
         if steps:  # what is still untrained is not worth keeping
             policy.save(out, jax.device_get(walk), {**about, "finished": False})
@@ -164,18 +164,18 @@ def train(config: Training, out: Path, seed: int, command: str, tell: Tell = pri
     return about
 
 
-def evaluate(asked: Evaluate, command: str) -> None:
-    """Measure a policy trial by trial; write the figures to `asked.out`, if given. Raises UserError if that exists."""
-    if asked.robots < 1:
-        raise UserError(f"--robots is {asked.robots}: give a positive number")
-    if asked.out and asked.out.exists():
-        raise UserError(f"{asked.out} exists: give another --out")
-    walk = policy.load(asked.policy) if asked.policy else policy.load()
-    figures = _examined(walk, jax.random.key(asked.seed), asked.robots, print)
-    if asked.out:
-        asked.out.parent.mkdir(parents=True, exist_ok=True)
-        contents = {"seed": asked.seed, **provenance(), "command": command, "figures": figures}
-        asked.out.write_text(json.dumps(contents, indent=1) + "\n")
+def evaluate(options: Evaluate, command: str) -> None:
+    """Measure a policy trial by trial; write the figures to `options.out`, if given. Raises UserError if it exists."""
+    if options.robots < 1:
+        raise UserError(f"--robots is {options.robots}: give a positive number")
+    if options.out and options.out.exists():
+        raise UserError(f"{options.out} exists: give another --out")
+    walk = policy.load(options.policy) if options.policy else policy.load()
+    figures = _examined(walk, jax.random.key(options.seed), options.robots, print)
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        contents = {"seed": options.seed, **provenance(), "command": command, "figures": figures}
+        options.out.write_text(json.dumps(contents, indent=1) + "\n")
 
 
 def _ppo(config: Training, seed: int, look: Callable[[int, Any, Any], None]) -> None:
@@ -216,8 +216,8 @@ def _examined(walk: Any, key: jax.Array, robots: int, tell: Tell) -> dict[str, d
     """Figures of a policy by trial, each told as soon as it is measured."""
     figures = {}
     tell(f"{robots} robots walk for 20 s, trial by trial")
-    for name, found in tracking.examine(walk, key, robots):
-        figures[name] = {figure: round(value, 5) for figure, value in found.items()}
+    for name, values in tracking.examine(walk, key, robots):
+        figures[name] = {figure: round(value, 5) for figure, value in values.items()}
         tell(f"{name:20}" + ", ".join(f"{figure} {value:.4g}" for figure, value in figures[name].items()))
     return figures
 
@@ -225,13 +225,13 @@ def _examined(walk: Any, key: jax.Array, robots: int, tell: Tell) -> dict[str, d
 def main(arguments: list[str] | None = None) -> int:
     """Read the arguments, then train or evaluate; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    asked = tyro.cli(Train | Evaluate, args=arguments, prog=Path(__file__).name, description=__doc__)
+    options = tyro.cli(Train | Evaluate, args=arguments, prog=Path(__file__).name, description=__doc__)
     command = shlex.join(["python", f"experiments/{Path(__file__).name}", *arguments])
     try:
-        if isinstance(asked, Train):
-            train(asked.train, asked.out, asked.seed, command)
+        if isinstance(options, Train):
+            train(options.train, options.out, options.seed, command)
         else:
-            evaluate(asked, command)
+            evaluate(options, command)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

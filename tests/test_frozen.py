@@ -51,7 +51,7 @@ KINDS = {  # those for whose parts no other kind stands
 ANGLES = np.linspace(0, 6, 40, dtype=np.float32)
 SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1)
 USED = ("flat", "relative")  # by the test of label files
-SHORT = USED, ("boxed", "demonstration"), ("billiards", "relative")  # the others differ in what tests/guides/ holds
+SHORT = USED, ("boxed", "demonstration"), ("billiards", "relative")  # tests/guides/ holds how the others differ
 ALL = [(world, kind) for world, kinds in {**KINDS, "billiards": ["relative"]}.items() for kind in kinds]
 CASES = [pytest.param(*case, marks=[] if case in SHORT else [pytest.mark.long]) for case in ALL]
 

@@ -16,31 +16,26 @@ from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.run_config import RunConfig
 
 PENDULUM = TASKS["Pendulum-v1"]
-# of the second episode; in the first the action is 0
-POLICIES = {
-    "CartPole-v1": lambda obs: int(obs @ np.array([0.1, 0.5, 10.0, 2.0]) > 0),
-    "MountainCar-v0": lambda obs: 2 * int(obs[1] > 0),
-    "Acrobot-v1": lambda obs: 2 * int(obs[5] > 0),
-    "Pendulum-v1": lambda obs: 6 * obs[1:2],
+CASES = {  # policy of the second episode, in the first the action is 0; steps of both, and whether time ended them
+    "CartPole-v1": (lambda obs: int(obs @ np.array([0.1, 0.5, 10.0, 2.0]) > 0), [(9, False), (500, True)]),
+    "MountainCar-v0": (lambda obs: 2 * int(obs[1] > 0), [(200, True), (153, False)]),
+    "Acrobot-v1": (lambda obs: 2 * int(obs[5] > 0), [(500, True), (82, False)]),
+    "Pendulum-v1": (lambda obs: 6 * obs[1:2], [(200, True), (200, True)]),
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "ends"),
-    [
-        ("CartPole-v1", [(9, False), (500, True)]),
-        ("MountainCar-v0", [(200, True), (153, False)]),
-        ("Acrobot-v1", [(500, True), (82, False)]),
-        ("Pendulum-v1", [(200, True), (200, True)]),
-    ],
-)
-def test_steps_are_gymnasiums(name, ends):
-    other, step, lengths = gymnasium.make(name), jax.jit(TASKS[name].step), []
-    is_box = isinstance(other.action_space, gymnasium.spaces.Box)
-    for chosen in (lambda _: np.zeros(1, np.float32) if is_box else 0, POLICIES[name]):
+@pytest.mark.parametrize("name", CASES)
+def test_starts_and_steps_are_gymnasiums(name):
+    (second, ends), env, other, lengths = CASES[name], TASKS[name], gymnasium.make(name), []
+    starts = np.array([other.reset(seed=seed) and other.unwrapped.state for seed in range(300)])
+    ours = np.asarray(jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 300))[0].state)
+    for end in (np.min, np.max):
+        assert (np.abs(end(ours, 0) - end(starts, 0)) <= 0.05 * np.ptp(starts, 0) + 1e-6).all()
+    is_box, step = isinstance(other.action_space, gymnasium.spaces.Box), jax.jit(env.step)
+    for policy in (lambda _: np.zeros(1, np.float32) if is_box else 0, second):
         obs, _ = other.reset(seed=3)
         for number in range(500):
-            action = chosen(obs)
+            action = policy(obs)
             state = Episode(np.float32(other.unwrapped.state), jnp.int32(number))
             obs, reward, terminated, truncated, _ = other.step(action)
             state, ours = step(jax.random.key(number), state, action if is_box else np.eye(3)[action])
