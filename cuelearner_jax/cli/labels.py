@@ -1,12 +1,11 @@
-"""`cuelearner labels inspect`, `merge` and `export`."""
+"""`cuelearner labels inspect` and `merge`."""
 
 from __future__ import annotations
 
-import csv
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -19,7 +18,6 @@ from cuelearner_jax.labelling import comparing
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import UNDONE, UNSURE, LabelFile
-from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console
@@ -73,38 +71,7 @@ class Merge:
         out.print(f"wrote {len(file.seeds)} labels of {len(self.files)} files to {self.out}{twice}")
 
 
-@dataclass(frozen=True)
-class LabelsExport:
-    """Labels as a table: a row a label; in CSV a column a number, in Parquet lists."""
-
-    files: Files
-    """One label file, or the folder of one."""
-    out: Path | None = None
-    """New file, .csv or .parquet; an existing file is not replaced."""
-
-    def run(self) -> None:
-        """Write the file. Raises UserError for several label files."""
-        if len(self.files) != 1:
-            raise UserError("export takes one label file: first join several by `cuelearner labels merge`")
-        if self.out is None or self.out.suffix not in (".csv", ".parquet"):
-            raise UserError("export needs --out: give it a name that ends in .csv or .parquet")
-        file = comparing.read_checked(self.files[0])
-        if self.out.suffix == ".parquet":
-            label_files.write_file(self.out, file)
-        else:
-            columns = _columns(file)
-            with replacing(self.out, fresh=True) as target:
-                writer = csv.writer(target)
-                writer.writerow(columns)
-                writer.writerows(zip(*columns.values(), strict=True))
-        out.print(f"wrote {len(file.seeds)} labels to {self.out}")
-
-
-Labels = (
-    Annotated[Inspect, tyro.conf.subcommand("inspect")]
-    | Annotated[Merge, tyro.conf.subcommand("merge")]
-    | Annotated[LabelsExport, tyro.conf.subcommand("export")]
-)
+Labels = Annotated[Inspect, tyro.conf.subcommand("inspect")] | Annotated[Merge, tyro.conf.subcommand("merge")]
 
 
 def run(arguments: list[str]) -> None:
@@ -153,19 +120,3 @@ def _with_teacher(path: Path, file: LabelFile) -> str:
     scalars = next((preset.config.scalars for preset in task.presets.values()), Scalars())
     rows = label_files.history(place)
     return str(comparing.with_teacher(task, file, rows, scalars, lambda words: console.print(f"{words} ...")))
-
-
-def _columns(file: LabelFile) -> dict[str, list[Any]]:
-    """Return the labels as columns of plain numbers and words."""
-    columns: dict[str, list[Any]] = {"seed": file.seeds.tolist()}
-    if file.people is not None:
-        columns |= {name: getattr(file.people, name).tolist() for name in file.people._fields}
-    columns["eps"] = [file.eps] * len(file.seeds)
-    layout = (file.session or {}).get("observation") or []
-    names = [f"obs: {part['name']}[{i}]" for part in layout for i in range(part["size"])]
-    for kind in ("action", "answer", "obs"):
-        values = np.asarray(getattr(file.labels, kind))
-        plain = [f"{kind}[{place}]" for place in range(values.shape[1])]
-        heads = names if kind == "obs" and len(names) == len(plain) else plain
-        columns |= dict(zip(heads, values.T.tolist(), strict=True))
-    return columns

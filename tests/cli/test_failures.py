@@ -56,7 +56,7 @@ def test_an_out_that_cannot_be_is_refused_before_any_work(refused, tmp_path, com
         ("sweep billiards", "go on with the same command and --resume"),
         ("adapt runs/a", "give the same command again"),
         ("export runs/a", "give the same command again"),
-        ("labels export a.parquet", "give the same command again"),
+        ("labels merge a.parquet", "give the same command again"),
     ],
 )
 def test_a_full_disk_advises_what_the_command_can_do(command, advice, capsys, monkeypatch):

@@ -1,6 +1,5 @@
 """`cuelearner label` and `cuelearner labels`: the real command, what it refuses, and what takes its files."""
 
-import csv
 import shlex
 import signal
 import socket
@@ -9,7 +8,6 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
-import numpy as np
 import pytest
 from sessions import OWN, expert, plan, served
 
@@ -162,22 +160,11 @@ def test_labels_are_inspected(labelled, capsys):
     assert "no labels to compare" in capsys.readouterr().out
 
 
-def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
-    both, flat, whole = tmp_path / "both.parquet", tmp_path / "both.csv", tmp_path / "again.parquet"
+def test_labels_are_merged(labelled, tmp_path, refused):
+    both = tmp_path / "both.parquet"
     assert main(["labels", "merge", str(labelled / "one"), str(labelled / "two"), "--out", str(both)]) == 0
     file = label_files.read(both)
     assert file.people.who.tolist() == ["one"] * 12 + ["two"] * 12
-    assert main(["labels", "export", str(both), "--out", str(flat)]) == 0
-    assert main(["labels", "export", str(labelled / "two"), "--out", str(whole)]) == 0
-    rows = list(csv.DictReader(flat.open()))
-    assert len(rows) == 24
-    np.testing.assert_allclose([float(row["obs[1]"]) for row in rows], file.labels.obs[:, 1], rtol=1e-6)
-    assert [float(row["answer[0]"]) for row in rows] == file.labels.answer[:, 0].tolist()
-    one, two = label_files.read(labelled / "two"), label_files.read(whole)
-    assert (two.session, two.task, two.eps) == (one.session, one.task, one.eps)
-    np.testing.assert_array_equal(one.labels.answer, two.labels.answer)
     refused(["labels", "merge", labelled / "one", "--out", both], "both.parquet exists: give another --out", tmp_path)
-    refused(["labels", "export", both, labelled / "one", "--out", "x.csv"], "takes one label file", tmp_path)
-    refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
     refused(["labels", "inspect", both, "--teacher"], "cannot be asked about this file", tmp_path)
-    refused(["labels", "mend"], "Available subcommands: inspect, merge, export", tmp_path)
+    refused(["labels", "mend"], "Available subcommands: inspect, merge", tmp_path)
