@@ -49,6 +49,8 @@ class DDQNConfig:
     """Arithmetic of the first look (bfloat16 is twice as fast on an accelerator); the choice is made in float32."""
     peaks: Annotated[int, POSITIVE] = 8
     """Peaks of the first look that are looked at closely."""
+    exploration: Annotated[float, SHARE] = 0.0
+    """Probability that an action while learning is one of the set by chance (epsilon-greedy)."""
     target_directions: Annotated[int, POSITIVE] = 720
     """Directions of the argmax inside bootstrapped targets (unused at discount 0)."""
     batch_size: Annotated[int, POSITIVE] = 100
@@ -132,7 +134,15 @@ class DoubleDQN:
     def explore(
         self, env: Any, options: DDQNConfig, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
-        """Return the greedy action, searched near the peaks of a coarse first look where the options say so."""
+        """Return the greedy action, searched near peaks where the options say so, or one of the set by chance."""
+        k_explore, k_choice = jax.random.split(key)
+        by_chance = jax.random.choice(k_choice, self._directions, (len(obs),))
+        explores = jax.random.bernoulli(k_explore, options.exploration, (len(obs), 1))
+        return jnp.where(explores, by_chance, self._greedy(env, params, obs, key))
+
+    def _greedy(
+        self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
+    ) -> Float[Array, "n action"]:
         own = self.options
         if not own.coarse_directions:
             return self.act(env, params, obs, key)

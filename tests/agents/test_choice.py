@@ -83,6 +83,16 @@ def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
     assert float(jnp.mean(given_up == 0)) > 0.9
 
 
+def test_actions_by_chance_are_as_many_as_said_and_of_the_set():
+    obs, params = jnp.zeros((2000, 5)), agent()
+    actions = chosen(dataclasses.replace(FULL, exploration=0.3), params, obs)
+    own = (actions == chosen(FULL, params, obs)).all(-1)
+    assert float(own.mean()) == pytest.approx(0.7 + 0.3 / 360, abs=0.04)  # four standard errors
+    off = jnp.abs(actions[:, None] - evenly_spaced(360)[None]).sum(-1).min(-1)
+    assert float(off.max()) < 1e-6
+    assert len(np.unique(np.asarray(actions[~own]), axis=0)) > 250
+
+
 def test_actions_do_not_depend_on_how_many_states_are_searched_at_once(monkeypatch):
     obs = jax.random.normal(jax.random.key(2), (7, 5))
     together = chosen(FULL, agent(), obs)
