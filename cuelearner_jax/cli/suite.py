@@ -176,7 +176,8 @@ def _world(name: str, values: dict[str, Any]) -> World:
         config, sizes = preset.config, {}
     config = with_groups(config, groups)
     start = start or ", ".join(f"{key}={value}" for key, value in groups.get("task", {}).items())
-    return World(name, values["use"], start, values["metric"], config, source, sizes, values.get("bound"))
+    ends = tuple(values.get("ends", (0.0, 1.0)))
+    return World(name, values["use"], start, values["metric"], ends, config, source, sizes, values.get("bound"))
 
 
 def _claim(folder: Path, text: str) -> None:

@@ -47,6 +47,7 @@ class World(NamedTuple):
     use: str  # of labels, one of `USES`
     start: str  # preset of the training, or changed world
     metric: str
+    ends: tuple[float, float]  # values of the metric that score 0 and 1
     config: RunConfig
     source: PolicySource  # the policy to adapt; to bootstrap, the task alone
     sizes: Mapping[str, Any]  # to adapt: sizes of the guide, other than the defaults of `cuelearner adapt`
@@ -159,8 +160,8 @@ def is_done(out: Path, cell: Cell) -> bool:
 def collect(out: Path, worlds: list[World]) -> pa.Table:
     """Return the rows of all finished cells below `out`, also of kinds that this call does not run.
 
-    A row is a lane and evaluation. `score` is its world's metric; `rewarded_steps` are those of the training so far, or
-    of judging a correction.
+    A row is a lane and evaluation. `score` is its world's metric between `ends`; `rewarded_steps` are those of the
+    training so far, or of judging a correction.
     """
     return pa.concat_tables(_collected(out, worlds), promote_options="permissive")
 
@@ -177,5 +178,12 @@ def _collected(out: Path, worlds: list[World]) -> Iterator[pa.Table]:
             if world.use == BOOTSTRAP:
                 rows = rows.append_column("rewarded_steps", pc.cast(rows["step"], pa.float64()))
             for end in ("", "_each"):
-                rows = rows.append_column(f"score{end}", rows[world.metric + end])
+                rows = rows.append_column(f"score{end}", _scores(rows[world.metric + end].combine_chunks(), world.ends))
             yield rows
+
+
+def _scores(values: Any, ends: tuple[float, float]) -> Any:
+    """Return Arrow's array of numbers, or of lists of them, on the scale whose `ends` are 0 and 1."""
+    if pa.types.is_list(values.type):
+        return pa.ListArray.from_arrays(values.offsets, _scores(values.values, ends))
+    return pc.divide(pc.subtract(values, ends[0]), ends[1] - ends[0])

@@ -25,6 +25,7 @@ metric = "reward"
 use = "adapt"
 subject = "page_task:left_of --task {BANDIT}"
 metric = "reward"
+ends = [-1.0, 3.0]
 bound = 90.0
 scalars = {{ eps_deg = 10.0 }}
 sizes = {{ feedback_layers = [16], fit_steps = 20 }}
@@ -74,6 +75,7 @@ def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys, monkeyp
     assert {row["guidance"] for row in of_use["bootstrap"]} == {"none", "clone"}
     assert {row["guidance"] for row in of_use["adapt"]} == {"none", "reading", "clone"}
     assert all(row["rewarded_steps"] == row["step"] for row in of_use["bootstrap"])
+    assert all(row["score"] == (row["reward"] + 1.0) / 4.0 for row in of_use["adapt"])
     assert all((row["rewarded_steps"] > 0) == (row["guidance"] == "clone") for row in of_use["adapt"])
     page = (tmp_path / "out" / "suite.md").read_text()
     assert "reading corrects finished policies only" in page
