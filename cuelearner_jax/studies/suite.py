@@ -134,11 +134,12 @@ class Cell(NamedTuple):
 
     def _request(self, config: RunConfig) -> AdaptRequest:
         kind, sizes = self.kind, replace(by_model.SIZES, frame=config.sizes.frame, **self.world.sizes)
-        by = None if guidances.find(kind).by_evidence else self.world.metric
+        by_answers = guidances.find(kind).by_evidence  # judged by answers, and within no bound
+        by, bound = (None, None) if by_answers else (self.world.metric, self.world.bound)
         scalars = by_model.settling(config.scalars, None)
         request = AdaptRequest.of(self.world.source.task, config, None, kind, by, scalars=scalars)
-        bound = () if self.world.bound is None else (self.world.bound,)
-        return replace(request, labels=self.labels, bound_deg=bound, seeds=f"0:{self.seeds}", sizes=sizes)
+        bounds = () if bound is None else (bound,)
+        return replace(request, labels=self.labels, bound_deg=bounds, seeds=f"0:{self.seeds}", sizes=sizes)
 
 
 def cells_of(table: dict[str, Any], scale: dict[str, Any], worlds: list[World], kinds: list[str]) -> list[Cell]:
