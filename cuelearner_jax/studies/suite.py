@@ -187,4 +187,4 @@ def _scores(values: Any, ends: tuple[float, float]) -> Any:
     """Return Arrow's array of numbers, or of lists of them, on the scale whose `ends` are 0 and 1."""
     if pa.types.is_list(values.type):
         return pa.ListArray.from_arrays(values.offsets, _scores(values.values, ends))
-    return pc.divide(pc.subtract(values, ends[0]), ends[1] - ends[0])
+    return pa.array((values.to_numpy(zero_copy_only=False) - ends[0]) / (ends[1] - ends[0]))
