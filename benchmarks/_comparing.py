@@ -100,7 +100,7 @@ def show(rows: list[dict[str, Any]], base: str) -> None:
         for row in own:
             returns, later = at[row["way"]], row["rows"][1:]
             over = f"{np.mean(returns) / own_base:.2f}" if own_base > 0 else "-"
-            stretch = row["rows"][0]["step"] * len(returns) * len(later)
+            stretch = row["rows"][0]["step"] * sum(len(r["returns"]) for r in later)
             rate = stretch / sum(r["seconds"] for r in later) * row["at_once"] if later else np.nan
             spread = f"{np.mean(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
             print(f"{name:<15}{row['way']:<10}{step:>9,}   {spread:<32}{over:>10}   {rate:>16,.0f}")
