@@ -105,7 +105,7 @@ class Evaluate:
 
 
 class _Enough(Exception):
-    """The time is over, or somebody options to stop."""
+    """The time is over, or somebody asked to stop."""
 
 
 def train(config: Training, out: Path, seed: int, command: str, tell: Tell = print) -> dict[str, Any]:

@@ -51,7 +51,7 @@ class World(NamedTuple):
     config: RunConfig
     source: PolicySource  # the policy to adapt; to bootstrap, the task alone
     sizes: Mapping[str, Any]  # to adapt: sizes of the guide, other than the defaults of `cuelearner adapt`
-    bound: float | None  # to adapt: the largest correction, in the space's unit; None: the default
+    bound: float | None  # to adapt, judged by episodes: the largest correction, in the space's unit
 
 
 class Cell(NamedTuple):
