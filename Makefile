@@ -108,7 +108,7 @@ docs: $(VENV)/.documented
 
 bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/billiards_speed.py
-	$(BIN)/python benchmarks/training_speed.py
+	$(BIN)/python benchmarks/scaling.py --out scaling.json
 
 PYTHONS ?= 3.11 3.12 3.13
 release: $(BIN)/uv

@@ -38,15 +38,16 @@ def evaluation(env: Any, functions: Any) -> Callable[[Any], jax.Array]:
     def one(params: Any) -> jax.Array:
         state, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), EPISODES))
 
-        def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
-            state, obs, running, total = carry
+        def step(carry: Any) -> Any:
+            number, state, obs, running, total = carry
+            key = jax.random.fold_in(jax.random.key(2), number)
             actions = functions.act(env, params, obs, key)
             state, after = jax.vmap(env.step)(jax.random.split(key, EPISODES), state, actions)
             total = total + jnp.where(running, after.reward, 0.0)
-            return (state, after.obs, running & ~(after.terminated | after.truncated), total), None
+            return number + 1, state, after.obs, running & ~(after.terminated | after.truncated), total
 
-        start = (state, obs, jnp.ones(EPISODES, bool), jnp.zeros(EPISODES))
-        return jax.lax.scan(step, start, jax.random.split(jax.random.key(2), LONGEST))[0][3].mean()
+        start = (0, state, obs, jnp.ones(EPISODES, bool), jnp.zeros(EPISODES))
+        return jax.lax.while_loop(lambda carry: (carry[0] < LONGEST) & carry[3].any(), step, start)[4].mean()
 
     return jax.jit(lambda params: jax.lax.map(one, params, batch_size=16))
 

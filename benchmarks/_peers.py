@@ -1,11 +1,12 @@
-"""Agents of sbx, CleanRL and PureJaxQL on a task of Gymnasium, in a Python of their own.
+"""Agents of sbx, rejax, CleanRL and PureJaxQL on a task of Gymnasium, in a Python of their own.
 
     PYTHON benchmarks/_peers.py WAY SETTING
 
-WAY is `SAC` or `CrossQ` (sbx), `CleanRL` or `PureJaxQL`. SETTING is a JSON object: name (of the environment), seeds
-(a list), steps, evaluations, episodes; further layers, batch_size, prefill, discount, rate and polyak for sbx, and
-folder, that of a checkout, for the others. One JSON object a line comes out for each evaluation: step, returns (of
-seeds, mean over episodes), seconds (of the training since the evaluation before). Nothing of this project is imported.
+WAY is `SAC` or `CrossQ` (sbx), `rejax` (its SAC), `CleanRL` or `PureJaxQL`. SETTING is a JSON object: name (of the
+environment), seeds (a list), steps, evaluations, episodes; further layers, batch_size, prefill, discount, rate and
+polyak for SAC, and folder, that of a checkout, for the last two. One JSON object a line comes out for each evaluation:
+step, returns (of seeds, mean over episodes), seconds (of the training since the evaluation before). Nothing of this
+project is imported.
 """
 
 # Peers are installed by whoever compares with them.
@@ -62,6 +63,44 @@ def sbx(way: str, setting: dict[str, Any]) -> None:
         model.learn(every, reset_num_timesteps=number == 0)
         policy = lambda obs: model.predict(obs, deterministic=True)[0]  # noqa: E731
         tell(setting, (number + 1) * every, time.perf_counter() - began, [policy])
+
+
+def rejax(way: str, setting: dict[str, Any]) -> None:
+    """Train rejax's SAC in gymnax's environment of the same name, all seeds side by side."""
+    import jax
+    import jax.numpy as jnp
+    from rejax import SAC
+
+    every = setting["steps"] // setting["evaluations"]
+    agent = SAC.create(
+        env=setting["name"],
+        hidden_layer_sizes=setting["layers"],
+        learning_rate=setting["rate"],
+        gamma=setting["discount"],
+        polyak=1 - setting["polyak"],
+        batch_size=setting["batch_size"],
+        fill_buffer=setting["prefill"],
+        buffer_size=setting["steps"],
+        total_timesteps=every,
+        eval_freq=every,
+        skip_initial_evaluation=True,
+    ).replace(eval_callback=lambda *_: ())
+    keys = jnp.stack([jax.random.key(seed) for seed in setting["seeds"]])
+    states = jax.jit(jax.vmap(agent.init_state))(keys)
+    program = jax.jit(jax.vmap(lambda state: agent.train(train_state=state)[0])).lower(states).compile()
+
+    @jax.jit
+    def middle(params: Any, obs: Any) -> Any:
+        distribution = agent.actor.apply(params, obs[None], method="_action_dist")
+        return (agent.actor.action_loc + agent.actor.action_scale * jnp.tanh(distribution.loc))[0]
+
+    for number in range(setting["evaluations"]):
+        began = time.perf_counter()
+        states = jax.block_until_ready(program(states))
+        seconds = time.perf_counter() - began
+        own = [jax.tree.map(lambda leaf, row=row: leaf[row], states.actor_ts.params) for row in range(len(keys))]
+        policies = [lambda obs, params=params: jax.device_get(middle(params, obs)) for params in own]
+        tell(setting, (number + 1) * every, seconds, policies)
 
 
 def cleanrl(way: str, setting: dict[str, Any]) -> None:
@@ -128,4 +167,5 @@ def purejaxql(way: str, setting: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    {"CleanRL": cleanrl, "PureJaxQL": purejaxql}.get(sys.argv[1], sbx)(sys.argv[1], json.loads(sys.argv[2]))
+    way, setting = sys.argv[1], json.loads(sys.argv[2])
+    {"rejax": rejax, "CleanRL": cleanrl, "PureJaxQL": purejaxql}.get(way, sbx)(way, setting)

@@ -4,9 +4,10 @@
     python benchmarks/sac_speed.py --environments Pendulum-v1 --seeds 64 --steps 20000 --out sac.json
     python benchmarks/sac_speed.py --table sac.json
 
-Ways: `sac` and `xqc` (the same with `--agent.bins`) here; sbx's `SAC` and `CrossQ`. SAC has the same networks,
-minibatches, updates a step, rates, discount, target entropy and random steps here and there; CrossQ has its own
-defaults. `Pendulum-v1` is that of `classic_control.py`, step for step Gymnasium's.
+Ways: `sac` and `xqc` (the same with `--agent.bins`) here; sbx's `SAC` and `CrossQ`; the SAC of `rejax`, for tasks that
+gymnax has. SAC has the same networks, minibatches, updates a step, rates, discount, target entropy and random steps
+here and there, but rejax takes its first steps by its policy; CrossQ has its own defaults. `Pendulum-v1` is that of
+`classic_control.py`, step for step Gymnasium's.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ SETTING: dict[str, Any] = {"layers": LAYERS, "batch_size": 256, "discount": 0.99
 
 def main() -> None:
     """Measure, print and write."""
-    parser = parser_of(__doc__, ["Pendulum-v1"], ["sac", "xqc", "SAC", "CrossQ"], seeds=5)
+    parser = parser_of(__doc__, ["Pendulum-v1"], ["sac", "xqc", "SAC", "CrossQ", "rejax"], seeds=5)
     parser.add_argument("--prefill", type=int, default=5_000, help="random steps before the first update")
     options = parser.parse_args()
     setting = {**SETTING, "prefill": options.prefill}
@@ -46,7 +47,7 @@ def main() -> None:
         )
         return RunConfig(None, Sizes(num_envs=1), scalars, schedule, agent)
 
-    elsewhere: dict[str, dict[str, Any]] = {"SAC": {}, "CrossQ": {}}
+    elsewhere: dict[str, dict[str, Any]] = {"SAC": {}, "CrossQ": {}, "rejax": {"together": True}}
     compare(options, setting, {"sac": config(False), "xqc": config(True)}, elsewhere, base="SAC")
 
 
