@@ -2,10 +2,11 @@
 
 Source: Palenicek et al., "XQC: Well-conditioned optimization accelerates deep reinforcement learning",
 arXiv:2509.25174, 2025. The projection onto bins: Bellemare et al., "A distributional perspective on reinforcement
-learning", ICML 2017. One batch for steps and next steps: Bhatt et al., "CrossQ", ICLR 2024.
+learning", ICML 2017. One batch for steps and next steps, also in the target: Bhatt et al., "CrossQ", ICLR 2024.
 
 Bins are in units of rms(reward) / (1 - discount) / `ROOM`, so that no option depends on the scale of rewards. XQC
-divides rewards by a running deviation of returns instead, which a minibatch of steps does not show.
+divides rewards by a running deviation of returns instead, which a minibatch of steps does not show. The first
+distribution is narrow: from equal logits, which mean all values alike, the pendulum takes half as long again.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from cuelearner_jax.types import Params
 
 BINS = np.linspace(-5.0, 5.0, 101, dtype=np.float32)  # their values, in units
 ROOM = 2.0  # the bin of a value of rms(reward) / (1 - discount); the largest bin is 2.5 times that
+FIRST = 0.2  # scale of the first distribution [units], Student's t of 3 degrees: narrow, with tails that can grow
 RATE = 1e-3  # share of a new batch in the mean square of rewards; the first 1 / RATE batches count alike
 
 
@@ -41,15 +43,21 @@ class CategoricalCritic(nn.Module):
         x = nn.BatchNorm(not train, name="BatchNorm_in")(x)
         for width in self.layers:
             x = nn.relu(nn.BatchNorm(not train)(nn.Dense(width, use_bias=False)(x)))
-        return nn.Dense(BINS.size, kernel_init=nn.initializers.zeros, name="bins")(x)
+        first = lambda *_: -2 * jnp.log1p((BINS / FIRST) ** 2)  # noqa: E731
+        return nn.Dense(BINS.size, kernel_init=nn.initializers.zeros, bias_init=first, name="bins")(x)
 
     def start(self, key: PRNGKeyArray, obs: Float[Array, " obs"], action: Float[Array, " action"]) -> Params:
         """Return a critic's random parameters, running statistics, and the unit of its bins in reward."""
         return with_unit_weights({**self.init(key, obs, action), "unit": jnp.ones(())})
 
-    def logits(self, critic: Params, obs: Array, action: Array) -> Float[Array, "... bins"]:
-        """Return logits by the running statistics."""
-        return jnp.asarray(self.apply(_variables(critic), obs, action))
+    def values(self, critic: Params, obs: Array, action: Array) -> Float[Array, "..."]:
+        """Return expected values by the running statistics, in reward."""
+        return jax.nn.softmax(jnp.asarray(self.apply(_variables(critic), obs, action))) @ BINS * critic["unit"]
+
+    def by_batch(self, critic: Params, obs: Float[Array, "n obs"], action: Array) -> tuple[Float[Array, "n bins"], Any]:
+        """Return logits by the statistics of these rows, and the new running statistics."""
+        logits, state = self.apply(_variables(critic), obs, action, train=True, mutable="batch_stats")
+        return jnp.asarray(logits), state["batch_stats"]
 
     def loss(
         self, critic: Params, obs: Float[Array, "n obs"], action: Array, target: Float[Array, "batch bins"]
@@ -58,18 +66,12 @@ class CategoricalCritic(nn.Module):
 
         The rows are a batch's steps, and after them its next steps where there are any.
         """
-        logits, state = self.apply(_variables(critic), obs, action, train=True, mutable="batch_stats")
-        logs = jax.nn.log_softmax(jnp.asarray(logits)[: len(target)])
-        return -jnp.sum(target * logs, -1).mean(), state["batch_stats"]
+        logits, statistics = self.by_batch(critic, obs, action)
+        return -jnp.sum(target * jax.nn.log_softmax(logits[: len(target)]), -1).mean(), statistics
 
 
 def _variables(critic: Params) -> Params:
     return {name: critic[name] for name in ("params", "batch_stats")}
-
-
-def values_of(critic: Params, logits: Float[Array, "... bins"]) -> Float[Array, "..."]:
-    """Return the expected values of distributions over the bins, in reward."""
-    return jax.nn.softmax(logits) @ BINS * critic["unit"]
 
 
 def next_unit(

@@ -198,7 +198,7 @@ class SoftActorCritic:
         """Return the values by each critic of actions in unit coordinates."""
         network = self._critic
         if isinstance(network, CategoricalCritic):
-            return jax.vmap(lambda critic: categorical.values_of(critic, network.logits(critic, obs, unit)))(critics)
+            return jax.vmap(network.values, (0, None, None))(critics, obs, unit)
         return jax.vmap(lambda critic: jnp.asarray(network.apply(critic, obs, unit))[..., 0])(critics)
 
     def update(
@@ -307,7 +307,8 @@ class SoftActorCritic:
     ) -> Callable[[Params], tuple[Array, dict[str, Any]]]:
         """Return the critics' cross-entropy as a function of them, with what else of them changes.
 
-        The target is the distribution of the next value by the critic that expects least.
+        The target is the distribution of the next value by the target critic that expects least, normalised as the
+        critics are: by one batch of steps and next steps.
         """
         network, obs, unit = self._critic, batch.obs, self.in_unit(batch.action)
         assert isinstance(network, CategoricalCritic)
@@ -316,13 +317,13 @@ class SoftActorCritic:
         if self.bootstraps:
             k_act, k_critics = jax.random.split(key)
             draws, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
-            logits = jax.vmap(network.logits, (0, None, None))(judges, batch.next_obs, draws.unit)
+            obs, unit = jnp.concatenate([obs, batch.next_obs]), jnp.concatenate([unit, draws.unit])
+            logits = jax.vmap(network.by_batch, (0, None, None))(judges, obs, unit)[0][:, len(batch.reward) :]
             least = (jax.nn.softmax(logits) @ categorical.BINS).argmin(0)
             weights = jax.nn.softmax(jnp.take_along_axis(logits, least[None, :, None], 0)[0])
             future = jnp.broadcast_to(categorical.BINS * judges["unit"][0], weights.shape)
             future = future - temperature * draws.log_density[:, None] * self.options.entropy_in_targets
             atoms = atoms + discount * batch.discount[:, None] * future
-            obs, unit = jnp.concatenate([obs, batch.next_obs]), jnp.concatenate([unit, draws.unit])
         target = categorical.project(atoms / size[0], weights)
         obs, unit, target = jax.lax.stop_gradient((obs, unit, target))
 

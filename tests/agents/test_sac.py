@@ -240,25 +240,35 @@ def test_the_unit_is_a_running_root_mean_square_of_rewards_by_their_horizon():
 
 @pytest.mark.parametrize("discount", [0.0, 0.9])
 def test_distributions_to_learn_are_those_counted_by_hand(discount):
-    """New critics predict every bin alike, so the bias of a bin falls by 1 / bins less the targets' mean there."""
+    """New critics predict the same everywhere; a bin's bias falls by the prediction less the targets' mean there."""
     agent, batch, temperature = BINNED.make("raw", SPACES, discount > 0), batch_of(), 0.3
     params, rest = agent.init(KEY)
     behind = discount, params["actor"], rest.target_critics, temperature, batch, KEY
     error = agent._binned_error(*behind, params["critics"], jnp.array(1))
     (loss, _), gradient = jax.value_and_grad(error, has_aux=True)(params["critics"])
-    assert float(loss) == pytest.approx(np.log(BINS.size), rel=1e-5)
-    result = 1 / BINS.size - 2 * np.asarray(
-        gradient["params"]["bins"]["bias"][0]
-    )  # the loss is the mean of two critics
+    weights = (1 + (BINS / 0.2) ** 2) ** -2
+    first = weights / weights.sum()
+    result = first - 2 * np.asarray(gradient["params"]["bins"]["bias"][0])  # the loss is the mean of two critics
     unit = float(next_unit(jnp.float32(1), batch.reward, discount, jnp.array(1)))
     drawn = agent.draw(params["actor"], batch.next_obs, jax.random.split(KEY)[0])
-    next_values = np.asarray(BINS)[None] * 1.0 - temperature * np.asarray(drawn.log_density)[:, None]
+    next_values = BINS - temperature * np.asarray(drawn.log_density)[:, None]
     values = np.asarray(batch.reward)[:, None] + discount * np.asarray(batch.discount)[:, None] * next_values
     expected = np.zeros(BINS.size)
-    for value in np.clip(values / unit, -5, 5).ravel():
-        closeness = np.clip(1 - np.abs((value + 5) / 0.1 - np.arange(BINS.size)), 0, 1)
-        expected += closeness / values.size
+    for value, weight in zip(np.clip(values / unit, -5, 5).ravel(), np.tile(first, len(values)), strict=True):
+        expected += weight / len(values) * np.clip(1 - np.abs((value + 5) / 0.1 - np.arange(BINS.size)), 0, 1)
     np.testing.assert_allclose(result, expected, atol=1e-4)
+    assert float(loss) == pytest.approx(-expected @ np.log(first), rel=1e-4)
+
+
+def test_targets_are_normalised_by_their_batch_alone():
+    agent, batch, one = BINNED.make("raw", SPACES, True), batch_of(), jnp.array(1)
+    params, rest = agent.init(KEY)
+    own, target = params["critics"], jax.tree.map(lambda leaf: leaf + 0.1, rest.target_critics)
+
+    def loss(critics):
+        return agent._binned_error(0.9, params["actor"], critics, 0.3, batch, KEY, own, one)(own)[0]
+
+    assert loss(target) == loss({**target, "batch_stats": own["batch_stats"]}) != loss(rest.target_critics)
 
 
 def test_an_update_keeps_weights_at_length_one_and_counts_the_batch():
