@@ -34,6 +34,7 @@ from cuelearner_jax.task import QUICKSTART
 from cuelearner_jax.tasks.presets import GROUPS, with_groups
 
 STOPPED = "stopped, with all work saved; the same command goes on"
+WORKS_FOR = "CUELEARNER_SUITE_WORKS_FOR"  # environment variable of a process of the suite: the process it works for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +84,8 @@ def run(arguments: list[str]) -> None:
         _run_in_processes(count, shard, arguments, options.out, os.environ | _compile_options(scale))
     else:
         _run_cells(own, options)
+    if WORKS_FOR in os.environ:
+        return
     done = sum(suite.is_done(options.out, cell) for cell in sensible)
     more = "" if done == len(sensible) else "; the same command goes on"
     out.print(f"{done} of {len(sensible)} cells are done{more}")
@@ -137,7 +140,8 @@ def _run_in_processes(count: int, shard: Shard, arguments: list[str], folder: Pa
     with ExitStack() as files, signals.interruptible("the work of all processes") as stopping:
         shards = [f"{shard.index + number * shard.count}/{shard.count * count}" for number in range(count)]
         writers = [files.enter_context(log.open("w", encoding="utf-8")) for log in logs]
-        start = partial(subprocess.Popen[bytes], stderr=subprocess.STDOUT, start_new_session=True, env=variables)
+        environ = variables | {WORKS_FOR: str(os.getpid())}
+        start = partial(subprocess.Popen[bytes], stderr=subprocess.STDOUT, start_new_session=True, env=environ)
         workers = [start([*command, one], stdout=file) for one, file in zip(shards, writers, strict=True)]
         out.print(f"{count} processes run the cells: {logs[0]} ...")
         while not stopping.is_set() and any(worker.poll() is None for worker in workers):
@@ -191,9 +195,12 @@ def _claim(folder: Path, text: str) -> None:
 
 @contextmanager
 def _deadline(minutes: float) -> Iterator[Any]:
-    """Yield whether the time is over; work in progress that can be saved is then asked to end."""
+    """Yield whether the time or the process that this one works for has ended; work is then asked to end, saved."""
     end, closed = time.monotonic() + 60 * minutes, threading.Event()
-    is_over = lambda: time.monotonic() > end  # noqa: E731
+
+    def is_over() -> bool:
+        parent = str(os.getppid())
+        return time.monotonic() > end or os.environ.get(WORKS_FOR, parent) != parent
 
     def watch() -> None:
         while not closed.wait(0.5):

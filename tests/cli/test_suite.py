@@ -89,6 +89,13 @@ def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys, monkeyp
     assert "holds a suite of another scale or table" in capsys.readouterr().err
 
 
+def test_a_process_ends_with_the_one_that_it_works_for(monkeypatch):
+    with command._deadline(60.0) as is_over:
+        for parent, ended in ((os.getppid(), False), (0, True)):
+            monkeypatch.setenv(command.WORKS_FOR, str(parent))
+            assert is_over() == ended
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
