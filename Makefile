@@ -74,7 +74,7 @@ test-quick: $(VENV)/.tested
 	$(PYTEST) -m "not slow and not long"
 
 test-foreign: $(VENV)/.foreign
-	$(PYTEST) tests/foreign
+	$(PYTEST) tests/foreign tests/examples/test_notebook.py
 
 PYTHON312 ?= python3.12
 LEROBOT := .venv-lerobot

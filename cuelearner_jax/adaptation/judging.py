@@ -74,13 +74,8 @@ class Judgement(NamedTuple):
     rewarded_steps: np.ndarray  # (lanes,) int: environment steps whose rewards or outcomes decided; 0 by labels
 
 
-def metrics_of(env: Environment) -> tuple[str, ...]:
-    """Return the names of the metrics that a roll-out measures in an environment."""
-    step = _step_of(env)
-    return ("reward", *step.metrics, *step.outcome)
-
-
-def _step_of(env: Any) -> Any:
+def step_of(env: Any) -> Any:
+    """Return the shapes of an environment's step, whose metrics and outcome a roll-out measures."""
     key = jax.random.key(0)
     state, _ = jax.eval_shape(env.reset, key)
     return jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))[1]
@@ -190,7 +185,7 @@ class Judge:
         assert how.env is not None  # a metric needs episodes
         mesh = None if policy is self.of.bases or self.mesh.size == 1 else self.mesh
         rolled = rollout_lanes(how.env, policy, key, num_envs, num_envs * how.steps, self.watch(what), mesh)
-        is_of_first = plays_once(how.env) or how.by in _step_of(how.env).outcome
+        is_of_first = plays_once(how.env) or how.by in step_of(how.env).outcome
         first = rolled.episode_steps.sum(-1)
         return rolled, first if is_of_first else np.full(len(first), num_envs * how.steps)
 

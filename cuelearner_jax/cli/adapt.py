@@ -6,7 +6,6 @@ import shlex
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.adaptation.judging import PERSON
@@ -53,7 +52,8 @@ def run(arguments: list[str]) -> None:
         # otherwise the changes stand for the folder's code
         if options.changes is not None and (guidances.resolve(options.guidance).by_evidence or source.adapted is None):
             subject = subject._replace(changes=changes.load(options.changes), changes_reference=options.changes)
-        with _person(options.judge_by) as prefer:
+        announce = lambda address: out.print(f"open {address}", soft_wrap=True)  # noqa: E731
+        with page_module("films").film_page(announce) if options.judge_by == PERSON else nullcontext() as prefer:
             outcome = options.run(subject._replace(prefer=prefer), watched_by(bars))
         outcome.write(place)
     for line in outcome.result.words:
@@ -62,13 +62,6 @@ def run(arguments: list[str]) -> None:
     out.print(f"wrote {options.out} (measure it with: {shlex.join(measure)})", soft_wrap=True)
     if outcome.result.failed.any():
         raise NotFinite("a fit is no longer finite, so its model is not used: lower --scalars.feedback-learning-rate")
-
-
-def _person(judge_by: str) -> Any:
-    """Return a context with the function by which a person judges, on a page; None where none does."""
-    if judge_by != PERSON:
-        return nullcontext()
-    return page_module("films").film_page(lambda address: out.print(f"open {address}", soft_wrap=True))
 
 
 def _named_again(options: Adapt, task: Task, code: str | None) -> list[str]:

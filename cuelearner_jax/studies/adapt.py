@@ -243,7 +243,8 @@ class AdaptRequest:
             raise UserError(f"judge_bounds is {text}: give shares of the bound above 0 and below 1")
         if shares and by in (LABELS, PERSON):
             raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
-        names = [*judging.metrics_of(subject.env), LABELS, PERSON]
+        step = judging.step_of(subject.env)
+        names = ["reward", *step.metrics, *step.outcome, LABELS, PERSON]
         if by not in names:
             raise UserError(f"judge_by is {by!r}, which is not a metric of {task.name}{suggestion(by, names)}")
         if by != LABELS:
