@@ -6,7 +6,7 @@ learning", ICML 2017. One batch for steps and next steps, also in the target: Bh
 
 Bins are in units of rms(reward) / (1 - discount) / `ROOM`, so that no option depends on the scale of rewards. XQC
 divides rewards by a running deviation of returns instead, which a minibatch of steps does not show. The first
-distribution is narrow: from equal logits, which mean all values alike, the pendulum takes half as long again.
+distribution is narrow: from equal logits, which hold all values alike, agents learn the pendulum later.
 """
 
 from __future__ import annotations

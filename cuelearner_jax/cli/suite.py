@@ -195,7 +195,7 @@ def _claim(folder: Path, text: str) -> None:
 
 @contextmanager
 def _deadline(minutes: float) -> Iterator[Any]:
-    """Yield whether the time or the process that this one works for has ended; work is then asked to end, saved."""
+    """Yield whether the time or the process that this one works for is over; work is then asked to end and be saved."""
     end, closed = time.monotonic() + 60 * minutes, threading.Event()
 
     def is_over() -> bool:

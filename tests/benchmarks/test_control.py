@@ -55,7 +55,7 @@ REDQ = {"critics": 4, "layer_norm": True, "updates_per_step": 4, "batch_size": 6
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("changes", "steps"), [({}, 5_000), (REDQ, 3_000)], ids=["two critics", "four, normalised"])
+@pytest.mark.parametrize(("changes", "steps"), [({}, 5_000), (REDQ, 3_000), ({"bins": True}, 5_000)])
 def test_soft_actor_critic_swings_it_up(changes, steps):
     """A random policy earns about -1,200 an episode, one that holds the pole up about -150."""
     schedule = Schedule(random_steps=500, learn_after=500, guidance_until=0)

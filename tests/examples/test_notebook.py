@@ -1,5 +1,6 @@
 """The notebooks, executed as a reader does, with less of everything."""
 
+import re
 from pathlib import Path
 
 import nbclient
@@ -25,7 +26,7 @@ FILES = "'contract.json', 'decide.py', 'decision.npz', 'golden.npz'"
             "sb3_fetch_push",
             ("torch", "stable_baselines3", "gymnasium_robotics"),
             FETCH_PUSH,
-            ["200 situations", "the camera displaced: ", "rewarded steps: 0", "success after 20 answers: "],
+            ["200 situations", "success with .* displaced: [01]", "rewarded steps: 0", "success after 20 answers: "],
         ),
     ],
 )
@@ -39,4 +40,4 @@ def test_a_notebook_runs_from_top_to_bottom(tmp_path, name, needs, less, words):
     cells[0].source = less
     nbclient.NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute()
     told = "".join(output.get("text", "") for cell in cells for output in cell.outputs)
-    assert all(word in told for word in words)
+    assert all(re.search(word, told) for word in words)
