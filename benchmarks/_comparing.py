@@ -54,7 +54,7 @@ def evaluation(env: Any, functions: Any) -> Callable[[Any], jax.Array]:
 
 def train_here(name: str, config: RunConfig, options: argparse.Namespace, tell: Tell) -> None:
     """Train with this package's loop, that of `cuelearner sweep`, all seeds side by side."""
-    env: Any = TASKS[name] if name in TASKS else cl.from_gymnasium(name, processes=1).env
+    env: Any = TASKS[name] if name in TASKS else cl.from_gymnasium(name, processes=options.processes).env
     lanes, returned = Timed(config, env, "none", options.seeds), evaluation(env, config.agent_in(env))
     every = options.steps // options.evaluations
     for number in range(options.evaluations):
@@ -116,6 +116,7 @@ def parser_of(about: str | None, environments: list[str], ways: list[str], seeds
     parser.add_argument("--seeds", type=int, default=seeds)
     parser.add_argument("--at-once", type=int, default=1, help="seeds of a peer that run side by side (default: 1)")
     parser.add_argument("--steps", type=int, default=500_000, help="of each training (default: 500,000)")
+    parser.add_argument("--processes", type=int, default=1, help="that play our environments (default: 1)")
     parser.add_argument("--evaluations", type=int, default=5, help="of each training (default: 5)")
     parser.add_argument("--out", type=Path, help="JSON file to write, or to go on with")
     parser.add_argument("--table", type=Path, nargs="+", help="print the table of these files, and measure nothing")
