@@ -21,7 +21,7 @@ from cuelearner_jax.runs.grid import Grid, check_grid, describe, with_control
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import label_files, tracking
 from cuelearner_jax.storage.folders import CONFIG, check_folder
-from cuelearner_jax.storage.results import setting_name
+from cuelearner_jax.storage.results import SETTINGS, setting_name
 from cuelearner_jax.task import Task, shape_of
 
 RequestT = TypeVar("RequestT", bound="TrainRequest")
@@ -88,6 +88,8 @@ def in_folders(orders: Sequence[Order]) -> list[Order]:
     if (out := orders[0].out / CONFIG).exists():
         raise UserError(f"{out.parent} holds a run of one setting: give another --out")
     folders = [order.out / setting_name(dict(order.setting)) for order in orders]
+    if orders[0].overwrite and (others := sorted({*orders[0].out.glob(SETTINGS)} - {*folders})):
+        raise UserError(f"{others[0]} is of another grid, and --overwrite keeps it: delete it, or give another --out")
     begun = [(folder / CONFIG).is_file() for folder in folders]
     none = not any(begun) and orders[0].shard is None  # then each order says so; a shard resumes by itself
     each = zip(orders, folders, begun, strict=True)

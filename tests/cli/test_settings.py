@@ -83,4 +83,6 @@ def test_impossible_grids_are_refused_before_anything_is_trained(grid, refused, 
     refused([*GRID, *out, "--resume"], "nothing to resume in", tmp_path)
     refused([*GRID, "--out", grid / "grid"], "is not empty: give --resume to go on", grid)
     refused([*GRID, "--out", grid / TWO], "holds a run of one setting: give another --out", grid)
+    refused([*GRID[:-1], "--out", grid / "grid", "--overwrite"], "is not a run folder", grid)
+    refused([*GRID[:-1], "3", "--out", grid / "grid", "--overwrite"], f"{FIVE} is of another grid", grid)
     refused([*SWEEP, "--out", grid / "grid"], "is not empty", grid)
