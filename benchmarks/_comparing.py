@@ -25,6 +25,7 @@ from _measuring import Timed
 from classic_control import TASKS
 
 import cuelearner_jax as cl
+from cuelearner_jax.bridges.brax import from_brax
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.provenance import provenance
 
@@ -52,13 +53,24 @@ def evaluation(env: Any, functions: Any) -> Callable[[Any], jax.Array]:
     return jax.jit(lambda params: jax.lax.map(one, params, batch_size=16))
 
 
+def environment(name: str, processes: int) -> Any:
+    """Return a task of `classic_control.py`, MuJoCo Playground (`playground:NAME`) or Gymnasium."""
+    if name in TASKS:
+        return TASKS[name]
+    if not name.startswith("playground:"):
+        return cl.from_gymnasium(name, processes=processes).env
+    from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
+
+    return from_brax(registry.load(name.removeprefix("playground:"), config_overrides={"impl": "jax"}))
+
+
 def train_here(name: str, config: RunConfig, options: argparse.Namespace, tell: Tell) -> None:
     """Train with this package's loop, that of `cuelearner sweep`, all seeds side by side."""
-    env: Any = TASKS[name] if name in TASKS else cl.from_gymnasium(name, processes=options.processes).env
+    env = environment(name, options.processes)
     lanes, returned = Timed(config, env, "none", options.seeds), evaluation(env, config.agent_in(env))
     every = options.steps // options.evaluations
     for number in range(options.evaluations):
-        seconds = lanes.train(every)
+        seconds = lanes.train(every // config.sizes.num_envs)
         earned = np.concatenate([np.asarray(returned(block.agent.params)) for block in lanes.blocks])
         tell({"step": (number + 1) * every, "returns": earned[: options.seeds].tolist(), "seconds": seconds})
 
@@ -104,7 +116,7 @@ def show(rows: list[dict[str, Any]], base: str) -> None:
             stretch = row["rows"][0]["step"] * sum(len(r["returns"]) for r in later)
             rate = stretch / sum(r["seconds"] for r in later) * row["at_once"] if later else np.nan
             spread = f"{np.mean(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
-            print(f"{name:<15}{row['way']:<10}{step:>9,}   {spread:<32}{over:>10}   {rate:>16,.0f}")
+            print(f"{name:<14} {row['way']:<10}{step:>9,}   {spread:<32}{over:>10}   {rate:>16,.0f}")
 
 
 def parser_of(about: str | None, environments: list[str], ways: list[str], seeds: int) -> argparse.ArgumentParser:

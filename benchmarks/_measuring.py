@@ -91,7 +91,7 @@ def measure(env: Callable[[], Environment], config: RunConfig, seeds: int, secon
     iterations = max(1, STEPS_A_STRETCH[jax.default_backend()] // config.sizes.num_envs)
     group.train(iterations)
     first = time.perf_counter() - began
-    at_rest = sum(state_bytes(block) for block in group.blocks) / sum(block.key.shape[0] for block in group.blocks)
+    at_rest = sum(leaf.nbytes for leaf in jax.tree.leaves(group.blocks)) / sum(len(block.key) for block in group.blocks)
     stretches = []
     while len(stretches) < FEWEST_STRETCHES or sum(stretches) < seconds:
         stretches.append(group.train(iterations))
@@ -115,11 +115,6 @@ def measure(env: Callable[[], Environment], config: RunConfig, seeds: int, secon
         "matmul_gflops": peak / 1e9,
         "share_of_matmul": flops / peak,
     }
-
-
-def state_bytes(tree: Any) -> int:
-    """Return the memory of a tree of arrays or shapes [bytes]."""
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def matmul_rate() -> float:

@@ -7,7 +7,7 @@
 Ways: `sac` and `xqc` (the same with `--agent.bins`) here; sbx's `SAC` and `CrossQ`; the SAC of `rejax`, for tasks that
 gymnax has. SAC has the same networks, minibatches, updates a step, rates, discount, target entropy and random steps
 here and there, but rejax takes its first steps by its policy; CrossQ has its own defaults. `Pendulum-v1` is that of
-`classic_control.py`, step for step Gymnasium's.
+`classic_control.py`, step for step Gymnasium's. `playground:NAME` is a task of MuJoCo Playground, for ways from here.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ def main() -> None:
     """Measure, print and write."""
     parser = parser_of(__doc__, ["Pendulum-v1"], ["sac", "xqc", "SAC", "CrossQ", "rejax"], seeds=5)
     parser.add_argument("--prefill", type=int, default=5_000, help="random steps before the first update")
+    parser.add_argument("--envs", type=int, default=1, help="environments a seed here, with as many updates a step")
     options = parser.parse_args()
-    setting = {**SETTING, "prefill": options.prefill}
+    setting = {**SETTING, "prefill": options.prefill, "envs": options.envs}
     schedule = Schedule(random_steps=options.prefill, learn_after=options.prefill, guidance_until=0)
     scalars = Scalars(discount=SETTING["discount"], max_grad_norm=1e9)  # the peers do not clip
 
@@ -45,7 +46,7 @@ def main() -> None:
             critic_rate=SETTING["rate"],
             temperature_rate=SETTING["rate"],
         )
-        return RunConfig(None, Sizes(num_envs=1), scalars, schedule, agent)
+        return RunConfig(None, Sizes(num_envs=options.envs), scalars, schedule, agent)
 
     elsewhere: dict[str, dict[str, Any]] = {"SAC": {}, "CrossQ": {}, "rejax": {"together": True}}
     compare(options, setting, {"sac": config(False), "xqc": config(True)}, elsewhere, base="SAC")

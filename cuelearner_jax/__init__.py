@@ -24,22 +24,29 @@ from typing import TYPE_CHECKING, Any
 # Of SciPy's BLAS, by which JAX factorizes matrices on a CPU: its threads wait for each other longer than they compute.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-if TYPE_CHECKING:
-    from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt, agreement, correct
-    from cuelearner_jax.api.labels import Labels
-    from cuelearner_jax.api.policies import (
-        CallablePolicy,
-        export_correction,
-        export_policy,
-        load_exported,
-        load_policy,
-        measure,
-    )
-    from cuelearner_jax.api.training import Run, read_run, train
-    from cuelearner_jax.api.worlds import World, from_gymnasium, make, teacher_of
-    from cuelearner_jax.errors import UserError
-    from cuelearner_jax.reading import Distortion, Unknown
-    from cuelearner_jax.spaces import UNSAID
+if TYPE_CHECKING:  # each by its own name, which tells type checkers that it is public
+    from cuelearner_jax.api.adaptation import AdaptedPolicy as AdaptedPolicy
+    from cuelearner_jax.api.adaptation import adapt as adapt
+    from cuelearner_jax.api.adaptation import agreement as agreement
+    from cuelearner_jax.api.adaptation import correct as correct
+    from cuelearner_jax.api.labels import Labels as Labels
+    from cuelearner_jax.api.policies import CallablePolicy as CallablePolicy
+    from cuelearner_jax.api.policies import export_correction as export_correction
+    from cuelearner_jax.api.policies import export_policy as export_policy
+    from cuelearner_jax.api.policies import load_exported as load_exported
+    from cuelearner_jax.api.policies import load_policy as load_policy
+    from cuelearner_jax.api.policies import measure as measure
+    from cuelearner_jax.api.training import Run as Run
+    from cuelearner_jax.api.training import read_run as read_run
+    from cuelearner_jax.api.training import train as train
+    from cuelearner_jax.api.worlds import World as World
+    from cuelearner_jax.api.worlds import from_gymnasium as from_gymnasium
+    from cuelearner_jax.api.worlds import make as make
+    from cuelearner_jax.api.worlds import teacher_of as teacher_of
+    from cuelearner_jax.errors import UserError as UserError
+    from cuelearner_jax.reading import Distortion as Distortion
+    from cuelearner_jax.reading import Unknown as Unknown
+    from cuelearner_jax.spaces import UNSAID as UNSAID
 
 __version__ = "1.0.0"
 
@@ -57,30 +64,7 @@ _NAMES = {
 }
 _PLACES = {name: module for module, names in _NAMES.items() for name in names}
 
-__all__ = [
-    "UNSAID",
-    "AdaptedPolicy",
-    "CallablePolicy",
-    "Distortion",
-    "Labels",
-    "Run",
-    "Unknown",
-    "UserError",
-    "World",
-    "adapt",
-    "agreement",
-    "correct",
-    "export_correction",
-    "export_policy",
-    "from_gymnasium",
-    "load_exported",
-    "load_policy",
-    "make",
-    "measure",
-    "read_run",
-    "teacher_of",
-    "train",
-]
+__all__ = [*_PLACES]  # noqa: PLE0604  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

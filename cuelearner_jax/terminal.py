@@ -63,7 +63,7 @@ def progress_bars(visible: bool = True) -> Iterator[Progress]:
 
 
 class TimedProgress(Progress):
-    """Progress with the time left of each piece of work, from its first measured stretch on.
+    """Progress with the time left of each piece of work, from its second stretch on.
 
     Fields of a piece: `begun`, where it went on, and `ahead`, how many times as much work comes after it.
     """
@@ -72,15 +72,16 @@ class TimedProgress(Progress):
         """Set the progress of a piece of work, and estimate the time left (the field `left`)."""
         super().update(task_id, **options)
         task = self._tasks.get(task_id)
-        if task is None or not task.total or task.completed <= (begun := task.fields.get("begun", 0)):
+        if task is None or not task.total or task.completed <= task.fields.get("begun", 0):
             return
         now = (task.elapsed or 0.0, task.completed)
-        first = task.fields.setdefault("first", now)  # stretch, which compiles: without it the rest is faster
-        word, since = ("about", first) if now[1] > first[1] else ("at most", (0.0, begun))
-        pace, ahead = (now[0] - since[0]) / (now[1] - since[1]), task.fields.get("ahead", 0) * task.total
+        first = task.fields.setdefault("first", now)  # stretch, which compiles and so tells nothing of the rest
+        if now[1] == first[1]:
+            return
+        pace, ahead = (now[0] - first[0]) / (now[1] - first[1]), task.fields.get("ahead", 0) * task.total
         left = [duration(pace * steps) for steps in (task.total - task.completed, task.total - task.completed + ahead)]
         more = f", {left[1]} with the kinds to come" if ahead else ""
-        task.fields["left"] = f"{word} {left[0]} left{more}" if more or not task.finished else ""
+        task.fields["left"] = f"about {left[0]} left{more}" if more or not task.finished else ""
 
 
 class _TimeLeft(ProgressColumn):

@@ -5,7 +5,7 @@
 A camera above a table sees a block; the arm's policy proposes where to put its fingers, and how far to open them. The
 camera was moved, so everything is proposed a little too far to the right. The folder gets recorded situations, which
 `cuelearner label runs/arm/situations --cues "left,right;up,down;open,close"` would show to a person. Here a function
-answers in a person's place, in three rounds: about what is proposed by then, moved at random. A minute on 2 cores.
+answers in a person's place, in three rounds: about what is proposed by then, moved at random. Some minutes on 2 cores.
 """
 
 import sys
@@ -81,6 +81,7 @@ def main(folder="runs/arm", situations=200, rounds=(0.2, 0.08, 0.04)):
     for asked, reach in zip(np.array_split(obs, len(rounds)), rounds, strict=True):
         parts = zip(labels, answered(better, asked, reach, random), strict=True)
         labels = cl.Labels(*map(np.concatenate, parts))
+        print(f"a reading of {len(labels.obs)} answers ...")
         better = cl.correct(arm, labels, cues=CUES, low=LOW, high=HIGH, eps=EPS, bound=0.25)
     others = blocks(500, random)
     print(*cl.agreement(better, answered(arm, others[:100], 0.2, random)).words(), sep="\n")

@@ -33,7 +33,7 @@ from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.reading import Distortion, Reading, Walk, declared_distortions
 from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
-from cuelearner_jax.report.statistics import RESAMPLES
+from cuelearner_jax.report.statistics import resampled
 from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.storage.provenance import provenance
@@ -197,18 +197,11 @@ def main() -> None:
 
 def mean_worth(rows: list[dict[str, Any]]) -> str:
     """Return the mean worth with its 95% bootstrap interval over bases and their label seeds, and the least worth."""
-    groups = [
-        [row["worth"] for row in rows if row["base"] == base] for base in dict.fromkeys(row["base"] for row in rows)
-    ]
-    values = np.full((len(groups), max(map(len, groups))), np.nan)  # NaN: not played
-    for own, group in zip(values, groups, strict=True):
-        own[: len(group)] = group
-    random, (bases, members) = np.random.default_rng(0), values.shape
-    base = random.integers(0, bases, (RESAMPLES, bases, 1))
-    means = np.nanmean(values[base, random.integers(0, members, (RESAMPLES, bases, members))], (1, 2))
-    low, high = np.quantile(means, (0.025, 0.975))
-    shown = f"{np.nanmean(values):.3f}" + (f" [{low:.3f}, {high:.3f}]" if values.size > 1 else "")
-    return f"{shown} (least {np.nanmin(values):.3f})"
+    bases = dict.fromkeys(row["base"] for row in rows)
+    values = np.array([[row["worth"] for row in rows if row["base"] == base] for base in bases])
+    low, high = np.quantile(resampled(values, mean=np.mean), (0.025, 0.975))
+    shown = f"{values.mean():.3f}" + (f" [{low:.3f}, {high:.3f}]" if values.size > 1 else "")
+    return f"{shown} (least {values.min():.3f})"
 
 
 def table(rows: list[dict[str, Any]]) -> None:

@@ -99,11 +99,6 @@ class Even(WholeObservations, struct.PyTreeNode):
         return study.to_even(self.world.robot, zoo.right(self.world, state))
 
 
-def unit_of(space: Space) -> float:
-    """Return half of a cue's range in the unit of settings: shares, or degrees for directions."""
-    return 90.0 if len(space.cues) == 1 else 0.5
-
-
 def learn(
     guidance: Guide, world: Any, key: PRNGKeyArray, wrong: Array, scalars: Scalars, bound: Array, labels: int
 ) -> Any:
@@ -141,7 +136,7 @@ def measure(
     env = Even.of(zoo.unchanged(jax.tree.map(lambda leaf: leaf[0], robots)), jax.random.key(0))
     of = KINDS[kind]
     guidance = of(SIZES, spaces_of(env))
-    unit = unit_of(space)
+    unit = 90.0 if len(space.cues) == 1 else 0.5  # half of a cue's range: degrees of directions, else shares
     eps = strength * unit
     scalars = replace(
         plain_scalars(space), eps_deg=eps, tau_deg=eps / 20, tau_max_deg=most * unit, feedback_learning_rate=rate,

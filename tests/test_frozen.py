@@ -23,6 +23,7 @@ from frozen_worlds import straight
 import cuelearner_jax as cl
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.errors import UserError
 
 ENTRY = str(Path(sys.executable).with_name("cuelearner"))
 STORED = Path(__file__).with_name("frozen.json")
@@ -178,5 +179,7 @@ def test_python_corrects_by_a_label_file_as_the_command_does(tmp_path, kind):
     better = cl.correct(straight, file, guidance=kind)
     typed = cl.load_policy(tmp_path / "command", base=straight)
     np.testing.assert_array_equal(typed(SEEN), better(SEEN))
+    with pytest.raises(UserError, match="corrects frozen_worlds:straight, but the base given acts otherwise"):
+        cl.load_policy(tmp_path / "command", base=lambda obs: obs[:, ::-1])
     # Adam amplifies the rounding of what the evidence does not decide: by 4% between processors
     check(f"corrected {kind}", [*better.judged[1:], *sums([better(SEEN)])], 0.05 if kind == "reading" else 1e-4)

@@ -35,7 +35,7 @@ COMMANDS = {  # each a file beside this one with `run(arguments)`
     "report": "Write curves and tables with intervals from recorded results.",
     "render": "Draw a still and a film of a policy at work, or the picture of a question.",
     "label": "Label actions in a browser: uniform ones, a policy's, or recorded ones.",
-    "labels": "Inspect, merge or export label files.",
+    "labels": "Inspect or merge label files.",
     "export": "Write a policy as a file for a robot, with a contract; --check FOLDER replays one.",
 }
 

@@ -25,6 +25,8 @@ from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
 from cuelearner_jax.tasks import shipped
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
+SHARES = "of what all episodes share, 0 or 1: Jeffreys' interval"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Finished, EvaluateRequest):
@@ -155,7 +157,7 @@ def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
         "episodes": f"one policy: mean and bootstrap over {episodes}",
         "seeds": f"several seeds: interquartile mean and bootstrap over seeds and {episodes}",
     }
-    caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, rows))
+    caption = "; ".join([*(words for kind, words in over.items() if kind in map(measurements.over, rows)), SHARES])
     table = Table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
     for number, row in enumerate(rows):
         own = [cells[number] for cells in columns.values()]
@@ -175,11 +177,11 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
     over = f"{episodes}, paired" if difference.over == "episodes" else f"seeds and {episodes} (interquartile means)"
     names = zip((title, other), map(measurements.variant, both), strict=True)
     heading = " against ".join(f"{name} ({variant})" if variant and name != "base" else name for name, variant in names)
-    caption = f"mean [95% bootstrap interval]; of the difference over {over}"
+    caption = f"mean [95% bootstrap interval]; {SHARES}; of the difference over {over}"
     table = Table("metric", "policy", "against", "difference", title=heading, caption=caption)
     for name, less in difference.metrics.items():
         own = (str(measurements.spread(row, name)) for row in both)
-        table.add_row(name, *own, f"{less.estimate:+.3f} [{less.lower:+.3f}, {less.upper:+.3f}]")
+        table.add_row(name, *own, f"{less:+}")
     return table
 
 

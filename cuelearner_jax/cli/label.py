@@ -64,8 +64,7 @@ class LabelOptions(NewWorld):
     out: Path = Path("labels/NAME")
     """Folder for the labels. A folder with labels of this session is continued."""
     labels: int = 500
-    """Number of answers to collect; to continue later, give more (default without a policy: the preset's largest
-    budget)."""
+    """Number of answers to collect; to continue later, give more (about a policy: as many as `adapt` asks for)."""
     guidance: str = ""
     """Kind of guidance that is fitted while you label; it determines the form of the answers."""
     who: str = "anonymous"

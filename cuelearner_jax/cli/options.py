@@ -46,7 +46,7 @@ class _Output(Console):
         width = self.measure(table, options=self.options.update(max_width=10_000)).maximum
         if not self.is_terminal or width > self.width:
             table.box = None
-        self.print(table, width=max(width, 80))
+        _Output(file=self.file, width=max(width, self.width), **PLAIN).print(table)
         if below:
             self.print(below)
 

@@ -172,6 +172,8 @@ class Session:
             pairs = enumerate(zip(situations, rows, strict=False))
             self._items = {n: Item(n, at, row.action) for n, (at, row) in pairs}
         self.number = min((number for number in self._items if rows[number].said == UNDONE), default=count)
+        if count:
+            tell("fitting the model to their answers")
         self._learner.fit(self.record.labels())
         self._items[count] = questions.ask(count, situations[-1])
 

@@ -32,14 +32,18 @@ class Interval(NamedTuple):
         return bool(self.lower > 0 or self.upper < 0)
 
     def __str__(self) -> str:
-        """Format the interval of a single number for tables, with digits enough to show its width."""
+        """Format the interval of a single number for tables."""
+        return format(self, "")
+
+    def __format__(self, sign: str) -> str:
+        """Format it with digits enough to show its width; `sign`: "+" gives positive numbers theirs."""
         if np.isnan(self.lower):
-            return f"{self.estimate:z.3f}"
+            return f"{self.estimate:{sign}z.3f}"
         for digits in (3, 4, 5, 6):
-            estimate, lower, upper = (f"{value:z.{digits}f}" for value in self)
+            estimate, lower, upper = (f"{value:{sign}z.{digits}f}" for value in self)
             if lower != upper:
                 return f"{estimate} [{lower}, {upper}]"
-        return f"{self.estimate:z.3f} [no spread]"
+        return f"{self.estimate:{sign}z.3f} [no spread]"
 
 
 class Curve(NamedTuple):

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -144,5 +145,5 @@ def _summary_cells(row: Row) -> list[object]:
         apart = [stretch.split("-") for stretch in str(row[column]).split("; ") if stretch]
         spans = [f"{int(start):,} to {int(end):,}" if start != end else f"{int(start):,}" for start, end in apart]
         cells.append("; ".join(spans))
-    better = [f"{row[name]:.2f}" for name in IMPROVES if row[name] != ""]
-    return [*cells, f"{better[0]} [{', '.join(better[1:])}]" if better[1:] else "".join(better)]
+    better: list[Any] = [np.nan if row[name] == "" else row[name] for name in IMPROVES]
+    return [*cells, "" if np.isnan(better[0]) else str(Interval(*better))]

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import serialization
-from cuelearner_jax.adaptation.by_model import AdaptationResult
+from cuelearner_jax.adaptation.by_model import AdaptationResult, reach
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
@@ -29,6 +30,7 @@ from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.types import Label
 
 COLUMNS = ("base", "seeds", "labels", "bounds_deg", "used")  # that describe the lanes
+GOLDEN, SAME = 8, 1e-3  # observations whose actions by code a folder keeps, and how near they must come, as a share
 CONVENTIONS = {
     "action": "the base policy's, refined by the model until a pass moves it by less than tau, within the bound; or, "
     "read, of the observation as it was before the changes, led back to what it meant",
@@ -76,6 +78,10 @@ class AdaptedLanes:
         if digest(arrays) != self.values.get("arrays"):
             raise UserError(f"{place} holds the arrays of another policy: {remedy}")
         policy = serialization.with_arrays(policy, arrays)
+        golden, space = self.values.get("base_acts"), actions_of(env)
+        if golden and reach(space, policy.base, **golden) > SAME * space.reach:
+            *_, code = layers(self.values["policy"])
+            raise UserError(f"{self.folder} corrects {code['named']}, but the base given acts otherwise: give that one")
         return policy.replace(base=Common(policy.base) if self.rows is None else policy.base.lane(self.lanes.base))
 
 
@@ -111,6 +117,10 @@ def write(
     lanes, judgement, env = result.lanes, result.judgement, shape_of(task, world)
     block = replace(result.policy(env), base=result.of.bases)
     values, arrays = serialization.to_json(block, origin.get("code")), serialization.arrays_of(block)
+    golden, (*_, last) = {}, layers(values)
+    if last["policy"] == "code" and lanes_in(result.of.bases) is None:  # not in the folder, but told from other code
+        obs = jnp.asarray(result.labels.obs[0, :GOLDEN])
+        golden = {"base_acts": {"obs": obs.tolist(), "action": block.base.act(jax.random.key(0), None, obs).tolist()}}
     contents = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
         **({"files": files} if (files := task.files(world)) else {}),
@@ -135,6 +145,7 @@ def write(
         },
         **({"reading": [one.to_json() for one in result.results]} if result.results else {}),
         **{name: value for name, value in more.items() if value},
+        **golden,
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,
         **provenance(),

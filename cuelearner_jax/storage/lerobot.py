@@ -33,11 +33,6 @@ OBSERVATION, ACTION, INTERVENTION = "observation", "action", "intervention"
 Frames = Callable[[int], Picture]  # row -> its picture
 
 
-def is_dataset(path: Path) -> bool:
-    """Whether a folder is a LeRobot dataset."""
-    return (path / INFO).is_file()
-
-
 def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str, ...], Frames | None]:
     """Read a dataset's rows, in the order of its files; pictures are read on demand.
 

@@ -80,7 +80,7 @@ def _read_at(path: Path, where: Path, when: tuple[int, ...]) -> Situations:
 
 def read(path: Path) -> Situations:
     """Read a folder of situations, its table alone, or a LeRobot dataset folder."""
-    if lerobot.is_dataset(path):
+    if (path / lerobot.INFO).is_file():
         observations, actions, names, entries, picture = lerobot.read(path)
         situations = _situations_of(path, observations, actions, names, entries)
         return situations._replace(picture=picture) if picture else situations

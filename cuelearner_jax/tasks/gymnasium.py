@@ -123,8 +123,8 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
 
 def _refuse(name: str, **arguments: Any) -> Any:
     raise UserError(
-        f"environment {name} is code, which is not imported because a file names it: name it again, as {FAMILY}:{name} "
-        "in place of the task, or by cl.from_gymnasium"
+        f"environment {name} is code, which is not imported because a file names it: name it again, by --env "
+        f"{FAMILY}:{name} or cl.from_gymnasium"
     )
 
 

@@ -53,6 +53,8 @@ def find(name: str) -> Task:
     if name in _registered:
         return _registered[name]
     if (entry := _installed().get(name)) is None:
+        if "/" in name:
+            raise UserError(f"folder {name} does not exist: give a folder that does, or a task by its name")
         raise UserError(f"unknown task {name!r}{suggestion(name, names())} (your own: package.module:NAME)")
     return dataclasses.replace(_loaded(entry.value), name=name)
 

@@ -48,10 +48,7 @@ def test_a_run_is_opened_without_its_environment_and_played_where_its_code_is_na
     assert (described["name"], described["environment"]) == ("gymnasium", "gymnasium_worlds:reach")
     policy = cl.load_policy(run)  # nothing is imported for it
     assert policy(np.zeros(6)).shape == (3,)
-    says = (
-        "environment gymnasium_worlds:reach is code, which is not imported because a file names it: name it again, as"
-    )
-    refused(["evaluate", run, "--episodes", "4"], says, run)
+    refused(["evaluate", run, "--episodes", "4"], f"a file names it: name it again, by --env {REACH} or", run)
     assert main(["evaluate", str(run), "--env", REACH, "--episodes", "4", "--task.processes", "1"]) == 0
     assert "success" in capsys.readouterr().out
 

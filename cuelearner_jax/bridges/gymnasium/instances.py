@@ -54,16 +54,18 @@ class Leaf(NamedTuple):
 
         Bounds of a Box are not checked, and its numbers are not cast to its type: many environments keep to neither.
         """
-        value = reduce(operator.getitem, self.path, obs)
+        value, wrong = reduce(operator.getitem, self.path, obs), f"not of {self.space}"
         if type(self.space).__name__ == "Box":
             value = np.asarray(value, np.float32)
-            if value.shape == self.space.shape and np.isfinite(value).all():
-                return value.ravel()
+            if value.shape == self.space.shape:
+                if np.isfinite(value).all():
+                    return value.ravel()
+                wrong = "not finite"
         elif self.space.contains(value):
             from gymnasium.spaces import flatten
 
             return np.asarray(flatten(self.space, value), np.float32)
-        raise ValueError(f"{self.name!r} is {format_value(value)}, not finite or not of {self.space}")
+        raise ValueError(f"{self.name!r} is {format_value(value)}, {wrong}")
 
 
 def leaves_of(whose: str, space: Any, path: tuple[Any, ...] = ()) -> tuple[Leaf, ...]:

@@ -116,7 +116,7 @@ def register_robotics() -> None:
         except AttributeError as error:  # of PyOpenGL, which finds no library
             library = os.environ.get("MUJOCO_GL", "")
             raise UserError(
-                f"MUJOCO_GL={library} finds no library ({error}): install libosmesa6 or libegl1, or give another"
+                f"MUJOCO_GL={library} finds no library: install libosmesa6 or libegl1, or set MUJOCO_GL=egl or osmesa"
             ) from error
 
     gymnasium.register_envs(gymnasium_robotics)
