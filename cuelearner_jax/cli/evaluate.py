@@ -25,7 +25,7 @@ from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
 from cuelearner_jax.tasks import shipped
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
-SHARES = "of what all episodes share, 0 or 1: Jeffreys' interval"
+SHARES = "where all are 0, or all are 1, Jeffreys' interval"
 
 
 @dataclass(frozen=True, kw_only=True)
