@@ -43,7 +43,7 @@ def check_folder(out: Path, contents: dict[str, Any], resume: bool, overwrite: b
         if not ours:
             raise UserError(f"nothing to resume in {out}: give the --out of an interrupted run, or leave out --resume")
         if differing := sorted(differences(formats.read("config", out / CONFIG), contents)):
-            names = ", ".join(differing[:4])
+            names = ", ".join(name.removeprefix("grid.") for name in differing[:4])
             raise UserError(f"{out} was run with other values of {names}: give the same options, or another --out")
     elif is_filled and not overwrite:
         raise UserError(f"{out} is not empty: give --resume to go on, --overwrite to delete it, or another --out")
