@@ -50,8 +50,9 @@ def run(arguments: list[str]) -> None:
         raise UserError(f"policy {name!r} asks the teacher, who needs the true state: choose another policy")
     contract.check_request(options.format, options.out)
     env = source.task.environment(options.task)
-    if options.only_correction and source.adapted is not None:
-        source = replace(source, adapted=replace(source.adapted, code=source.adapted.code or uniform_in(env)))
+    if options.only_correction and (lanes := source.adapted) is not None and lanes.code is None:  # it is elsewhere
+        values = {**lanes.values, "base_acts": None}
+        source = replace(source, adapted=replace(lanes, code=uniform_in(env), values=values))
     policy, lane = options.lane_in(source, options.task, env)
     draw, view = (lambda: decisions.observations(env, policy)), env
     if options.only_correction:
