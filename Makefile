@@ -8,7 +8,7 @@ UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
 .PHONY: help setup quickstart gallery smoke test test-all test-quick test-foreign test-lerobot durations lint format docs bench release constraints clean
 help:
-	@echo "make quickstart   train, report and film the small billiards example (six to eight minutes)"
+	@echo "make quickstart   train, report and film the small billiards example (four to eight minutes)"
 	@echo "make gallery      the films of docs/gallery.md"
 	@echo "make test         run the tests (8 to 20 minutes on 2 cores, by their speed)"
 	@echo "make test-all     these, and what checks the same at length"
