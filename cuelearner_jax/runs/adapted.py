@@ -119,7 +119,7 @@ def write(
     values, arrays = serialization.to_json(block, origin.get("code")), serialization.arrays_of(block)
     golden, (*_, last) = {}, layers(values)
     if last["policy"] == "code" and lanes_in(result.of.bases) is None:  # not in the folder, but told from other code
-        obs = jnp.asarray(result.labels.obs[0, :GOLDEN])
+        obs = jnp.asarray(result.labels.obs[0, : min(GOLDEN, lanes.budget[0])])
         golden = {"base_acts": {"obs": obs.tolist(), "action": block.base.act(jax.random.key(0), None, obs).tolist()}}
     contents = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
