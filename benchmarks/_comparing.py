@@ -146,8 +146,8 @@ def compare(
     if options.table:
         show([row for file in options.table for row in json.loads(file.read_text())["rows"]], base)
         return
-    if options.evaluations < 2 or options.steps % options.evaluations:
-        raise SystemExit("give at least two evaluations that divide --steps")
+    if options.evaluations < 2 or options.steps % (options.evaluations * setting.get("envs", 1)):
+        raise SystemExit("give at least two evaluations that divide --steps, each a multiple of --envs")
     rows = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
     rows = [row for row in rows if len(row["rows"]) == options.evaluations]
     setting = {**setting, "steps": options.steps, "evaluations": options.evaluations, "episodes": EPISODES}

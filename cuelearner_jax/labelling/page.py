@@ -226,7 +226,7 @@ class Page:
         self._bar.value = status.answered / status.labels
         self._pace.text = f"{status.per_minute:.0f} labels a minute" if status.per_minute else "no labels yet"
         minutes, newest = status.minutes_left, status.newest
-        self._minutes.text = f"{minutes:.0f} min left" if minutes else ""
+        self._minutes.text = f"{max(minutes, 1):.0f} min left" if minutes else ""
         by_evidence = self.session.plan.guidance.by_evidence
         what, doing = ("estimate", "reading") if by_evidence else ("model", "fitting")
         state = f"{what} {newest.number}, of {newest.labels} labels" if newest.number else f"no {what} yet"

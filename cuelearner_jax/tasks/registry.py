@@ -54,7 +54,7 @@ def find(name: str) -> Task:
         return _registered[name]
     if (entry := _installed().get(name)) is None:
         if "/" in name:
-            raise UserError(f"folder {name} does not exist: give a folder that does, or a task by its name")
+            raise UserError(f"{name} is no task, and no folder of a run, a policy or situations: give one of these")
         raise UserError(f"unknown task {name!r}{suggestion(name, names())} (your own: package.module:NAME)")
     return dataclasses.replace(_loaded(entry.value), name=name)
 
