@@ -68,7 +68,7 @@ def test_a_run_of_another_robot_is_described_and_comes_back_on_that_robot(out, t
     [
         ("agent.q_layers", probes.config(agent={"q_layers": (32,)}), GRID, {}),
         ("scalars.eps_deg", probes.config(scalars={"eps_deg": 6.0}), GRID, {}),
-        ("grid.seeds", probes.CONFIG, Grid(("none", "relative"), (4, 8), (10, 15)), {}),
+        ("seeds", probes.CONFIG, Grid(("none", "relative"), (4, 8), (10, 15)), {}),
         ("split", probes.CONFIG, GRID, {"split": "validation"}),
         ("task.name", probes.CONFIG, GRID, {"task": probes.make_task("another")}),
     ],
