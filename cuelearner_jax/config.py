@@ -36,6 +36,7 @@ from cuelearner_jax.errors import UserError, format_value, suggestion
 
 LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
 LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
+NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
 TRACED = "traced"  # annotates a whole number that does not shape the program
 
 PartT = TypeVar("PartT")
@@ -57,13 +58,13 @@ class Bounds(NamedTuple):
         """Describe the allowed numbers for a message."""
         if math.isinf(self.most):
             return "a positive number" if self.least or self.above else "a number that is not negative"
-        if self.above:
-            return f"a number above {self.least:g} and up to {self.most:g}"
-        return f"a number from {self.least:g} to {self.most:g}"
+        least, most = (f"{bound:,}" if isinstance(bound, int) else f"{bound:g}" for bound in self[:2])
+        return f"a number {'above' if self.above else 'from'} {least} {'and up ' if self.above else ''}to {most}"
 
 
 POSITIVE = Bounds(1)  # bounds of whole numbers
 SHARE = Bounds(0, 1)
+EPISODE = Bounds(1, 1_000_000)  # of an episode's steps
 Layers = Annotated[tuple[int, ...], POSITIVE]  # hidden widths of a network
 
 
@@ -102,11 +103,12 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
         if name not in fields:
             raise UserError(f"{prefix} has no field {format_value(name)}{suggestion(name, fields)}")
         if not fits(value, kind := kinds[name]):
-            called = kind.__name__ if isinstance(kind, type) and not get_args(kind) else kind
-            advice = (
-                " or ".join(map(str, get_args(kind))) if get_origin(kind) is Literal else f"a value of type {called}"
-            )
-            raise UserError(f"{prefix}.{name} is {format_value(value)}: give {advice}")
+            if get_origin(kind) is Literal:
+                advice = suggestion(str(value), get_args(kind))
+            else:
+                called = kind.__name__ if isinstance(kind, type) and not get_args(kind) else kind
+                advice = f": give {NUMBERS.get(kind, f'a value of type {called}')}"
+            raise UserError(f"{prefix}.{name} is {format_value(value)}{advice}")
     return values
 
 
@@ -154,10 +156,11 @@ def to_json(config: Any) -> dict[str, Any]:
 def from_json(kind: type, values: dict[str, Any]) -> Any:
     """Return a flat configuration dataclass (Sizes, Scalars, Schedule, a task's) from JSON values; lists become tuples.
 
-    Raises UserError for an unknown field, or a value of another type than its field's.
+    `name` and `from`, which say where the class is found, are ignored. Raises UserError for an unknown field, or a
+    value of another type than its field's.
     """
     hints, fields = get_type_hints(kind), {field.name for field in dataclasses.fields(kind)}
-    values = {name: plain(value) for name, value in values.items()}
+    values = {name: plain(value) for name, value in values.items() if name in fields or name not in ("name", "from")}
     for name, value in values.items():
         if name not in fields or not fits(value, hints[name]):
             raise UserError(f"{name} is {value!r} in a file of another version of cuelearner or of the task")

@@ -150,5 +150,4 @@ def part_to_json(options: Any) -> dict[str, Any]:
 
 def part_from_json(sort: str, values: Mapping[str, Any]) -> Any:
     """Return a part's options from JSON values. Raises as `from_json`."""
-    options = {name: value for name, value in values.items() if name != "name"}
-    return configuration.from_json(plugins.find(PARTS[sort], values["name"], sort), options)
+    return configuration.from_json(plugins.find(PARTS[sort], values["name"], sort), dict(values))

@@ -12,18 +12,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 from brax import envs
 from jaxtyping import Array, Float
 
-from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import Paced
 from cuelearner_jax.bridges.brax import JaxEnvironment, from_brax
-from cuelearner_jax.config import Scalars, Schedule, Sizes
+from cuelearner_jax.config import EPISODE, Scalars, Schedule, Sizes, check_part
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Cue
 from cuelearner_jax.task import Body, Preset, Task
@@ -35,7 +34,7 @@ PUSH = Cue("push", ("right", "left"), ("ArrowRight", "ArrowLeft"), "shares")
 class PendulumConfig:
     """An inverted pendulum. Every field is an option `--task.…`, the line below it its help."""
 
-    max_steps: int = 200
+    max_steps: Annotated[int, EPISODE] = 200
     """Steps after which an episode is truncated."""
     backend: Literal["spring", "positional", "generalized"] = "spring"
     """Physics backend of brax."""
@@ -55,7 +54,7 @@ def toward_the_lean(obs: Float[Array, " obs"]) -> Float[Array, "1"]:
 
 def make_environment(config: PendulumConfig, split: str = "training") -> JaxEnvironment:
     """The environment of a configuration."""
-    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
+    check_part(config, "task")
     return from_brax(_made(config.backend), max_steps=config.max_steps, heuristic=toward_the_lean, cues=(PUSH,))
 
 

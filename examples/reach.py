@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +29,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cuelearner_envs import svg
-from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import Paced
-from cuelearner_jax.config import Scalars, Schedule, Sizes
+from cuelearner_jax.config import EPISODE, Bounds, Scalars, Schedule, Sizes, check_part
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.pictures import palette_of, write_film
 from cuelearner_jax.run_config import RunConfig
@@ -53,13 +52,13 @@ BOAT, BUOY, WIND, ARROW, WATER = "#0072B2", "#009E73", "#7f7f7f", "#E69F00", "#f
 class ReachConfig:
     """A lake and the boat on it. Every field is an option `--task.…`, its docstring is the help."""
 
-    wind: float = 0.5
+    wind: Annotated[float, Bounds(0)] = 0.5
     """Speed of the wind's drift [m/s]; its direction changes with every episode."""
-    speed: float = 1.0
+    speed: Annotated[float, Bounds(0)] = 1.0
     """Speed of the boat through the water [m/s]."""
     rudder_deg: float = 0.0
     """Changed world: the boat's heading is rotated counterclockwise by this angle [deg]."""
-    max_steps: int = 40
+    max_steps: Annotated[int, EPISODE] = 40
     """Steps of 0.1 s after which an episode is truncated."""
     mirrors: bool = False
     """Add the quarter turns of labels and transitions to the data, whatever the guidance."""
@@ -143,10 +142,7 @@ class Reach(WholeObservations, struct.PyTreeNode):
 
 def make_environment(config: ReachConfig, split: str = "training") -> Reach:
     """Return the environment of a configuration; splits need not differ, since episodes are random."""
-    check_number("wind", config.wind, 0, unit="m/s")
-    check_number("speed", config.speed, 0, unit="m/s")
-    check_number("rudder_deg", config.rudder_deg, unit="degrees")
-    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
+    check_part(config, "task")
     return Reach(
         wind=jnp.float32(config.wind),
         speed=jnp.float32(config.speed),

@@ -68,11 +68,6 @@ class SoftQ:
     bootstraps: bool
 
     @property
-    def described(self) -> dict[str, Any]:
-        """The number of actions, and what the network sees."""
-        return {"actions": len(self.choices), "frame": self.frame}
-
-    @property
     def choices(self) -> Array:
         """The actions (choices, action) to choose from."""
         return self.spaces.actions.spread(self.options.actions)

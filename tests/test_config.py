@@ -20,7 +20,7 @@ from cuelearner_jax.errors import UserError
         ("agent", {"q_layers": 32}, "agent.q_layers is 32: give a value of type"),
         ("agent", {"replay_capacity": 4001}, "agent.replay_capacity is 4001: give a multiple of sizes.num_envs"),
         ("scalars", {"eps_deg": 181.0}, "scalars.eps_deg is 181.0: give a number above 0 and up to 180"),
-        ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': give best or nearest or shuffled"),
+        ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': choose one of best, nearest, shuffled"),
         ("schedule", {"total_steps": 2**31}, "schedule.total_steps is 2147483648: give at most 2147483647"),
         ("schedule", {"eval_every": 18}, "schedule.eval_every is 18: give a multiple of sizes.num_envs"),
         ("schedule", {"eval_steps": 25}, "schedule.eval_steps is 25: give a multiple of schedule.eval_envs"),

@@ -42,7 +42,7 @@ ROWS = [
     ["cli"],
 ]
 ROW = {room: number for number, row in enumerate(ROWS) for room in row}
-FOR_TASKS = {"errors", "types", "spaces", "environment", "pictures", "devices"}  # what a task may know of the method
+FOR_TASKS = {"config", "errors", "types", "spaces", "environment", "pictures", "devices"}  # what a task may know
 # Of guidance; "heuristic" names a member and a policy too.
 KINDS = {"relative", "intent", "demonstration", "scalar", "preference", "dcoach", "bdcoach", "clic"}
 

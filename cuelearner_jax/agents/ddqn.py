@@ -111,11 +111,6 @@ class DoubleDQN:
     spaces: Spaces
     bootstraps: bool  # whether targets use the next observation (discount above 0)
 
-    @property
-    def described(self) -> dict[str, Any]:
-        """The set of actions and the network's frame, as JSON values for an export's contract."""
-        return {"directions": self.options.directions, "frame": self.frame}
-
     def init(self, key: PRNGKeyArray) -> tuple[Params, DDQNState]:
         """Return random parameters, and a target network that is a copy of them."""
         network = q_network(self.options.q_layers).clone(start=self.options.q_start)

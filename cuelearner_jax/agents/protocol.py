@@ -33,11 +33,6 @@ class AgentFunctions(Protocol):
         """The frame of the networks' inputs."""
         ...
 
-    @property
-    def described(self) -> dict[str, Any]:
-        """Facts for an export's contract, as JSON values."""
-        ...
-
     def init(self, key: PRNGKeyArray) -> tuple[Params, Any]:
         """Return parameters that act, and the rest of the learning state."""
         ...
@@ -50,12 +45,6 @@ class AgentFunctions(Protocol):
         self, env: Any, options: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return actions during learning; `options`: see `update`."""
-        ...
-
-    def value(
-        self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
-    ) -> Float[Array, "*m"]:
-        """Return the expected value of each action; `obs` is one situation for all actions, or one for each."""
         ...
 
     def update(

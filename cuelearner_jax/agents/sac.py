@@ -143,11 +143,6 @@ class SoftActorCritic:
     spaces: Spaces
     bootstraps: bool  # whether targets use the next observation (discount above 0)
 
-    @property
-    def described(self) -> dict[str, Any]:
-        """The rule of choice and the networks' frame, as JSON values for an export's contract."""
-        return {"rule": "tanh of the actor's mean", "frame": self.frame}
-
     def init(self, key: PRNGKeyArray) -> tuple[Params, SACState]:
         """Return random parameters, target critics that are copies, and the first temperature."""
         own, space = self.options, self.spaces.actions
@@ -170,12 +165,6 @@ class SoftActorCritic:
     ) -> Float[Array, "n action"]:
         """Return actions drawn from the squashed Gaussian."""
         return self.in_box(self.draw(params["actor"], obs, key).unit)
-
-    def value(
-        self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
-    ) -> Float[Array, "*m"]:
-        """Return the smallest critic's value of each action; `obs` is one situation for all, or one for each."""
-        return self.values(params["critics"], obs, self.in_unit(actions)).min(0)
 
     def in_unit(self, actions: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
         """Return actions of the box in unit coordinates."""
@@ -228,7 +217,8 @@ class SoftActorCritic:
             if own.bins:
                 error = self._binned_error(*behind, critics, count)
             else:
-                error = self._squared_error(batch, self.targets(*behind))
+                targets, unit = self.targets(*behind)[None], self.in_unit(batch.action)
+                error = lambda params: (jnp.mean((self.values(params, batch.obs, unit) - targets) ** 2), {})  # noqa: E731
             (loss, news), gradient = jax.value_and_grad(error, has_aux=True)(critics)
             critics, opt_state = optimizer_step(options.critic_rate, most, gradient, opt_state, critics)
             critics = categorical.with_unit_weights({**critics, **news}) if own.bins else critics
@@ -286,13 +276,6 @@ class SoftActorCritic:
         own = self.values(judges, batch.next_obs, draws.unit).min(0)
         value = own - temperature * draws.log_density if self.options.entropy_in_targets else own
         return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
-
-    def _squared_error(
-        self, batch: Transition, targets: Float[Array, " batch"]
-    ) -> Callable[[Params], tuple[Array, dict[str, Any]]]:
-        """Return the critics' mean squared error as a function of them, with nothing else that changes."""
-        unit = self.in_unit(batch.action)
-        return lambda critics: (jnp.mean(jnp.square(self.values(critics, batch.obs, unit) - targets[None])), {})
 
     def _binned_error(
         self,

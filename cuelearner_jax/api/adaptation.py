@@ -315,8 +315,7 @@ def world_of(file: LabelFile, before: LogsConfig | None = None) -> World:
         raise UserError(
             "the policy was corrected with other bounds or cues before: leave out cues, low, high and space"
         )
-    own = {name: value for name, value in file.task.items() if name not in ("name", "from")}
-    recording = before or (from_json(LogsConfig, own) if file.task.get("name") == logs.NAME else None)
+    recording = before or (from_json(LogsConfig, file.task) if file.task.get("name") == logs.NAME else None)
     if recording is not None and sum(recording.entries) == size:
         config = dataclasses.replace(recording, path="", digest="", order="recorded", rows=len(obs))
     else:

@@ -12,7 +12,7 @@ import tyro
 from rich.table import Table
 
 from cuelearner_jax.cli.options import Flag, out, parse
-from cuelearner_jax.config import Scalars
+from cuelearner_jax.config import Scalars, from_json
 from cuelearner_jax.errors import UserError, one_line
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.spaces import UNSAID
@@ -46,7 +46,7 @@ class Inspect:
             table.add_row(name, *(one_line(facts.get(name, "")) for facts in columns))
         if len(files) == 2:
             task = registry.find(str(files[0].task.get("name")))
-            env = shape_of(task, comparing.world_of(task, files[0]))
+            env = shape_of(task, from_json(task.config, files[0].task))
             table.add_row("agree with each other", str(comparing.between(files[0], files[1], env)))
         out.print_table(table)
 

@@ -20,6 +20,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from cuelearner_jax.api.worlds import NoOptions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.policy_sources import POLICIES
@@ -69,11 +70,6 @@ NUMBERS = tyro.constructors.ConstructorRegistry()
 NUMBERS.primitive_rule(lambda info: WHOLE if info.type is int else None)
 
 
-@dataclass(frozen=True)
-class Unnamed:
-    """Options of a task that is not named yet."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Outside:
     """The subject of a command, and the code and worlds that it names."""
@@ -104,7 +100,7 @@ class RunParts:
 class NewWorld(Outside):
     """The world that a finished policy meets."""
 
-    task: Any = field(default_factory=Unnamed)
+    task: Any = field(default_factory=NoOptions)
     scenario: str | None = None
     """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     robot: str | None = None

@@ -11,12 +11,12 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from cuelearner_jax import plugins
+from cuelearner_jax.api.worlds import NoOptions
 from cuelearner_jax.cli.options import (
     Flag,
     Kinds,
     Outside,
     RunParts,
-    Unnamed,
     about,
     look_ahead_of,
     out,
@@ -46,7 +46,7 @@ class TrainingOptions(Outside, RunParts, Order):
     split: Settled = "validation"
     shard: Settled = None
     setting: Settled = ()
-    config: Annotated[RunConfig[Kinds], unprefixed] = field(default_factory=lambda: RunConfig(Unnamed()))
+    config: Annotated[RunConfig[Kinds], unprefixed] = field(default_factory=lambda: RunConfig(NoOptions()))
     out: Path = Path("runs/NAME")
     """Folder for results and checkpoints."""
     resume: Flag[bool] = False

@@ -10,8 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from cuelearner_jax import config as configuration
-from cuelearner_jax.config import Scalars
+from cuelearner_jax.config import Scalars, from_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import AnswerForm
@@ -36,12 +35,6 @@ def read_checked(path: Path) -> LabelFile:
     return file
 
 
-def world_of(task: Task, file: LabelFile) -> Any:
-    """Return the task configuration in which a file's labels were given. Raises UserError for another task's."""
-    values = {name: value for name, value in file.task.items() if name not in ("name", "from")}
-    return configuration.from_json(task.config, values)
-
-
 def with_teacher(
     task: Task, file: LabelFile, rows: list[dict[str, Any]], scalars: Scalars, tell: Callable[[str], None]
 ) -> AnswerAgreement:
@@ -52,7 +45,8 @@ def with_teacher(
     form = form_of(file)
     if form is None or file.people is None or file.session is None:
         raise UserError("the teacher cannot be asked about this file: give a file that `cuelearner label` wrote")
-    config, task = world_of(task, file), task.on(str(file.session.get("robot", "")).partition(" ")[0] or None)
+    config = from_json(task.config, file.task)
+    task = task.on(str(file.session.get("robot", "")).partition(" ")[0] or None)
     tell(f"asking the teacher of {task.name} about {len(rows)} questions")
     env = task.environment(config)
     teacher = task.make_teacher(config, env)

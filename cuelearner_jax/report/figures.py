@@ -23,6 +23,10 @@ from cuelearner_jax.report.variants import Variant, guidance_name
 # Palette of Okabe and Ito, distinguishable with any colour vision, without the colours of the package's kinds.
 OTHER_COLOURS = ("#E69F00", "#56B4E9", "#B8A600", "#000000")
 DASHES = ("-", (0, (5, 1.5)), (0, (2, 1.5)), (0, (6, 1.5, 1, 1.5)))  # by which equal lines are told apart
+PROFILE_TEXTS = (
+    "normalised score\nband: 95% bootstrap interval over seeds and episodes, drawn in each task",
+    "share of runs above the score",
+)
 FAILED = "a failed seed, left out"
 AXIS_NAMES = {"reward": "reward a step", "success": "success rate", "collision": "collision rate"}
 STYLE: dict[Any, Any] = {
@@ -163,19 +167,8 @@ def draw_profiles(over: Aggregates) -> Figure:
     curves = [(variant, profile) for variant, profile, _ in over.each]
     runs = dict.fromkeys(variant.run for variant, _ in curves)
     groups = [[variant for variant, _ in curves if variant.run == run] for run in runs]
-    words = "normalised score\nband: 95% bootstrap interval over seeds and episodes, drawn in each task"
     title = f"{len(over.ends)} tasks: {', '.join(over.ends)}"
-    return _draw_panels(groups, curves, title, (words, "share of runs above the score"), ticker.ScalarFormatter())
-
-
-def _draw_profiles(axes: Any, over: Aggregates) -> None:
-    colours = colours_of([variant for variant, *_ in over.each])
-    for place, (variant, profile, _) in enumerate(over.each):
-        _draw_curve(axes, profile, variant.name, colours[place], place)
-    axes.set_ylabel("share of runs above the score")
-    axes.set_xlabel(
-        "normalised score\nband: 95% bootstrap interval over seeds and episodes, drawn in each task", fontsize=9
-    )
+    return _draw_panels(groups, curves, title, PROFILE_TEXTS, ticker.ScalarFormatter())
 
 
 def draw_suite(overs: Mapping[str, Aggregates], title: str) -> Figure:
@@ -189,7 +182,12 @@ def draw_suite(overs: Mapping[str, Aggregates], title: str) -> Figure:
             left.set_ylabel("normalised score")
             left.set_title(f"{name}: {len(over.ends)} task{'s' * (len(over.ends) > 1)}", fontsize=10)
             most = max(variant.labels for variant, *_ in over.each)
-            _draw_profiles(right, over._replace(each=[one for one in over.each if one[0].labels in (0, most)]))
+            largest = [(variant, profile) for variant, profile, _ in over.each if variant.labels in (0, most)]
+            colours = colours_of([variant for variant, _ in largest])
+            for place, (variant, profile) in enumerate(largest):
+                _draw_curve(right, profile, variant.name, colours[place], place)
+            right.set_xlabel(PROFILE_TEXTS[0], fontsize=9)
+            right.set_ylabel(PROFILE_TEXTS[1])
             right.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
         figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure

@@ -147,5 +147,4 @@ def world_of(values: dict[str, Any], find: Callable[[str], Task], path: Path) ->
             f"{path} belongs to a task outside the package; its code is not loaded just because a file names it: "
             f"add --task {origin} if you trust that code"
         ) from error
-    fields = {field: value for field, value in values.items() if field not in ("name", "from")}
-    return task, configuration.from_json(task.config, fields)
+    return task, configuration.from_json(task.config, values)

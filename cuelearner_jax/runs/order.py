@@ -151,8 +151,7 @@ def _check_world(path: Path, head: dict[str, Any], task: Task, world: Any) -> No
     """Raise UserError unless labels belong to a run's task and, in all that labels depend on, to its world."""
     if (name := head.get("name")) != task.name:
         raise UserError(f"{path} holds labels of {name}, but the task is {task.name}: give labels of the same task")
-    values = {name: value for name, value in head.items() if name not in ("name", "from")}
-    theirs, ours = configuration.to_json(configuration.from_json(task.config, values)), configuration.to_json(world)
+    theirs, ours = configuration.to_json(configuration.from_json(task.config, head)), configuration.to_json(world)
     apart = [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]
     if apart:
         raise UserError(

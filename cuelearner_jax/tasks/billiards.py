@@ -47,7 +47,7 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     trained_in = _learned_in(folder, config)
     own = make_environment(trained_in)
     network = teachers.load(folder, own, aim_error, habit)
-    if config.teacher == LOCAL_SEARCH or trained_in.acceleration != config.acceleration:
+    if config.teacher == LOCAL_SEARCH or trained_in.acceleration != tuple(config.acceleration):
         return LocalSearchTeacher(network, own, env, aim_error, habit)
     return Transferred(network, own, env)
 

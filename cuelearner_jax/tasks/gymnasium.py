@@ -9,21 +9,22 @@ folder imports no code beyond that of Gymnasium's own registry.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pkgutil import resolve_name
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax import plugins
 from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
 from cuelearner_jax.bridges.gymnasium.instances import Actions, Running
 from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
+from cuelearner_jax.config import EPISODE, Bounds, check_part
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, checked_quantities
 from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
@@ -37,7 +38,6 @@ FRAMES = "cuelearner_jax.tasks.frames"  # whose Pillow is not loaded for every c
 NUM_ENVS = 8
 UNLIMITED = 1_000  # steps of an episode, where neither environment nor caller gives a limit
 TRIED = 1_000  # most steps of an episode, to find out whether the environment reports success
-MOST_PROCESSES = 256
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class GymnasiumConfig:
     """Id in Gymnasium's registry, or the name of code; gymnasium:NAME fills this field and the layout below."""
     arguments: str = "{}"
     """Arguments of the environment by name, as JSON."""
-    max_steps: int = 1
+    max_steps: Annotated[int, EPISODE] = 1
     """Largest number of steps of an episode, after which it is truncated."""
-    processes: int = 0
+    processes: Annotated[int, Bounds(0, 256)] = 0
     """Number of processes that run environments (0: one per processor; 1: run them in the training process)."""
     slices: tuple[str, ...] = ()
     """Layout: names of an observation's slices."""
@@ -63,7 +63,7 @@ class GymnasiumConfig:
     units: tuple[str, ...] = ()
     """Layout: unit of each slice; those in m or rad may shift, by what answers say."""
     slice_kinds: tuple[str, ...] = ()
-    """Layout: own, for a slice that a robot measures of itself, or beams, or directions."""
+    """Layout: own, for a slice that a robot measures of itself, directions, or "beams 10", 10 degrees apart."""
     low: tuple[float, ...] = ()
     """Layout: lower bounds of actions."""
     high: tuple[float, ...] = ()
@@ -80,11 +80,19 @@ class GymnasiumConfig:
     @property
     def observation(self) -> tuple[Quantity, ...]:
         """The slices of an observation. Raises UserError for an unknown unit or kind."""
-        rows = zip(self.slices, self.slice_sizes, self.units, self.slice_kinds, strict=True)
+        kinds = (kind.partition(" ") for kind in self.slice_kinds)
+        rows = zip(self.slices, self.slice_sizes, self.units, kinds, strict=True)
         texts = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
-        return checked_quantities(
-            Quantity(name, size, unit, texts.get(name, ""), kind) for name, size, unit, kind in rows
-        )
+        try:
+            return checked_quantities(
+                Quantity(name, size, unit, texts.get(name, ""), kind, float(step or 0))
+                for name, size, unit, (kind, _, step) in rows
+            )
+        except ValueError:
+            raise UserError(
+                f"task.slice_kinds is {format_value(self.slice_kinds)}: give one size, unit and kind for each of "
+                f"{len(self.slices)} slices, with degrees after beams, as 'beams 10'"
+            ) from None
 
     @property
     def space(self) -> Space:
@@ -105,8 +113,7 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
     """
     if not (name := config.environment):
         raise UserError(f"task.environment is empty: name the task {FAMILY}:ENVIRONMENT, as {FAMILY}:FetchReach-v4")
-    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
-    check_number("processes", config.processes, 0, MOST_PROCESSES, whole=True)
+    check_part(config, "task")
     try:
         dict(**json.loads(config.arguments))
     except (ValueError, TypeError):
@@ -174,8 +181,7 @@ def task_from(
     `called`: name of code in messages and files (default: its module:NAME). For the others see `cl.from_gymnasium`.
     """
     check_installed()
-    if max_steps is not None:
-        check_number("max_steps", max_steps, 1, MOST_STEPS, whole=True)
+    check_part(GymnasiumConfig(max_steps=1 if max_steps is None else max_steps), "task")
     factory, name, fetch = None, source, None
     if isinstance(source, str):
         fetch, max_steps = fetch_layout.layout_of(source), max_steps or registry_spec(source).max_episode_steps
@@ -187,7 +193,7 @@ def task_from(
             f"env is {format_value(source)}: give an id of Gymnasium's registry, or a class or function that "
             "gives environments"
         )
-    text = json.dumps(dict(arguments or {}))
+    text = _as_json(dict(arguments or {}))
     actions, slices, limit, succeeds, ends = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
     if not max_steps and not limit and not ends:
         console.print(
@@ -198,7 +204,7 @@ def task_from(
     pairs = cues.split(";") if isinstance(cues, str) else cues
     words = tuple(pair if isinstance(pair, str) else ",".join(pair) for pair in pairs if pair)
     is_fetch = not words and fetch is not None
-    names, sizes, slice_units, _, kinds, *_ = zip(*slices, strict=True)
+    names, sizes, slice_units, *_ = zip(*slices, strict=True)
     config = GymnasiumConfig(
         environment=name,
         arguments=text,
@@ -207,7 +213,7 @@ def task_from(
         slices=names,
         slice_sizes=sizes,
         units=slice_units,
-        slice_kinds=kinds,
+        slice_kinds=tuple(f"{one.kind} {one.step_deg}" if one.step_deg else one.kind for one in slices),
         **actions._asdict(),
         cues=fetch_layout.CUES if is_fetch else words,
         cue_names=fetch_layout.CUE_NAMES if is_fetch else (),
@@ -218,6 +224,16 @@ def task_from(
     preset = quickstart(config, config.space, num_envs, 10 * config.max_steps, (64, 64), **lanes)
     changes: dict[str, Any] = {"default": config, "bodies": (_body(factory),), "presets": {QUICKSTART: preset}}
     return dataclasses.replace(GYMNASIUM, about=f"Gymnasium's {name}", **changes)
+
+
+def _as_json(arguments: dict[str, Any]) -> str:
+    with contextlib.suppress(TypeError, ValueError):
+        if json.loads(text := json.dumps(arguments, default=np.generic.item)) == arguments:
+            return text
+    raise UserError(
+        f"arguments are {format_value(arguments)}, which JSON does not keep: give numbers, words and lists, or make "
+        "the environment in a function of your own and give that"
+    )
 
 
 def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
@@ -267,6 +283,11 @@ def _with_names(
     except TypeError as error:
         advice = 'give (name, entries, unit) for each slice, as ("goal", 3, "m")'
         raise UserError(f"observation is {format_value(names)}: {advice}") from error
+    if any(quantity.origin or quantity.follows for quantity in own):
+        raise UserError(
+            "observation has an origin or a slice that follows another, which Gymnasium's worlds do not keep: leave "
+            "both out, and give the turn of a sensor as one of your own `changes`"
+        )
     if total != size:
         raise UserError(f"observation names {total} entries, and {name} has {size}: name each entry once")
     if unknown := sorted(set(units) - {quantity.name for quantity in own}):

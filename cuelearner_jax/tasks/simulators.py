@@ -11,13 +11,13 @@ import warnings
 from dataclasses import dataclass
 from functools import cache, partial
 from pkgutil import resolve_name
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.bridges.brax import Interface, JaxEnvironment, layout_of
+from cuelearner_jax.config import EPISODE, check_part
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity
 from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.task import QUICKSTART, Body, Task
@@ -36,7 +36,7 @@ class SimulatorConfig:
 
     environment: str = ""
     """Name of the environment in its library; FAMILY:NAME fills this field and the layout below."""
-    max_steps: int = 1000
+    max_steps: Annotated[int, EPISODE] = 1000
     """Largest number of steps of an episode, after which it is truncated."""
     slices: tuple[str, ...] = ()
     """Layout: names of an observation's slices."""
@@ -111,7 +111,7 @@ def _from_playground(name: str) -> Any:
 
 def make_environment(family: str, config: Any, split: str = "training") -> JaxEnvironment:
     """Return the environment of a configuration; the simulator is made at the first step or reset."""
-    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
+    check_part(config, "task")
     if not config.entries or len(config.slices) != len(config.slice_sizes):
         raise UserError(
             f"task.environment is {format_value(config.environment)}, and task.slices, slice_sizes or entries are of "

@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Annotated, Literal
 
 import jax
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from cuelearner_envs.bounds import MOST_SEED, check_number, check_word
 from cuelearner_envs.zoo import ERRORS, STEPS, ZooWorld, change, robots
-from cuelearner_envs.zoo.distil import SPLITS
 from cuelearner_envs.zoo.environment import ZooEnvironment, ZooTeacher
+from cuelearner_envs.zoo.worlds import Error
 from cuelearner_jax.adaptation.by_model import plain_scalars
-from cuelearner_jax.config import Sizes
+from cuelearner_jax.config import Bounds, Sizes, check_part
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.run_config import RunConfig
@@ -29,25 +29,21 @@ Index = int | Int[Array, ""]
 class ZooConfig:
     """A robot of the zoo, and the world for it."""
 
-    cues: int = 3
+    cues: Annotated[int, Bounds(1, MOST_CUES)] = 3
     """Number of cues of the robot's actions, up to 7; 1: directions in the plane."""
-    number: int = 0
+    number: Annotated[int, Bounds(0)] = 0
     """Which of the robots with as many cues; those with odd numbers have a neural policy, where it succeeds."""
-    split: str = "tuning"
+    split: Literal["tuning", "held_out"] = "tuning"
     """Which robots: tuning, for choosing settings, or held_out, for reports."""
-    error: str = "nothing"
+    error: Error = "nothing"
     """What is wrong in the world: nothing, constant, gain, mixing, seen_shift, seen_turn, region, waves, two,
     other_way, other_way_shift (`cuelearner_envs.zoo.worlds` explains them)."""
-    seed: int = 0
+    seed: Annotated[int, Bounds(0)] = 0
     """Seed of the robots and of their errors."""
 
     def __post_init__(self) -> None:
         """Raise UserError with one line for the first value that cannot work."""
-        check_number("cues", self.cues, 1, MOST_CUES, whole=True)
-        check_number("number", self.number, 0, MOST_SEED, whole=True)
-        check_word("split", self.split, SPLITS)
-        check_word("error", self.error, ERRORS)
-        check_number("seed", self.seed, 0, MOST_SEED, whole=True)
+        check_part(self, "task")
 
 
 @cache

@@ -80,7 +80,7 @@ def test_a_name_that_is_none_is_refused_in_one_line(capsys):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"max_steps": 0}, "task.max_steps is 0: give a whole number from 1"),
+        ({"max_steps": 0}, "task.max_steps is 0: give a number from 1 to 1,000,000"),
         ({"slice_sizes": (1, 1)}, "name the task brax:ENVIRONMENT, which fills them"),
     ],
 )

@@ -15,4 +15,4 @@ def test_an_evaluation_of_the_short_episodes_alone_is_refused(refused, tmp_path)
     sweep = ["sweep", "navigation", "--preset", "quickstart", *few, "--out", tmp_path / "none"]
     cut = "an episode lasts up to 21: give --schedule.eval-steps 210"
     refused([*sweep, *WORLDS, "21"], cut, tmp_path)
-    refused([*sweep, "--task.worlds", "0"], "task.worlds is 0: give a whole number from 1", tmp_path)
+    refused([*sweep, "--task.worlds", "0"], "task.worlds is 0: give a number from 1", tmp_path)

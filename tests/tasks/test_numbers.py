@@ -46,9 +46,3 @@ def test_a_number_that_makes_no_world_is_refused_in_one_line(task, field, valid)
     if isinstance(valid, int):
         with pytest.raises(UserError, match="give a whole number"):
             found.environment(found.config(**{field: 1.5}))
-
-
-def test_a_table_that_there_is_not_is_refused_in_one_line():
-    billiards = registry.find("billiards")
-    with pytest.raises(UserError, match=r"task\.table is 'mro': choose one of one_ball, easy, regulation"):
-        billiards.environment(billiards.config(table="mro"))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import jax.numpy as jnp
 
 from cuelearner_envs.arm.environment import Arm, Camera, Reward, Skill
 from cuelearner_envs.arm.physics import ArmGround
-from cuelearner_envs.bounds import MOST_STEPS, check_number, check_vector, check_word
+from cuelearner_jax.config import EPISODE, Bounds, check_part
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
 
@@ -28,32 +28,25 @@ class ArmConfig:
     the distance from gripper to cube."""
     obstacle: bool = True
     """Skill push: place a post between cube and goal. Without the post, cube and goal lie as in FetchPush."""
-    max_steps: int = 50
+    max_steps: Annotated[int, EPISODE] = 50
     """Steps of 0.04 s after which an episode is truncated."""
-    within: float = 0.05
+    within: Annotated[float, Bounds(0, above=True)] = 0.05
     """An episode is a success if it ends within this distance of the goal [m]."""
-    camera_turn_deg: float = 0.0
+    camera_turn_deg: Annotated[float, Bounds(-180, 180)] = 0.0
     """Changed world: the camera is rotated counterclockwise about the robot's base by this angle [deg], so that goal
     and cube seem rotated."""
-    camera_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_offset: Annotated[tuple[float, float, float], Bounds(-1, 1)] = (0.0, 0.0, 0.0)
     """Changed world: offset of the observed positions of goal and cube, x, y and z [m]."""
-    friction: float = 1.0
+    friction: Annotated[float, Bounds(0.01, 10)] = 1.0
     """Changed world: friction of the cube on table, fingers and post."""
     preferred_side: Literal["none", "left", "right"] = "none"
     """Changed preference, with a post: the teacher pushes the cube past the post on this side."""
 
     def __post_init__(self) -> None:
         """Raise UserError with one line for the first value that cannot work."""
-        check_word("skill", self.skill, get_args(Skill))
-        check_word("reward", self.reward, get_args(Reward))
-        check_word("preferred_side", self.preferred_side, SIDES)
+        check_part(self, "task")
         if self.preferred_side != "none" and not self.has_post:
             raise UserError(f"task.preferred_side is {self.preferred_side}: that needs --task.skill push and its post")
-        check_number("max_steps", self.max_steps, 1, MOST_STEPS, whole=True)
-        check_number("within", self.within, positive=True, unit="metres")
-        check_number("camera_turn_deg", self.camera_turn_deg, -180, 180, unit="degrees")
-        check_vector("camera_offset", self.camera_offset, 3, -1, 1, "metres")
-        check_number("friction", self.friction, 0.01, 10)
 
     @property
     def has_post(self) -> bool:

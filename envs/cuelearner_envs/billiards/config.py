@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax.numpy as jnp
 
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.table import Table
-from cuelearner_envs.bounds import check_number, check_vector, check_word
+from cuelearner_jax.config import SHARE, Bounds, check_part
 
-MOST_DIRECTIONS = 100_000  # the teacher simulates a shot for each direction in every state
 SHOTS = {"one_ball": 1, "easy": 10, "regulation": 10}  # of an episode
 
 
@@ -22,33 +21,28 @@ class BilliardsConfig:
     table: Literal["one_ball", "easy", "regulation"] = "regulation"
     """one_ball: one large target, one shot. easy: three large targets. regulation: the paper's table."""
     mirrors: bool = False
-    """Add the mirror images of transitions on an unchanged table to replay; labels are not mirrored."""
-    action_turn_deg: float = 0.0
+    """Add the mirror images of transitions on an unchanged table to replay (a changed one has no mirror images); labels
+    are not mirrored."""
+    action_turn_deg: Annotated[float, Bounds(-360, 360)] = 0.0
     """Changed world: every strike is rotated counterclockwise by this angle [deg] (paper: 0.8)."""
-    observation_bias: tuple[float, float] = (0.0, 0.0)
+    observation_bias: Annotated[tuple[float, float], Bounds(-1, 1)] = (0.0, 0.0)
     """Changed world: offset of the observed positions of balls on the table, x and y [m] (paper: 0.0071 0.0071)."""
-    acceleration: tuple[float, float] = (0.0, 0.0)
+    acceleration: Annotated[tuple[float, float], Bounds(-9.81, 9.81)] = (0.0, 0.0)
     """Changed world: constant acceleration of the balls on a tilted table, x and y [m/s^2] (paper: 0 0.005)."""
     teacher: str = "search"
     """Teacher: search (tries every direction), learned (shipped for easy and regulation), local_search (tries shots
     near the learned teacher's proposals), or a folder made by `experiments/train_teacher.py`."""
-    aim_error_deg: float = 0.5
+    aim_error_deg: Annotated[float, Bounds(0, 360)] = 0.5
     """Standard deviation of the aim of the player for whom the teacher evaluates directions [deg]."""
-    habit: float = 0.2
+    habit: Annotated[float, SHARE] = 0.2
     """Share by which the teacher reduces values over a full counterclockwise turn from x, which settles ties
     consistently."""
-    search_directions: int = 1440
+    search_directions: Annotated[int, Bounds(1, 100_000)] = 1440
     """Number of directions that the search teacher tries in every state."""
 
     def __post_init__(self) -> None:
         """Raise UserError with one line for the first value that cannot work."""
-        check_word("table", self.table, SHOTS)
-        check_number("action_turn_deg", self.action_turn_deg, -360, 360, unit="degrees")
-        check_vector("observation_bias", self.observation_bias, 2, -1, 1, "metres")
-        check_vector("acceleration", self.acceleration, 2, -9.81, 9.81, "m/s^2")
-        check_number("aim_error_deg", self.aim_error_deg, 0, 360, unit="degrees")
-        check_number("habit", self.habit, 0, 1)
-        check_number("search_directions", self.search_directions, 1, MOST_DIRECTIONS, whole=True)
+        check_part(self, "task")
 
 
 def make_environment(config: BilliardsConfig) -> Billiards:
@@ -59,5 +53,5 @@ def make_environment(config: BilliardsConfig) -> Billiards:
         action_turn=jnp.deg2rad(jnp.array(config.action_turn_deg, jnp.float32)),
         observation_bias=jnp.array(config.observation_bias, jnp.float32),
         max_shots=SHOTS[config.table],
-        mirrors=config.mirrors,
+        mirrors=config.mirrors and not any((config.action_turn_deg, *config.observation_bias, *config.acceleration)),
     )

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cuelearner_envs.navigation.geometry import free_path, free_paths
-from cuelearner_envs.navigation.lidar import BEAM_ANGLES, BEAMS, MAX_RANGE
+from cuelearner_envs.navigation.lidar import BEAM_ANGLES, BEAMS, MAX_RANGE, Scalar
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.devices import goes_through
@@ -48,14 +48,15 @@ STEP = 0.2  # who cannot walk so far in a direction has no first leg there [m]
 SHORTER = 0.05
 
 
-def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
-    """The ways of a situation; see `Navigation.aims`.
+def aims_of(obs: Float[Array, " obs"], ahead: bool = False, max_range: Scalar = MAX_RANGE) -> Aims:
+    """The ways of a situation, seen by a lidar of a range [m]; see `Navigation.aims`.
 
     With `ahead` the last three features tell where two legs lead (`look_ahead`).
     """
     goal, away = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2] * FARTHEST
     ways = rotate(jnp.broadcast_to(goal, (WAYS, 2)), jnp.arange(WAYS) * (2 * jnp.pi / WAYS))
-    free = free_ways(obs, ways)
+    points = points_of(obs, max_range)
+    free = free_ways(points, ways)
     visible = jnp.abs(to_angle(ways)) <= -BEAM_ANGLES[0] + math.radians(0.5)
     near = jnp.where(visible[None], jnp.exp(-free), UNSEEN)
     beside = [jnp.roll(near, -step, axis=1) for step in BESIDE]
@@ -63,25 +64,24 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
     rows = [*_lengths(ways, free[1], goal, away), *_seen_from(ways, goal[None]), *_seen_from(ways, previous)]
     rows += [jnp.full(WAYS, away / SCALE), ways[:, 0], ways[:, 1], visible.astype(jnp.float32)]
     if ahead:
-        rest, detour, leg = look_ahead(points_of(obs)[::EVERY], ways, free[2], away * goal, RADII[2])
+        rest, detour, leg = look_ahead(points[::EVERY], ways, free[2], away * goal, RADII[2])
         rows += [rest / SCALE, jnp.clip(detour / SCALE, 0.0, 3.0), leg / SCALE]
     features = jnp.concatenate([row.reshape(-1, WAYS) for row in [*beside, *rows]]).T
     room = (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & visible
     return Aims(ways, features, jnp.ones(WAYS, bool), room)
 
 
-def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Array, "radii n"]:
-    """Return how far a disc of each radius can go in directions before it touches what the lidar sees [m], to 10 m."""
-    points = points_of(obs)
+def free_ways(points: Float[Array, "points 2"], ways: Float[Array, "n 2"]) -> Float[Array, "radii n"]:
+    """Return how far a disc of each radius can go in directions before it touches a point [m], to 10 m."""
     along = ways[:, :1] * points[None, :, 0] + ways[:, 1:] * points[None, :, 1]
     across = ways[:, :1] * points[None, :, 1] - ways[:, 1:] * points[None, :, 0]
     return jnp.stack([free_path(along, across, radius, MAX_RANGE) for radius in RADII])
 
 
-def points_of(obs: Float[Array, " obs"]) -> Float[Array, "271 2"]:
-    """Return each beam's hit in the body's frame [m]; `FAR_AWAY` without a hit."""
+def points_of(obs: Float[Array, " obs"], max_range: Scalar = MAX_RANGE) -> Float[Array, "271 2"]:
+    """Return each beam's hit in the body's frame [m]; `FAR_AWAY` without a hit, which reads `max_range`."""
     ranges = -jnp.log(jnp.maximum(obs[:BEAMS], math.exp(-MAX_RANGE)))
-    hit = ranges < MAX_RANGE - 0.01
+    hit = ranges < jnp.minimum(max_range, MAX_RANGE) - 0.01
     return jnp.where(hit[:, None], ranges[:, None] * from_angle(jnp.asarray(BEAM_ANGLES)), FAR_AWAY)
 
 

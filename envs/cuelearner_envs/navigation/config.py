@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 
-from cuelearner_envs.bounds import MOST_SEED, MOST_STEPS, check_number, check_word
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_envs.navigation.layouts import STYLES
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.worlds import generate_many
+from cuelearner_jax.config import EPISODE, SHARE, Bounds, check_part
 from cuelearner_jax.errors import UserError
 
 SIDES = {"none": 0, "left": 1, "right": -1}
@@ -27,21 +26,21 @@ class NavigationConfig:
 
     style: Literal["clutter", "rooms", "corridor"] = "clutter"
     """clutter: a hall of boxes and columns. rooms: rooms, doorways, thin obstacles. corridor: pass left or right."""
-    worlds: int = 1024
+    worlds: Annotated[int, Bounds(1, MOST_WORLDS)] = 1024
     """Number of worlds, each with 16 routes. Training and validation use different worlds."""
-    world_seed: int = 0
+    world_seed: Annotated[int, Bounds(0)] = 0
     """Seed of the worlds."""
-    max_steps: int = 200
+    max_steps: Annotated[int, EPISODE] = 200
     """Largest number of steps of 0.2 s in an episode, after which it is truncated."""
-    goal_radius: float = 0.5
+    goal_radius: Annotated[float, Bounds(0, above=True)] = 0.5
     """The goal is reached within this distance [m]."""
-    max_range: float = 10.0
+    max_range: Annotated[float, Bounds(0, above=True)] = 10.0
     """Range of the lidar [m]."""
     lidar_rotation_deg: float = 0.0
     """Changed world: the lidar is mounted rotated counterclockwise by this angle [deg] (paper: 15)."""
-    lidar_noise: float = 0.0
+    lidar_noise: Annotated[float, Bounds(0)] = 0.0
     """Changed world: standard deviation of a beam's error [m]."""
-    lidar_dropout: float = 0.0
+    lidar_dropout: Annotated[float, SHARE] = 0.0
     """Changed world: probability that a beam reads the full range."""
     goal_rotation_deg: float = 0.0
     """Changed world: the measured direction to the goal is rotated counterclockwise by this angle [deg]."""
@@ -54,19 +53,9 @@ class NavigationConfig:
 
     def __post_init__(self) -> None:
         """Raise UserError with one line for the first value that cannot work."""
-        check_word("style", self.style, STYLES)
-        check_word("preferred_side", self.preferred_side, SIDES)
+        check_part(self, "task")
         if self.preferred_side != "none" and self.style != "corridor":
             raise UserError(f"task.preferred_side is {self.preferred_side}: that needs --task.style corridor")
-        check_number("worlds", self.worlds, 1, MOST_WORLDS, whole=True)
-        check_number("world_seed", self.world_seed, 0, MOST_SEED, whole=True)
-        check_number("max_steps", self.max_steps, 1, MOST_STEPS, whole=True)
-        check_number("goal_radius", self.goal_radius, positive=True, unit="metres")
-        check_number("max_range", self.max_range, positive=True, unit="metres")
-        check_number("lidar_rotation_deg", self.lidar_rotation_deg, unit="degrees")
-        check_number("goal_rotation_deg", self.goal_rotation_deg, unit="degrees")
-        check_number("lidar_noise", self.lidar_noise, 0, unit="metres")
-        check_number("lidar_dropout", self.lidar_dropout, 0, 1, unit="a probability")
 
 
 def make_environment(config: NavigationConfig, split: str = "training") -> Navigation:
@@ -83,7 +72,7 @@ def make_environment(config: NavigationConfig, split: str = "training") -> Navig
         max_steps=jnp.int32(config.max_steps),
         goal_radius=jnp.float32(config.goal_radius),
         goal_rotation=jnp.deg2rad(jnp.float32(config.goal_rotation_deg)),
-        mirrors=config.mirrors,
+        mirrors=config.mirrors and not (config.lidar_rotation_deg or config.goal_rotation_deg),
         sides=config.style == "corridor",
         look_ahead=config.look_ahead,
     )

@@ -213,7 +213,7 @@ class Navigation(Described, struct.PyTreeNode):
         actions. With `look_ahead` also what is left to the goal after two legs of which the first goes there, what a
         detour they are, and the first leg's length (`aims.look_ahead`).
         """
-        return aims_of(obs, self.look_ahead)
+        return aims_of(obs, self.look_ahead, self.lidar.max_range)
 
     def mirror(
         self, which: Int[Array, ""] | int, obs: Float[Array, " obs"], vector: Float[Array, "2"]

@@ -7,7 +7,7 @@ a way of its own. Functions take one world; `jax.vmap` serves many.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ from cuelearner_envs.zoo.robots import (
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.spaces.directions import rotate
 
-ERRORS = (
+Error = Literal[
     "nothing",
     "constant",  # added to the executed action; directions: a turn
     "gain",  # each entry of the executed action times a factor of its own
@@ -46,7 +46,8 @@ ERRORS = (
     "two",  # constant and seen_shift
     "other_way",  # nothing is wrong, but the teacher has another way
     "other_way_shift",  # seen_shift, and the teacher has another way
-)
+]
+ERRORS: tuple[str, ...] = get_args(Error)
 STEPS = 50  # of an episode
 TOLERANCE = 0.07  # distance from the goal that counts as there, for n = 2
 HOLD = 5  # steps in a row near the goal that make a success; 1 of directions, which cannot stop

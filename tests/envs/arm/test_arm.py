@@ -101,7 +101,7 @@ def test_the_teacher_sees_true_places_and_the_heuristic_what_is_seen():
     ("changes", "said"),
     [
         ({"skill": "throw"}, "task.skill is 'throw'"),
-        ({"friction": 0.0}, "task.friction is 0.0: give a finite number from 0.01 up to 10"),
+        ({"friction": 0.0}, "task.friction is 0.0: give a number from 0.01 to 10"),
         ({"preferred_side": "left", "skill": "pick"}, "that needs --task.skill push and its post"),
     ],
 )

@@ -14,7 +14,8 @@ features = jax.jit(EASY.features)
 heuristic = jax.jit(EASY.heuristic)
 
 
-def test_mirrored_shots_have_mirrored_results():
+def test_mirrored_shots_have_mirrored_results_on_a_level_table():
+    assert make_environment(BilliardsConfig("easy", mirrors=True, acceleration=(0.0, 0.005))).symmetries == 1
     states, strikes = random_states()
     keys = jax.random.split(KEY, BATCH)
     obs = observe_many(EASY, states)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import rooms
 
-from cuelearner_envs.navigation.aims import ROOM, free_ways
+from cuelearner_envs.navigation.aims import ROOM, free_ways, points_of
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_jax.spaces.directions import from_angle
@@ -22,12 +22,14 @@ def test_a_disc_is_stopped_where_it_touches():
     beams = from_angle(jnp.asarray(BEAM_ANGLES))
     wall = jnp.where(beams[:, 0] > 0.3, 3.0 / jnp.maximum(beams[:, 0], 0.3), 10.0)
     obs = jnp.concatenate([jnp.exp(-jnp.minimum(wall, 10.0)), jnp.zeros(9)])
-    np.testing.assert_allclose(free_ways(obs, AHEAD[None])[:, 0], 3.0 - np.array([0.28, 0.42, 0.55]), atol=1e-3)
+    np.testing.assert_allclose(free_ways(points_of(obs), AHEAD[None])[:, 0], [2.72, 2.58, 2.45], atol=1e-3)
     post = jnp.full(271, 10.0).at[135 + 9].set(2.0)  # 9 degrees to the left
     obs = jnp.concatenate([jnp.exp(-post), jnp.zeros(9)])
     along, across = 2.0 * math.cos(math.radians(9)), 2.0 * math.sin(math.radians(9))
     stopped = [10.0, *(along - math.sqrt(radius**2 - across**2) for radius in (0.42, 0.55))]
-    np.testing.assert_allclose(free_ways(obs, AHEAD[None])[:, 0], stopped, atol=1e-3)
+    np.testing.assert_allclose(free_ways(points_of(obs), AHEAD[None])[:, 0], stopped, atol=1e-3)
+    nothing = points_of(jnp.full(280, math.exp(-5.0)), max_range=5.0)  # of a lidar that sees 5 m
+    assert free_ways(nothing, AHEAD[None]).min() == 10.0
 
 
 def test_aims_are_ways_with_room_and_the_goal_comes_first():
@@ -38,5 +40,5 @@ def test_aims_are_ways_with_room_and_the_goal_comes_first():
     possible = np.asarray(aims.open)
     assert np.asarray(aims.possible).all()
     assert not possible[behind].any()
-    free = jax.jit(jax.vmap(free_ways))(obs, aims.actions)
+    free = jax.vmap(free_ways)(jax.vmap(points_of)(obs), aims.actions)
     assert np.asarray(free[:, 0])[possible].min() > ROOM[0]

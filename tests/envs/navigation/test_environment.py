@@ -172,7 +172,7 @@ def test_every_split_has_worlds_of_its_own_and_always_the_same():
     ("name", "value", "words"),
     [
         ("style", "maze", "task.style is 'maze': choose one of clutter, rooms, corridor"),
-        ("lidar_dropout", 2.0, "task.lidar_dropout is 2.0: give a finite number from 0 up to 1 (a probability)"),
+        ("lidar_dropout", 2.0, "task.lidar_dropout is 2.0: give a number from 0 to 1"),
         ("preferred_side", "rigth", "task.preferred_side is 'rigth', did you mean 'right'?"),
         ("preferred_side", "left", "task.preferred_side is left: that needs --task.style corridor"),
     ],
