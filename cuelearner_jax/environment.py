@@ -18,7 +18,7 @@ has is in `Environment`. It may also have these members; no module asks for the 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -160,6 +160,25 @@ class WholeObservations(Described):
     ) -> Float[Array, " obs"]:
         """Return the next observation."""
         return aftermath
+
+    def step_to(
+        self: Any,
+        key: PRNGKeyArray,
+        after: EnvState,
+        reward: Float[Array, ""],
+        terminated: Bool[Array, ""],
+        truncated: Bool[Array, ""],
+        metrics: Mapping[str, Float[Array, ""]],
+        outcome: Mapping[str, Float[Array, ""]],
+    ) -> tuple[EnvState, Step]:
+        """Return what `step` returns, for the state `after` an action; where the episode ended, a new one begins.
+
+        The environment observes a state by `observe(state)`.
+        """
+        ended, final_obs, (start, first_obs) = terminated | truncated, self.observe(after), self.reset(key)
+        obs = jnp.where(ended, first_obs, final_obs)
+        step = Step(obs, final_obs, final_obs, reward, terminated, truncated, metrics, outcome)
+        return jax.tree.map(lambda new, old: jnp.where(ended, new, old), start, after), step
 
 
 def offers(env: Any, name: str) -> bool:

@@ -100,19 +100,9 @@ class Reach(WholeObservations, struct.PyTreeNode):
         after = self.moved(state, action)
         reached = jnp.linalg.norm(after.buoy - after.place) < GOAL_RADIUS
         late = (after.steps >= self.max_steps) & ~reached
-        fresh, fresh_obs = self.reset(key)
-        success, final_obs, ended = reached.astype(jnp.float32), self.observe(after), reached | late
-        step = Step(
-            obs=jnp.where(ended, fresh_obs, final_obs),
-            final_obs=final_obs,
-            aftermath=final_obs,  # as WholeObservations has it
-            reward=success,
-            terminated=reached,
-            truncated=late,
-            metrics={},
-            outcome={"success": success, "duration": after.steps * PERIOD},
-        )
-        return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after), step
+        success = reached.astype(jnp.float32)
+        outcome = {"success": success, "duration": after.steps * PERIOD}
+        return self.step_to(key, after, reward=success, terminated=reached, truncated=late, metrics={}, outcome=outcome)
 
     def moved(self, state: Boat, action: Float[Array, "2"]) -> Boat:
         """Return the state after a step, without a reset."""

@@ -85,10 +85,7 @@ class Even(WholeObservations, struct.PyTreeNode):
     def step(self, key: PRNGKeyArray, state: Any, action: Float[Array, " action"]) -> tuple[Any, Step]:
         """Execute an action; a new episode follows the last step of one."""
         after, reward = zoo.step(self.world, state, study.from_even(self.world.robot, action))
-        ends, final = after.steps >= zoo.STEPS, self.observe(after)
-        start, first = self.reset(key)
-        step = Step(jnp.where(ends, first, final), final, final, reward, jnp.array(False), ends, {}, {})
-        return jax.tree.map(lambda new, old: jnp.where(ends, new, old), start, after), step
+        return self.step_to(key, after, reward, jnp.array(False), after.steps >= zoo.STEPS, {}, {})
 
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the action of the robot's policy."""

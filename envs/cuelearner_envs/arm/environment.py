@@ -94,19 +94,8 @@ class Arm(WholeObservations, struct.PyTreeNode):
         """Execute an action; a new episode follows the end of one."""
         after = self.after(state, physics.control(state.body, self.command(state, action), self.ground))
         outcome, truncated = self.ends(after)
-        following = jax.tree.map(lambda new, old: jnp.where(truncated, new, old), self._start(key), after)
-        final_obs = self.observe(after)
-        step = Step(
-            obs=jnp.where(truncated, self.observe(following), final_obs),
-            final_obs=final_obs,
-            aftermath=final_obs,
-            reward=self._earned(after),
-            terminated=jnp.array(False),
-            truncated=truncated,
-            metrics={"within": (self.distance(after) < self.within).astype(jnp.float32)},
-            outcome=outcome,
-        )
-        return following, step
+        metrics = {"within": (self.distance(after) < self.within).astype(jnp.float32)}
+        return self.step_to(key, after, self._earned(after), jnp.array(False), truncated, metrics, outcome)
 
     def command(self, state: Situation, action: Float[Array, "4"]) -> physics.Command:
         """Return the targets of the drives that an action means."""

@@ -81,24 +81,9 @@ class Billiards(WholeObservations, struct.PyTreeNode):
             shots=state.shots + 1,
         )
         cleared = after.pocketed[1:].all()
-        ended = cleared | (after.shots >= self.max_shots)
-        racked, racked_obs = self.reset(k_reset)
-        final_obs = self.observe(after)
-        step = Step(
-            obs=jnp.where(ended, racked_obs, final_obs),
-            final_obs=final_obs,
-            aftermath=final_obs,
-            reward=reward,
-            terminated=cleared,
-            truncated=ended & ~cleared,
-            metrics={
-                "scored": (reward > 0).astype(jnp.float32),
-                "foul": foul.astype(jnp.float32),
-                "exhausted": shot.exhausted.astype(jnp.float32),
-            },
-            outcome={},
-        )
-        return jax.tree.map(lambda new, old: jnp.where(ended, new, old), racked, after), step
+        metrics = {"scored": reward > 0, "foul": foul, "exhausted": shot.exhausted}
+        metrics = {name: value.astype(jnp.float32) for name, value in metrics.items()}
+        return self.step_to(k_reset, after, reward, cleared, (after.shots >= self.max_shots) & ~cleared, metrics, {})
 
     def path(self, balls: Balls, action: Float[Array, "2"]) -> Trajectory:
         """Simulate the shot of an action event by event, for drawing."""

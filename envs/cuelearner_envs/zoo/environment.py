@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -36,24 +35,17 @@ class ZooEnvironment(WholeObservations, struct.PyTreeNode):
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
         """Begin an episode."""
         state = worlds.reset(key, self.world)
-        return state, worlds.observe(self.world, state)
+        return state, self.observe(state)
+
+    def observe(self, state: State) -> Float[Array, " obs"]:
+        """Return the observation of a state."""
+        return worlds.observe(self.world, state)
 
     def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"]) -> tuple[EnvState, Step]:
         """Execute an action; a new episode follows the last step of one."""
         after, reward = worlds.step(self.world, state, action)
-        truncated, final_obs = after.steps >= STEPS, worlds.observe(self.world, after)
-        start, first_obs = self.reset(key)
-        step = Step(
-            obs=jnp.where(truncated, first_obs, final_obs),
-            final_obs=final_obs,
-            aftermath=final_obs,
-            reward=reward,
-            terminated=jnp.array(False),
-            truncated=truncated,
-            metrics={},
-            outcome={"success": worlds.success(self.world, after).astype(jnp.float32)},
-        )
-        return jax.tree.map(lambda new, old: jnp.where(truncated, new, old), start, after), step
+        outcome = {"success": worlds.success(self.world, after).astype(jnp.float32)}
+        return self.step_to(key, after, reward, jnp.array(False), after.steps >= STEPS, {}, outcome)
 
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the action of the robot's policy, which knows nothing of what is wrong."""
