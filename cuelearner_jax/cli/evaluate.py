@@ -36,7 +36,8 @@ class Evaluate(Finished, EvaluateRequest):
     package.module:NAME, any function of observations."""
 
     compare: str | None = None
-    """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference."""
+    """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference.
+    --guidance, --labels and --seed choose its lanes too; in another folder only --seed does, if there are several."""
     labels_from: Path | None = None
     """Instead: how many answers of this label file the policy agrees with. Also of package.module:NAME and of a file in
     ONNX; beside the policy as it was and "already right" always."""
@@ -57,10 +58,8 @@ def run(arguments: list[str]) -> None:
     evaluate.amount(source.task, options)
     if options.out and options.out.exists():
         raise UserError(f"{options.out} exists: give another --out")
-    requests: list[tuple[PolicySource, Evaluate]] = [(source, options)]
-    if options.compare:
-        other, policy = _other(source, options, options.compare)
-        requests.append((other, replace(options, policy=policy, guidance=(), labels=(), seed=())))
+    requests = [(source, options)]
+    requests += [_other(source, options, options.compare)] if options.compare else []
     plans = [evaluate.prepare(*request) for request in requests]
     if options.compare:  # what cannot be compared is not measured first
         measurements.differences(
@@ -124,22 +123,30 @@ def _print_agreement(source: PolicySource, options: Evaluate) -> None:
     out.print_table(table)
 
 
-def _other(source: PolicySource, options: Evaluate, name: str) -> tuple[PolicySource, str]:
-    """Return the source and name of the policy to compare with. Raises UserError if it does not act in that world."""
+def _other(source: PolicySource, options: Evaluate, name: str) -> tuple[PolicySource, Evaluate]:
+    """Return the source and options of the policy to compare with, which acts in the same world on the same robot.
+
+    Guidance and labels choose lanes of the same folder only. Raises UserError if the policy does not act in that world.
+    """
     folder = shipped.folder_of(name)
     if folder.exists():
         code = source.adapted.code if source.adapted and policy_folders.is_one(folder) else None
-        other = source_in(folder, source.task, code, None).on(options.robot)
+        other = replace(source_in(folder, source.task, code, None), task=source.task)
         policy = other.default_policy
     elif name in POLICIES:
         other, policy = source, name
     else:
         names = ", ".join(POLICIES)
         raise UserError(f"--compare is {name!r}: give a run folder, a policy folder, a shipped agent or one of {names}")
-    if policy == options.policy and other.folder.absolute() == source.folder.absolute():
+    is_same = other.folder.absolute() == source.folder.absolute()
+    if policy == options.policy and is_same:
         raise UserError(f"--compare is {name!r}, the policy that is evaluated: give another one")
-    other.check(policy, options.task)
-    return other, policy
+    seeds = other.grid.seeds if other.grid else other.adapted.lanes.seed if other.adapted else ()
+    choice = LANE if is_same else ("seed",) if len({*seeds}) > 1 else ()
+    unused = [one for one in LANE if one not in choice or not POLICIES[policy].from_folder]
+    options = replace(options, policy=policy, **dict.fromkeys(unused, ()))
+    other.check(policy, options.task, guidance=options.guidance)
+    return other, options
 
 
 def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:

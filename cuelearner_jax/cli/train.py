@@ -12,17 +12,7 @@ import tyro
 
 from cuelearner_jax import plugins
 from cuelearner_jax.api.worlds import NoOptions
-from cuelearner_jax.cli.options import (
-    Flag,
-    Kinds,
-    Outside,
-    RunParts,
-    about,
-    look_ahead_of,
-    out,
-    parse,
-    unprefixed,
-)
+from cuelearner_jax.cli.options import Flag, Kinds, Outside, RunParts, about, look_ahead_of, out, parse, unprefixed
 from cuelearner_jax.cli.sources import preset_of, task_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -30,6 +20,7 @@ from cuelearner_jax.run_config import PARTS, RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.storage import label_files
 from cuelearner_jax.studies import train
 from cuelearner_jax.task import QUICKSTART
 
@@ -54,7 +45,7 @@ class TrainingOptions(Outside, RunParts, Order):
     overwrite: Flag[bool] = False
     """Delete an earlier run in the folder."""
     labels_from: Path | None = None
-    """Label file to use instead of asking the teacher."""
+    """Label file to use instead of asking the teacher; --labels is then by default the file's labels per seed."""
     tuning: Flag[bool] = False
     """Evaluate on the tuning episodes, which are for choosing settings, not on the validation episodes."""
     robot: str | None = None
@@ -106,6 +97,8 @@ def parse_training(
     name, preset = preset_of(task, ahead.preset, QUICKSTART)
     request = train.suggested(task, preset)
     grid, config = request.grid, request.config
+    if ahead.labels_from is not None:
+        grid = replace(grid, labels=(label_files.read(Path(ahead.labels_from)).budget,))
     for part, table in PARTS.items():
         own = None if (word := getattr(ahead, part)) is None else plugins.resolve(table, word, part)
         if own is not None and own is not type(getattr(config, part)):

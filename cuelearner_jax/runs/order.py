@@ -18,8 +18,8 @@ from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid, check_grid, describe, with_control
-from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.storage import label_files, tracking
+from cuelearner_jax.runs.shards import OWN, Shard, differing_options
+from cuelearner_jax.storage import formats, label_files, tracking
 from cuelearner_jax.storage.folders import CONFIG, check_folder
 from cuelearner_jax.storage.results import SETTINGS, setting_name
 from cuelearner_jax.task import Task, shape_of
@@ -115,7 +115,20 @@ def make_plan(order: Order) -> Plan:
         contents["shard"] = {**shard._asdict(), "seeds": list(sweep.grid.seeds)}
         shard.check_sweep(sweep.out, contents)
     check_folder(order.out, contents, order.resume, order.overwrite)
+    if order.setting and not order.overwrite:
+        _check_settings(sweep.out.parent, contents)
     return Plan(order, contents, labels)
+
+
+def _check_settings(out: Path, contents: dict[str, Any]) -> None:
+    """Raise UserError unless a setting, described by `contents`, belongs to the grid whose settings have begun."""
+    pattern, own = ("shard-*-of-*/", OWN) if "shard" in contents else ("", ())
+    now = {**contents, "setting": sorted(contents["setting"])}
+    for path in sorted(out.glob(f"{SETTINGS}/{pattern}{CONFIG}")):
+        before = formats.read("config", path)
+        before["setting"] = sorted(before.get("setting", ()))
+        if names := differing_options(before, now, (*own, *now["setting"])).replace("grid.", ""):
+            raise UserError(f"{path.parent} is of a grid with another {names}: give the same options, or another --out")
 
 
 def read_labels(

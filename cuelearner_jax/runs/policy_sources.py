@@ -174,8 +174,28 @@ class PolicySource:
             blocks = [Block(own.guidance, *columns, 0, policy, np.zeros(own.lanes.number, bool))]
         else:
             blocks = [one._replace(policy=self._policy(name, one, view, teacher)) for one in self.load(kinds)]
-        blocks = _select(blocks, seeds, labels)
+        blocks = self.select(blocks, seeds, labels)
         return blocks if failed_too else without_failed(blocks)
+
+    def select(
+        self, blocks: list[Block], seeds: tuple[int, ...], labels: tuple[int, ...], bound: float = 0.0, unit: str = ""
+    ) -> list[Block]:
+        """Return the lanes with some seeds, budgets (empty: all) and a bound in a unit (0: any), or raise UserError."""
+        rest = []
+        for block in blocks:
+            mask = np.isin(block.seeds, seeds or block.seeds) & np.isin(block.budgets, labels or block.budgets)
+            mask &= np.isclose(block.bounds, bound, rtol=1e-4) | (bound == 0)
+            if mask.any():
+                rest.append(block.lanes(mask))
+        there = [{*np.concatenate([getattr(block, part) for block in blocks]).tolist()} for part in Block._fields[1:4]]
+        if rest and {*seeds} <= there[0] and {*labels} <= there[1]:
+            return rest
+        words = [f"seed {format_numbers(seeds)}"] * bool(seeds) + [f"{format_numbers(labels)} labels"] * bool(labels)
+        near, others = (f" within {text} {unit}" if bound else "" for text in (f"{bound:g}", format_numbers(there[2])))
+        raise UserError(
+            f"{self.folder} has no lane with {' and '.join(words)}{near}: there are seeds {format_numbers(there[0])} "
+            f"and labels {format_numbers(there[1])}{others}"
+        )
 
     def _policy(self, name: str, block: Block, view: Any, teacher: Teacher | None) -> Any:
         """Return a trained policy of a run's lanes (`lanes_of`)."""
@@ -232,27 +252,6 @@ def best_lane(table: pa.Table, choice: Choice, metric: str = "reward") -> Choice
         f"({last[best]:.4g}); {OPTIONS} choose another"
     )
     return (*best[:2], seeds or best[2:])
-
-
-def _select(
-    blocks: list[Block], seeds: tuple[int, ...], labels: tuple[int, ...], bound: float = 0.0, unit: str = ""
-) -> list[Block]:
-    """Return the lanes with some seeds, budgets (empty: all) and a bound in a unit (0: any), or raise UserError."""
-    rest = []
-    for block in blocks:
-        mask = np.isin(block.seeds, seeds or block.seeds) & np.isin(block.budgets, labels or block.budgets)
-        mask &= np.isclose(block.bounds, bound, rtol=1e-4) | (bound == 0)
-        if mask.any():
-            rest.append(block.lanes(mask))
-    there = [{*np.concatenate([getattr(block, part) for block in blocks]).tolist()} for part in Block._fields[1:4]]
-    if rest and {*seeds} <= there[0] and {*labels} <= there[1]:
-        return rest
-    words = [f"seed {format_numbers(seeds)}"] * bool(seeds) + [f"{format_numbers(labels)} labels"] * bool(labels)
-    near, others = (f" within {text} {unit}" if bound else "" for text in (f"{bound:g}", format_numbers(there[2])))
-    raise UserError(
-        f"no lane with {' and '.join(words)}{near}: there are seeds {format_numbers(there[0])} and labels "
-        f"{format_numbers(there[1])}{others}"
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,13 +314,13 @@ class LaneChoice:
         bound = float(max(block.bounds.max() for block in blocks)) if self.bound_deg is None else self.bound_deg
         policies, lanes, unit = [], [], actions_of(view).unit
         for seed in seeds or (int(blocks[0].seeds[0]),):
-            lane = _select(blocks, (seed,), (labels,), bound, unit)[0]
+            lane = source.select(blocks, (seed,), (labels,), bound, unit)[0]
             if lane.failed[0]:
                 console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
             policies.append(lane.policy.lane(0))
             lanes.append({"guidance": lane.guidance, "labels": labels, "seed": seed})
         budgets = () if self.labels is None else (self.labels,)
-        count = sum(len(block.seeds) for block in _select(blocks, self.seed, budgets, self.bound_deg or 0.0, unit))
+        count = sum(len(one.seeds) for one in source.select(blocks, self.seed, budgets, self.bound_deg or 0.0, unit))
         if source.adapted and count > len(lanes):
             names = ", ".join(f"{variant_name(lane['guidance'], labels)}, seed {lane['seed']}" for lane in lanes)
             console.print(f"{names}: of {count} lanes the first with most labels and bound; {OPTIONS} choose another")

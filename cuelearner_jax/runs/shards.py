@@ -62,9 +62,9 @@ class Shard(NamedTuple):
         return tuple(int(seed) for seed in np.array_split(np.array(seeds), self.count)[self.index - 1])
 
 
-def differing_options(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """Return at most four options in which the sweeps of two descriptions differ, see `folders.differences`."""
-    return ", ".join(sorted({*differences(before, now)} - set(OWN))[:4])
+def differing_options(before: dict[str, Any], now: dict[str, Any], own: tuple[str, ...] = OWN) -> str:
+    """Return at most four options, but for `own`, in which the sweeps of two descriptions differ."""
+    return ", ".join(sorted({*differences(before, now)} - set(own))[:4])
 
 
 def missing(configurations: list[Path]) -> list[str]:

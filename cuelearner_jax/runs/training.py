@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from typing import Any
 
 import jax
@@ -17,9 +18,9 @@ from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import Agent, Guided, PolicyNode, asked_from
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage import label_files, results
 from cuelearner_jax.storage.checkpoint import Checkpoints
-from cuelearner_jax.types import Label, Params, Teacher
+from cuelearner_jax.types import Label, Teacher
 
 
 def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
@@ -44,6 +45,12 @@ def restore_clock(store: Checkpoints) -> tuple[Clock, float, int, int]:
     like = {"clock": jax.eval_shape(start_clock), "wall_s": np.float32(0), "cut": np.zeros(2, np.int32)}
     arrays = store.restore({"clock": like})["clock"]
     return arrays["clock"], float(arrays["wall_s"]), *arrays["cut"].tolist()
+
+
+def ambiguous_names(step: Any) -> list[str]:
+    """Return the metrics and outcomes of an environment's step that have the name of another column of results."""
+    names, columns = [*step.metrics, *step.outcome], {"reward", "finished", *results.MEANINGS} - {"*"}
+    return [name for name in names if names.count(name) > 1 or any(fnmatchcase(name, one) for one in columns)]
 
 
 class Training:
@@ -163,19 +170,16 @@ class Training:
 
     def evaluation(self) -> dict[str, Any]:
         """Return the columns of one evaluation of all agents: scalars, or (lanes,) with NaN for failed lanes."""
-        group = self.group
+        group, view = self.group, view_of(self.eval_env)
         own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
-        own |= {"failed": self.failed.astype(float), "episodes": self.group.config.schedule.eval_envs}
-        return {**own, **self._evaluate(lambda lane: self._policy(lane.agent.params, view_of(self.eval_env)))}
+        own |= {"failed": self.failed.astype(float), "episodes": group.config.schedule.eval_envs}
+        return {**own, **self._evaluate(lambda lane: Agent(lane.agent.params, group.config.agent_in(view), view))}
 
     def policies(self, view: Any) -> PolicyNode:
         """The finished policies of all lanes as they stand, for a world of that view."""
         params = [lane.agent.params for lane in self.blocks]
         whole = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
-        return self._policy(whole, view)
-
-    def _policy(self, params: Params, view: Any) -> PolicyNode:
-        return Agent(params, self.group.config.agent_in(view), view)
+        return Agent(whole, self.group.config.agent_in(view), view)
 
     def guide_alone(self) -> dict[str, np.ndarray]:
         """Return metrics (lanes,) of the actions that questions begin with, under guidance; without that, of chance."""

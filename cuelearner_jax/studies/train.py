@@ -1,10 +1,6 @@
 """Training as one request, filled alike by the command line and Python: kinds of guidance x seeds x label budgets.
 
 Kinds are trained in turn; the lanes of a kind (seeds x label budgets) are trained side by side.
-
-    request = suggested(task, preset)    # the preset's grid
-    run(Order(request.task, request.config, request.grid, out))    # in a folder, resumable
-    found = in_memory(request, env, examined, teacher)    # for Python
 """
 
 from __future__ import annotations
@@ -15,6 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from cuelearner_jax.adaptation.judging import step_of
 from cuelearner_jax.devices import SHARED, lane_mesh, place, release_programs
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import NotFinite, UserError
@@ -25,7 +22,7 @@ from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order, TrainRequest, in_folders, labels_of, make_plan, resolve_request
 from cuelearner_jax.runs.runner import Runner
-from cuelearner_jax.runs.training import Training, mean_of_finite
+from cuelearner_jax.runs.training import Training, ambiguous_names, mean_of_finite
 from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, prepare_folder
 from cuelearner_jax.task import Preset, Task, shape_of
@@ -49,8 +46,10 @@ def _begin(
 ) -> tuple[list[LaneGroup], Teacher | None]:
     """Return the lane group of each kind, and who answers: None where no kind asks, or labels answer.
 
-    `find`: environment -> teacher. Raises UserError for one that cannot be asked.
+    `find`: environment -> teacher. Raises UserError for one that cannot be asked, or for ambiguous names of metrics.
     """
+    if names := ambiguous_names(step_of(env)):
+        raise UserError(f"a metric or outcome is called {names[0]!r}, as another column of results: give another name")
     config, env = request.config, place(lane_mesh(), env, SHARED)
     groups = [LaneGroup(config, env, config.guide_in(env, kind), request.grid) for kind in request.grid.guidance]
     asking = [group.guidance.name for group in groups if group.guidance.asks]

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from cuelearner_jax.environment import Aims, Environment, actions_of, offers, symmetries_of
+from cuelearner_jax.runs.training import ambiguous_names
 from cuelearner_jax.testing.laws import Laws, shapes_of
 
 COMPARED = 8  # steps of the roll-out that are taken again in one batch, and actions that features are asked about
@@ -62,10 +63,8 @@ def _check_shapes(laws: Laws, env: Environment) -> None:
         for name, value in values.items():
             fits = value.dtype == kind and value.shape == shape
             laws.hold(fits, f"{name} is {value.dtype} of shape {value.shape}: make it {kind} of shape {shape}")
-    every = {*step.metrics, *step.outcome}
-    dotted = {name for name in every if "." in name}  # as settings of sweeps are called
-    names = sorted({"reward", "finished"} & every | {*step.metrics} & {*step.outcome} | dotted)
-    laws.hold(not names, f"a metric or outcome is called {names[:1]}, which results have already: give another name")
+    names = ambiguous_names(step)
+    laws.hold(not names, f"metrics or outcomes are called {names}, as other columns of results: give other names")
     one, other = (re.sub("0x[0-9a-f]+", "", str(program)) for program in programs)  # without memory addresses
     laws.hold(one == other, "two traces give two programs: draw all random numbers from the key alone")
 

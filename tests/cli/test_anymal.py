@@ -1,11 +1,14 @@
 """The quadruped's commands: walking policies, other robots and engines for a trained agent."""
 
 import json
+import shutil
 
 import pytest
+from probes import edit_json
 
 from cuelearner_envs.anymal import policy
 from cuelearner_jax.cli import main
+from cuelearner_jax.studies import evaluate
 
 REFUSED = [
     (["evaluate", "billiards", "--robot", "anymal"], "billiards has no robots to choose from: leave out --robot"),
@@ -21,6 +24,15 @@ REFUSED = [
 def test_bad_combinations_are_refused(refused, tmp_path, monkeypatch, command, says):
     monkeypatch.chdir(tmp_path)
     refused(command, says, tmp_path)
+
+
+def test_policies_of_two_robots_are_compared_on_one(tmp_path, monkeypatch):
+    other, robots = shutil.copytree("docs/data/navigation_agent", tmp_path / "other"), []
+    edit_json(other / "config.json", lambda told: told.update(robot="anymal"))
+    prepare = lambda source, request: robots.append(source.task.bodies[0].name) or (None, [])  # noqa: E731
+    monkeypatch.setattr(evaluate, "prepare", prepare)
+    assert main(["evaluate", "shipped:navigation", "--compare", str(other)]) == 0
+    assert robots == ["simple", "simple"]
 
 
 def test_it_walks_by_a_policy_of_the_users_own(tmp_path):

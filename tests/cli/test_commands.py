@@ -10,6 +10,8 @@ from xml.etree import ElementTree
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from probes import long_but
+from small_runs import BANDIT
 
 from cuelearner_jax import studies
 from cuelearner_jax.api.policies import load_policy
@@ -18,6 +20,7 @@ from cuelearner_jax.runs.order import make_plan
 from cuelearner_jax.storage import results
 from cuelearner_jax.studies import train
 
+TRAINED = ("agent", "guide", "guided")
 README = Path(__file__).resolve().parents[2] / "README.md"
 
 
@@ -35,21 +38,14 @@ def test_a_sweep_leaves_a_complete_folder(run_folder):
     assert (run_folder / "relative" / "labels.parquet").exists()
 
 
-@pytest.mark.parametrize(
-    "policy",
-    [
-        "agent",
-        "uniform",
-        *(pytest.param(name, marks=pytest.mark.long) for name in ("guided", "guide", "teacher", "heuristic")),
-    ],
-)
+@pytest.mark.parametrize("policy", long_but(("agent", "uniform"), (*TRAINED, "uniform", "teacher", "heuristic")))
 def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     out = tmp_path / "measured.json"
     command = ["evaluate", str(run_folder), "--policy", policy, "--steps", "20", "--envs", "10", "--out", str(out)]
     assert main(command) == 0
     told = capsys.readouterr().out
     assert "reward" in told
-    trained = policy in ("agent", "guide", "guided")
+    trained = policy in TRAINED
     assert ("trained steps" in told) == ("bootstrap over seeds and 10 environments" in told) == trained
     assert ("mean and bootstrap over 10 environments of 2 steps" in told) == (not trained)
     rows = json.loads(out.read_text())["rows"]
@@ -83,13 +79,16 @@ def test_lanes_are_chosen_and_what_cannot_be_is_refused_before_anything_is_measu
     command, out = ["evaluate", run_folder, "--steps", "20", "--envs", "10"], tmp_path / "rows.json"
     chosen = ["--guidance", "relative", "--labels", "20", "--seed", "2001"]
     capsys.readouterr()
-    assert main([str(word) for word in [*command, *chosen, "--out", out, "--json"]]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads(out.read_text())
-    (row,) = json.loads(out.read_text())["rows"]
-    assert (row["guidance"], row["labels"], row["seeds"]) == ("relative", 20, [2001])
+    for other in ("guided", shutil.copytree(run_folder, tmp_path / "copy")):
+        out.unlink(missing_ok=True)
+        assert main([str(word) for word in [*command, *chosen, "--compare", other, "--out", out, "--json"]]) == 0
+        written = json.loads(out.read_text())
+        assert json.loads(capsys.readouterr().out) == written
+        for row in (*written["rows"], *(one["less"] for one in written["compared"]["differences"])):
+            assert (row["guidance"], row["labels"], row["seeds"]) == ("relative", 20, [2001])
     monkeypatch.setattr(studies.evaluate, "rollout_lanes", None)
     refused([*command, "--policy", "uniform", "--compare", run_folder], "has 3 variants", tmp_path)
-    refused([*command, "--seed", "5"], "no lane with seed 5: there are seeds 2000, 2001 and labels 0, 10, 20", tmp_path)
+    refused([*command, "--seed", "5"], f"{run_folder} has no lane with seed 5: there are seeds 2000, 2001 ", tmp_path)
     refused([*command, "--policy", "uniform", "--seed", "2000"], "belongs to no lane", tmp_path)
     refused(["render", "shipped:billiards", "--policy", "heuristic", "--labels", "100"], "belongs to no lane", tmp_path)
 
@@ -106,7 +105,7 @@ def test_a_task_alone_is_drawn_on_any_of_its_tables(tmp_path):
     assert main(["render", "billiards", "--task.table", "one_ball", "--question", "--out", str(tmp_path)]) == 0
 
 
-def test_the_sweep_of_the_readme_would_begin(monkeypatch, tmp_path):
+def test_the_sweep_of_the_readme_would_begin(run_folder, monkeypatch, tmp_path):
     (line,) = re.findall(r"^cuelearner (sweep .*)$", README.read_text(encoding="utf-8"), re.MULTILINE)
     orders = []
     monkeypatch.chdir(tmp_path)
@@ -117,6 +116,10 @@ def test_the_sweep_of_the_readme_would_begin(monkeypatch, tmp_path):
     grid = orders[1].grid
     assert (grid.guidance[0], grid.labels, grid.seeds) == ("none", (50,), (5, 6))
     assert orders[1].config.schedule.total_steps == 60_000
+    for command in (["sweep", BANDIT, "--seeds", "2"], ["train", BANDIT, "--seed", "2001"]):  # all labels of a file
+        given = ["--guidance", "relative", "--labels-from", str(run_folder / "relative" / "labels.parquet")]
+        assert main([*command, *given]) == 0
+        assert orders.pop().grid.labels == (20,)
 
 
 def test_a_report_has_curves_and_tables(run_folder, tmp_path, capsys):

@@ -86,3 +86,6 @@ def test_impossible_grids_are_refused_before_anything_is_trained(grid, refused, 
     refused([*GRID[:-1], "--out", grid / "grid", "--overwrite"], "is not a run folder", grid)
     refused([*GRID[:-1], "3", "--out", grid / "grid", "--overwrite"], f"{FIVE} is of another grid", grid)
     refused([*SWEEP, "--out", grid / "grid"], "is not empty", grid)
+    other, says = ["--scalars.eps-deg", "10", "20", "--agent.learning-rate"], f"{TWO} is of a grid with another "
+    refused([*SWEEP, *other, "0.5", "--out", grid / "grid"], f"{says}agent.learning_rate: give the same options", grid)
+    refused([*SWEEP, *other, "0.5", "0.1", "--out", grid / "grid"], f"{says}setting: give", grid)

@@ -96,6 +96,8 @@ def test_a_piece_that_is_missing_is_named(pieces, measured, tmp_path):
 
 def test_pieces_that_do_not_fit_together_are_refused(pieces, refused, tmp_path):
     refused([*SWEEP, "--shard", "1/4", "--out", tmp_path / "run"], "3 seeds cannot be divided into 4 shards", tmp_path)
+    half = pieces / "shard-1-of-2"
+    refused(["evaluate", pieces, "--seed", "9", "--compare", half], f"{half} has no lane with seed 9", pieces)
     other = ["--scalars.eps-deg", "3"]
     first, second = ([*SWEEP, "--shard", piece, "--out", pieces] for piece in ("1/2", "2/2"))
     shutil.rmtree(pieces / "shard-2-of-2")

@@ -63,6 +63,10 @@ def mirrored(image):
 
 ENVIRONMENTS = {
     "sizes": (other(observation=(Quantity("a", 3, "1"),)), "observation is float32 of shape (2,): make it"),
+    "a column": (
+        stepping(lambda state, after, step: (after, step.replace(outcome={"failed": step.reward}))),
+        "metrics or outcomes are called ['failed'], as other columns of results",
+    ),
     "random numbers": (Outside(), "draw all random numbers from the key alone"),
     "no end": (
         stepping(lambda state, after, step: (state, step.replace(obs=state, terminated=jnp.array(False)))),
@@ -85,7 +89,7 @@ ENVIRONMENTS = {
 }
 
 
-@pytest.mark.parametrize("law", long_but(("sizes", "random numbers", "no reset", "recall"), ENVIRONMENTS))
+@pytest.mark.parametrize("law", long_but(("sizes", "a column", "random numbers", "no reset", "recall"), ENVIRONMENTS))
 def test_a_broken_law_of_environments_is_found(law):
     env, message = ENVIRONMENTS[law]
     breaks(check_environment, message, env)
