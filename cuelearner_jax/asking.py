@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -19,6 +20,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import bound_scalars
@@ -255,11 +257,17 @@ def _choose(
     Seung, Opper, Sompolinsky, 1992); before the first fit the first one.
     """
     candidates = guide.env, guide.obs, actions, first
-    if guide.obs.ndim == 1 or not of.guidance.has_members:
+    if guide.obs.ndim == 1 or of.guidance.sizes.ensemble == 1:
         return candidates
     apart = of.guidance.disagreement(guide.model, of.env, guide.obs, actions)
     index = jnp.where(guide.model.fitted, jnp.argmax(apart), 0)
     return jax.tree.map(lambda leaf: leaf[index], candidates)
+
+
+def check_observations(obs: Any) -> None:
+    """Raise UserError unless all of an environment's observations are finite."""
+    if not np.isfinite(np.asarray(obs)).all():
+        raise UserError("this world gave an observation that is not finite: give a number in place of inf and NaN")
 
 
 def blame(
@@ -269,12 +277,13 @@ def blame(
     base: Policy | None = None,
     key: PRNGKeyArray | None = None,
 ) -> None:
-    """Raise UserError if a teacher or a base policy returns invalid actions in the guide's situation.
+    """Raise UserError if the guide's situation, or a teacher's or a base policy's action in it, is invalid.
 
     Call this for a lane that failed while asking: its situation is the one before the failure, and its labels do not
     show the fault.
     """
     (states, obs), space = _situations(guide), actions_of(env)
+    check_observations(obs)
     if base is not None:
         assert key is not None
         user_code.check_actions(space.only_actions(base.act(key, states, obs)), policy_name(base))

@@ -21,18 +21,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax.adaptation.by_model import settling
-from cuelearner_jax.adaptation.by_reading import CHOICE
+from cuelearner_jax.adaptation.by_reading import ask_in_batches
 from cuelearner_jax.agents.choice import best_near_peaks
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.reading import Distortion, Reading, Walk, declared_distortions
-from cuelearner_jax.reading.session import BATCHES, LEAST_BATCH
 from cuelearner_jax.report.statistics import resampled
 from cuelearner_jax.runs.policy_sources import LaneChoice, PolicySource
 from cuelearner_jax.spaces.directions import evenly_spaced
@@ -105,19 +103,6 @@ def worth(world: World, policy: Any, split: str, steps: int) -> float:
     return float(evaluate_policy(world.shown, policy, episodes(split), ENVS, steps)[name])
 
 
-def asked(reading: Reading, walk: Walk, seed: int, labels: int) -> None:
-    """Ask so many questions, in batches."""
-    key, size = jax.random.key(seed), max(LEAST_BATCH, -(-labels // BATCHES))
-    for done in range(0, labels, size):
-        key, k_where, k_ask, k_answer = jax.random.split(key, 4)
-        states, obs = walk.situations(k_where, reading.policy(), CHOICE * size)
-        index, action = reading.questions(np.asarray(obs), min(size, labels - done), k_ask)
-        states, obs = jax.tree.map(lambda leaf, index=index: leaf[index], (states, obs))
-        answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
-        there = np.isfinite(answer).any(-1)
-        reading.learn(np.asarray(obs)[there], action[there], answer[there])
-
-
 class Study(NamedTuple):
     """Base policies, worlds and answers of one study."""
 
@@ -142,7 +127,7 @@ class Study(NamedTuple):
         start, walk = time.time(), Walk(world.env, world.teacher, world.scalars)
         policy, eps = self.bases[base], float(world.scalars.eps_deg)
         reading = Reading(policy, family, actions_of(world.env), eps, labels, world.env.observation)
-        asked(reading, walk, seed * 1000 + labels, labels)
+        ask_in_batches(reading, walk, seed * 1000 + labels, labels)
         found = reading.result()
         seconds, better = round(time.time() - start, 1), found.policy if found.used else policy
         estimates = {

@@ -12,13 +12,16 @@ import pytest
 
 from cuelearner_jax import asking
 from cuelearner_jax.adaptation import by_reading
+from cuelearner_jax.adaptation.judging import Judging
+from cuelearner_jax.adaptation.lanes import product
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import PREFERENCE
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import Heuristic, Uniform
+from cuelearner_jax.policies import Common, Heuristic, Taught, Uniform
 from cuelearner_jax.spaces import directions
 
-ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
+ENV, EXPERT, HEURISTIC = probes.Window(), probes.Expert(probes.Window()), Heuristic(probes.Window())
 RELATIVE = guidances.make("relative", probes.SIZES, ENV)
 ROUND = probes.SIZES.labels_per_round
 FAULTY = dataclasses.replace(
@@ -145,3 +148,43 @@ def test_shuffled_answers_are_those_given_each_with_another_label():
     np.testing.assert_array_equal(exchanged, np.concatenate([found, answer + 0.5], -1))
     other = asking.fitted_labels(jax.random.key(12), labels, scalars)
     assert (np.asarray(other.answer) != found).any()
+
+
+class Lidar(probes.Window):
+    """Sees a distance at the start, then the last action."""
+
+    start: float = 1.0
+
+    def reset(self, key):
+        return super().reset(key)[0], jnp.full(2, self.start)
+
+    def step(self, key, state, action):
+        state, step = super().step(key, state, action)
+        return state, step.replace(obs=action)
+
+
+class Lost(probes.Expert):
+    """Knows no action."""
+
+    def best_action(self, state, obs):
+        return obs * jnp.nan
+
+
+def test_a_reading_names_who_fails_and_tells_that_nobody_answers():
+    def read(start=1.0, base=HEURISTIC, teacher=EXPERT, silence=0.0):
+        env, scalars = Lidar(start=start), dataclasses.replace(probes.SCALARS, silence_probability=silence)
+        of = guidances.make("reading", probes.SIZES, env), probes.SIZES, scalars, env, Common(base), ()
+        lanes, how = product(1, (0,), (20,), (60.0,)), Judging(None, by="labels")
+        return by_reading.adapt(by_reading.ReadingAdaptation(*of), lanes, how, teacher)
+
+    lost = Lost(ENV)
+    for failing, name in (
+        ({"start": jnp.inf}, "this world gave an observation"),
+        ({"base": Taught(lost)}, "policy Taught"),
+        ({"teacher": lost}, "teacher Lost"),
+    ):
+        with pytest.raises(UserError, match=name):
+            read(**failing)
+    with pytest.raises(UserError, match="this world gave an observation"):
+        asking.blame(ENV, None, begun().replace(obs=jnp.full(2, jnp.inf)))
+    assert read(silence=1.0).words == ["20 labels: No question was answered."]

@@ -17,6 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import AdaptationResult, result_of
 from cuelearner_jax.adaptation.judging import Judge, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
@@ -75,7 +76,7 @@ def adapt(
     of: ReadingAdaptation,
     lanes: Lanes,
     how: Judging,
-    teacher: Teacher | None = None,
+    teacher: Teacher | Any = None,
     labels: Label | None = None,
     watch: Callable[[str], Tell] = lambda what: ignore_progress,
 ) -> AdaptationResult:
@@ -90,7 +91,7 @@ def adapt(
         reading = Reading(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation)
         if labels is None:
             progress = lambda count, before=total_before: tell(before + count, total)  # noqa: E731
-            own = _ask(of, reading, seed, budget, teacher, progress)
+            own = ask_in_batches(reading, Walk(of.env, teacher, of.scalars), seed, budget, progress)
         else:
             own = jax.tree.map(lambda leaf: np.asarray(leaf)[len(rows)], labels)
             reading.read_in_batches(*_valid(jax.random.key(seed), own, of.scalars))
@@ -110,12 +111,11 @@ def adapt(
     return result_of(judge, block, lanes.number, tuple(results))
 
 
-def _ask(
-    of: ReadingAdaptation, reading: Reading, seed: int, budget: int, teacher: Any, tell: Callable[[int], None]
+def ask_in_batches(
+    reading: Reading, walk: Walk, seed: int, budget: int, tell: Callable[[int], None] = lambda count: None
 ) -> Label:
-    """Return one lane's labels, asked and read in batches."""
-    walk, rows = Walk(of.env, teacher, of.scalars), []
-    key, size = jax.random.key(seed), max(LEAST_BATCH, -(-budget // BATCHES))
+    """Return one lane's labels, asked and read in batches. Raises UserError for a failing world or teacher."""
+    rows, key, size = [], jax.random.key(seed), max(LEAST_BATCH, -(-budget // BATCHES))
     for start in range(0, budget, size):
         tell(start)
         key, k_where, k_ask, k_answer = jax.random.split(key, 4)
@@ -123,10 +123,10 @@ def _ask(
         states, obs = walk.situations(k_where, reading.policy(), CHOICE * size)
         index, action = reading.questions(np.asarray(obs), count, k_ask)
         states, obs = pick((states, obs), index)
-        answer = np.asarray(walk.answers(k_answer, states, obs, jnp.asarray(action)))
-        valid = np.asarray(np.isfinite(answer).any(-1))
+        answer, valid = map(np.asarray, walk.answers(k_answer, states, obs, jnp.asarray(action)))
+        user_code.check_actions(answer[valid], f"teacher {type(walk.teacher).__name__}")
         rows.append(Label(np.asarray(obs), action, np.where(valid[:, None], answer, 0), valid))  # pyright: ignore[reportArgumentType]
-        reading.learn(*_valid(k_answer, rows[-1], of.scalars))
+        reading.learn(*_valid(k_answer, rows[-1], walk.scalars))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
 
 

@@ -123,7 +123,7 @@ class Judge:
             for pair, spent in pairs if usable.any() or not is_person else ():
                 values.append([one[self.how.by] for one in pair])
                 steps += spent
-                test.add(differences(pair, self.how.by))
+                test.add(differences(pair, self.how.by), gains(pair, self.how.by))
                 if (test.decided | ~usable).all():
                     break
         before, after = np.concatenate(values, -1) if values else np.full((2, number, 1), np.nan)
@@ -132,10 +132,10 @@ class Judge:
     def _by_metric(self, block: Any) -> Generator[tuple[Pair, np.ndarray], None, None]:
         """Yield values of base and adapted policy on the same episodes, and the rewarded steps (lanes,) of these."""
         adapted = self.of.policy(block, self.how.env)
-        for number in range(-(-self.how.num_envs // AT_ONCE)):
-            key = jax.random.fold_in(episodes(SPLIT), number)
-            bases, base_steps = self._rolled(self.of.bases, "the policy as it was", key, AT_ONCE)
-            after, steps = self._rolled(adapted, "the corrected policy", key, AT_ONCE)
+        for first in range(0, self.how.num_envs, AT_ONCE):
+            key, count = jax.random.fold_in(episodes(SPLIT), first // AT_ONCE), min(AT_ONCE, self.how.num_envs - first)
+            bases, base_steps = self._rolled(self.of.bases, "the policy as it was", key, count)
+            after, steps = self._rolled(adapted, "the corrected policy", key, count)
             own = self.lanes.base if len(base_steps) > 1 else np.zeros(self.lanes.number, int)
             yield ({name: values[own] for name, values in bases.each.items()}, after.each), steps + base_steps[own]
 
@@ -194,11 +194,12 @@ class PairedTest:
     """A sequential test of differences in [-1, 1], whose chance to call better what is not is 1/20 at most.
 
     Under "not better", E = mean over lambda of prod(1 + lambda d) is a test martingale; so is H with -d under "not
-    worse". The first to reach 20 decides (Ville's inequality: the chance to ever reach 20 is 1/20).
+    worse". The first to reach 20 decides (Ville's inequality: the chance to ever reach 20 is 1/20). The bound holds for
+    shares. Rewards and returns are clipped, so a rare crash counts too little: better also needs a mean gain so far.
     """
 
     def __init__(self, lanes: int) -> None:
-        self._products = np.ones((2, len(STAKES), lanes))  # for better, for worse
+        self._products, self._gain = np.ones((2, len(STAKES), lanes)), np.zeros(lanes)  # for better and worse; so far
         self.better, self.worse = np.zeros(lanes, bool), np.zeros(lanes, bool)
 
     @property
@@ -206,31 +207,41 @@ class PairedTest:
         """Whether the test of each lane (lanes,) has ended."""
         return self.better | self.worse
 
-    def add(self, differences: np.ndarray) -> None:
-        """Add episodes (lanes, episodes) in their order."""
-        for d in differences.T:
+    def add(self, differences: np.ndarray, gains: np.ndarray | None = None) -> None:
+        """Add episodes (lanes, episodes) in their order; `gains`: their differences where these are clipped."""
+        for d, gain in zip(differences.T, (differences if gains is None else gains).T, strict=True):
             self._products *= 1 + np.stack([np.outer(STAKES, d), -np.outer(STAKES, d)])
+            self._gain += gain
             better, worse = self._products.mean(1) >= DECIDED
+            better &= self._gain >= 0  # False for NaN
             open_yet = ~self.decided
             self.better |= open_yet & better
             self.worse |= open_yet & worse & ~better
+
+
+def gains(pair: Pair, by: str) -> np.ndarray:
+    """Return after less before of each episode: NaN without a value after, 0 without one before; such a share is 0."""
+    before, after = (one[by] for one in pair)
+    if by in SHARES:
+        return np.nan_to_num(after) - np.nan_to_num(before)
+    return np.where(np.isnan(before), 0.0, after - before)
 
 
 def differences(pair: Pair, by: str) -> np.ndarray:
     """Return how much better each episode (lanes, episodes) of the second policy was, in [-1, 1].
 
     Values of a share, as success, count as they are; others in units of the largest value of both policies in the
-    batch, since a unit of one policy alone would favour the other where neither is better.
-    Where a share is equal, the returns decide, with half of the weight.
+    batch, since a unit of one policy alone would favour the other where neither is better. Where the second policy
+    alone has no value, it is worse. Where a share is equal, the returns decide, with half of the weight.
     """
     before, after = pair
 
     def relative(name: str) -> np.ndarray:
         largest = np.nanmax(np.abs(np.concatenate([before[name], after[name]], -1)), axis=-1, keepdims=True)
-        return np.nan_to_num(np.clip((after[name] - before[name]) / np.maximum(largest, 1e-9), -1, 1))
+        return np.nan_to_num(np.clip(gains(pair, name) / np.fmax(largest, 1e-9), -1, 1), nan=-1.0)
 
     if by in SHARES:
-        d = np.nan_to_num(after[by]) - np.nan_to_num(before[by])
+        d = gains(pair, by)
         return np.where(d == 0, 0.5 * relative("return"), d) if "return" in before else d
     return relative(by)
 

@@ -115,8 +115,8 @@ def human_answer(
 ) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
     """Return (h of each cue, answered) of a person with the faults of `scalars` who intends `best`.
 
-    Mistakes and silence are drawn for each cue by itself. `scalars.says` decides which cues an answer names; h is
-    `UNSAID` for the others. An answer that names no cue counts as not answered.
+    Mistakes and silence are drawn for each cue by itself. `scalars.says` decides which of the cues that people are
+    asked about an answer names; h is `UNSAID` for the others. An answer that names no cue counts as not answered.
     """
     mistaken, spoken = _slips(key, scalars, (len(space.cues),))
     eps, indifference = space.from_unit(scalars.eps_deg), space.from_unit(scalars.indifference_deg)
@@ -124,21 +124,21 @@ def human_answer(
     h = jnp.where(mistaken, -h, h)
     if len(space.cues) == 1:  # with one cue, silence about it is no answer
         return h, spoken[0]
-    spoken = spoken & _spoken_of(key, space.log(action, best), scalars.says)
+    spoken = spoken & _spoken_of(key, space, space.log(action, best), scalars.says)
     return jnp.where(spoken | ~jnp.isfinite(h), h, UNSAID), spoken.any()
 
 
-def _spoken_of(key: PRNGKeyArray, off: Float[Array, " cues"], says: str) -> Bool[Array, " cues"]:
-    """Return which cues a teacher names: all, the one with the largest difference (ties: the first), or a random one.
+def _spoken_of(key: PRNGKeyArray, space: Space, off: Float[Array, " cues"], says: str) -> Bool[Array, " cues"]:
+    """Return which of the cues that people are asked about a teacher names: all, the worst (the first of several), one.
 
     Cues of one space count in one unit, so the largest difference is also the largest in units of eps.
     """
-    if says == "all":
-        return jnp.ones(off.shape, bool)
-    number = jnp.arange(len(off))
+    numbers = jnp.array([number for number, cue in enumerate(space.cues) if cue.is_asked])
     if says == "worst":
-        return number == jnp.argmax(jnp.abs(off))
-    return number == jax.random.randint(jax.random.fold_in(key, len(off)), (), 0, len(off))
+        numbers = numbers[jnp.argmax(jnp.abs(off[numbers]))]
+    elif says == "one":
+        numbers = numbers[jax.random.randint(jax.random.fold_in(key, len(off)), (), 0, len(numbers))]
+    return jnp.isin(jnp.arange(len(off)), numbers)
 
 
 def demonstrate(

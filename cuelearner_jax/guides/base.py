@@ -75,11 +75,6 @@ class Guide:
         if self.options is None and self.config is not None:
             object.__setattr__(self, "options", self.config())
 
-    @property
-    def has_members(self) -> bool:
-        """Whether the guide's model is an ensemble, whose members can disagree."""
-        return self.asks and self.sizes.ensemble > 1
-
     @cached_property
     def network(self) -> GuideModel:
         """The network, or ensemble, of situations and actions."""

@@ -26,7 +26,7 @@ here where silence is meant there. A cue of which nothing was said is no part of
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -114,18 +114,14 @@ class Clic(Guide):
 
     name, title = "clic", "CLIC"
     about = "an energy over actions, low in the sets that corrections leave possible"
-    form, colour, outputs = RELATIVE, "#117733", 1  # minus the energy of an action
+    form: ClassVar[Any] = RELATIVE
+    colour, outputs = "#117733", 1  # minus the energy of an action
 
     def energy(
         self, env: Any, params: Params, obs: Observation, actions: Actions, base: Action | None, scalars: GuideScalars
     ) -> Float[Array, " n"]:
         """Return E of actions in one situation; `base`, the policy's own action, is ignored."""
         return -self.network.predict(env, params, obs, actions)[:, 0]
-
-    def target_action(self, row: Contrast, scalars: GuideScalars) -> Action:
-        """Return the action that a label calls better than the one asked about."""
-        space = self.spaces.actions
-        return space.toward(row.action, row.answer, space.from_unit(scalars.eps_deg))
 
     def membership(
         self, key: PRNGKeyArray, row: Contrast, actions: Actions, scalars: GuideScalars
@@ -139,10 +135,10 @@ class Clic(Guide):
 
     def sample_actions(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Actions:
         """Return the sampled actions of one label: two known ones, uniform ones, and ones near a."""
-        space, count = self.spaces.actions, SAMPLED - 2
+        space, count, eps = self.spaces.actions, SAMPLED - 2, self.spaces.actions.from_unit(scalars.eps_deg)
         k_any, k_near = jax.random.split(key)
-        change = NEAR * space.from_unit(scalars.eps_deg) * jax.random.normal(k_near, (count // 2, len(space.cues)))
-        from_label = jnp.stack([row.action, self.target_action(row, scalars)])
+        change = NEAR * eps * jax.random.normal(k_near, (count // 2, len(space.cues)))
+        from_label = jnp.stack([row.action, self.form.correct(space, row.action, row.answer, eps)])
         near = space.exp(jnp.broadcast_to(row.action, (count // 2, space.size)), change)
         return jnp.concatenate([from_label, space.sample(k_any, (count - count // 2,)), near])
 
@@ -159,17 +155,13 @@ class Clic(Guide):
 
     def examples(self, labels: Label, scalars: GuideScalars) -> Contrast:
         """Return labels (slots, ...) as contrasts; a label that names no cue is not valid."""
-        numbers, valid = jnp.arange(len(labels.valid)), labels.valid & self.informative(labels)
+        numbers, valid = jnp.arange(len(labels.valid)), says_something(labels.answer) | self.form.is_action
         base = labels.action if labels.base is None else labels.base
-        return Contrast(labels.obs, labels.action, labels.answer, valid, numbers, base)
+        return Contrast(labels.obs, labels.action, labels.answer, labels.valid & valid, numbers, base)
 
     def augmented(self, key: PRNGKeyArray, batch: Contrast) -> Contrast:
         """Return the batch with new random streams for sampling."""
         return batch.replace(draw=jax.random.randint(key, batch.draw.shape, 0, 2**30))
-
-    def informative(self, labels: Label) -> Bool[Array, " slots"]:
-        """Return which labels name any cue."""
-        return says_something(labels.answer)
 
     def minimise_energy(
         self, env: Any, params: Params, obs: Observation, base: Action, scalars: GuideScalars
@@ -197,14 +189,13 @@ class Clic(Guide):
         self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the action of least energy within tau_max of a, in active rows of a fitted model."""
-        guided = active & model.fitted
 
         def choose(where: Array) -> Array:
             own_obs, base = jnp.split(where, [obs.shape[1]])
             return self.minimise_energy(env, model.params, own_obs, base, scalars)
 
         best = each_in_portions(choose, jnp.concatenate([obs, actions], -1), SEARCHED)
-        return replaced(best, actions, guided)
+        return replaced(best, actions, active & model.fitted)
 
 
 class ClicShown(Clic):
@@ -213,14 +204,6 @@ class ClicShown(Clic):
     name, title = "clic_shown", "CLIC, demonstrations"
     about = "an energy over actions, low around what the teacher shows"
     form, colour, by_cues = DEMONSTRATION, "#44AA99", True
-
-    def target_action(self, row: Contrast, scalars: GuideScalars) -> Action:
-        """Return the demonstrated action."""
-        return row.answer
-
-    def informative(self, labels: Label) -> Bool[Array, " slots"]:
-        """Return True for all labels: each shows an action."""
-        return jnp.ones_like(labels.valid)
 
     def membership(
         self, key: PRNGKeyArray, row: Contrast, actions: Actions, scalars: GuideScalars

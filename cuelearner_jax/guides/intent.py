@@ -152,8 +152,7 @@ class Intent(Guide):
         """Move each action by at most eps a pass toward the likeliest aim, in active rows with a sure, fitted model."""
         space, aims = self.spaces.actions, jax.vmap(env.aims)(obs)
         share = self.shares(model, env, aims)
-        find = partial(choose_aim, space, doubt=self.options.aim_doubt)
-        goals, sure = jax.vmap(find)(share, aims.actions, actions)
+        goals, sure = jax.vmap(partial(choose_aim, space, doubt=self.options.aim_doubt))(share, aims.actions, actions)
 
         def phi(current: Actions) -> Actions:
             return space.approach(current, goals, space.from_unit(scalars.eps_deg)) - current

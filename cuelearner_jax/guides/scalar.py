@@ -50,10 +50,9 @@ class Scalar(Guide):
         self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions, active: Rows, scalars: GuideScalars
     ) -> Refinement:
         """Return the best of all actions in active rows of a fitted model."""
-        guided = active & model.fitted
         value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
         best = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
-        return replaced(best, actions, guided)
+        return replaced(best, actions, active & model.fitted)
 
     def question(
         self, key: PRNGKeyArray, model: GuidanceModel, env: Any, obs: Observation, base: Action, scalars: GuideScalars

@@ -7,12 +7,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from cuelearner_jax import user_code
+from cuelearner_jax.asking import check_observations
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.devices import portions
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.feedback.answers import RELATIVE
+from cuelearner_jax.policies import policy_name
 from cuelearner_jax.reading.session import run_of
 from cuelearner_jax.types import EnvState, Teacher
 
@@ -35,20 +38,23 @@ class Walk:
         keys = jax.random.split(key, 1 + total)
         if self.states is None or len(self.obs) != envs:
             self.states, self.obs = _start(self.env, jax.random.split(keys[0], envs))
-        act, situations = run_of(policy), []
+        act, name, situations = run_of(policy), policy_name(policy), []
         for rest in reversed(range(total)):
             k_act, k_env = jax.random.split(keys[total - rest])
+            check_observations(self.obs)
             action = act(k_act, self.states, self.obs)
+            user_code.check_actions(actions_of(self.env).only_actions(action), name)  # before the world is blamed
             self.states, self.obs = _step(self.env, jax.random.split(k_env, envs), self.states, action)
             if rest % APART == 0 and rest < steps:
                 situations.append((self.states, self.obs))
+        check_observations(self.obs)
         # Situations of one environment are adjacent, so that one question is chosen from few environments.
         return _adjacent(count, situations)
 
     def answers(
         self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
-    ) -> Float[Array, "n cues"]:
-        """Return the teacher's answers; NaN where it says nothing."""
+    ) -> tuple[Float[Array, "n cues"], Bool[Array, " n"]]:
+        """Return the teacher's answers, and which questions are answered."""
         keys = jax.random.split(key, len(obs))
         return _answers(self.env, self.teacher, self.scalars, keys, states, obs, actions)
 
@@ -73,7 +79,6 @@ def _step(env: Any, keys: Any, states: Any, actions: Any) -> Any:
 def _answers(env: Any, teacher: Any, scalars: Any, keys: Any, states: Any, obs: Any, actions: Any) -> Any:
     def one(row: Any) -> Any:
         key, state, own_obs, action = row
-        answer, answered = RELATIVE.answer(key, env, teacher, state, own_obs, action, scalars)
-        return jnp.where(answered, answer, jnp.nan)
+        return RELATIVE.answer(key, env, teacher, state, own_obs, action, scalars)
 
     return jax.lax.map(one, (keys, states, obs, actions), batch_size=min(len(obs), portions().states))

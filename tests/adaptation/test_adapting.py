@@ -30,7 +30,7 @@ RELATIVE = guidances.make("relative", SIZES, ENV)
 OBS = directions.evenly_spaced(4)
 SHIFTS = (-25.0, 40.0)  # by which the base policies miss the best direction [deg]
 MESH = lane_mesh(jax.local_devices()[:1])
-JUDGING = Judging(ENV, num_envs=20, steps=10)
+JUDGING = Judging(ENV, num_envs=15, steps=10)
 
 
 class Shifted(PolicyNode):
@@ -94,7 +94,7 @@ def test_a_constant_shift_is_recovered_to_within_eps():
     assert judged.after[(LANES.budget == 80) & (LANES.bound_deg == 60)].min() == 1.0
     np.testing.assert_allclose(judged.difference[:, 0], judged.after - judged.before, atol=1e-6)
     assert (judged.difference[:, 1] <= judged.difference[:, 0]).all()
-    assert set(judged.rewarded_steps.tolist()) == {2 * 20 * JUDGING.steps}  # before and after
+    assert set(judged.rewarded_steps.tolist()) == {2 * 15 * JUDGING.steps}  # before and after
 
 
 def test_the_bound_is_never_exceeded():
@@ -193,7 +193,7 @@ def test_a_bound_is_narrowed_where_that_is_worth_more():
     assert wide.judgement.within_deg.tolist() == pytest.approx([60.0])
     assert (narrow.judgement.after[0], narrow.judgement.in_use[0]) == (1.0, True)
     assert narrow.judgement.within_deg.tolist() == pytest.approx([3.0])
-    episodes = 3 * 20 + 2 * 10, 2 * 20  # the three bounds, then pairs until the test decides
+    episodes = 3 * 15 + 2 * 10, 2 * 15  # the three bounds, then pairs until the test decides
     spent = narrow.judgement.rewarded_steps[0], wide.judgement.rewarded_steps[0]
     assert spent == tuple(count * JUDGING.steps for count in episodes)
     assert errors(narrow.policy(ENV), 0) == pytest.approx(5.0, abs=0.01)

@@ -14,7 +14,7 @@ from flax import struct
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import DEMONSTRATION, PREFERENCE, RELATIVE, SCALAR, check_teacher, human_answer
-from cuelearner_jax.spaces import DIRECTIONS, UNSAID, Choices, directions
+from cuelearner_jax.spaces import DIRECTIONS, UNSAID, Box, Choices, cues_from, directions
 from cuelearner_jax.types import ValuesDirections
 
 FORMS = {"relative": RELATIVE, "demonstration": DEMONSTRATION, "scalar": SCALAR}
@@ -199,3 +199,15 @@ def test_a_teacher_of_one_cue_speaks_of_each_as_often_and_rightly():
     np.testing.assert_allclose(told.mean(0), 1 / 3, atol=0.07)  # standard deviation 0.016
     for cue, h in enumerate((1, -1, 0)):
         np.testing.assert_array_equal(np.asarray(answers)[told[:, cue], cue], h)
+
+
+@pytest.mark.parametrize("says", ["all", "worst", "one"])
+def test_no_teacher_speaks_of_a_cue_that_people_are_not_asked_about(says):
+    space = Box((-1.0, -1.0), (1.0, 1.0), cues_from("x=left,right", ("x", "y")))
+    scalars = dataclasses.replace(SCALARS, eps_deg=0.1, says=says)
+    keys = jax.random.split(KEY, 9)
+    answers, answered = jax.vmap(lambda key: human_answer(key, space, jnp.zeros(2), jnp.array([0.0, 1.0]), scalars))(
+        keys
+    )
+    np.testing.assert_array_equal(answers, [[0, UNSAID]] * 9)
+    assert answered.all()
