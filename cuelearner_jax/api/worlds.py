@@ -123,7 +123,8 @@ def from_gymnasium(
         max_steps: an episode is truncated after so many (default: as the environment says, or 1,000).
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         observation: a name, a number of entries and a unit for each slice of the flattened observation,
-            [("gripper", 3, "m"), ("goal", 3, "m")] (default: its entries by the names of its space).
+            [("gripper", 3, "m"), ("goal", 3, "m")] (default: its entries by the names of its space). A description, a
+            kind and degrees between beams may follow.
         units: units of slices by name, in place of `observation`; a reading may shift slices in "m" and "rad".
         processes: number of processes that play (0: one for each processor; 1: this process plays).
         arguments: arguments of the environment.

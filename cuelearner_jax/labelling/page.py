@@ -156,8 +156,8 @@ class Page:
                 return "there is nothing to take back" if number == self.session.number else LATE
             answer = controls.answer_of(self.space, control, angle, self._parts if self._parts_of == number else {})
             return "" if await run.io_bound(self.session.answer, number, answer, seconds) else LATE
-        except UserError as error:
-            return str(error)
+        except Exception as error:
+            return str(error) or type(error).__name__
 
     def _script(self, code: str) -> None:
         """Run a script in the browser."""

@@ -117,7 +117,7 @@ class Status(NamedTuple):
     minutes_left: float | None
     fitting: bool
     newest: Fitted
-    trouble: str  # why the last answer is not saved; empty: no problem
+    trouble: str  # why the last answer is not saved, or no question follows; empty: no problem
     seconds: float  # that all answers took
 
 
@@ -242,11 +242,18 @@ class Session:
                 item = self._items[number]
                 answer = None if answer is None else item.in_form(answer)
                 self.record.save(item, UNSURE if answer is None else ANSWERED, answer, took)
-            self._next.result()
-            self._show(number + 1)
+            if self._is_ready(self._next):
+                self._show(number + 1)
             if self._learner.is_due(self.record.count(ANSWERED)):
                 self._fits.submit(self._fit)
             return True
+
+    def _is_ready(self, preparing: Future[None]) -> bool:
+        """Wait for a question. Return whether it can be shown; where not, the status says why."""
+        if error := preparing.exception():
+            why = f"your answers are saved, but the next question cannot be made ({type(error).__name__}: {error})"
+            self.record.trouble = f"{why}: stop with Ctrl-C and repeat the command"
+        return error is None
 
     def undo(self, number: int) -> bool:
         """Take back the answer before this question and ask it again.
@@ -259,8 +266,8 @@ class Session:
                 if number != self.number or before is None:
                     return False
                 self.record.save(before, UNDONE, None, time.monotonic() - self._since)
-            self._ahead.submit(self._prepare, number - 1).result()
-            self._show(number - 1)
+            if self._is_ready(self._ahead.submit(self._prepare, number - 1)):
+                self._show(number - 1)
             return True
 
     def finish(self) -> Path:

@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import os
 import sys
 import threading
 from collections.abc import Callable
 from functools import lru_cache, partial
+from glob import escape
 from pathlib import Path
 from typing import Any, cast
 
@@ -64,7 +66,7 @@ class Opaque(PolicyNode):
             shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
             return _valid(self.actions, jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims"))
         # called here: one that computes with JAX would wait for the program that waits for it
-        return _valid(self.actions, jnp.asarray(self._called_back(np.asarray(obs))))
+        return _valid(self.actions, jnp.asarray(self._called(np.asarray(obs))))
 
     def _called_back(self, obs: Any) -> np.ndarray:
         """Return the function's actions; NaN once it has failed, which `user_code` reports after the program."""
@@ -184,6 +186,10 @@ def policy_of(source: Any, space: Space | None = None) -> Any:
                 f"policy {code_name(policy)} takes {', '.join(more)}: give a function of observations alone, for "
                 f"instance jax.jit(lambda obs: policy(obs, {', '.join(more[1:])})[0])"
             )
+        try:
+            hash(policy)
+        except TypeError:  # a dataclass, say
+            policy = Foreign(policy, lambda one, obs: one(obs))
         policy = Opaque(policy, on_host=not isinstance(policy, jax.stages.Wrapped))
     elif jax.tree_util.all_leaves([policy]):
         kind = type(policy).__name__
@@ -239,11 +245,11 @@ def teaching(source: Any, space: Space) -> Teacher:
 class Foreign:
     """Another library's policy as a function of a batch of observations (n, obs) that returns actions, in NumPy.
 
-    Two functions of one object, or of one file, are equal: programs that call them are compiled once.
+    Two functions of one object, or of one file's contents, are equal: programs that call them are compiled once.
     """
 
-    def __init__(self, model: Any, act: Callable[[Any, Any], Any], path: Path | None = None) -> None:
-        self.model, self._act, self._key = model, act, path or id(model)
+    def __init__(self, model: Any, act: Callable[[Any, Any], Any], path: Path | None = None, digest: str = "") -> None:
+        self.model, self._act, self._key = model, act, (path, digest) if path else id(model)
         self.__qualname__ = str(path or type(model).__qualname__)
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
@@ -360,4 +366,6 @@ def _onnx(path: Path) -> Foreign:
         parts = np.split(rows, len(rows)) if inputs[0].shape[0] == 1 else [rows]
         return np.concatenate([session.run(names, {inputs[0].name: part})[0] for part in parts])
 
-    return Foreign(session, act, path.resolve())
+    files = sorted(path.parent.glob(f"{escape(path.name)}*"))  # weights may lie in a file of their own beside it
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files if file.is_file())).hexdigest()
+    return Foreign(session, act, path.resolve(), digest)

@@ -50,11 +50,6 @@ class Range(NamedTuple):
     lower: Samples
     upper: Samples
 
-    @classmethod
-    def exact(cls, samples: Samples) -> Range:
-        """Return the range of a quantity that is known exactly."""
-        return cls(samples, samples)
-
 
 class Sampled(NamedTuple):
     """A variant with the samples of its mean over the curve and of its steps to the level."""
@@ -140,7 +135,8 @@ def _level(variants: Sequence[Variant], question: Question) -> tuple[float, str]
     if unguided is None:
         raise UserError("no results of unguided agents, whose level would be the one to reach: give --level")
     steps = unguided.curve.steps
-    at = question.level_at if question.level_at is not None else int(steps[: unguided.until][-1])
+    shared = steps[steps <= max(steps[0], unguided.span[1])]
+    at = question.level_at if question.level_at is not None else int(shared[-1])
     if at not in steps:
         raise UserError(f"--level-at {at}: {unguided.name} has no such step, but {', '.join(map(str, steps))}")
     level = float(unguided.curve.estimate[np.flatnonzero(steps == at)[0]])
@@ -159,11 +155,11 @@ def _row(own: Sampled, unguided: Sampled | None) -> Row:
     if unguided is None:
         return row
     row["against"] = unguided.variant.name
-    comparisons = {
-        "mean_difference": Range.exact(own.areas - unguided.areas),
-        "mean_ratio": ratio_bounds(Range.exact(own.areas), Range.exact(unguided.areas)),
-        "steps_ratio": ratio_bounds(own.steps, unguided.steps),
-    }
+    mean, other, difference = (Range(each, each) for each in (own.areas, unguided.areas, own.areas - unguided.areas))
+    comparisons = {"mean_difference": difference, "mean_ratio": ratio_bounds(mean, other)}
+    comparisons["steps_ratio"] = ratio_bounds(own.steps, unguided.steps)
+    if min(own.areas.min(), unguided.areas.min()) < 0:  # the ratio of negative means is larger for the worse one
+        del comparisons["mean_ratio"]
     for name, bounds in comparisons.items():
         row |= _columns(name, bounds, own, unguided)
     return row

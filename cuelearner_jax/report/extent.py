@@ -81,12 +81,13 @@ def gaps(groups: Sequence[Group], variants: Sequence[Variant], metric: str, spli
         lines += _short(group.every, own)
         if group.invalid:
             lines.append(f"{where}{group.invalid:,} {split} rows have no finite {metric}; their steps are left out")
-    for task in dict.fromkeys(variant.task for variant in variants):
-        ends = {int(variant.steps[-1]) for variant in variants if variant.task == task}
+    for task, (start, end) in {one.task: one.span for one in variants}.items():
+        ends = {(int(one.steps[0]), int(one.steps[-1])) for one in variants if one.task == task}
+        span = f"from step {start:,.0f} to {end:,.0f}, shared by all" if start <= end else "over no shared steps"
         if len(ends) > 1:
             lines.append(
-                f"{task and f'{task}: '}curves end at different steps, so their final values cannot be compared; "
-                f"means over the curve are taken to step {min(ends):,}, shared by all"
+                f"{task and f'{task}: '}curves begin or end at different steps, so their final values cannot be "
+                f"compared; means over the curve are taken {span}"
             )
     return lines
 

@@ -37,7 +37,7 @@ def spread(row: Measured, metric: str) -> Interval | None:
     """
     if not np.isfinite(row.metrics[metric]).all():
         return None
-    each = row.each[metric]
+    each = row.each[metric][:1] if is_single(row) else row.each[metric]
     if each.min() == each.max() and each.min() in (0, 1) and each.size > 1:
         certain = float(scipy.stats.beta.ppf(0.05, each.size + 0.5, 0.5))
         return Interval(*map(np.asarray, (1.0, certain, 1.0) if each.min() else (0.0, 0.0, 1 - certain)))

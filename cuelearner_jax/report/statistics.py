@@ -97,12 +97,15 @@ def improvement(
 
 
 def mean_over_curve(
-    steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "*seeds steps"]
+    steps: Int[np.ndarray, "steps"],
+    values: Float[np.ndarray, "*seeds steps"],
+    span: tuple[float, float] = (-np.inf, np.inf),
 ) -> Float[np.ndarray, "*seeds"]:
-    """Return the mean of each seed's curve over its steps: the area by the trapezoidal rule over the span."""
-    span = float(steps[-1] - steps[0])
-    area = np.trapezoid(values, np.asarray(steps, dtype=float), axis=-1)
-    return area / span if span > 0 else np.asarray(values, dtype=float)[..., 0]
+    """Return the mean of each seed's curve over its steps in a span; curves are straight between steps."""
+    points = np.clip(np.asarray(steps, dtype=float), *span)
+    shares = np.stack([np.interp(points, steps, of_step) for of_step in np.eye(len(steps))])
+    weights = np.trapezoid(shares, points, axis=-1) if points[-1] > points[0] else shares[:, 0]
+    return (np.asarray(values, dtype=float) * weights).sum(axis=-1) / weights.sum()
 
 
 def step_at_level(

@@ -15,7 +15,8 @@ from cuelearner_jax.report import figures, tables
 from cuelearner_jax.report.aggregates import Aggregates, aggregates_of
 from cuelearner_jax.report.document import origins
 from cuelearner_jax.report.efficiency import Question, efficiency_of
-from cuelearner_jax.report.variants import Variant, group_of, guidance_name, variants_of
+from cuelearner_jax.report.variants import Variant, group_of, guidance_name, rows_of, variants_of
+from cuelearner_jax.runs.failures import describe_failed, variant_name
 
 SCORE, LEVEL = "score", 0.8  # the level of label efficiency
 NOTE = (
@@ -40,7 +41,7 @@ def write(out: Path, table: pa.Table, right: str, lines: Sequence[str], command:
     """Write the page and its tables into `out`; return the path of the page. `lines`: what was run, in Markdown."""
     overs: dict[str, Aggregates] = {}
     own: dict[str, list[tables.Row]] = {}
-    missing, teachers = [], list(dict.fromkeys(table["teacher"].to_pylist()))
+    missing, teachers = _left_out(table), list(dict.fromkeys(table["teacher"].to_pylist()))
     for use in dict.fromkeys(table["use"].to_pylist()):
         faulty: list[Variant] = []
         for teacher in teachers:
@@ -58,7 +59,7 @@ def write(out: Path, table: pa.Table, right: str, lines: Sequence[str], command:
             if teacher == right:
                 _add(overs, missing, use, each)
             else:
-                faulty += [replace(one, task=f"{one.task}, {teacher}") for one in each]
+                faulty += [replace(one, task=f"{one.task}, {teacher}", stream=one.task) for one in each]
         _add(overs, missing, f"{use}, faulty teachers", faulty)
     for name, over in overs.items():
         for file, these in over.tables.items():
@@ -74,6 +75,17 @@ def write(out: Path, table: pa.Table, right: str, lines: Sequence[str], command:
         tables.write_csv(out / f"{name}.csv", rows)
     (out / "suite.md").write_text("\n".join(page), encoding="utf-8")
     return out / "suite.md"
+
+
+def _left_out(table: pa.Table) -> list[str]:
+    """Return one line for each variant with failed lanes, and for the other rows without a finite score."""
+    lines = []
+    for key in table.group_by(["use", "task", "teacher"], use_threads=False).aggregate([]).to_pylist():
+        group = group_of("", SCORE, {"task": key["task"]}, rows_of(table, key), None)
+        own = [f"{variant_name(*one)}: {seeds} failed" for one, seeds in describe_failed(group.failed).items()]
+        own += [f"{group.invalid:,} rows have no finite score"] * (group.invalid > 0)
+        lines += [f"{key['use']}, {key['task']}, teacher {key['teacher']}: {line}: left out" for line in own]
+    return lines
 
 
 def _add(overs: dict[str, Aggregates], missing: list[str], name: str, each: list[Variant]) -> None:

@@ -40,8 +40,9 @@ class Variant:
     guide: Float[np.ndarray, "guides"] | None = None  # metric of each seed's guide alone, where it was measured
     episodes: int = 0  # of an evaluation, at least; 0: the runs, of an earlier version, keep none
     each: Float[np.ndarray, "seeds groups steps"] | None = None  # values of groups of episodes; None: of one group
-    until: int | None = None  # number of steps up to the last one that a task's variants share; None: all steps
+    span: tuple[float, float] = (-np.inf, np.inf)  # first and last step that the curves of a task's variants share
     task: str = ""  # where there are several
+    stream: str = ""  # name whose variants draw their seeds together, where that is not the task
 
     @cached_property
     def curve(self) -> Curve:
@@ -50,7 +51,7 @@ class Variant:
 
     @cached_property
     def mean(self) -> Interval:
-        """The mean over the curve, up to the last step that the task's variants share."""
+        """The mean over the curve, see `area`."""
         return interval(self.area(self.values), self.area(self.groups))
 
     @property
@@ -59,8 +60,8 @@ class Variant:
         return self.values[:, None] if self.each is None else self.each
 
     def area(self, curves: Float[np.ndarray, "*seeds steps"]) -> Float[np.ndarray, "*seeds"]:
-        """Return the mean of each curve up to the last step that the task's variants share."""
-        return mean_over_curve(self.steps[: self.until], curves[..., : self.until])
+        """Return the mean of each curve over the span that the task's variants share."""
+        return mean_over_curve(self.steps, curves, self.span)
 
     def samples(
         self,
@@ -71,7 +72,7 @@ class Variant:
 
         Variants of a task with equal seeds draw them together: their lanes start alike, so comparisons are paired.
         """
-        stream = zlib.crc32(self.task.encode() + np.asarray(self.seeds, np.int64).tobytes())
+        stream = zlib.crc32((self.stream or self.task).encode() + np.asarray(self.seeds, np.int64).tobytes())
         own = mean(of(self.values), axis=0)
         return np.concatenate([own[None], statistics.resampled(self.groups, seed=stream, of=of, mean=mean)])
 
@@ -145,7 +146,7 @@ def _groups(name: str, folders: Sequence[PathLike], metric: str, split: str) -> 
     every = every.filter(pc.field("split") == split)
     keys = every.group_by(["task", *results.settings(every)]).aggregate([]).to_pylist()
     keys = sorted(keys, key=lambda key: [(value is not None, value) for value in key.values()])
-    groups = [group_of(name, metric, key, _rows(every, key), guides) for key in keys]
+    groups = [group_of(name, metric, key, rows_of(every, key), guides) for key in keys]
     if any(group.table.num_rows for group in groups):
         return groups
     if lost := "; ".join(words for group in groups if (words := failures.summary(group.failed))):
@@ -153,7 +154,7 @@ def _groups(name: str, folders: Sequence[PathLike], metric: str, split: str) -> 
     raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
 
 
-def _rows(table: pa.Table, key: dict[str, Any]) -> pa.Table:
+def rows_of(table: pa.Table, key: dict[str, Any]) -> pa.Table:
     """Return the rows with these columns' values; a column that the table lacks is null."""
     for column, value in key.items():
         if column in table.column_names:
@@ -167,12 +168,19 @@ def group_of(name: str, metric: str, key: dict[str, Any], every: pa.Table, guide
     """Return a task's and setting's results, without failed lanes and without rows whose metric is not finite."""
     setting = {option: "-" if value is None else value for option, value in key.items() if option != "task"}
     name = ", ".join(dict.fromkeys(filter(None, (name, results.setting_name(setting)))))
-    lost, lanes = results.failures(every), zip(*(every[name].to_pylist() for name in results.LANE), strict=True)
-    of_failed = np.array([lane in lost for lane in lanes], bool)
+    marks = every[results.FAILED].to_pylist() if results.FAILED in every.column_names else []
+    lost = {lane for lane, is_failed in zip(_lanes(every), marks, strict=False) if is_failed}
+    of_failed = np.array([lane in lost for lane in _lanes(every)], bool)
     rows, failed = every.filter(pa.array(~of_failed)), every.filter(pa.array(of_failed))
     table = rows.filter(pc.field(metric).is_valid())
-    guides = guides and _rows(guides, {**key, "split": every["split"][0].as_py()})
+    guides = guides and rows_of(guides, {**key, "split": every["split"][0].as_py()})
     return Group(key["task"], name, table, failed, rows.num_rows - table.num_rows, every, guides)
+
+
+def _lanes(table: pa.Table) -> list[tuple[Any, ...]]:
+    """Return the lane of each row; a lane that was trained again in another folder is another lane."""
+    names = [name for name in (*results.LANE, "folder") if name in table.column_names]
+    return list(zip(*(table[name].to_pylist() for name in names), strict=True))
 
 
 def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
@@ -190,22 +198,22 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
             episodes = 0 if each is None else min(rows["episodes"].to_pylist())
             own = Variant(kind, labels, seeds, steps, values, lost, group.name, guide, episodes, each)
             variants.append(replace(own, task=group.task if several else ""))
-    shared = {one.task: min(other.steps[-1] for other in variants if other.task == one.task) for one in variants}
-    ends = [int(np.searchsorted(variant.steps, shared[variant.task], side="right")) for variant in variants]
-    return [replace(variant, until=max(1, end)) for variant, end in zip(variants, ends, strict=True)]
+    ends = {one.task: np.array([own.steps[[0, -1]] for own in variants if own.task == one.task]) for one in variants}
+    spans = {task: (float(own[:, 0].max()), float(own[:, 1].min())) for task, own in ends.items()}
+    return [replace(variant, span=spans[variant.task]) for variant in variants]
 
 
 def _guides(rows: pa.Table, metric: str, guides: pa.Table | None) -> np.ndarray | None:
     """Return the metric of each seed's guide after its last label, (seeds,); None where none was measured."""
-    column, seeds = f"guide_{metric}", set(rows["seed"].to_pylist())  # without failed lanes
-    latest: dict[int, float] = {}
+    column, lanes = f"guide_{metric}", set(_lanes(rows))  # without failed lanes
+    latest: dict[tuple[Any, ...], float] = {}
     for table, mark in ((rows, "step"), (guides, "asked")):
         if table is None or column not in table.column_names:
             continue
         measured = table.filter(pc.field(column).is_valid()).sort_by(mark)
-        pairs = zip(measured["seed"].to_pylist(), measured[column].to_pylist(), strict=True)
-        latest |= {seed: value for seed, value in pairs if seed in seeds}
-    return np.array([latest[seed] for seed in sorted(latest)]) if latest else None
+        pairs = zip(_lanes(measured), measured[column].to_pylist(), strict=True)
+        latest |= {lane: value for lane, value in pairs if lane in lanes}
+    return np.array([latest[lane] for lane in sorted(latest)]) if latest else None
 
 
 def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:

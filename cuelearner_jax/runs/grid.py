@@ -99,7 +99,7 @@ def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from:
         **run_config.to_json(config),
         "grid": {"guidance": list(grid.guidance), "seeds": list(grid.seeds), "labels": list(grid.labels)},
         "split": split,
-        "labels_from": f"{labels_from.name} {label_files.digest(labels_from)}" if labels_from else None,
+        "labels_from": f"{labels_from.stem} {label_files.digest(labels_from)}" if labels_from else None,
         "total_steps": config.schedule.total_steps,
     }
 

@@ -23,7 +23,6 @@ the actions, with names, words and unit of its cues, and the strength of all ans
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -199,8 +198,10 @@ def _standing(table: pa.Table) -> pa.Table:
 
 
 def digest(path: Path) -> str:
-    """Return a short SHA-256 of a file's contents."""
-    return hashlib.sha256((found_in(path) or path).read_bytes()).hexdigest()[:12]
+    """Return a short SHA-256 of the labels that still count and of the head, in whichever format they are stored."""
+    table, _ = _table_and_head(found_in(path) or path)
+    table = _standing(table) if "item" in table.column_names else table
+    return tables.digest(table.select([name for name in table.column_names if name in ("seed", *ROW)]))[:12]
 
 
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:

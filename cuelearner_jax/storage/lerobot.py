@@ -69,8 +69,10 @@ def _damage_error(path: Path, why: object) -> UserError:
 def _parts(path: Path, features: dict[str, Any], name: str, cameras: list[str]) -> list[str]:
     """Return the features of numbers called `name` or `name.PART`; none for observations by `cameras` alone."""
     kinds = ("float", "int", "uint", "bool")
-    vectors = [key for key, one in features.items() if one["dtype"].startswith(kinds) and len(one["shape"]) == 1]
-    parts = [name] if name in vectors else [key for key in vectors if key.startswith(f"{name}.")]
+    own = [key for key, one in features.items() if one["dtype"].startswith(kinds) and key.split(".")[0] == name]
+    if more := [key for key in own if len(features[key]["shape"]) != 1]:
+        raise UserError(f"{path}: {more[0]} has more than one axis: store it with one, or take it out of {INFO}")
+    parts = [name] if name in own else own
     others = {key for key in features if key.startswith(name)} - {*cameras}
     if not parts and (name != OBSERVATION or others or not cameras):
         there = ", ".join(features)

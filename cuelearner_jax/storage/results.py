@@ -109,16 +109,16 @@ def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -
                 folder = pa.repeat(pa.scalar(file.parent.as_posix()), part.num_rows)
                 parts[file.resolve()] = part.append_column(schema.arrow_field("folder"), folder)
     table = pa.concat_tables(parts.values(), promote_options="permissive")
-    if table.num_rows == 0:
+    if table.num_rows == 0 and schema is SCHEMA:
         raise UserError(f"no rows yet in {', '.join(map(str, parts))}: wait for the first evaluation")
     return table
 
 
 def read_guides(paths: Sequence[PathLike]) -> pa.Table | None:
-    """Read the tables of guides' own performance, as `read`; None where no run asked for labels."""
-    names = (GUIDES.jsonl, GUIDES.parquet)
-    there = [path for path in paths if any(next(Path(path).rglob(name), None) for name in names)]
-    return read(there, GUIDES) if there else None
+    """Read the tables of guides' own performance, as `read`; None where there are none yet."""
+    there = [path for path in paths if any([*Path(path).rglob(GUIDES.jsonl), *Path(path).rglob(GUIDES.parquet)])]
+    table = read(there, GUIDES) if there else None
+    return table if table and table.num_rows else None
 
 
 def metrics(table: pa.Table) -> list[str]:

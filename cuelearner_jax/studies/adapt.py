@@ -271,5 +271,5 @@ class AdaptedStudy(NamedTuple):
     def write(self, place: Place) -> None:
         """Write the policy folder. Raises UserError if the policy cannot be kept."""
         path, task, world = self.request.labels_from, self.subject.task, self.request.task
-        inputs = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": task.robot}
+        inputs = {"labels_from": f"{path.stem} {label_files.digest(path)}" if path else None, "robot": task.robot}
         adapted.write(place, self.result, task, world, self.subject.origin, inputs)

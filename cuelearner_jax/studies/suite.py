@@ -184,7 +184,7 @@ def _collected(out: Path, worlds: list[World]) -> Iterator[pa.Table]:
 
 
 def _scores(values: Any, ends: tuple[float, float]) -> Any:
-    """Return Arrow's array of numbers, or of lists of them, on the scale whose `ends` are 0 and 1."""
+    """Return Arrow's array of numbers, or of lists of them, on the scale whose `ends` are 0 and 1; null stays null."""
     if pa.types.is_list(values.type):
         return pa.ListArray.from_arrays(values.offsets, _scores(values.values, ends))
-    return pa.array((values.to_numpy(zero_copy_only=False) - ends[0]) / (ends[1] - ends[0]))
+    return pa.array((values.to_numpy(zero_copy_only=False) - ends[0]) / (ends[1] - ends[0]), from_pandas=True)

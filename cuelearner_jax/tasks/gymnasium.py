@@ -89,10 +89,8 @@ class GymnasiumConfig:
                 for name, size, unit, (kind, _, step) in rows
             )
         except ValueError:
-            raise UserError(
-                f"task.slice_kinds is {format_value(self.slice_kinds)}: give one size, unit and kind for each of "
-                f"{len(self.slices)} slices, with degrees after beams, as 'beams 10'"
-            ) from None
+            about = f"task.slice_kinds is {format_value(self.slice_kinds)}"
+            raise UserError(f"{about}: give a size, unit and kind for each slice, as 'beams 10'") from None
 
     @property
     def space(self) -> Space:
@@ -231,8 +229,7 @@ def _as_json(arguments: dict[str, Any]) -> str:
         if json.loads(text := json.dumps(arguments, default=np.generic.item)) == arguments:
             return text
     raise UserError(
-        f"arguments are {format_value(arguments)}, which JSON does not keep: give numbers, words and lists, or make "
-        "the environment in a function of your own and give that"
+        f"arguments are {format_value(arguments)}, which JSON does not keep: wrap the environment in a function"
     )
 
 
@@ -284,10 +281,7 @@ def _with_names(
         advice = 'give (name, entries, unit) for each slice, as ("goal", 3, "m")'
         raise UserError(f"observation is {format_value(names)}: {advice}") from error
     if any(quantity.origin or quantity.follows for quantity in own):
-        raise UserError(
-            "observation has an origin or a slice that follows another, which Gymnasium's worlds do not keep: leave "
-            "both out, and give the turn of a sensor as one of your own `changes`"
-        )
+        raise UserError("observation has an origin or a slice to follow: leave both out, and give adapt the changes=")
     if total != size:
         raise UserError(f"observation names {total} entries, and {name} has {size}: name each entry once")
     if unknown := sorted(set(units) - {quantity.name for quantity in own}):

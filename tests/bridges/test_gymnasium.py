@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium_worlds import Adder, Faulty, Forgetful, Nested, start_of
 
 import cuelearner_jax as cl
@@ -106,6 +107,12 @@ def test_a_state_that_was_left_is_taken_up_by_replaying_its_actions():
     assert found.replays == 1 + 3  # the instance that was put to state 1 then stands at state 2
     branched, _ = walk(here, [[0.4]], states[2])
     assert branched[1].place.tolist() != states[3].place.tolist()
+    # Other worlds end this one's instances; the next is one that replays.
+    for start in np.arange(pool.MOST_POOLS):
+        world(Adder, start=start + 1).reset(KEYS[0])
+    assert len(pool._pools) == pool.MOST_POOLS
+    same(here.step(KEYS[4], states[3], np.float32(actions[3])), (states[4], steps[3]))
+    assert instances_of(here).replays == 3
 
 
 def test_lanes_that_share_a_state_each_get_an_instance():
@@ -116,13 +123,13 @@ def test_lanes_that_share_a_state_each_get_an_instance():
     @jax.jit
     def three(lanes):
         def one(lanes, number):
-            actions = jnp.array([[0.1], [0.1], [0.2], [-0.5]]) * (number + 1)
+            actions = jnp.array([[0.1], [0.1], [0.2], [-0.3]]) * (number + 1)
             return jax.vmap(env.step)(jnp.stack([KEYS[9]] * 4), lanes, actions)
 
         return jax.lax.scan(one, lanes, jnp.arange(3))[1]
 
     totals = three(lanes).final_obs[-1, :, 0]
-    np.testing.assert_allclose(totals, start_of(state.seed) + np.array([0.6, 0.6, 1.2, -3.0]), rtol=1e-6)
+    np.testing.assert_allclose(totals, start_of(state.seed) + np.array([0.6, 0.6, 1.2, -1.8]), rtol=1e-6)
     found = instances_of(here)
     assert len(found.running) == 4
     assert found.replays == 0
@@ -177,6 +184,11 @@ def test_nested_observations_are_named_and_flattened_in_the_order_of_their_space
     np.testing.assert_array_equal(rows(steps, "final_obs")[:, -3:], np.eye(3))
 
 
+def test_beams_have_the_angle_between_them():
+    (lidar,) = world(Adder, observation=[("lidar", 2, "m", "", "beams", 7.5)]).observation
+    assert (lidar.kind, lidar.step_deg) == ("beams", 7.5)
+
+
 BOX = spaces.Box(-1, 1, (1,), np.float32)
 
 
@@ -188,8 +200,11 @@ BOX = spaces.Box(-1, 1, (1,), np.float32)
     [
         ({"env": "CartPol-v1"}, "no environment 'CartPol-v1', did you mean 'CartPole-v1'.*; of an id that your own"),
         ({"env": "os:system"}, "would import code"),
-        ({"env": Adder, "max_steps": 0}, "max_steps is 0: give a whole number"),
+        ({"env": Adder, "max_steps": 0}, "max_steps is 0: give a number from 1"),
         ({"env": Adder, "cues": "left,right;up,down"}, "2 cues for 1 entries"),
+        ({"env": Adder, "start": (0, 0)}, r"arguments are {'start': \(0, 0\)}, which JSON does not keep"),
+        ({"env": Adder, "observation": [("total", 2, "m", "", "", 0.0, (0.0, 0.0))]}, "observation has an origin"),
+        ({"env": Adder, "observation": [("total", 2, "m", "", "beams x")]}, "slice_kinds is .*beams x.*: give a size"),
         ({"env": Adder, "observation": [("total", 3, "m")]}, "names 3 entries, and .*Adder has 2"),
         ({"env": Adder, "units": {"observation": "metres"}}, "unit of 'observation' is 'metres': give a symbol, as m"),
     ],
@@ -235,9 +250,10 @@ class World(gymnasium.Env):
         return np.zeros(1, np.float32), {}
 
     def step(self, action):
+        assert self.action_space.contains(action)
         self.steps += 1
         end = self.steps == self.length
-        return np.zeros(1, np.float32), float(np.sum(action)), end, False, self.info if end else {}
+        return np.zeros(1, np.float32), float(np.sum(action)), end, False, self.info if end else None
 
     def close(self):
         raise AttributeError("no viewer")  # forgiven
@@ -268,6 +284,8 @@ def test_choices_count_from_the_start_of_the_space_and_integers_are_rounded():
     assert measured(short(actions=spaces.Discrete(3, start=-1)), lambda obs: np.zeros(len(obs), int))["return"] == -1
     whole = short(actions=spaces.Box(0, 9, (1,), np.int64))
     assert measured(whole, lambda obs: 0 * obs + 2.7)["return"] == 3
+    tenth = short(actions=spaces.Box(-0.1, 0.1, (1,), np.float64))  # in single precision 0.1 is more
+    assert measured(tenth, lambda obs: 0 * obs + 1)["return"] == np.float32(0.1)
 
 
 @pytest.mark.parametrize(
@@ -276,6 +294,8 @@ def test_choices_count_from_the_start_of_the_space_and_integers_are_rounded():
         (lambda: World(spaces.Box(np.array([-1, 0]), np.array([1, 0]), dtype=np.float64)), "each high above its low"),
         (lambda: World(spaces.Box(-3.4e38, 3.4e38, (1,), np.float32)), "entry 1 .* no bounds"),
         (lambda: gymnasium.make_vec("Pendulum-v1", num_envs=3), "a vector of 3"),
+        (type("Old", (World,), {"reset": lambda self, **_: np.zeros(1)}), r"return \(observation, info\), which is"),
+        (type("Old", (World,), {"step": lambda *_: (np.zeros(1), 0.0, True, {})}), r"return \(observation, reward, te"),
         (lambda: gymnasium.wrappers.NormalizeObservation(gymnasium.make("Pendulum-v1")), "does not repeat itself"),
     ],
 )
@@ -291,7 +311,9 @@ def test_episodes_that_all_begin_alike_are_told_once(capsys):
     assert "alike" not in capsys.readouterr().err
 
 
-def test_an_id_of_the_callers_own_is_played_in_other_processes():
-    gymnasium.register(id="doors/World-v0", entry_point=World, max_episode_steps=5)
-    found = cl.measure(lambda obs: obs, cl.from_gymnasium("doors/World-v0", num_envs=2, processes=2), episodes=2)
-    assert found.metrics["finished"][0] == 1
+def test_an_id_is_played_in_other_processes_as_its_caller_registered_it_last(monkeypatch):
+    for name, start in (("doors/Adder-v0", 2), ("Pendulum-v1", 0), ("Pendulum-v1", 2)):  # from 2 it succeeds at once
+        spec = EnvSpec(name, entry_point=Adder, max_episode_steps=5, kwargs={"start": start})
+        monkeypatch.setitem(gymnasium.registry, name, spec)
+        there = cl.from_gymnasium(name, num_envs=2, processes=2)
+        assert cl.measure(lambda obs: 0 * obs[:, :1], there, episodes=2).metrics["success"][0] == (start == 2)

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import threading
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -67,9 +68,13 @@ def roll(env, lanes=5, steps=8):
     return np.asarray(rolled())
 
 
-def test_processes_give_the_numbers_of_one_and_end_when_they_are_closed():
+def test_processes_give_the_numbers_of_one_and_end_when_they_are_closed(monkeypatch):
     here = cl.from_gymnasium(Adder, max_steps=6, processes=1).env
-    there = cl.from_gymnasium(Adder, max_steps=6, processes=2).env
+    there = (world := cl.from_gymnasium(Adder, max_steps=6, processes=2)).env
+    with monkeypatch.context() as patched:  # no answer stays unread
+        patched.setattr(Process, "receive", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            world.reset(KEY)
     np.testing.assert_array_equal(roll(here), roll(there))
     begun = pids(there)
     assert len(begun) == 2
@@ -79,7 +84,6 @@ def test_processes_give_the_numbers_of_one_and_end_when_they_are_closed():
     assert pids(there) == begun
     # A process that is killed is told, and its place is taken by a new one.
     os.kill(begun[1], signal.SIGKILL)
-    world = cl.from_gymnasium(Adder, max_steps=6, processes=2)
     with pytest.raises(UserError, match=r"a process that played it ended \(exit status -9\): see what it wrote"):
         cl.measure(lambda obs: obs[:, :1], world, episodes=5)
     assert np.isfinite(cl.measure(lambda obs: obs[:, :1], world, episodes=5).metrics["return"]).all()

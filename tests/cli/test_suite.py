@@ -4,6 +4,7 @@ import os
 import sys
 import tomllib
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from small_runs import BANDIT, listing
@@ -57,6 +58,7 @@ def test_the_cells_of_every_scale_make_sense_for_their_worlds():
         biased = suite.Cell(world, "biased", table["teachers"]["biased"], "relative", (25,), 1).config().scalars
         assert biased.teacher_bias_deg == biased.eps_deg > 0
         assert cells[f"{place}/wrong/scalar"] is None
+    assert suite._scores(pa.array([None, 1.0]), (0.0, 2.0)).to_pylist() == [None, 0.5]
 
 
 def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys, monkeypatch):

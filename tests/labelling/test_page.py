@@ -57,7 +57,7 @@ def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, t
     assert file.counts == {"answer": 10, "unsure": 1, "undone": 1}
 
 
-def test_an_answer_names_its_item_and_when_all_is_answered_the_page_says_so(opened):
+def test_an_answer_names_its_item_and_when_all_is_answered_the_page_says_so(opened, monkeypatch):
     session = opened(labels=2)
 
     async def acts(user, pages):
@@ -69,6 +69,10 @@ def test_an_answer_names_its_item_and_when_all_is_answered_the_page_says_so(open
             await page._act("undo", 0, {"name": "undo", "item": 0})
         assert session.number == 1
         assert told_it == ['cue.refused("the next question was already shown")'] * 2  # each is told as not taken
+        with told_browser(user) as told_it, monkeypatch.context() as patched:
+            patched.setattr(session, "answer", lambda *_: 1 / 0)
+            await page._act("+1", 1, told)
+        assert told_it == ['cue.refused("division by zero")']
         await page._act("nonsense", 1, {"name": "nonsense", "item": 1})
         await page._act("point", 1, {"name": "point", "item": 1, "angle": 30.0})  # not of this form
         assert session.number == 1

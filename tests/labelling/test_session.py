@@ -161,6 +161,11 @@ def test_where_the_disk_takes_no_more_nothing_moves_on_and_nothing_is_saved_late
     assert session.status().trouble == ""
     rows = label_files.history(tmp_path / "labels" / JSONL)
     assert [(row["item"], row["answer"]) for row in rows][1:] == [(1, [1.0])]
+    session._next.result()
+    monkeypatch.setattr(session.questions, "draw", lambda item: 1 / 0)  # question 3 is there already
+    assert all([session.answer(2, np.ones(1)), session.answer(3, np.ones(1)), session.undo(3)])
+    assert (session.number, lines(tmp_path / "labels")) == (3, 5)
+    assert "saved, but the next question cannot be made (ZeroDivisionError" in session.status().trouble
 
 
 def test_a_session_is_finished_once_and_takes_nothing_afterwards(opened, tmp_path):

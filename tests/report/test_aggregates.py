@@ -4,10 +4,12 @@ import csv
 import json
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.report import suite
 from cuelearner_jax.report.document import ReportRequest, report
 from cuelearner_jax.report.variants import Variant
 from cuelearner_jax.storage import results
@@ -52,11 +54,8 @@ def test_scores_are_normalised_by_task_and_pooled(tasks, tmp_path):
     assert float(none["optimality_gap"]) == pytest.approx((1 + 1 + 1.25 + 0.75) / 4)
     assert float(relative["probability_of_improvement"]) == 1.0
     assert float(relative["mean_lower"]) == pytest.approx(0.5)  # both seeds of both tasks the low ones: 1 draw in 16
-    shares = {
-        round(float(row["score"]), 3): row
-        for row in table(tmp_path / "report" / "profiles.csv")
-        if row["labels"] == "100"
-    }
+    profile = [row for row in table(tmp_path / "report" / "profiles.csv") if row["labels"] == "100"]
+    shares = {round(float(row["score"]), 3): row for row in profile}
     assert [float(shares[tau]["share"]) for tau in (-0.25, 0.475, 0.525, 1.25)] == [1.0, 1.0, 0.5, 0.5]
     assert "- small: 0 is 0.100, 1 is 0.300" in text
     assert "- large: 0 is 10.000, 1 is 50.000" in text
@@ -70,6 +69,23 @@ def test_equal_seeds_are_drawn_together_within_a_task_alone():
     one, alike, other = (Variant("none", 0, np.arange(4), np.zeros(1, int), values, task=task) for task in "aab")
     np.testing.assert_array_equal(one.samples(), alike.samples())
     assert (one.samples() != other.samples()).any()
+
+
+def test_a_suite_draws_one_control_for_all_faulty_teachers_and_names_failed_lanes(tmp_path):
+    scores = [0.0, 0.1, 0.2, 0.6]
+    cells = [("right", "none", 0, scores), ("right", "clic", 25, scores), ("wrong", "clic", 25, scores)]
+    cells += [("late", "clic", 25, [*scores[:3], None]), ("late", "relative", 25, [None] * 4)]
+    rows = [
+        {"use": "adapt", "task": "zoo", "teacher": teacher, "guidance": kind, "labels": labels, "seed": seed, "step": 7}
+        | {"score": score, "failed": float(score is None), "rewarded_steps": 0.0}
+        for teacher, kind, labels, each in cells
+        for seed, score in enumerate(each)
+    ]
+    page = suite.write(tmp_path, pa.Table.from_pylist(rows), "right", [], "").read_text()
+    own = {row["part"]: row for row in table(tmp_path / "aggregates.csv") if row["guidance"] == "none"}
+    assert float(own["adapt, faulty teachers"]["mean_upper"]) == pytest.approx(float(own["adapt"]["mean_upper"]))
+    for lost in ("clic, 25 labels: seed 3 (by step 7)", "relative, 25 labels: seeds 0 (by step 7), 1 (by step 7)"):
+        assert f"- adapt, zoo, teacher late: {lost}" in page
 
 
 def test_the_command_takes_a_level_for_the_score_1(tasks, capsys):

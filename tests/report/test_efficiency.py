@@ -53,6 +53,8 @@ def test_known_curves_give_known_steps_ratios_and_areas():
     pair = [variant("none", 0, ramp(1.0) + shared), variant("relative", 100, ramp(1.0) + shared + 0.2)]
     row = efficiency_of(pair, Question(level=0.9)).tables["efficiency"][1]
     assert [row[f"mean_difference{end}"] for end in ("_lower", "_upper")] == pytest.approx([0.2] * 2)
+    negative = [same("none", 0, -0.2), same("relative", 100, -0.1)]
+    assert "mean_ratio" not in efficiency_of(negative, Question(level=0.1)).tables["efficiency"][1]
 
 
 def test_the_level_is_the_unguided_agents_at_a_step():

@@ -50,6 +50,7 @@ def test_a_share_of_all_episodes_has_an_interval():
     assert measurements.spread(row, "success") == pytest.approx((1, 0.981, 1), abs=1e-3)  # Jeffreys, 100 of 100
     lost = row._replace(metrics={"success": np.zeros(2)}, each={"success": np.zeros((2, 50))})
     assert measurements.spread(lost, "success") == pytest.approx((0, 0, 0.019), abs=1e-3)
+    assert measurements.spread(row._replace(is_shared=True), "success") == pytest.approx((1, 0.962, 1), abs=1e-3)
 
 
 def test_a_difference_of_two_policies_is_paired_by_episode():

@@ -102,6 +102,7 @@ def test_says_what_is_missing(runs, tmp_path):
     write(runs / "scalar-a", "scalar", 0.2, 100, seeds=[0, 1], steps=STEPS[:6])
     write(runs / "scalar-b", "scalar", 0.2, 100, seeds=[2], steps=STEPS)
     write(runs / "heuristic", "heuristic", 0.2, seeds=[0], config_hash="1e")
+    write(runs / "intent", "intent", 0.2, 100, steps=STEPS[1::2])
     (runs / "planned").mkdir()
     planned(runs / "planned")
     write(runs / "sweep" / "demonstration", "demonstration", 0.2, 100, steps=STEPS[:9])
@@ -119,10 +120,10 @@ def test_says_what_is_missing(runs, tmp_path):
     assert "sweep: no results of none guidance" in missing
     assert "no results of demonstration" not in missing
     assert "configurations 0f, 1e" in missing
-    assert "means over the curve are taken to step 50" in missing
+    assert "means over the curve are taken from step 10 to 50, shared by all" in missing
     assert "scalar-b: at step" not in missing
-    # The mean over the curve of a finished variant ends with the shortest: half of 30..40 and 40..50, over 50.
-    assert float(summary(tmp_path / "report")["relative", 500]["mean"]) == pytest.approx(0.6 * 15 / 50, abs=0.01)
+    # The mean over the curve of a finished variant is over what all share: half of 30..40 and 40..50, over 40.
+    assert float(summary(tmp_path / "report")["relative", 500]["mean"]) == pytest.approx(0.6 * 15 / 40, abs=0.01)
 
 
 def test_seeds_budgets_and_pieces_of_the_plan_without_results_are_named(runs, tmp_path):
@@ -162,18 +163,19 @@ def lose(folder, guidance, labels=0, seeds=(0, 1, 2), by=20):
 def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path):
     report([runs], tmp_path / "before")
     lose(runs / "relative-500", "relative", 500, seeds=[8, 9, 10])
+    lose(runs / "first-try", "relative", 500, seeds=[0])  # trained again
     lose(runs / "scalar", "scalar", 100, seeds=[0, 1])
     text = report([runs], tmp_path / "after").read_text()
     before, after = summary(tmp_path / "before"), summary(tmp_path / "after")
     assert {name: row for name, row in after["relative", 500].items() if name != "failed"} == {
         name: row for name, row in before["relative", 500].items() if name != "failed"
     }
-    assert [after[key]["failed"] for key in before] == ["0", "0", "3"]
+    assert [after[key]["failed"] for key in before] == ["0", "0", "4"]
     assert after.keys() == before.keys()
-    assert "| relative | 500 | 8 of 11, 3 failed | 30 |" in text
+    assert "| relative | 500 | 8 of 12, 4 failed | 30 |" in text
     assert (
-        "relative, 500 labels: seeds 8 (by step 20), 9 (by step 20), 10 (by step 20) failed, no longer finite: curve "
-        "and means are over the other 8"
+        "relative, 500 labels: seeds 0 (by step 20), 8 (by step 20), 9 (by step 20), 10 (by step 20) failed, no longer "
+        "finite: curve and means are over the other 8"
     ) in text
     assert "scalar, 100 labels: seeds 0 (by step 20), 1 (by step 20) failed, no longer finite: no lane is left" in text
     assert "all runs are complete" not in text
@@ -184,7 +186,7 @@ def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path)
     note = "a failed seed, left out"
     assert note in marked
     crosses = marked.count("<use ") - plain.count("<use ") - len(note)  # letters are drawn so too
-    assert crosses == 3 + 1  # one for each lane that a curve lacks, and the legend's
+    assert crosses == 4 + 1  # one for each lane that a curve lacks, and the legend's
 
 
 def test_errors_are_clear_and_leave_no_folder(runs, tmp_path):

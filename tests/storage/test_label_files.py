@@ -154,9 +154,13 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
     assert_holds(files.read(tmp_path / files.PARQUET), labels, 20)
     files.write(tmp_path / "whole.parquet", TASK, "relative", DIRECTIONS, EPS, np.array([7]), labels)
     assert (tmp_path / "whole.parquet").read_bytes() == (tmp_path / files.PARQUET).read_bytes()
+    before = files.digest(tmp_path)
+    said(tmp_path, [])  # opened again, without another answer
+    assert not (tmp_path / files.PARQUET).exists()
+    assert files.digest(tmp_path) == before
     said(tmp_path, [3])
     assert len(files.read(tmp_path / files.JSONL).seeds) == 21
-    assert not (tmp_path / files.PARQUET).exists()
+    assert files.digest(tmp_path) != before
 
 
 def test_a_label_that_could_not_be_read_is_not_written(tmp_path):

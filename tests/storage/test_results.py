@@ -68,6 +68,8 @@ def test_errors_are_one_clear_line(tmp_path):
     assert "no results at or below" in message(tmp_path / "nowhere")
     TableWriter(tmp_path / "empty", results.SCHEMA, CONSTANTS).close()
     assert "no rows yet" in message(tmp_path / "empty")
+    TableWriter(tmp_path / "empty", results.GUIDES, CONSTANTS).close()
+    assert results.read_guides([tmp_path]) is None  # the first kind is being labelled
     write(tmp_path / "a")
     write(tmp_path / "b", task="easy")
     assert set(results.read(tmp_path)["task"].to_pylist()) == {"easy", "one_ball"}  # no error: the rows tell them apart

@@ -184,6 +184,7 @@ def test_nothing_is_unpickled(tmp_path, capsys):
         (lambda info: info.update(codebase_version="v2.1"), "of the format 'v2.1', v3.0 is needed"),
         (lambda info: info["features"].pop("action"), "has no feature action"),
         (lambda info: info["features"]["action"].update(shape=[2]), "action does not hold 2 numbers"),
+        (lambda info: info["features"]["action"].update(shape=[2, 3]), "action has more than one axis: store it"),
     ],
 )
 def test_a_lerobot_dataset_that_cannot_be_read_is_told(change, told, tmp_path):

@@ -16,7 +16,6 @@ from cuelearner_jax.bridges.gymnasium.instances import PLACE_BYTES, Request
 from cuelearner_jax.bridges.gymnasium.pool import pool_of
 from cuelearner_jax.bridges.gymnasium.source import Source
 from cuelearner_jax.environment import Quantity, WholeObservations
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Step
 
@@ -107,7 +106,7 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         if requests and not user_code.is_waiting():
             try:
                 results = pool_of(self.source).carry_out(requests)
-            except UserError as error:
+            except BaseException as error:  # one that left the compiled program would be an error of XLA's
                 user_code.leave(error)
             else:
                 results = [one._replace(place=np.frombuffer(one.place, np.uint32)) for one in results]  # pyright: ignore

@@ -28,6 +28,7 @@ SUCCESS = ("success", "is_success", "succeed")  # names in `info`
 PLACE_BYTES = 8
 MOST_INSTANCES = 1024  # spare instances, beyond those that one call needs
 RECENT = 16  # an instance that was used within so many calls is kept
+RESET, STEP = ("observation", "info"), ("observation", "reward", "terminated", "truncated", "info")
 LARGEST = 1e30  # a bound from here on is none: float32's own largest number, say
 
 
@@ -155,18 +156,18 @@ class Running:
     def reset(self, seed: int) -> np.ndarray:
         """Begin an episode."""
         self.seed, self.steps, self.total = seed, 0, 0.0
-        obs = self._vector(self._called(self.env.reset, seed=seed)[0])
+        obs = self._vector(self._called(RESET, self.env.reset, seed=seed)[0])
         self.place = hashlib.blake2b(seed.to_bytes(8, "little") + obs.tobytes(), digest_size=PLACE_BYTES).digest()
         return obs
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, float]:
         """Execute an action (action,). Return observation, reward, terminated, truncated, success."""
         self.steps += 1
-        raw, reward, terminated, truncated, info = self._called(self.env.step, self._own_action(action))
+        raw, reward, terminated, truncated, info = self._called(STEP, self.env.step, self._own_action(action))
         obs, reward, terminated = self._vector(raw), self._number("a reward", reward), bool(terminated)
         self.total += reward
         truncated = (bool(truncated) or self.steps >= self.max_steps > 0) and not terminated
-        name = next((name for name in SUCCESS if info.get(name) is not None), None)
+        name = next((name for name in SUCCESS if info and info.get(name) is not None), None)
         success = float(name is not None and self._number(f"info[{name!r}]", info[name]) != 0)
         self.reports_success |= name is not None
         outcome = struct.pack("<d??d", reward, terminated, truncated, success)
@@ -179,19 +180,24 @@ class Running:
         step = f"step {self.steps} of the episode" if self.steps else "its reset"
         return f"{step} with seed {self.seed}"
 
-    def _called(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    def _called(self, parts: Sequence[str], function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """Call a function of the environment. Raises UserError unless it returns the parts that Gymnasium's API has."""
         try:
-            return function(*arguments, **options)
+            result = function(*arguments, **options)
         except Exception as error:
             raise user_code_error(f"{self.whose}, in {self._when},", error) from error
+        if not isinstance(result, tuple) or len(result) != len(parts):
+            api = f"return ({', '.join(parts)}), which is Gymnasium's API"
+            raise UserError(f"{self.whose} returned {format_value(result)} in {self._when}: {api}")
+        return result
 
     def _own_action(self, vector: np.ndarray) -> Any:
-        """Return the environment's own form of an action (action,)."""
+        """Return the environment's own form of an action (action,), within the bounds after rounding too."""
         if self.actions.choices:
             return int(vector.argmax()) + int(self.space.start)
         if np.issubdtype(self.space.dtype, np.integer):
             vector = np.round(vector)
-        return vector.reshape(self.space.shape).astype(self.space.dtype)
+        return np.clip(vector.reshape(self.space.shape).astype(self.space.dtype), self.space.low, self.space.high)
 
     def _number(self, called: str, value: Any) -> float:
         """Return a number of the environment. Raises UserError for anything but one finite number."""
@@ -242,8 +248,8 @@ class Instances:
         self.running: list[Running] = []
         self.calls = self.replays = 0  # number of calls, and of replayed steps
 
-    def carry_out(self, requests: Sequence[Request]) -> list[Went | str]:
-        """Return the result of each request, or the words of an error.
+    def carry_out(self, requests: Sequence[Request]) -> list[Went | str] | str:
+        """Return the result of each request, or the words of the first error.
 
         The instance for a request stands at the place, or is the least recently used one, or new.
         """
@@ -255,7 +261,8 @@ class Instances:
         for one in filter(None, instances):
             one.last_use = self.calls
         free = iter(sorted((one for one in self.running if one.last_use < self.calls), key=lambda one: one.last_use))
-        return [self._result(request, one, free) for request, one in zip(requests, instances, strict=True)]
+        results = [self._result(request, one, free) for request, one in zip(requests, instances, strict=True)]
+        return next((one for one in results if isinstance(one, str)), results)
 
     def _result(self, request: Request, one: Running | None, free: Iterator[Running]) -> Went | str:
         try:

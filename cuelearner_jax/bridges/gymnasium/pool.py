@@ -15,6 +15,7 @@ import socket
 import subprocess
 import sys
 import threading
+from collections import OrderedDict
 from collections.abc import Mapping
 from ctypes.util import find_library
 from multiprocessing.connection import Connection
@@ -28,6 +29,7 @@ from cuelearner_jax.bridges.gymnasium.source import Source
 from cuelearner_jax.errors import UserError, user_code_error
 
 PACKAGES = Path(__file__).parents[3]  # folder that this package is imported from
+MOST_POOLS = 4  # with instances at one time
 
 
 class Process:
@@ -109,25 +111,34 @@ class Pool:
     def __init__(self, source: Source) -> None:
         from cuelearner_jax.devices import CORES  # loads JAX, which the processes do not need
 
-        self.source, self.lock = source, threading.RLock()
+        self.source, self.spec, self.lock = source, None, threading.RLock()  # `spec`: of its instances
         self.count = 1 if source.draws else source.processes or CORES
         self.hosts: dict[int, Process | Here] = {}
 
     def carry_out(self, requests: Mapping[int, Request]) -> list[Went]:
-        """Carry out the rows of a call, each by its number. Raises UserError for the first that fails."""
-        with self.lock:
-            rows: dict[int, list[int]] = {}
-            for row in requests:
-                rows.setdefault(row % self.count, []).append(row)
-            for number, own in rows.items():
-                self._host(number).send("carry_out", [requests[row] for row in own])
-            results: dict[int, Any] = dict.fromkeys(requests)
-            for number, own in rows.items():
-                answers = self.hosts[number].receive()
-                results.update(zip(own, [answers] * len(own) if isinstance(answers, str) else answers, strict=True))
-        if fault := next((one for one in results.values() if isinstance(one, str)), None):
-            raise UserError(fault)
+        """Carry out the rows of a call, each by its number. Raises UserError where one fails."""
+        rows: dict[int, list[int]] = {}
+        for row in requests:
+            rows.setdefault(row % self.count, []).append(row)
+        calls = {number: ([requests[row] for row in own],) for number, own in rows.items()}
+        results: dict[int, Any] = dict.fromkeys(requests)
+        for own, answers in zip(rows.values(), self._call("carry_out", calls), strict=True):
+            results.update(zip(own, answers, strict=True))
         return list(results.values())
+
+    def _call(self, method: str, calls: Mapping[int, tuple[Any, ...]]) -> list[Any]:
+        """Call a method of hosts, each with its arguments. Raises UserError with the words of the first error."""
+        with self.lock:
+            try:
+                for number, arguments in calls.items():
+                    self._host(number).send(method, *arguments)
+                answers = [self.hosts[number].receive() for number in calls]
+            except BaseException:  # such as an interrupt, after which answers would stay unread
+                self.close()
+                raise
+        if fault := next((one for one in answers if isinstance(one, str)), None):
+            raise UserError(fault)
+        return answers
 
     def _host(self, number: int) -> Process | Here:
         if number not in self.hosts or self.hosts[number].is_gone:
@@ -137,13 +148,7 @@ class Pool:
 
     def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
         """Return pictures of an episode from step `first` on. Raises UserError if there are none."""
-        with self.lock:
-            host = self._host(0)
-            host.send("film", seed, actions, first)
-            frames = host.receive()
-        if isinstance(frames, str):
-            raise UserError(frames)
-        return frames
+        return self._call("film", {0: (seed, actions, first)})[0]
 
     def close(self) -> None:
         """End all processes and close all instances."""
@@ -159,12 +164,19 @@ def drawing_variables() -> dict[str, str]:
     return {"MUJOCO_GL": "osmesa" if find_library("OSMesa") else "egl"}
 
 
-_pools: dict[Source, Pool] = {}
+_pools: OrderedDict[Source, Pool] = OrderedDict()  # the one used last at the end
 
 
 def pool_of(source: Source) -> Pool:
-    """Return the pool of a source; its processes start when they are needed."""
-    return _pools.setdefault(source, Pool(source))
+    """Return the pool of a source, whose processes start when they are needed; close the pools unused for longest."""
+    pool = _pools.setdefault(source, Pool(source))
+    _pools.move_to_end(source)
+    while len(_pools) > MOST_POOLS:
+        _pools.popitem(last=False)[1].close()
+    before, pool.spec = pool.spec, source.spec
+    if before is not None and before is not pool.spec:  # the id is registered anew
+        pool.close()
+    return pool
 
 
 @atexit.register

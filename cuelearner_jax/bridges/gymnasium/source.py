@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
+from pkgutil import resolve_name
 from types import SimpleNamespace
 from typing import Any
 
@@ -44,10 +45,12 @@ class Source:
             arguments["render_mode"] = "rgb_array"
         if self.factory is not None:
             return partial(make_from_code, self.factory, arguments)
-        import gymnasium
+        return partial(make_registered, self.name, arguments, self.max_steps, self.spec)
 
-        spec = gymnasium.registry.get(self.name)  # of the caller's own registry, which another process lacks
-        return partial(make_registered, self.name, arguments, self.max_steps, spec)
+    @property
+    def spec(self) -> Any:
+        """The id's specification in the caller's own registry, which another process lacks; None: there is none."""
+        return resolve_name("gymnasium:registry").get(self.name) if self.factory is None else None
 
 
 def _takes_render_mode(factory: Callable[..., Any]) -> bool:
@@ -83,16 +86,16 @@ def registry_spec(name: str) -> Any:
 
 
 def make_registered(name: str, arguments: dict[str, Any], max_steps: int, spec: Any = None) -> Any:
-    """Return an environment of Gymnasium's registry, or of a specification that this process's registry lacks."""
+    """Return an environment of a specification, by default that of this process's registry."""
     try:
-        spec = registry_spec(name)
+        own = registry_spec(name)  # makes those of gymnasium_robotics work too
     except UserError:
-        if spec is None:
+        if (own := spec) is None:
             raise
     import gymnasium
 
     limited = {"max_episode_steps": max_steps} if max_steps else {}
-    return gymnasium.make(spec, **limited, **arguments)
+    return gymnasium.make(spec or own, **limited, **arguments)
 
 
 def make_from_code(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
