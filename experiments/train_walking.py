@@ -27,7 +27,6 @@ from cuelearner_envs.anymal import policy, tracking
 from cuelearner_envs.anymal.locomotion import Locomotion
 from cuelearner_jax import config as configuration
 from cuelearner_jax.agents.networks import all_finite
-from cuelearner_jax.bridges.brax import supply_device_put_replicated
 from cuelearner_jax.config import Bounds, Layers
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.storage.folders import claimed, in_use
@@ -183,7 +182,9 @@ def _ppo(config: Training, seed: int, look: Callable[[int, Any, Any], None]) -> 
     from brax.training.agents.ppo import networks  # takes seconds to load
     from brax.training.agents.ppo import train as ppo
 
-    supply_device_put_replicated()
+    if not hasattr(jax, "device_put_replicated"):  # PPO of brax 0.14.2 calls it, here for one device; JAX 0.10 lacks it
+        stacked = lambda tree, devices: jax.tree.map(lambda leaf: jax.numpy.asarray(leaf)[None], tree)  # noqa: E731
+        setattr(jax, "device_put_replicated", stacked)  # noqa: B010 (the type checker knows no such name)
     ppo.train(
         environment=Locomotion(),
         num_timesteps=config.steps,

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
@@ -145,19 +144,3 @@ def from_brax(
     name = type(env.unwrapped).__name__
     layout, steps = layout_of(env, name), jnp.array(max_steps, jnp.int32)
     return JaxEnvironment(steps, FixedSimulator(env), layout.observation, layout.box(cues), heuristic)
-
-
-def supply_device_put_replicated() -> None:
-    """Restore `jax.device_put_replicated`, which JAX 0.10 removed, where it is missing.
-
-    PPO, SAC and APG of brax 0.14.2 call it: call this before one of them trains.
-    """
-    if not hasattr(jax, "device_put_replicated"):
-        setattr(jax, "device_put_replicated", _device_put_replicated)  # noqa: B010 (the type checker knows no such name)
-
-
-def _device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
-    """Copy every leaf to every device, stacked along a new first axis, one entry a device, as `pmap` takes it."""
-    mesh = jax.sharding.Mesh(np.array(devices), ("device",))
-    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
-    return jax.tree.map(lambda leaf: jax.device_put(np.stack([np.asarray(leaf)] * len(devices)), sharding), tree)

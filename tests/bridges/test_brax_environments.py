@@ -7,7 +7,6 @@ import pytest
 from brax import envs
 from brax.envs.wrappers import training
 
-from cuelearner_jax.bridges import brax as brax_adapter
 from cuelearner_jax.bridges.brax import from_brax
 from cuelearner_jax.environment import Environment, symmetries_of
 from cuelearner_jax.errors import UserError
@@ -119,16 +118,3 @@ def test_observations_in_a_dictionary_are_one_vector_with_named_slices():
 def test_what_does_not_fit_is_refused_in_one_line(env, words):
     with pytest.raises(UserError, match=words):
         from_brax(env)
-
-
-def test_device_put_replicated_stacks_a_copy_for_each_device(monkeypatch):
-    monkeypatch.delattr(jax, "device_put_replicated", raising=False)
-    brax_adapter.supply_device_put_replicated()
-    supplied = jax.device_put_replicated  # pyright: ignore[reportAttributeAccessIssue]
-    devices = jax.local_devices()[:1]
-    copies = supplied({"a": jnp.arange(3.0), "b": 2}, devices)
-    np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
-    assert copies["b"].shape == (1,)
-    np.testing.assert_array_equal(jax.pmap(lambda a: a + 1, devices=devices)(copies["a"]), [[1, 2, 3]])
-    brax_adapter.supply_device_put_replicated()
-    assert jax.device_put_replicated is supplied  # pyright: ignore[reportAttributeAccessIssue]
