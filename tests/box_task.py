@@ -1,18 +1,17 @@
 """A bandit with actions of a box, its task with a page, and scalars in shares of the box's ranges."""
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+import page_task
 import probes
 from flax import struct
 
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.spaces import Box, Cue
 from cuelearner_jax.task import Body, Pictures, Preset, Task
-from cuelearner_jax.types import Reel, Sketch, Step
+from cuelearner_jax.types import Reel, Step
 
 SMALL = Box((-1.0, 0.0, -2.0), (1.0, 4.0, 0.0))  # ranges 2, 4, 2
 EPS = 0.1  # shares
@@ -68,12 +67,6 @@ class ArmConfig:
     """Distance of the goal from its place in training [shares]."""
 
 
-def _sketch(env, state):
-    """A square with a dot where the context is."""
-    x, y = map(float, state)
-    return Sketch((-2, -2, 4, 4), "<rect/>", {"dot": "<circle r='0.1'/>"}, {"dot": (x, -y, 0.0)}, (0, 0), (0, 1), 0.0)
-
-
 def _reel(env, state, action):
     """Film without motion; its words give the action's distance from the goal."""
     x, y = map(float, state)
@@ -83,10 +76,10 @@ def _reel(env, state, action):
 
 
 def _trails(env, state, actions):
-    return [f"<path d='{index}'/>" for index, _ in zip(itertools.count(), np.asarray(actions), strict=False)]
+    return [f"<path d='{index}'/>" for index in range(len(actions))]
 
 
-PICTURES = Pictures(None, None, None, None, _sketch, _reel, _trails)  # pyright: ignore[reportArgumentType]
+PICTURES = Pictures(None, None, None, None, page_task.sketch, _reel, _trails)  # pyright: ignore[reportArgumentType]
 TASK = Task(
     "box_arm",
     "a bandit with actions of a box",

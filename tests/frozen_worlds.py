@@ -6,15 +6,13 @@ import box_task
 import jax.numpy as jnp
 import numpy as np
 import probes
+import recorded_situations
 import walk_task
 
-from cuelearner_jax.config import to_json
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS
-from cuelearner_jax.storage import label_files
 from cuelearner_jax.task import Body, Preset, Task
 from cuelearner_jax.tasks.logs import LogsConfig
-from cuelearner_jax.types import Label
 
 
 class Reach(box_task.Reach):
@@ -50,12 +48,10 @@ def straight(obs):
     return obs
 
 
-def recorded_labels(path):
+def recorded_labels(folder):
     """Write 40 labels of a recording: the best action is the observation, turned by 0.6 rad. Return the path."""
     angles = np.linspace(0, 6, 40, dtype=np.float32)
     obs, action, best = (np.stack([np.cos(at), np.sin(at)], -1) for at in (angles, angles + 0.2, angles + 0.6))
     answer = np.sign(action[:, :1] * best[:, 1:] - action[:, 1:] * best[:, :1]).astype(np.float32)
-    rows = Label(obs, action.astype(np.float32), answer, np.ones(40, bool))
-    of = {"name": "logs", **to_json(LogsConfig(entries=(2,), actions="directions"))}
-    label_files.write_file(path, label_files.LabelFile(of, "relative", DIRECTIONS, 10.0, np.zeros(40), rows), "more")
-    return path
+    config = LogsConfig(entries=(2,), actions="directions")
+    return recorded_situations.write_labels(folder, config, DIRECTIONS, 10.0, (obs, action.astype(np.float32), answer))

@@ -3,14 +3,15 @@
 python many_devices.py FOLDER LOOK TO STOP AT | communication
 """
 
+import contextlib
 import re
 import sys
-import threading
-from contextlib import contextmanager
 from pathlib import Path
 
 import jax
 import probes
+import pytest
+from small_runs import stopping_at
 
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
@@ -31,25 +32,8 @@ GRID = Grid(("relative",), seeds=(3, 5, 8), labels=(15, 30))  # 6 lanes, which d
 
 def run(out: Path, stop_at: int | None = None, **options) -> None:
     """The sweep, interrupted at the given look at the event."""
-
-    class Event(threading.Event):
-        looks = 0
-
-        def is_set(self) -> bool:
-            self.looks += 1
-            return self.looks == stop_at
-
-    @contextmanager
-    def interruptible():
-        yield Event()
-
-    usual, train.interruptible = train.interruptible, interruptible
-    try:
+    with stopping_at(stop_at), contextlib.nullcontext() if stop_at is None else pytest.raises(Interrupted):
         train.run(Order(probes.make_task(), CONFIG, GRID, out, **options))
-    except Interrupted:
-        assert stop_at is not None
-    finally:
-        train.interruptible = usual
 
 
 def communication() -> list[str]:

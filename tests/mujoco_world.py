@@ -35,21 +35,11 @@ def settled(model: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
-def scan(
-    model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray, max_range: float, angles: np.ndarray = ANGLES
-) -> np.ndarray:
-    """MuJoCo's distances along beams [m], `max_range` where a ray meets nothing nearer.
-
-    Args:
-        model: from `model`.
-        data: from `settled`.
-        pose: x, y, yaw [m, rad].
-        max_range: [m].
-        angles: of the beams, from straight ahead [rad].
-    """
+def scan(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray, max_range: float) -> np.ndarray:
+    """MuJoCo's distances along beams from a pose (x, y, yaw) [m, rad], at most `max_range` [m]."""
     x, y, yaw = (float(value) for value in pose)
     origin, geom = np.array([x, y, LIDAR_HEIGHT]), np.zeros(1, np.int32)
-    turned = yaw + angles
+    turned = yaw + ANGLES
     beams = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
     found = np.array([mujoco.mj_ray(model, data, origin, beam, None, 1, -1, geom) for beam in beams])
     return np.minimum(np.where(found < 0, max_range, found), max_range)

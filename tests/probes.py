@@ -4,7 +4,6 @@ In the manner of bsuite's and rejax's probes: each isolates one thing that a lea
 """
 
 import dataclasses
-import hashlib
 import json
 import math
 from dataclasses import dataclass
@@ -18,10 +17,11 @@ from flax import struct
 
 from cuelearner_jax import asking
 from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents.networks import as_function, q_network
 from cuelearner_jax.config import Scalars, Schedule, Sizes, digest
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
-from cuelearner_jax.export import runner
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces.directions import difference, evenly_spaced, from_angle, inward, rotate
@@ -174,6 +174,27 @@ def config(arbiter=None, **groups):
     return dataclasses.replace(CONFIG, arbiter=arbiter or CONFIG.arbiter, **changed)
 
 
+CHAIN = config(  # of runs on the chain, which learn from uniform actions
+    sizes={"num_envs": 2},
+    scalars={"discount": 0.5},
+    schedule={"random_steps": 2000, "learn_after": 50},
+    agent={"polyak": 0.05, "learning_rate": 0.005, "target_every": 1},
+)
+
+
+def chain_program(config, kind):
+    """Return a training program on the chain."""
+    return make_program(config, guidances.make(kind, config.sizes, Chain()), Chain(jnp.array(False)), 0)
+
+
+def chain_values(program, config, truncates):
+    """Return the learned values at both places of east, north, west and south; and the state."""
+    env = Chain(jnp.array(truncates))
+    _, state, _ = program.train(env, config.settings, start_clock(), start(program, [3], [0], env), 1000)
+    q, params = as_function(q_network(config.agent.q_layers)), lane(state.agent.params, 0)
+    return [np.asarray(q(params, env.observe(place), evenly_spaced(4)))[:, 0] for place in (0, 1)], state
+
+
 LARGEST = 60  # labels of the largest budget in the tests' loop
 
 
@@ -255,14 +276,3 @@ def edit_json(path, change):
     sealed = values.pop("digest", None) is not None
     change(values)
     path.write_text(json.dumps({**values, "digest": digest(values)} if sealed else values))
-
-
-def edit_contract(folder, change=lambda contract: None):
-    """Rewrite an export's contract by a function of its values, with the digests of the files as they are now."""
-    contract = json.loads((folder / runner.CONTRACT).read_text())
-    contract.pop(runner.DIGEST, None)
-    change(contract)
-    if isinstance(files := contract.get("files"), dict):
-        there = {name: folder / name for name in files if "/" not in name and (folder / name).is_file()}
-        files |= {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in there.items()}
-    (folder / runner.CONTRACT).write_text(json.dumps({**contract, runner.DIGEST: runner.digest(contract)}))

@@ -1,12 +1,21 @@
 """Folders of recorded situations, and a small LeRobot dataset, as tests write them."""
 
+import importlib.util
 import json
+from pathlib import Path
 
 import imageio.v2 as imageio
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
+
+from cuelearner_jax.config import to_json
+from cuelearner_jax.feedback.answers import relative_feedback
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.types import Label
 
 ENTRIES = ("sideways", "height", "fingers")
 LOW, HIGH = (-0.5, 0.0, -1.0), (0.5, 0.4, 1.0)
@@ -44,6 +53,30 @@ def write(folder, rows=12, form="parquet", pictures=True):
         table = {"observation": list(observations), **columns, **({"picture": names} if pictures else {})}
         pq.write_table(pa.table(table), folder / "situations.parquet")
     return observations, actions
+
+
+def plugin_module(name):
+    """Import a file of LeRobot's plugin, which is not installed here."""
+    folder = Path(__file__).parents[1] / "plugins/lerobot_processor_cuelearner/lerobot_processor_cuelearner"
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def said(space, actions, best, eps):
+    """What a person says of actions who wants the best ones."""
+    told = jax.vmap(lambda action, best: relative_feedback(space, action, best, eps))
+    return np.array(told(jnp.asarray(actions), jnp.asarray(best, jnp.float32)))
+
+
+def write_labels(folder, config, space, eps, rows):
+    """Write a file of relative labels of a recording (obs, action, answer), as the page does; return its path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    count, path = len(rows[0]), folder / "labels.parquet"
+    of, labels = {"name": "logs", **to_json(config)}, Label(*rows, np.ones(count, bool))
+    label_files.write_file(path, label_files.LabelFile(of, "relative", space, eps, np.zeros(count), labels), "more")
+    return path
 
 
 def write_lerobot(folder, lengths=(5, 7), fps=10, version="v3.0", names=True, video_fps=10):

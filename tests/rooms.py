@@ -57,6 +57,14 @@ def to_circle(points, circle):
     return np.maximum(np.linalg.norm(points - circle[:2], axis=-1) - circle[2], 0.0)
 
 
+def to_segments(points, starts, ends):
+    """Distances from points to segments (..., 2)."""
+    along = ends - starts
+    length = np.maximum(np.sum(along**2, -1), 1e-30)
+    share = np.clip(np.sum((points - starts) * along, -1) / length, 0, 1)
+    return np.linalg.norm(points - starts - share[..., None] * along, axis=-1)
+
+
 def distance(points, boxes, circles):
     """From each point to the nearest solid; 0 inside one."""
     each = [to_box(points, box) for box in boxes] + [to_circle(points, circle) for circle in circles]

@@ -55,14 +55,7 @@ def test_a_run_s_options_come_back_from_json_with_their_parts():
 
 def test_the_digest_does_not_change_from_version_to_version():
     # Hashes stand in published results: if this fails, old results can no longer be told to be of one configuration.
-    assert config.digest({"a": 1, "b": [1.5, "x"]}) == "d7aa7c69cbeb"
-
-
-def test_the_digest_depends_on_values_and_not_on_order():
-    values = config.to_json(probes.SIZES)
-    assert config.digest(values) == config.digest(dict(reversed(values.items())))
-    assert config.digest(values) != config.digest(values | {"num_envs": 17})
-    assert len(config.digest(values)) == 12
+    assert config.digest({"a": 1, "b": [1.5, "x"]}) == config.digest({"b": [1.5, "x"], "a": 1}) == "d7aa7c69cbeb"
 
 
 def test_an_unknown_field_is_named_and_a_missing_one_has_its_default():

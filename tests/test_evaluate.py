@@ -1,7 +1,5 @@
 """Roll-outs: means over whole first episodes or none at all, and the same numbers in one stretch or in many."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,7 @@ import probes
 import pytest
 
 from cuelearner_jax import evaluate
-from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.devices import Portions, lane_mesh
 from cuelearner_jax.policies import Agent, Uniform
 
 LONGEST = 4
@@ -65,7 +63,7 @@ def test_a_roll_out_in_stretches_is_bitwise_that_in_one(steps):
 @pytest.mark.parametrize("at_once", [2, *(pytest.param(number, marks=pytest.mark.long) for number in (1, 16))])
 def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     """Three lanes, one, two or all at a time."""
-    monkeypatch.setattr(evaluate, "portions", lambda: Portions(at_once))
+    monkeypatch.setattr(evaluate, "portions", lambda: Portions(actions=8192, agents=at_once, states=16, passes=1))
     program = probes.window_program("none")
     agents = Agent(probes.start(program, [0, 1, 2], [0, 0, 0]).agent.params, probes.FUNCTIONS)
     told = []
@@ -80,15 +78,6 @@ def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     assert told[0] == (0, 6 * batches)
     assert told[-1] == (6 * batches, 6 * batches)
     evaluate._on_mesh.clear_cache()  # it has seen other portions than the device's
-
-
-@dataclasses.dataclass
-class Portions:
-    """As `devices.Portions`, of another device."""
-
-    agents: int
-    actions: int = 8192
-    states: int = 16
 
 
 @pytest.mark.parametrize("shape", [(7,), (2, 3, 50), (0, 4)])

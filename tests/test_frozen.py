@@ -113,7 +113,7 @@ def test_a_training_ends_with_the_stored_parameters_replay_and_rows(runs, world,
 @pytest.mark.filterwarnings("ignore:Sharding info")
 def test_a_killed_sweep_goes_on_to_the_same_bits(tmp_path):
     sweep = ["sweep", "frozen_worlds:FLAT", "--guidance", "relative", "--seeds", 2, "--labels", 20]
-    sweep += ["--schedule.total-steps", 4800, "--schedule.guidance-until", 2400, "--schedule.checkpoint-every", 480]
+    sweep += ["--schedule.total-steps", 2400, "--schedule.guidance-until", 1200, "--schedule.checkpoint-every", 480]
     run(*sweep, "--out", tmp_path / "whole")
     killed = tmp_path / "killed"
     process = subprocess.Popen(
@@ -143,8 +143,6 @@ def test_an_exported_agent_decides_the_stored_golden_cases(runs, tmp_path):
     with np.load(tmp_path / "agent" / "golden.npz") as golden:
         check("golden cases", [*sums([golden["obs"]]), *sums([golden["actions"]])])
         np.testing.assert_allclose(decide(golden["obs"]), golden["actions"], atol=1e-5)
-        own = cl.load_policy(runs / "billiards")
-        np.testing.assert_allclose(own(golden["obs"]), golden["actions"], atol=1e-5)
 
 
 FIT = ["--sizes.feedback-layers", 16, "--sizes.fit-steps", 40, "--sizes.fit-batch-size", 16, "--guidance"]
@@ -173,7 +171,7 @@ def test_python_adapts_and_measures_as_the_commands_do(tmp_path):
 
 @pytest.mark.parametrize("kind", ["relative", pytest.param("reading", marks=pytest.mark.long)])
 def test_python_corrects_by_a_label_file_as_the_command_does(tmp_path, kind):
-    file = frozen_worlds.recorded_labels(tmp_path / "labels.parquet")
+    file = frozen_worlds.recorded_labels(tmp_path)
     command = ["adapt", "frozen_worlds:straight", "--labels-from", file, "--guidance", kind]
     run(*command, "--out", tmp_path / "command")
     better = cl.correct(straight, file, guidance=kind)

@@ -1,7 +1,7 @@
 """The training loop on probes: values known by hand, who acts when, and what lanes owe each other (nothing)."""
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +15,12 @@ from cuelearner_jax.arbiters import Episodes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent
-from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.types import Step
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 MESH = lane_mesh()
 q = as_function(q_network(probes.AGENT.q_layers))
-
-
 LARGEST = probes.LARGEST
 STRETCH = 12  # iterations of one call, always the same: another number compiles again
 
@@ -73,30 +70,9 @@ def reward_of(params):
     return np.asarray(measured["reward"])
 
 
-CHAIN = probes.config(
-    sizes={"num_envs": 2},
-    scalars={"discount": 0.5},
-    schedule={"random_steps": 2000, "learn_after": 50},
-    agent={"polyak": 0.05, "learning_rate": 0.005, "target_every": 1},
-)
-
-
-@cache
-def chain_program():
-    env = probes.Chain(jnp.array(False))
-    return make_program(CHAIN, guidances.make("heuristic", CHAIN.sizes, env), env, 0)
-
-
-@cache
-def chain_values(truncates):
-    """Learned values at both places of east, north, west and south; and the state."""
-    env = probes.Chain(jnp.array(truncates))
-    state = probes.start(chain_program(), [3], [0], env)
-    assert state.agent.training.target_params is not None
-    _, state, _ = chain_program().train(env, CHAIN.settings, loop.start_clock(), state, 1000)
-    params = probes.lane(state.agent.params, 0)
-    values = [np.asarray(q(params, env.observe(place), directions.evenly_spaced(4)))[:, 0] for place in (0, 1)]
-    return values, state
+CHAIN = probes.CHAIN
+chain_program = cache(partial(probes.chain_program, CHAIN, "heuristic"))
+chain_values = cache(lambda truncates: probes.chain_values(chain_program(), CHAIN, truncates))
 
 
 @pytest.mark.parametrize("truncates", [False, True])

@@ -57,13 +57,3 @@ def test_sgd_steps_along_a_gradient_clipped_to_the_global_norm():
     assert float(change["b"][0]) == pytest.approx(-0.1 * 0.4)
     short = {"a": jnp.array([0.3]), "b": jnp.array([0.0])}
     assert float(change_by(optimizer, short, params)["a"][0]) == pytest.approx(-0.03)
-
-
-@pytest.mark.parametrize("name", ["sgd", "adam"])
-def test_learning_rate_and_norm_may_be_traced(name):
-    def change(rate, norm):
-        return change_by(ddqn.optimizer(name, rate, norm), jnp.array([3.0, 4.0]), jnp.array([1.0, 1.0]))
-
-    traced = jax.jit(change)
-    np.testing.assert_allclose(traced(0.1, 0.5), change(0.1, 0.5), rtol=1e-5)
-    np.testing.assert_allclose(traced(0.2, 0.5), 2 * traced(0.1, 0.5), rtol=1e-5)

@@ -1,7 +1,6 @@
 """N-step returns: by hand, out of the ring buffer, and in the whole loop on a chain whose values are known."""
 
 import dataclasses
-from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +8,9 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import loop
-from cuelearner_jax.agents.networks import as_function, q_network
+from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.agents.replay import LaterSteps, Memory, StoredStep, Transition, buffer_for, n_step_return
 from cuelearner_jax.environment import spaces_of
-from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs.program import make_program
-from cuelearner_jax.spaces.directions import evenly_spaced
 
 HALF = 0.5  # the discount factor of everything worked out by hand
 WEIGHT = 0.5  # of the n-step target in the whole loop
@@ -157,32 +152,12 @@ def test_the_target_lies_between_that_of_one_step_and_that_of_many_by_the_weight
 
 # The whole loop.
 
-LOOP = probes.config(
-    sizes={"num_envs": 2},
-    scalars={"discount": HALF},
-    schedule={"random_steps": 2000, "learn_after": 50},
-    agent={"n_step": 3, "polyak": 0.05, "learning_rate": 0.005, "target_every": 1},
-)
-
-
-@cache
-def program():
-    return make_program(LOOP, guidances.make("none", LOOP.sizes, CHAIN), CHAIN, 0)
-
-
-def learned(truncates, weight):
-    """Values at both places of east, north, west and south, learned from uniform actions."""
-    env = probes.Chain(jnp.array(truncates))
-    agent = dataclasses.replace(LOOP.agent, n_step_weight=weight)
-    state = probes.start(program(), [3], [0], env)
-    _, state, _ = program().train(env, LOOP.settings._replace(agent=agent), loop.start_clock(), state, 1000)
-    q, params = as_function(q_network(LOOP.agent.q_layers)), probes.lane(state.agent.params, 0)
-    return [np.asarray(q(params, env.observe(place), evenly_spaced(4)))[:, 0] for place in (0, 1)]
+LOOP = dataclasses.replace(probes.CHAIN, agent=dataclasses.replace(probes.CHAIN.agent, n_step=3, n_step_weight=WEIGHT))
 
 
 def test_values_of_a_chain_that_is_truncated():
     # Place 1 goes on as if it had no end, whatever the window: Q(1, a) = a_x + 1, at most 2. Place 0: a_y / 2 plus
     # 0.5 * 2 by one step; plus 0.5 * 0 + 0.25 * 2 by two, for the episode's end cuts the window of three.
-    start, end = learned(True, WEIGHT)
+    (start, end), _ = probes.chain_values(probes.chain_program(LOOP, "none"), LOOP, truncates=True)
     np.testing.assert_allclose(end, [2, 1, 0, 1], atol=0.12)
     np.testing.assert_allclose(start, np.array([0, 0.5, 0, -0.5]) + 1.0 - 0.5 * WEIGHT, atol=0.12)

@@ -10,24 +10,23 @@ from cuelearner_jax.agents.replay import RingBuffer, StoredStep, count_guided, d
 EXAMPLE = StoredStep(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.zeros(3))
 
 
-def numbered(first, count, bootstraps=True):
+def numbered(first, count):
     """Steps whose every entry is their own number, apart from its place."""
-    kept = slice(None) if bootstraps else slice(0)
     numbers = jnp.arange(first, first + count, dtype=jnp.float32)
     return StoredStep(
         obs=numbers[:, None] + jnp.array([[0.0, 0.1, 0.2]]),
         action=numbers[:, None] + jnp.array([[0.3, 0.4]]),
         reward=numbers + 0.5,
-        discount=(numbers[:, None] + 0.6)[:, kept],
-        ended=(numbers[:, None] + 0.7)[:, kept],
-        aftermath=(numbers[:, None] + jnp.array([[0.8, 0.9, 1.0]]))[:, kept],
+        discount=numbers[:, None] + 0.6,
+        ended=numbers[:, None] + 0.7,
+        aftermath=numbers[:, None] + jnp.array([[0.8, 0.9, 1.0]]),
     )
 
 
-def filled(buffer, capacity, at_once, steps, bootstraps=True):
+def filled(buffer, capacity, at_once, steps):
     rows, add = buffer.empty(capacity), jax.jit(buffer.add)
     for step in range(0, steps, at_once):
-        rows = add(rows, jnp.array(step), numbered(step, at_once, bootstraps))
+        rows = add(rows, jnp.array(step), numbered(step, at_once))
     return rows
 
 
@@ -45,40 +44,12 @@ def test_the_oldest_rows_are_written_over():
     np.testing.assert_array_equal(np.asarray(rows)[:, 0], [6, 7, 8, 9, 4, 5])
 
 
-def drawn_from(buffer, rows, key, steps, count):
-    return buffer.read(rows, buffer.draw(jax.random.key(key), rows, jnp.array(steps), count))
-
-
-def test_samples_are_whole_steps():
-    buffer = RingBuffer(EXAMPLE)
-    drawn = drawn_from(buffer, filled(buffer, 6, 2, 6), 0, 6, 50)
-    number = np.asarray(drawn.reward) - 0.5
-    np.testing.assert_allclose(drawn.obs, number[:, None] + [0.0, 0.1, 0.2], rtol=1e-5)
-    np.testing.assert_allclose(drawn.action, number[:, None] + [0.3, 0.4], rtol=1e-5)
-    np.testing.assert_allclose(drawn.discount[:, 0], number + 0.6, rtol=1e-5)
-    np.testing.assert_allclose(drawn.ended[:, 0], number + 0.7, rtol=1e-5)
-    np.testing.assert_allclose(drawn.aftermath, number[:, None] + [0.8, 0.9, 1.0], rtol=1e-5)
-
-
 @pytest.mark.parametrize(("steps", "numbers"), [(4, {0, 1, 2, 3}), (14, set(range(6, 14)))])
 def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
     buffer = RingBuffer(EXAMPLE)
-    drawn = drawn_from(buffer, filled(buffer, 8, 1, steps), 1, steps, 500)
+    rows = filled(buffer, 8, 1, steps)
+    drawn = buffer.read(rows, buffer.draw(jax.random.key(1), rows, jnp.array(steps), 500))
     assert set((np.asarray(drawn.reward) - 0.5).tolist()) == numbers  # an empty row would be -0.5
-
-
-@pytest.mark.parametrize("steps", [10, 24])
-def test_what_follows_a_step_is_its_own_environments(steps):
-    """Two environments in turn, 12 rows: row n's followers are n + 2, n + 4, ... up to the newest, across the seam."""
-    buffer = RingBuffer(EXAMPLE)
-    rows = filled(buffer, 12, 2, steps)
-    oldest = max(0, steps - 12)
-    numbers = jnp.arange(oldest, steps)
-    after = buffer.follow(rows, jnp.array(steps), numbers % 12, 4, 2)
-    expected = np.arange(oldest, steps)[:, None] + 2 * np.arange(4)
-    np.testing.assert_array_equal(after.exists, expected < steps)
-    for found, part in ((after.rewards, 0.5), (after.discounts, 0.6), (after.ended, 0.7)):
-        np.testing.assert_allclose(np.asarray(found)[expected < steps], expected[expected < steps] + part, rtol=1e-5)
 
 
 def test_in_lanes_the_write_stays_one_slice_update():

@@ -2,15 +2,13 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+import recorded_situations
 
 import cuelearner_jax as cl
 from cuelearner_jax.api.labels import rows_of
 from cuelearner_jax.config import GuideSizes, Scalars
-from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.spaces import Box, cues_from
 from cuelearner_jax.storage import label_files
 
@@ -34,10 +32,9 @@ def off(obs):
     return wanted(obs) + OFFSET
 
 
-def answers(obs, actions, space=SPACE, best=wanted):
+def answers(obs, actions):
     """What people say of actions."""
-    told = jax.vmap(lambda action, best: relative_feedback(space, action, best, EPS))
-    return np.array(told(jnp.asarray(actions), jnp.asarray(best(obs))))
+    return recorded_situations.said(SPACE, actions, wanted(obs), EPS)
 
 
 def asked(count, seed=0, reach=0.2):

@@ -56,15 +56,13 @@ TASK = Task(
 def straight(obs):
     return obs.copy()
 
-def narrow(obs):
-    return obs[:, :1]
-
 def failing(obs):
     raise RuntimeError("out of ink")
 '''
 TASK = ["--task", "own_turned:TASK"]
 FIT = ["--guidance", "relative", "--sizes.feedback-layers", "32", "--sizes.fit-steps", "200"]
 FIT += ["--sizes.fit-batch-size", "32", "--scalars.feedback-learning-rate", "0.005"]
+AGAIN = [*TASK, "--base", "own_turned:straight"]  # the policy folder's code, as it is named again
 CODE = ["adapt", "own_turned:straight", *TASK, "--scenario", "aslant", *FIT, "--judge-episodes", "20"]
 EVALUATE = ["--steps", "2000", "--envs", "20"]  # as many as are judged on, so that one program does both
 ANGLES = np.linspace(0, 6, 40, dtype=np.float32)
@@ -91,23 +89,18 @@ def measured(tmp_path, *command):
     return json.loads(out.read_text())["rows"]
 
 
-def own(*names):
-    """The policy folder's code, as it is named again."""
-    return [*TASK, "--base", *(names or ("own_turned:straight",))]
-
-
 def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
     values = json.loads((adapted / "policy.json").read_text())
     assert values["task"]["offset_deg"] == -20.0
     assert values["of"] == {"code": "own_turned:straight"}
     assert values["judged"]["rewarded_steps"] == [2 * 20 * 100] * 4
     assert values["policy"]["base"] == {"policy": "code", "named": "own_turned:straight"}
-    rows = measured(tmp_path, adapted, *own())
+    rows = measured(tmp_path, adapted, *AGAIN)
     assert [(row["labels"], row["bound_deg"]) for row in rows] == [(20, 3.0), (80, 3.0), (20, 45.0), (80, 45.0)]
     rewards = [row["reward"][0] for row in rows]
     assert rewards[:2] == [0.0, 0.0]  # 17 of 20 degrees off
     assert rewards[3] == 1.0
-    (before,) = {row["reward"][0] for row in measured(tmp_path, adapted, *own(), "--policy", "base")}
+    (before,) = {row["reward"][0] for row in measured(tmp_path, adapted, *AGAIN, "--policy", "base")}
     assert before == 0.0
 
 
@@ -168,7 +161,7 @@ def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path, capsys):
     refused([*CODE, "--out", adapted], "is not empty: give --overwrite", adapted)
     refused([*CODE, "--out", adapted.parent, "--overwrite"], "is not a policy folder", adapted)
     refused(["evaluate", adapted, *TASK], "add --base own_turned:straight if you trust that code", adapted)
-    refused(["evaluate", adapted, *own(), "--policy", "agent"], "needs a trained run", adapted)
+    refused(["evaluate", adapted, *AGAIN, "--policy", "agent"], "needs a trained run", adapted)
     forget()
     refused(["evaluate", adapted], "add --task own_turned:TASK if you trust that code", adapted)
     load = partial(cl.load_policy, task="own_turned:TASK", base=lambda obs: obs)

@@ -8,7 +8,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import imageio.v2 as imageio
-import numpy as np
 import pytest
 from probes import long_but
 from small_runs import BANDIT
@@ -17,25 +16,10 @@ from cuelearner_jax import studies
 from cuelearner_jax.api.policies import load_policy
 from cuelearner_jax.cli import dispatch, main
 from cuelearner_jax.runs.order import make_plan
-from cuelearner_jax.storage import results
 from cuelearner_jax.studies import train
 
 TRAINED = ("agent", "guide", "guided")
 README = Path(__file__).resolve().parents[2] / "README.md"
-
-
-def test_a_sweep_leaves_a_complete_folder(run_folder):
-    described = json.loads((run_folder / "config.json").read_text())
-    assert described["task"]["name"] == "bandit"
-    assert described["grid"] == {"guidance": ["none", "relative"], "seeds": [2000, 2001], "labels": [10, 20]}
-    for kind, lanes in (("none", 2), ("relative", 4)):
-        rows = results.read(run_folder / kind).to_pylist()
-        assert (run_folder / kind / "results.parquet").exists()
-        assert len(rows) == lanes * 3  # steps 0, 100 and 200
-        assert {row["step"] for row in rows} == {0, 100, 200}
-        assert {(row["episodes"], len(row["reward_each"])) for row in rows} == {(40, 20)}
-        assert all(np.mean(row["reward_each"]) == pytest.approx(row["reward"], abs=1e-6) for row in rows)
-    assert (run_folder / "relative" / "labels.parquet").exists()
 
 
 @pytest.mark.parametrize("policy", long_but(("agent", "uniform"), (*TRAINED, "uniform", "teacher", "heuristic")))
@@ -131,20 +115,9 @@ def test_a_report_has_curves_and_tables(run_folder, tmp_path, capsys):
     assert main(["report", str(run_folder), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["guidance"], row["labels"]) for row in rows] == [("none", 0), ("relative", 10), ("relative", 20)]
-    assert all(row["final_lower"] <= row["final"] <= row["final_upper"] for row in rows)
     table = (out / "report.md").read_text()
     assert "| relative | 20 | 2 |" in table
     assert (out / "label_efficiency.png").exists()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("film", ["gif", "mp4"])
-def test_render_makes_a_film_and_a_still(tmp_path, film):
-    command = ["render", "shipped:billiards", "--film", film]
-    assert main([*command, "--steps", "1", "--out", str(tmp_path)]) == 0
-    (still,), (filmed,) = (list(tmp_path.glob(f"*-agent.{end}")) for end in ("png", film))
-    assert imageio.imread(still).std() > 1
-    assert filmed.stat().st_size > 1000
 
 
 def test_the_overview_has_a_line_for_each_command(capsys):

@@ -26,8 +26,6 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--compare", "nowhere"], "--compare is 'nowhere': give a run folder, a policy folder"),
     (["evaluate", "billiards", "--compare", "docs/data/navigation_agent"], "not of billiards: give one of billiards"),
     (["evaluate", "billiards", "--steps", "150"], "multiple of envs"),
-    (["evaluate", "billiards", "--guidance", "none"], "belongs to no lane of a run"),
-    (["render", "billiards", "--seed", "3"], "belongs to no lane of a run"),
     (["render", "billiards", "--film", "avi"], "gif or mp4"),
     (["evaluate", "billiards", "--task.table", "one_ball", "--policy", "teacher"], "--task.teacher search"),
     (["report", "--out", "report"], "no folder to report on"),

@@ -1,7 +1,5 @@
 """Labels of a recording on the command line: a policy corrected, judged and exported without a task or a simulator."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -10,12 +8,8 @@ import recorded_situations as recorded
 from small_runs import next_command
 
 import cuelearner_jax as cl
-from cuelearner_jax import config as configuration
 from cuelearner_jax.cli import main
-from cuelearner_jax.feedback.answers import relative_feedback
-from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import logs
-from cuelearner_jax.types import Label
 
 NAME = "own_arm"
 OWN = """
@@ -23,9 +17,6 @@ import numpy as np
 
 def policy(obs):
     return obs[:, :3] * np.array([0.3, 0.1, 0.6]) + np.array([0.0, 0.2, 0.0])  # within the bounds
-
-def narrow(obs):
-    return obs[:, :2]
 """
 EPS = 0.05
 SIZES = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20", "--sizes.fit-batch-size", "20")
@@ -44,12 +35,8 @@ def place(home):
     exec(OWN, namespace)
     actions = namespace["policy"](obs).astype(np.float32)
     best = np.clip(actions + 0.1, recorded.LOW, recorded.HIGH).astype(np.float32)
-    told = jax.vmap(lambda action, best: relative_feedback(space, action, best, EPS))
-    rows = Label(obs, actions, np.asarray(told(jnp.asarray(actions), jnp.asarray(best))), np.ones(40, bool))
-    of = {"name": "logs", **configuration.to_json(task.plain())}
-    (folder / "labels").mkdir()
-    file = label_files.LabelFile(of, "relative", space, EPS, np.zeros(40), rows)
-    label_files.write_file(folder / "labels/labels.parquet", file, "more")
+    answers = recorded.said(space, actions, best, EPS)
+    recorded.write_labels(folder / "labels", task.plain(), space, EPS, (obs, actions, answers))
     return folder
 
 
@@ -89,11 +76,7 @@ def test_proposed_actions_are_corrected_by_their_labels_alone(tmp_path, monkeypa
     env = task.environment(task.plain())
     obs, asked = np.asarray(env.rows), np.asarray(env.recorded)
     more = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (40, 1))
-    of = {"name": "logs", **configuration.to_json(task.plain())}
-    rows = Label(obs, asked, more, np.ones(40, bool))
-    file = label_files.LabelFile(of, "relative", env.actions, EPS, np.zeros(40), rows)
-    (tmp_path / "labels").mkdir()
-    label_files.write_file(tmp_path / "labels/labels.parquet", file, "more")
+    recorded.write_labels(tmp_path / "labels", task.plain(), env.actions, EPS, (obs, asked, more))
     assert main(["adapt", "--labels-from", "labels", "--out", "better"]) == 0
     assert "action: " in capsys.readouterr().out
     moved = np.asarray(cl.load_policy("better")(obs)) - asked

@@ -25,7 +25,6 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs.program import make_program
 from cuelearner_jax.storage import results
 from cuelearner_jax.tasks import registry as tasks
 from cuelearner_jax.testing import check_environment, check_guidance, check_policy, check_task
@@ -174,7 +173,7 @@ def test_the_soft_agent_learns_the_soft_values_of_a_chain():
         agent=options,
     )
     env = probes.Chain(False)
-    program = make_program(config, guidances.make("none", config.sizes, env), env, 0)
+    program = probes.chain_program(config, "none")
     _, state, _ = program.train(env, config.settings, loop.start_clock(), probes.start(program, [0], [0], env), 600)
     agent, params = options.make("raw", spaces_of(env), True), probes.lane(state.agent.params, 0)
     assert isinstance(agent, AgentFunctions)

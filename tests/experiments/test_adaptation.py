@@ -1,9 +1,6 @@
 """The study of adaptation: every piece is a command with options that exist, and is gone on with."""
 
-import importlib
-import sys
-from pathlib import Path
-
+import adaptation as study
 import pytest
 from _pieces import scaled
 
@@ -11,15 +8,7 @@ from cuelearner_jax.cli import adapt, main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.tasks import registry
 
-FOLDER = Path(__file__).parents[2] / "experiments"
 AGENTS = {"navigation": "shipped:navigation", "billiards": "shipped:billiards"}
-
-
-@pytest.fixture(scope="module")
-def study():
-    sys.path.insert(0, str(FOLDER))
-    yield importlib.import_module("adaptation")
-    sys.path.remove(str(FOLDER))
 
 
 def bases(folder, task):
@@ -28,7 +17,7 @@ def bases(folder, task):
     (folder / task / "bases/none/config.json").write_text('{"grid": {"seeds": [5000, 5001]}}')
 
 
-def corrections(study, scale, folder):
+def corrections(scale, folder):
     """Every piece that asks, with its command line, of agents that are at hand."""
     for task in AGENTS:
         bases(folder, task)
@@ -39,14 +28,14 @@ def corrections(study, scale, folder):
             yield own, [AGENTS[piece.world] if word.endswith("/bases/none") else word for word in command]
 
 
-def test_every_piece_acts_in_a_world_of_its_task(study):
+def test_every_piece_acts_in_a_world_of_its_task():
     assert len({piece.path for piece in study.PIECES}) == len(study.PIECES)
     for piece in study.PIECES:
         assert piece.run in (*registry.find(piece.world).scenarios, study.BASES, study.UNCHANGED)
 
 
 @pytest.mark.parametrize("scale", ["smoke", pytest.param("paper", marks=pytest.mark.long)])
-def test_every_correction_has_options_that_exist(study, scale, monkeypatch, tmp_path):
+def test_every_correction_has_options_that_exist(scale, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     worlds = []
 
@@ -55,7 +44,7 @@ def test_every_correction_has_options_that_exist(study, scale, monkeypatch, tmp_
         raise UserError("all options are read")
 
     monkeypatch.setattr(adapt, "subject_of", subject_of)
-    commands = [command for _, command in corrections(study, scale, tmp_path)][:: 3 if scale == "smoke" else 1]
+    commands = [command for _, command in corrections(scale, tmp_path)][:: 3 if scale == "smoke" else 1]
     for command in commands:
         main(command)
     assert len(worlds) == len(commands)

@@ -1,9 +1,10 @@
 """The studies of label efficiency: every piece is a sweep that would begin; recorded tables are their data's."""
 
 import csv
-import importlib
 from pathlib import Path
 
+import billiards_bootstrapping
+import navigation_bootstrapping
 import pytest
 from _pieces import scaled, sweep_command
 
@@ -16,16 +17,11 @@ from cuelearner_jax.studies import train
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(params=["billiards", "navigation"])
-def experiment(request, monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
-    return importlib.import_module(f"{request.param}_bootstrapping").EXPERIMENT
-
-
+@pytest.mark.parametrize("study", [billiards_bootstrapping, navigation_bootstrapping], ids=lambda study: study.__name__)
 @pytest.mark.parametrize("scale", ["smoke", pytest.param("paper", marks=pytest.mark.long)])
-def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, monkeypatch, tmp_path):
+def test_every_piece_is_a_sweep_that_would_begin(study, scale, monkeypatch, tmp_path):
     """The command line itself plans each: options exist, values are legal, counts divide each other."""
-    orders = []
+    experiment, orders = study.EXPERIMENT, []
     monkeypatch.setattr(train, "run", lambda order: orders.append(make_plan(order).order))
     assert len({piece.path for piece in experiment.pieces}) == len(experiment.pieces)
     different = {}

@@ -15,7 +15,6 @@ def test_an_experiment_has_a_help_of_its_own(file, monkeypatch, capsys):
     if "lerobot" in file.stem:  # it needs an environment of its own
         pytest.importorskip("lerobot")
     monkeypatch.setattr(sys, "argv", [str(file), "--help"])
-    monkeypatch.syspath_prepend(str(FOLDER))  # as Python does for a file that it runs
     with pytest.raises(SystemExit) as stopped:
         runpy.run_path(str(file), run_name="__main__")
     assert not stopped.value.code

@@ -1,7 +1,5 @@
 """Scripted arms in changed worlds: the scripts, what is changed and undone, and what the page tells."""
 
-import importlib
-import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -12,16 +10,6 @@ import pytest
 from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, push, reach
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def study():
-    pytest.importorskip("gymnasium_robotics")
-    sys.path.insert(0, str(ROOT / "experiments"))
-    try:
-        yield importlib.import_module("scripted_arms")
-    finally:
-        sys.path.remove(str(ROOT / "experiments"))
 
 
 def observed(**places):
@@ -42,7 +30,10 @@ def test_the_scripts_do_what_they_say():
     np.testing.assert_allclose(push(observed(**at, gripper=(0.05, 0, 0.4))), [[0, 0, 1, 0]])  # rises before the object
 
 
-def test_the_page_tells_what_was_recorded(study):
+def test_the_page_tells_what_was_recorded():
+    pytest.importorskip("gymnasium_robotics")
+    import scripted_arms as study
+
     rows = pq.read_table(ROOT / "docs" / "data" / "scripted_arms.parquet").to_pylist()
     page = (ROOT / "docs" / "results" / "scripted_arms.md").read_text(encoding="utf-8")
     for robots, of in (("Fetch", True), ("Meta-World", False)):

@@ -71,8 +71,6 @@ def test_of_a_saved_policy_it_needs_no_base_and_does_beside_it_what_the_policy_d
             decide(*given)
     with pytest.raises(ContractError, match="or equally many"):  # before the base is asked
         decide.base_observations(OTHERS[:, :2])
-    with pytest.raises(cl.UserError, match="is not empty"):
-        cl.export_correction(better, tmp_path / "out")
 
 
 def reading(better, below, theta=0.0, alpha=0.01, bound=0.2):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
-from probes import AGENT, SCALARS, SIZES, Aimed, Expert, Window, edit_contract, long_but
+from probes import AGENT, SCALARS, SIZES, Aimed, Expert, Window, long_but
 
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -131,6 +131,15 @@ def test_a_folder_that_is_damaged_or_changed_is_refused(folder, tmp_path):
         contract.open_decision(tmp_path / "nowhere")
 
 
+def edit_contract(folder, change=lambda contract: None):
+    """Rewrite a contract by a function of its values, with the digests of the files as they are now."""
+    contract = json.loads((folder / runner.CONTRACT).read_text())
+    del contract[runner.DIGEST]
+    change(contract)
+    contract["files"] = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in contract["files"]}
+    (folder / runner.CONTRACT).write_text(json.dumps({**contract, runner.DIGEST: runner.digest(contract)}))
+
+
 def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_path):
     there = copied(folder / "stablehlo", tmp_path)
     exported = jax.export.deserialize(bytearray((there / "decision.stablehlo").read_bytes()))
@@ -175,8 +184,6 @@ def test_what_only_stablehlo_can_say_is_refused_of_the_others(tmp_path):
         with pytest.raises(UserError, match="does not support sort"):
             write(policy, format, tmp_path / "out")
     assert write(policy, "stablehlo", tmp_path / "out")["difference"] == 0.0
-    with pytest.raises(UserError, match="is not empty"):
-        write(policy, "stablehlo", tmp_path / "out")
 
 
 def test_golden_cases_are_those_that_rounding_does_not_turn():

@@ -1,6 +1,5 @@
 """A hand's kinematics of an MJCF: MuJoCo's positions, a constant error that labels correct, arrows, refusals."""
 
-import importlib.util
 import json
 import re
 from pathlib import Path
@@ -11,10 +10,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from recorded_situations import plugin_module
 
 from cuelearner_jax.tasks import logs
 
-PLUGIN = Path(__file__).parents[2] / "plugins/lerobot_processor_cuelearner/lerobot_processor_cuelearner"
 MJCF = Path(__file__).with_name("arm.xml")
 JOINTS = ["pan", "lift", "elbow", "turn", "flex", "roll"]
 ENTRIES = [*(f"{name}.pos" for name in JOINTS), "gripper"]
@@ -27,10 +26,7 @@ BOTH = ([0.5 / 200, 0, 0], [0, 1 / HEIGHT, 0], [0, 0, 1])  # its picture is the 
 
 @pytest.fixture(scope="module")
 def kinematics():
-    spec = importlib.util.spec_from_file_location("kinematics", PLUGIN / "kinematics.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return plugin_module("kinematics")
 
 
 @pytest.fixture(scope="module")

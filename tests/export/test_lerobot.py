@@ -1,14 +1,13 @@
 """A correction of proposed actions in a copy of a LeRobot checkpoint: its files, its golden cases, what is refused."""
 
 import dataclasses
-import importlib.util
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from recorded_situations import plugin_module
 
 from cuelearner_jax.adaptation.judging import PairedTest
 from cuelearner_jax.environment import BASE, EFFECT
@@ -20,7 +19,6 @@ from cuelearner_jax.reading.families import ACTIONS_ALONE, declared_distortions
 from cuelearner_jax.reading.policy import unread
 from cuelearner_jax.tasks import logs
 
-PLUGIN = Path(__file__).parents[2] / "plugins/lerobot_processor_cuelearner/lerobot_processor_cuelearner"
 CONFIG = logs.LogsConfig(
     names=("x", "y", "phase", BASE), entries=(1, 1, 1, 2), low=(-1.0, 0.0), high=(1.0, 4.0), rows=20
 )
@@ -29,14 +27,6 @@ ROBOT = {
     "output_features": {"action": {"type": "ACTION", "shape": [2]}},
     "n_action_steps": 5,
 }
-
-
-def plugin_module(name):
-    """Import a file of the plugin, which is not installed here."""
-    spec = importlib.util.spec_from_file_location(name, PLUGIN / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def step(name, **config):

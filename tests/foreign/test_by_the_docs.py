@@ -6,20 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import recorded_situations as recorded
 
-from cuelearner_jax import config as configuration
 from cuelearner_jax.cli import main
-from cuelearner_jax.feedback.answers import relative_feedback
-from cuelearner_jax.storage import label_files
 from cuelearner_jax.tasks import logs
-from cuelearner_jax.types import Label
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnxruntime")
@@ -91,12 +85,6 @@ def acted(policy, obs):
         return policy.eval()(torch.as_tensor(np.asarray(obs, np.float32))).numpy()
 
 
-def told(space, wanted, obs, actions):
-    """What a person says of actions (n, 3)."""
-    one = jax.vmap(lambda action, best: relative_feedback(space, action, best, EPS))
-    return np.asarray(one(jnp.asarray(actions), jnp.asarray(wanted(obs), jnp.float32)))
-
-
 def in_file(folder, policy, wanted, count, seed):
     """Writes a label file as the page does, about the policy's actions moved at random."""
     task = logs.task_of("situations", COMMANDS["label"][3], recorded.LOW, recorded.HIGH)
@@ -104,11 +92,8 @@ def in_file(folder, policy, wanted, count, seed):
     obs = random.uniform(-1, 1, (count, 4)).astype(np.float32)
     actions = np.clip(acted(policy, obs) + random.uniform(-0.2, 0.2, (count, 3)) * RANGE, recorded.LOW, recorded.HIGH)
     actions = actions.astype(np.float32)
-    rows = Label(obs, actions, told(space, wanted, obs, actions), np.ones(count, bool))
-    of = {"name": "logs", **configuration.to_json(task.plain())}
-    file = label_files.LabelFile(of, "relative", space, EPS, np.zeros(count), rows)
-    folder.mkdir(parents=True)
-    label_files.write_file(folder / "labels.parquet", file, "more")
+    answers = recorded.said(space, actions, wanted(obs), EPS)
+    recorded.write_labels(folder, task.plain(), space, EPS, (obs, actions, answers))
 
 
 def test_the_commands_of_the_page_correct_a_policy_of_pytorch(place, tmp_path, capsys):

@@ -81,15 +81,9 @@ def test_a_share_of_the_questions_is_about_refined_actions_and_the_rest_about_th
 # The table of kinds.
 
 
-@pytest.fixture
-def table(monkeypatch):
-    """The table of kinds; what a test adds is forgotten after it."""
-    copy = dict(guidance.guides())
-    monkeypatch.setattr(guidance, "guides", lambda: copy)
-    return copy
-
-
-def test_a_kind_can_be_added_again_but_not_another_of_its_name(table):
+def test_a_kind_can_be_added_again_but_not_another_of_its_name(monkeypatch):
+    table = dict(guidance.guides())
+    monkeypatch.setattr(guidance, "guides", lambda: table)
     calm, other = (type("Calm", (NoGuide,), {"name": name, "needs": ("mirror",)}) for name in ("calm", "none"))
     for _ in range(2):
         assert plugins.add(table, calm, "guidance") is calm

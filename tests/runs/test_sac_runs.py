@@ -6,7 +6,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 import walk_task
 from small_runs import stopping_at
@@ -81,12 +80,9 @@ def test_what_is_loaded_acts_as_what_was_evaluated(whole):
     assert float(found["reward"]) == last["reward"]
 
 
-@pytest.mark.parametrize(
-    "format", ["onnx", *(pytest.param(one, marks=pytest.mark.long) for one in ("numpy", "stablehlo"))]
-)
-def test_the_agent_is_exported_as_it_acts(whole, tmp_path, format):
+def test_the_agent_is_exported_as_it_acts(whole, tmp_path):
     policy = policy_of(whole)
-    written = contract.write(policy, ENV, partial(decisions.observations, ENV, policy, 32), format, tmp_path, {})
+    written = contract.write(policy, ENV, partial(decisions.observations, ENV, policy, 32), "onnx", tmp_path, {})
     assert written["difference"] <= decisions.TOLERANCE
     assert written["action"]["space"]["name"] == "box"
     assert written["policy"]["agent"]["name"] == "sac"
@@ -100,40 +96,13 @@ def test_a_policy_folder_can_keep_the_agent(whole):
     np.testing.assert_array_equal(*(policy.act(jax.random.key(0), None, obs) for policy in (agent, again)))
 
 
-# Lanes.
-
-
-@pytest.fixture(scope="module")
-def lanes():
-    """Two lanes after eight iterations: vmapped, as an accelerator has them, and each alone."""
+def test_replay_tells_ends_by_time_from_terminations_and_guided_steps():
     lane = loop.lane_of(CONFIG.sizes, loop.parts_of(CONFIG), registry.make("heuristic", CONFIG.sizes, ENV), 0, ENV)
-
-    def iterated(state):
-        def one(carry, _):
-            clock, state = carry
-            state, _ = lane.iterate(ENV, CONFIG.settings, clock, state)
-            return (lane.advance(clock, CONFIG.schedule), state), None
-
-        return jax.lax.scan(one, (loop.start_clock(), state), length=8)[0][1]
-
-    init, alone = jax.jit(lambda key: lane.init(ENV, key, 0)), jax.jit(iterated)
-    start = [init(jax.random.fold_in(jax.random.key(0), seed)) for seed in range(2)]
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *start)
-    return jax.jit(jax.vmap(iterated))(both), [alone(state) for state in start]
-
-
-@pytest.mark.long
-def test_side_by_side_lanes_are_those_of_single_seeds(lanes):
-    """On a CPU lanes are taken one by one, and are equal by the bit; vmapped, products are summed in another order."""
-    beside, alone = lanes
-    for index, single in enumerate(alone):
-        other = jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), single)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-4, atol=2e-5), probes.lane(beside, index), other)
-    assert int(np.asarray(beside.agent.guided).max()) > 0
-
-
-def test_replay_tells_ends_by_time_from_terminations_and_guided_steps(lanes):
-    _, (state, _) = lanes
+    clock, state = loop.start_clock(), jax.jit(lambda key: lane.init(ENV, key, 0))(jax.random.key(0))
+    iterate = jax.jit(lane.iterate)
+    for _ in range(8):
+        state, _ = iterate(ENV, CONFIG.settings, clock, state)
+        clock = lane.advance(clock, CONFIG.schedule)
     columns = np.asarray(state.agent.replay)  # place, time, two entries, reward, discount, ended, next place and time
     discount, ended, place, time = columns[:, 5], columns[:, 6], columns[:, 7], columns[:, 8]
     off = np.abs(place) > walk_task.EDGE

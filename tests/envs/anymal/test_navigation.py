@@ -44,14 +44,13 @@ def walked(env):
     step = jax.jit(jax.vmap(env.step))
     keys = jax.random.split(jax.random.key(1), WALKERS)
     following, first = step(keys, state, told)
-    later, second = step(keys, following, told)
-    last, third = step(keys, later, told)
-    return [state, following, later, last], [first, second, third]
+    _, second = step(keys, following, told)
+    return [state, following], [first, second]
 
 
 @pytest.mark.long
 def test_every_end_has_its_name(walked):
-    _, (first, _, _) = walked
+    _, (first, _) = walked
     outcome = {name: np.asarray(value).tolist() for name, value in first.outcome.items() if name != "duration"}
     assert outcome == {
         "success": [0, 1, 0, 0],

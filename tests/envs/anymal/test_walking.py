@@ -12,15 +12,6 @@ from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal import policy, tracking
 
 
-def random_policy(layers=(16, 8)):
-    """A policy with random weights."""
-    rng, sizes = np.random.default_rng(0), (policy.OBS, *layers, robot.JOINTS)
-    pairs = itertools.pairwise(sizes)
-    made = [(rng.normal(size=pair) / 8, rng.normal(size=pair[1]) / 8) for pair in pairs]
-    mean, std = rng.normal(size=policy.OBS), rng.uniform(0.5, 2.0, policy.OBS)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), policy.WalkingPolicy(mean, std, tuple(made)))
-
-
 def test_the_network_is_the_mean_of_braxs_policy():
     from brax.training.acme import running_statistics, specs
     from brax.training.agents.ppo import networks
@@ -38,7 +29,10 @@ def test_the_network_is_the_mean_of_braxs_policy():
 
 
 def test_a_saved_policy_acts_as_before(tmp_path):
-    made = random_policy()
+    rng, sizes = np.random.default_rng(0), (policy.OBS, 16, 8, robot.JOINTS)
+    layers = [(rng.normal(size=pair) / 8, rng.normal(size=pair[1]) / 8) for pair in itertools.pairwise(sizes)]
+    own = policy.WalkingPolicy(rng.normal(size=policy.OBS), rng.uniform(0.5, 2.0, policy.OBS), tuple(layers))
+    made = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), own)
     policy.save(tmp_path / "kept", made, {"seed": 3})
     obs = jax.random.normal(jax.random.key(0), (100, policy.OBS))
     np.testing.assert_allclose(policy.load(tmp_path / "kept")(obs), made(obs), atol=5e-3)  # kept in half precision

@@ -15,10 +15,6 @@ reset = jax.jit(lambda env, key: env.reset(key))
 shoot = jax.jit(simulate)
 
 
-def repeated(state):
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (BATCH, *leaf.shape)), state)
-
-
 CORNER = balls([(0.2, 0.0), (0.35, 0.15), (-0.3, 0.1), (-0.3, -0.1)])  # ball 1 lies between the cue ball and a corner
 FOUL = balls([(0.3, 0.1), (-0.2, 0.0), (-0.3, 0.1), (-0.3, -0.1)])  # nothing lies between the cue ball and a corner
 CORNERWARDS, NOWHERE = toward(45.0), toward(90.0)  # NOWHERE: in all these scenes the cue ball stays on a line across
@@ -66,7 +62,8 @@ def test_the_reward_counts_the_balls_of_this_shot_alone():
 
 
 def test_a_foul_puts_every_ball_back_and_the_cue_ball_somewhere_free_on_the_left():
-    after, result = step_many(EASY, jax.random.split(KEY, BATCH), repeated(FOUL), jnp.tile(CORNERWARDS, (BATCH, 1)))
+    fouls = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (BATCH, *leaf.shape)), FOUL)
+    after, result = step_many(EASY, jax.random.split(KEY, BATCH), fouls, jnp.tile(CORNERWARDS, (BATCH, 1)))
     assert (result.metrics["foul"] == 1).all()
     assert (result.reward == 0).all()
     assert (after.shots == 1).all()

@@ -6,14 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rooms import to_segments
 from scipy.integrate import solve_ivp
 
 from cuelearner_envs.billiards import Table, physics, positions_at, simulate, trace
 from cuelearner_envs.billiards.table import cushions, rack
 
 RATE = -math.log(0.7)  # of the drag, lambda [1/s]
-REACH = (0.5 - 0.05) / RATE  # how far a free ball rolls until a shot is over [m]
-DURATION = math.log(0.5 / 0.05) / RATE  # [s]
 
 shoot = jax.jit(simulate)
 shoot_many = jax.jit(jax.vmap(simulate, (None, 0, 0, 0)))
@@ -98,22 +97,6 @@ def test_collision_keeps_momentum_and_reverses_the_normal_speed(friction, restit
         assert (np.abs(along - after.rim.sum(-1)) < 2e-6).mean() > 0.9
 
 
-def test_free_ball_rolls_as_far_and_as_long_as_linear_drag_says():
-    shot = play_one(LARGE, [[-1.0, 0.1], [0.0, 0.9]], 0.3)
-    np.testing.assert_allclose(shot.positions[0], [-1 + REACH * math.cos(0.3), 0.1 + REACH * math.sin(0.3)], atol=2e-6)
-    np.testing.assert_allclose(shot.positions[1], [0.0, 0.9])
-    assert shot.duration == pytest.approx(DURATION, abs=1e-5)
-    assert int(shot.events) == 1
-
-
-def distance_to_segments(points, segments):
-    """From each point (..., 2) to the nearest of the segments (n, 2, 2)."""
-    start, along = segments[:, 0], segments[:, 1] - segments[:, 0]
-    share = ((points[..., None, :] - start) * along).sum(-1) / (along**2).sum(-1)
-    foot = start + np.clip(share, 0, 1)[..., None] * along
-    return np.linalg.norm(points[..., None, :] - foot, axis=-1).min(-1)
-
-
 def test_nothing_overlaps_at_rest_and_no_shot_runs_out_of_events():
     table = Table.regulation().replace(acceleration=(0.0, 0.005))
     places, angles = scattered(table, 1000)
@@ -125,7 +108,7 @@ def test_nothing_overlaps_at_rest_and_no_shot_runs_out_of_events():
     assert apart.min() > 2 * table.ball_radius - 2e-6
     on = shot.positions[~shot.pocketed]
     reach = table.ball_radius + table.cushion_radius
-    assert distance_to_segments(on, np.asarray(cushions(table), float)).min() > reach - 2e-6
+    assert to_segments(on[:, None], *np.moveaxis(np.asarray(cushions(table), float), 1, 0)).min() > reach - 2e-6
     assert (np.abs(on) <= np.array([table.width / 2, table.height / 2]) + table.pocket_margin).all()
     moved = np.linalg.norm(shot.positions - places, axis=-1) > 1e-4
     assert moved[:, 1:].any(1).mean() > 0.5

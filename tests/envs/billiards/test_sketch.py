@@ -5,20 +5,18 @@ from xml.etree import ElementTree
 
 import jax.numpy as jnp
 import pytest
+from billiards_scenes import balls
 
 from cuelearner_envs.billiards import Table
-from cuelearner_envs.billiards.environment import Balls, Billiards
+from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.sketch import reel, sketch
 
+BOTH = (False, False)  # pocketed
 ENV = Billiards(Table.one_ball().replace(max_events=24))
 
 
-def balls(positions, pocketed=(False, False)):
-    return Balls(jnp.array(positions), jnp.array(pocketed), jnp.zeros((), jnp.int32))
-
-
 def test_balls_and_the_arrow_are_where_they_should_be_with_y_downwards():
-    found = sketch(ENV, balls([[0.1, -0.1], [0.3, 0.15]]))
+    found = sketch(ENV, balls([[0.1, -0.1], [0.3, 0.15]], BOTH))
     assert found.places == {"ball-0": pytest.approx((0.1, 0.1, 0)), "ball-1": pytest.approx((0.3, -0.15, 0))}
     assert found.foot == pytest.approx((0.1, 0.1))
     assert (found.turn, found.words) == (0.0, "1 of 1 on the table")
@@ -41,7 +39,7 @@ def test_balls_and_the_arrow_are_where_they_should_be_with_y_downwards():
 
 def test_a_film_ends_as_the_shot_does():
     along = jnp.array([math.cos(math.pi / 4), math.sin(math.pi / 4)])
-    state = balls([[0.1, -0.1], [0.3, 0.1]])
+    state = balls([[0.1, -0.1], [0.3, 0.1]], BOTH)
     film = reel(ENV, state, along)  # the diagonal into the corner
     assert film.words == "1 pocketed"
     assert film.frames[0] == {"ball-0": pytest.approx((0.1, 0.1, 0)), "ball-1": pytest.approx((0.3, -0.1, 0))}

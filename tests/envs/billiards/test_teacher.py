@@ -18,6 +18,7 @@ from cuelearner_jax.teachers import LearnedTeacher
 RACKS, DIRECTIONS = 30, 1440
 ONE = make_environment(BilliardsConfig("one_ball"))
 AIM, HABIT = np.deg2rad(0.5), 0.2
+searched = jax.jit(lambda teacher, states: jax.lax.map(teacher.rewards, states))
 best = jax.jit(lambda teacher, states, obs: jax.lax.map(lambda pair: teacher.best_action(*pair), (states, obs)))
 play = jax.jit(lambda env, states, actions: jax.vmap(env.step, (None, 0, 0))(jax.random.key(0), states, actions)[1])
 
@@ -36,13 +37,8 @@ def chosen(racks):
     return best(SearchTeacher(ONE, AIM, HABIT), *racks)
 
 
-@pytest.fixture(scope="module")
-def wins(racks):
-    teacher = SearchTeacher(ONE, AIM, HABIT)
-    return np.asarray(jax.jit(lambda states: jax.lax.map(teacher.rewards, states))(racks[0])) > 0
-
-
-def test_search_finds_a_winning_direction_where_few_win(racks, chosen, wins):
+def test_search_finds_a_winning_direction_where_few_win(racks, chosen):
+    wins = np.asarray(searched(SearchTeacher(ONE, AIM, HABIT), racks[0])) > 0
     assert wins.shape == (RACKS, DIRECTIONS)
     assert float(play(ONE, racks[0], chosen).reward.mean()) > 0.9  # 1.0 measured
     assert 0 < wins.mean() < 0.03  # the reward of uniform directions; 0.008 measured
@@ -92,9 +88,6 @@ def near(request, easy):
     full = SearchTeacher(env, local.aim_error, local.habit, PROPOSALS)
     states = easy[0]
     return local, full, searched(full, states), states, jax.vmap(env.observe)(states)
-
-
-searched = jax.jit(lambda teacher, states: jax.lax.map(teacher.rewards, states))
 
 
 @pytest.mark.long

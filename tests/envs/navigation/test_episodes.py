@@ -90,15 +90,6 @@ def test_an_end_is_followed_by_a_new_episode_of_any_world_and_nothing_else_is(pl
     np.testing.assert_array_equal(np.asarray(following.steps), np.where(ended, 0, states.steps + 1))
 
 
-def test_each_step_has_one_end_at_most_and_pays_accordingly(plays):
-    _, (_, _, _, _, result, _) = plays["plain"]
-    ends = np.stack([np.asarray(result.outcome[name]) for name in ("success", "collision", "timeout")])
-    assert set(ends.sum(0).ravel().tolist()) == {0.0, 1.0}
-    np.testing.assert_array_equal(result.reward, 10 * ends[0] - 10 * ends[1])
-    np.testing.assert_array_equal(result.terminated, ends[0] + ends[1] > 0)
-    np.testing.assert_array_equal(result.truncated, ends[2] > 0)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_remembered_steps_rebuild_what_was_seen_before_and_after(plays, kind):
     env, played_steps = plays[kind]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rooms
 from probes import long_but
+from rooms import to_segments
 
 from cuelearner_envs.navigation.environment import Navigation, Walker
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
@@ -30,14 +31,6 @@ ROUNDING = 2e-5  # of the map's float32 against float64 here [m]
 STYLES = ("clutter", "rooms", "corridor")
 ASKED = 40  # places in each world that the teacher is asked about
 ROUTES = (0, 5, 11)  # of each world
-
-
-def to_segments(points, starts, ends):
-    """Distances from points to segments (..., 2)."""
-    along = ends - starts
-    length = np.maximum(np.sum(along**2, -1), 1e-30)
-    share = np.clip(np.sum((points - starts) * along, -1) / length, 0, 1)
-    return np.linalg.norm(points - starts - share[..., None] * along, axis=-1)
 
 
 def cross(a, b):
@@ -70,12 +63,8 @@ def room(world, starts, ends):
 
 
 def clear_of(world, points):
-    """Distance from points (points, 2) to the nearest solid; 0 inside a box."""
-    corners, _ = solids(world)
-    points = np.asarray(points, float)
-    sides = np.roll(corners, -1, axis=1) - corners
-    inside = (cross(sides, points[:, None, None] - corners) > 0).all(-1).any(-1)
-    return np.where(inside, 0, room(world, points, points))
+    """Distance from points (points, 2) to the nearest solid; 0 inside one."""
+    return rooms.distance(np.asarray(points, float), np.asarray(world.boxes, float), np.asarray(world.circles, float))
 
 
 def gate(side):

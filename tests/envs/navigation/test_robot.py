@@ -23,17 +23,12 @@ def toward(angle):
 POST = world(circles=[[2.0, 1.0, 0.3]])
 
 
-def random_motions(count, seed=0):
-    rng = np.random.default_rng(seed)
-    speed, heading = np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
-    velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
-    pose = np.concatenate([rng.uniform(-5, 5, (count, 2)), rng.uniform(-np.pi, np.pi, (count, 1))], -1)
-    angle = rng.uniform(-np.pi, np.pi, count)
-    return pose, velocity, angle
-
-
 def test_a_step_is_what_a_general_integrator_finds():
-    pose, velocity, angle = random_motions(20)
+    rng = np.random.default_rng(0)
+    speed, heading = np.sqrt(rng.uniform(size=20)), rng.uniform(-np.pi, np.pi, 20)
+    velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    pose = np.concatenate([rng.uniform(-5, 5, (20, 2)), rng.uniform(-np.pi, np.pi, (20, 1))], -1)
+    angle = rng.uniform(-np.pi, np.pi, 20)
     robot = Robot(speed=0.8, lag=0.15)
     direction = np.stack([np.cos(angle), np.sin(angle)], -1)
     own = (jnp.asarray(rows, jnp.float32) for rows in (pose, velocity, direction))

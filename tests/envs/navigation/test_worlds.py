@@ -113,13 +113,6 @@ def test_every_obstacle_of_a_corridor_can_be_passed_on_either_side(sample, side)
         assert joined(*walkable(np.concatenate([boxes, closed]), circles, extent), *ends).all()
 
 
-def test_the_same_key_gives_the_same_world(sample):
-    style, many = sample
-    for number in (0, KEYS - 1):
-        again = generate_one(jax.random.fold_in(jax.random.key(3), number), style=style)
-        jax.tree.map(lambda a, b, n=number: np.testing.assert_array_equal(a, b[n]), again, many)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("sample", ["rooms"], indirect=True)
 @pytest.mark.parametrize("at_once", [None, 3, 64])
