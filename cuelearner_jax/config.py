@@ -103,11 +103,9 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
         if name not in fields:
             raise UserError(f"{prefix} has no field {format_value(name)}{suggestion(name, fields)}")
         if not fits(value, kind := kinds[name]):
-            if get_origin(kind) is Literal:
-                advice = suggestion(str(value), get_args(kind))
-            else:
-                called = kind.__name__ if isinstance(kind, type) and not get_args(kind) else kind
-                advice = f": give {NUMBERS.get(kind, f'a value of type {called}')}"
+            called = kind.__name__ if isinstance(kind, type) and not get_args(kind) else kind
+            advice = f": give {NUMBERS.get(kind, f'a value of type {called}')}"
+            advice = suggestion(str(value), get_args(kind)) if get_origin(kind) is Literal else advice
             raise UserError(f"{prefix}.{name} is {format_value(value)}{advice}")
     return values
 
@@ -156,8 +154,7 @@ def to_json(config: Any) -> dict[str, Any]:
 def from_json(kind: type, values: dict[str, Any]) -> Any:
     """Return a flat configuration dataclass (Sizes, Scalars, Schedule, a task's) from JSON values; lists become tuples.
 
-    `name` and `from`, which say where the class is found, are ignored. Raises UserError for an unknown field, or a
-    value of another type than its field's.
+    Ignores `name` and `from`. Raises UserError for an unknown field, or a value of another type than its field's.
     """
     hints, fields = get_type_hints(kind), {field.name for field in dataclasses.fields(kind)}
     values = {name: plain(value) for name, value in values.items() if name in fields or name not in ("name", "from")}

@@ -50,8 +50,8 @@ class Quantity(NamedTuple):
     size: int  # number of entries
     unit: str  # unit of an entry, as "m", "rad" or "1" for a pure number
     about: str = ""  # meaning, source and order of the entries, in a few words
-    # "beams" at equal angles, counterclockwise, or "directions", unit vectors: what a sensor turns with; "own": what a
-    # robot measures of itself, which no displaced sensor shifts; "proposed": the action of a policy elsewhere;
+    # "beams" at equal angles, counterclockwise, or "directions", unit vectors (x, y): what a sensor turns with; "own":
+    # what a robot measures of itself, which no displaced sensor shifts; "proposed": the action of a policy elsewhere;
     # "effect": change of that action by one unit of each of the first entries of the observation (entry, action)
     kind: str = ""
     step_deg: float = 0.0  # angle between neighbouring beams
@@ -171,10 +171,7 @@ class WholeObservations(Described):
         metrics: Mapping[str, Float[Array, ""]],
         outcome: Mapping[str, Float[Array, ""]],
     ) -> tuple[EnvState, Step]:
-        """Return what `step` returns, for the state `after` an action; where the episode ended, a new one begins.
-
-        The environment observes a state by `observe(state)`.
-        """
+        """Return `step`'s result for the state `after` an action, by `observe`; a new episode follows an end."""
         ended, final_obs, (start, first_obs) = terminated | truncated, self.observe(after), self.reset(key)
         obs = jnp.where(ended, first_obs, final_obs)
         step = Step(obs, final_obs, final_obs, reward, terminated, truncated, metrics, outcome)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import jax
@@ -70,7 +71,7 @@ class Body:
     name: str
     about: str
     environment: Callable[[Any, str], Environment]  # (configuration, split); for the splits see `evaluate.SPLITS`
-    engines: dict[str, Rollout] = field(default_factory=dict)  # roll-outs in other physics, by name
+    engines: Mapping[str, Rollout | str] = field(default_factory=dict)  # roll-outs in other physics, or module:NAME
     # loads the drawing functions, when called; None: the body cannot be drawn
     pictures: Callable[[], Pictures] | None = None
     # a folder of the user's -> the body with what lies there; raises UserError if that is not for it; None: takes none
@@ -231,7 +232,8 @@ class Task:
         """Return the first body's roll-out in other physics (None: its own). Raises UserError for an unknown engine."""
         engines = self.bodies[0].engines
         if name is None or name in engines:
-            return engines.get(name or "")
+            rollout = engines.get(name or "")
+            return resolve_name(rollout) if isinstance(rollout, str) else rollout
         if name in (body.name for body in self.bodies):
             raise UserError(f"{name} is a robot of {self.name}, not an engine: give --robot {name}")
         if not engines:

@@ -11,9 +11,10 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -121,7 +122,7 @@ class Status(NamedTuple):
     seconds: float  # that all answers took
 
 
-class Session:
+class Session(AbstractContextManager[Any, None]):
     """Asks questions, saves answers and fits models. Its methods may be called from any thread."""
 
     def __init__(self, plan: SessionPlan, folder: Path, tell: Callable[[str], None] = lambda words: None) -> None:
@@ -301,9 +302,6 @@ class Session:
         self._fits.shutdown(wait=True, cancel_futures=True)
         self._ahead.shutdown(wait=True, cancel_futures=True)
         self.record.close()
-
-    def __enter__(self) -> Session:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

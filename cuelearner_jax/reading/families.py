@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -30,6 +31,7 @@ class Unknown(NamedTuple):
     unit: str
     scale: float | None = None  # typical size in its unit; None: found from the policy's actions (`steps`)
     most: float = math.inf  # largest possible size, in its unit
+    is_log: bool = False  # whether it is the logarithm of a factor, in percent; told as the change of the factor
 
 
 Undoing = Callable[[Float[Array, " unknowns"], Float[Array, " size"]], Float[Array, " size"]]
@@ -180,7 +182,7 @@ def _gain(slices: list[tuple[Quantity, int]]) -> Distortion:
         return obs * jnp.ones(len(obs)).at[index].set(jnp.exp(-PERCENT * theta[0]))
 
     name = f"{_called(slices)}: gain"
-    return Distortion(name, (Unknown(name, "percent", most=100.0),), sees)
+    return Distortion(name, (Unknown(name, "percent", most=100.0, is_log=True),), sees)
 
 
 def _turn(what: str, sees: Undoing) -> Distortion:
@@ -194,19 +196,16 @@ def _roll(quantity: Quantity, start: int) -> Distortion:
     own = slice(start, start + quantity.size)
 
     def sees(theta: Array, obs: Array) -> Array:
-        number = jnp.arange(quantity.size) - theta[0] / quantity.step_deg
-        number = jnp.mod(number, quantity.size) if ring else jnp.clip(number, 0.0, quantity.size - 1.0)
-        first = jnp.floor(number)
-        here = first.astype(jnp.int32) % quantity.size
-        following = (here + 1) % quantity.size if ring else jnp.minimum(here + 1, quantity.size - 1)
-        every = jnp.arange(len(obs))
-        before, after = obs[every.at[own].set(start + here)], obs[every.at[own].set(start + following)]
-        return before + jnp.zeros(len(obs)).at[own].set(number - first) * (after - before)
+        number, mode = jnp.arange(quantity.size) - theta[0] / quantity.step_deg, "wrap" if ring else "nearest"
+        beams = jax.scipy.ndimage.map_coordinates(obs[own], [number], order=1, mode=mode)
+        return jnp.concatenate([obs[: own.start], beams, obs[own.stop :]])
 
     return _turn(quantity.name, sees)
 
 
 def _turned(quantity: Quantity, start: int) -> Distortion:
+    if quantity.size % 2:
+        raise UserError(f"slice {quantity.name!r} has {quantity.size} entries: give pairs of x and y, or no kind")
     x, y = (slice(start + entry, start + quantity.size, 2) for entry in (0, 1))
 
     def sees(theta: Array, obs: Array) -> Array:
@@ -225,13 +224,11 @@ def _turned_places(places: list[tuple[Quantity, int]]) -> list[Distortion]:
     groups: dict[tuple[float, float], list[tuple[Quantity, int]]] = {}
     for quantity, start in places:
         if quantity.follows and quantity.follows not in starts:
-            raise UserError(
-                f"slice {quantity.name!r} follows {quantity.follows!r}, which is not a slice of the "
-                "observation: name one"
-            )
+            raise UserError(f"slice {quantity.name!r} follows {quantity.follows!r}, which is not a slice: name one")
+        if (quantity.origin is not None or quantity.follows) and (quantity.unit != "m" or quantity.size < 2):
+            what = "follows another" if quantity.follows else "has an origin"
+            raise UserError(f"slice {quantity.name!r} {what} but is not a place: give x and y in metres")
         if quantity.origin is not None:
-            if quantity.unit != "m" or quantity.size < 2:
-                raise UserError(f"slice {quantity.name!r} has an origin but is not a place: give x and y in metres")
             groups.setdefault(quantity.origin, []).append((quantity, start))
     turns = []
     for origin, slices in groups.items():

@@ -44,6 +44,8 @@ WORTH = 3.0  # nats by which a hypothesis must predict better than "nothing chan
 # it lies, where a narrow width would take them for answers about something else.
 WIDE = 2.5
 _NEVER = -30.0  # logarithm of an amplitude that is no process
+PORTION = 2**24  # largest number of entries of the observations that the policy is asked about at once
+THETA = Change(0, *3 * [None])  # pyright: ignore[reportArgumentType]  # axes of one estimate with several theta
 
 
 class Hypothesis(struct.PyTreeNode):
@@ -96,7 +98,7 @@ class Reader:
 
     space: Space  # of the actions, with cues
     family: Family  # what the world declares or the user names; empty: any entry of the observation may shift
-    acts: Acts  # the policy; plain Python, or traced with everything else
+    acts: Acts  # the policy, NaN where it has no action; plain Python, or traced with everything else
     eps: Float[Array, ""] | float  # strength of an answer, in the unit of `space.log`
     # size of each unknown of the family that changes actions by a usual correction; None without a family
     step: Float[Array, " unknowns"] | None = None
@@ -118,11 +120,10 @@ class Reader:
         """Return the units of the linear model, and the labels about which the policy answers steadily."""
         frame = linear.frame_of(self.family, labels, self.step)
         change = linear.no_change(self.space, self.family, labels.obs.shape[-1])
-        probe_obs = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
-        actions = self._ask(probe_obs)
-        steady = ~linear.jumps(self.space, self.family, frame, change, probe_obs, actions, self.eps).any(-1)
+        whole = self._probe(frame, _one(change), labels.obs)[0]
+        steady = ~linear.jumps(self.space, whole, self.eps).any(-1)
         if not self.family:
-            mixed = linear.influence(self.space, frame, labels, actions)
+            mixed = linear.influence(self.space, labels, whole)
             frame = linear.frame_of((), labels, None, mixed)
         return frame, steady
 
@@ -134,30 +135,41 @@ class Reader:
         """
         change, worth = linear.no_change(self.space, self.family, labels.obs.shape[-1]), jnp.zeros(())
         for _ in range(ENTRIES):
-            changes = _moves(self.family, frame, change)
-            change, worth = _best(changes, self._worth(labels, changes))
-        own = self._worth(labels, plain.change)
+            tried = _moves(self.family, frame, change)
+            change, worth = _best(tried, self._worth(labels, tried))
+        own = self._worth(labels, plain.change.replace(theta=plain.change.theta[:, None]))[:, 0]
         return plain.replace(change=_replace_worse(plain.change, own, change, worth))
 
-    def _worth(self, labels: RelativeLabels, changes: Change) -> Float[Array, " k"]:
-        """Return the log likelihood of labels by each of stacked estimates, without the process."""
+    def _worth(self, labels: RelativeLabels, changes: Change) -> Float[Array, "h k"]:
+        """Return the log likelihood of labels by stacked estimates, each with several theta, without the process."""
         before = _undone_each(self.family, changes, labels.obs)
         return _worth(self.space, self.family, changes, labels, before, self._ask(before), self.eps)
 
     def _fit(self, frame: ObservationFrame, labels: RelativeLabels, hypothesis: Hypothesis) -> Fit:
         """Return stacked hypotheses fitted to labels."""
-        rows = self._data(frame, labels, hypothesis.change)
+        own = self._ask(labels.obs)
+        rows = self._data(frame, labels, own, hypothesis.change)
         posteriors = _unread(rows, hypothesis.hyper)
-        for number in range(ROUNDS):
-            rows = self._data(frame, labels, hypothesis.change) if number else rows
+        for _ in range(ROUNDS):
             posteriors, hypothesis = _update(rows, frame, hypothesis, posteriors)
-        rows = self._data(frame, labels, hypothesis.change)
+            rows = self._data(frame, labels, own, hypothesis.change)
         return _scored(rows, frame, hypothesis, posteriors)
 
-    def _data(self, frame: ObservationFrame, labels: RelativeLabels, change: Change) -> Data:
-        """Return the linear models at stacked estimates."""
-        probe_obs = _probes(self.family, frame, change, labels.obs)
-        return _data(self.space, self.family, frame, change, labels, probe_obs, self._ask(probe_obs), self.eps)
+    def _data(self, frame: ObservationFrame, labels: RelativeLabels, own: Array, change: Change) -> Data:
+        """Return the linear models at stacked estimates; `own`: what the policy does about the observations."""
+        whole = self._probe(frame, change, labels.obs)
+        return _data(self.space, self.family, frame, change, labels, own, whole, self.eps)
+
+    def _probe(
+        self, frame: ObservationFrame, changes: Change, obs: Float[Array, "n obs"]
+    ) -> Float[Array, "h k n action"]:
+        """Return what actions at `linear.sides` of stacked estimates mean. The policy is asked in portions of sides."""
+        sides, whole = _sides(frame, changes), []
+        count = min(sides.shape[1], -(-sides.shape[0] * sides.shape[1] * obs.size // PORTION))
+        for thetas in jnp.array_split(sides, count, 1):
+            before = _undone_each(self.family, changes.replace(theta=thetas), obs)
+            whole.append(_meant_each(self.family, thetas, before, self._ask(before)))
+        return jnp.concatenate(whole, 1)
 
     def act(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return corrected actions by one fit."""
@@ -173,9 +185,8 @@ class Reader:
         Changes are in units of `SCALE` eps; log p [nats] is of the answer about each cue, 0 where nothing was said.
         """
         frame, change = fitted.frame, fitted.hypothesis.change
-        probe_obs = _probes(self.family, frame, jax.tree.map(lambda leaf: leaf[None], change), labels.obs)[0]
-        own, actions = self.act(fitted, labels.obs), self._ask(probe_obs)
-        return _predicted(self.space, self.family, fitted, labels, probe_obs, actions, own, self.eps)
+        whole, own = self._probe(frame, _one(change), labels.obs)[0], self._ask(labels.obs)
+        return _predicted(self.space, self.family, fitted, labels, own, whole, self.act(fitted, labels.obs), self.eps)
 
     def ratio(self, fits: Fit, labels: RelativeLabels) -> Float[Array, ""]:
         """Return log((1 + r) / 2), r = p(answers | best hypothesis) / p(answers | nothing changed)."""
@@ -236,35 +247,35 @@ def _predicted(
     family: Family,
     fitted: Fit,
     labels: RelativeLabels,
-    probe_obs: Array,
-    actions: Array,
     own: Array,
+    whole: Array,
+    action: Array,
     eps: Any,
 ) -> tuple[Array, Array, Array]:
-    rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, probe_obs, actions, eps)
+    rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, own, whole, eps)
     parts, hyper = fitted.hypothesis.parts, fitted.posterior.hyper
     _, variance = posterior.predict(fitted.posterior, fitted.data, parts, rows.features, rows.inputs)
-    mean = space.log(labels.action, own) / (SCALE * eps)
+    mean = space.log(labels.action, action) / (SCALE * eps)
     habits = posterior.habits(hyper, 1 / SCALE)
     return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, habits)
 
 
 @partial(jax.jit, static_argnames="family")
 def _moves(family: Family, frame: ObservationFrame, change: Change) -> Change:
-    """Return an estimate, and it with another shift of one unknown: of a family, or of the entries that matter most."""
+    """Return an estimate with its theta, and with another shift of an unknown: a family's, or an entry that matters."""
     size = len(frame.step)
     entries = jnp.arange(size) if family else frame.mixed
     each = jnp.eye(size)[entries] * frame.step[None]
     several = (jnp.array(TRIED)[:, None, None] * each[None]).reshape(len(TRIED) * len(entries), size)
     moves = jnp.concatenate([jnp.zeros((1, size)), several])
-    return jax.vmap(lambda move: change.replace(theta=change.theta + move))(moves)
+    return _one(change.replace(theta=change.theta[None] + moves))
 
 
 @jax.jit
-def _best(changes: Change, worth: Array) -> tuple[Change, Array]:
-    """Return the best of stacked estimates, and its worth. The best of many must beat the first and chance."""
-    best = jnp.argmax(worth.at[1:].add(-WORTH - math.log(len(worth))))
-    return pick(changes, best), worth[best]
+def _best(tried: Change, worth: Array) -> tuple[Change, Array]:
+    """Return an estimate with the best theta, and its worth. The best of many must beat the first and chance."""
+    best = jnp.argmax(worth[0].at[1:].add(-WORTH - math.log(worth.size)))
+    return pick(tried, 0).replace(theta=tried.theta[0, best]), worth[0, best]
 
 
 @jax.jit
@@ -285,15 +296,18 @@ def _worth(
     def one(change: Change, before: Array, action: Array) -> Array:
         base = linear.meant(family, change.theta, before, action)
         own = space.exp(base, SCALE * eps * (linear.basis(space, base) @ change.action.T))
-        return log_likelihood(space.log(labels.action, own) / (SCALE * eps), answers, usual).sum()
+        worth = log_likelihood(space.log(labels.action, own) / (SCALE * eps), answers, usual).sum()
+        return jnp.where(jnp.isnan(worth), -jnp.inf, worth)  # NaN: the policy has no action there
 
-    return jax.vmap(one)(changes, before, actions)
+    return jax.vmap(jax.vmap(one, (THETA, 0, 0)))(changes, before, actions)
 
 
-# Of stacked estimates, and of what the policy does about each
-_undone_each = jax.jit(jax.vmap(linear.undone, (None, 0, None)), static_argnums=0)
-_probes = jax.jit(jax.vmap(linear.probes, (None, None, 0, None)), static_argnums=0)
-_data = jax.jit(jax.vmap(linear.data, (None, None, None, 0, None, 0, 0, None)), static_argnums=(0, 1))
+# Of stacked estimates, the first two with several theta each, and of what the policy does about each
+_undone_each = jax.jit(jax.vmap(jax.vmap(linear.undone, (None, THETA, None)), (None, 0, None)), static_argnums=0)
+_meant_each = jax.jit(jax.vmap(jax.vmap(linear.meant, (None, 0, 0, 0)), (None, 0, 0, 0)), static_argnums=0)
+_sides = jax.jit(jax.vmap(linear.sides, (None, 0)))
+_one = partial(jax.tree.map, lambda leaf: leaf[None])
+_data = jax.jit(jax.vmap(linear.data, (None, None, None, 0, None, None, 0, None)), static_argnums=(0, 1))
 _unread = jax.jit(jax.vmap(posterior.unread))
 
 

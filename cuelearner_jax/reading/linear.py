@@ -4,7 +4,9 @@
 
 `theta` are the unknowns of a family of distortions (`families`), or, where a world declares none, a shift of each entry
 of the observation; `M` mixes the entries on which the policy depends most. The policy is a black box: it is asked at
-both sides of each unknown (`probes`), and `data` makes the central differences of its answers.
+both sides of each unknown (`sides`), and `data` makes the central differences of its answers. Where it has no action
+at one side, the other side tells the slope; where it has none about the undone observation, it is taken to act as it
+does about the observation itself.
 """
 
 from __future__ import annotations
@@ -141,58 +143,31 @@ def frame_of(
     return ObservationFrame(mean, jnp.where(varies, deviation, 1.0), varies * 1.0, step, mixed)
 
 
-def probes(
-    family: Family, frame: ObservationFrame, change: Change, obs: Float[Array, "n obs"]
-) -> Float[Array, "k n obs"]:
-    """Return the observations to ask the policy about: as they are, undone, and undone at both sides of each unknown.
+@partial(jax.jit, static_argnums=0)
+def jumps(space: Space, whole: Float[Array, "k n action"], eps: Float[Array, ""] | float) -> Bool[Array, "n unknowns"]:
+    """Return where the policy chooses something else, at a side of an unknown, or has no action at both.
 
-    k = 2 + 2 * unknowns.
+    A policy that takes the best of far-apart actions does so near ties, where a slope says nothing. `whole`: what its
+    actions at `sides` mean.
     """
-    shifted = jax.vmap(lambda theta: undone(family, change.replace(theta=theta), obs))(_sides(frame, change))
-    return jnp.concatenate([obs[None], shifted])
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def jumps(
-    space: Space,
-    family: Family,
-    frame: ObservationFrame,
-    change: Change,
-    probe_obs: Float[Array, "k n obs"],
-    actions: Float[Array, "k n action"],
-    eps: Float[Array, ""] | float,
-) -> Bool[Array, "n unknowns"]:
-    """Return where the policy chooses something else, rather than a little more or less, at a side of an unknown.
-
-    A policy that takes the best of far-apart actions does so near ties, where a slope says nothing.
-    """
-    whole, size = _whole(family, frame, change, probe_obs, actions), len(frame.step)
+    size = len(whole) // 2
     near, far = space.log(whole[:1], whole[1 : 1 + size]), space.log(whole[:1], whole[1 + size :])
-    largest = jnp.maximum(jnp.abs(near), jnp.abs(far)) / (SCALE * eps)
+    largest = jnp.fmax(jnp.abs(near), jnp.abs(far)) / (SCALE * eps)
     bent = jnp.abs(near + far) > 0.5 * jnp.abs(near - far)
-    return ((largest > JUMP) & bent).any(-1).T
+    return ((largest > JUMP) & bent | ~jnp.isfinite(largest)).any(-1).T
 
 
-def _sides(frame: ObservationFrame, change: Change) -> Float[Array, "k unknowns"]:
+def sides(frame: ObservationFrame, change: Change) -> Float[Array, "k unknowns"]:
     """Return the unknowns of an estimate, and those at both sides of each."""
     steps, theta = jnp.diag(frame.step), change.theta[None]
     return jnp.concatenate([theta, theta - steps, theta + steps])
 
 
-def _whole(
-    family: Family, frame: ObservationFrame, change: Change, probe_obs: Array, actions: Array
-) -> Float[Array, "k n action"]:
-    """Return what a policy's answers to `probes`, but for the first, mean in the changed world."""
-    return jax.vmap(partial(meant, family))(_sides(frame, change), probe_obs[1:], actions[1:])
-
-
 @partial(jax.jit, static_argnums=0)
-def influence(
-    space: Space, frame: ObservationFrame, labels: RelativeLabels, actions: Float[Array, "k n action"]
-) -> Int[Array, " mixed"]:
-    """Return the entries on which the policy's actions depend most, from its answers to `probes`."""
-    size = len(frame.step)
-    slope = space.log(actions[2 : 2 + size], actions[2 + size :])
+def influence(space: Space, labels: RelativeLabels, whole: Float[Array, "k n action"]) -> Int[Array, " mixed"]:
+    """Return the entries on which the policy's actions depend most, from what it does at `sides`."""
+    size = len(whole) // 2
+    slope = jnp.nan_to_num(space.log(whole[1 : 1 + size], whole[1 + size :]))
     effect = jnp.einsum("n,unc->u", labels.valid * 1.0, slope**2)
     return jax.lax.top_k(effect, min(MIXED, size))[1]
 
@@ -203,23 +178,26 @@ def data(
     frame: ObservationFrame,
     change: Change,
     labels: RelativeLabels,
-    probe_obs: Float[Array, "k n obs"],
-    actions: Float[Array, "k n action"],
+    own: Float[Array, "n action"],
+    whole: Float[Array, "k n action"],
     eps: Float[Array, ""],
 ) -> Data:
     """Return the linear model at labels, about the estimate `change`; its weights count from no change.
 
-    `probe_obs`: `probes` of the labels' observations. `actions`: what the policy does there. `eps`: strength of an
-    answer, in the unit of `space.log`.
+    `own`: what the policy does about the labels' observations. `whole`: what its actions at `sides` mean in the changed
+    world. `eps`: strength of an answer, in the unit of `space.log`.
     """
     scale, size = SCALE * eps, len(frame.step)
-    whole = _whole(family, frame, change, probe_obs, actions)
-    base, slope = whole[0], jnp.moveaxis(space.log(whole[1 : 1 + size], whole[1 + size :]), 0, -1) / (2 * scale)
-    slope = jnp.where(jumps(space, family, frame, change, probe_obs, actions, eps)[:, None], 0.0, slope)
+    base = jnp.where(jnp.isfinite(whole[0]), whole[0], own)
+    low, high = whole[1 : 1 + size], whole[1 + size :]
+    slope, below, above = space.log(low, high), space.log(low, base[None]), space.log(base[None], high)
+    slope = jnp.where(jnp.isfinite(slope), slope, 2 * jnp.where(jnp.isfinite(above), above, below))
+    slope = jnp.moveaxis(slope, 0, -1) / (2 * scale)
+    slope = jnp.where(jumps(space, whole, eps)[:, None], 0.0, slope)
     x = features(space, frame, slope, labels.obs, base)
     cut = size + len(frame.mixed) ** 2
     offset = space.log(labels.action, base) / scale - x[:, :, :cut] @ weights_of(frame, change)[:cut]
-    situation = inputs(space, frame, labels.obs, whole[0] if has_effects(family) else actions[0])
+    situation = inputs(space, frame, labels.obs, base if has_effects(family) else own)
     return Data(offset, x, situation, answers_of(space, labels, eps), groups(space, family, len(frame.mean)))
 
 
@@ -284,25 +262,20 @@ def steps_of(
     """
     obs = jnp.asarray(obs)[:: max(1, len(obs) // STEP_SITUATIONS)][:STEP_SITUATIONS]
     target = min(SCALE * eps, float(space.from_unit(LARGEST_STEP * space.reach)))
-    steps = []
+    nothing, steps = no_change(space, family, obs.shape[1]), []
     for place, unknown in enumerate(unknowns_of(family)):
         if unknown.scale is not None:
             steps.append(unknown.scale)
             continue
         sizes = STEP_SIZES[max(unknown.most / 4, STEP_SIZES[0]) >= STEP_SIZES]
         thetas = jnp.zeros((1 + len(sizes), len(unknowns_of(family)))).at[1:, place].set(jnp.asarray(sizes))
-        before = _undone(family, thetas, obs)
+        before = jax.vmap(lambda theta: undone(family, nothing.replace(theta=theta), obs))(thetas)
         actions = acts(before.reshape(-1, before.shape[-1])).reshape(*before.shape[:2], -1)
         effects = np.asarray(_effects(space, family, thetas, before, actions))
-        effects = np.minimum(effects, 3 * target).mean(1)
+        effects = np.minimum(np.nan_to_num(effects), 3 * target).mean(1)
         enough = np.flatnonzero(effects >= min(target, 0.5 * max(effects.max(), 1e-12)))
         steps.append(float(sizes[enough[0]]) if effects.max() > 0 else float(sizes[-1]))
     return jnp.asarray(steps, jnp.float32)
-
-
-@partial(jax.jit, static_argnames="family")
-def _undone(family: Family, thetas: Array, obs: Array) -> Array:
-    return jax.vmap(lambda theta: jax.vmap(partial(undo_observation, family, theta))(obs))(thetas)
 
 
 @partial(jax.jit, static_argnames=("space", "family"))

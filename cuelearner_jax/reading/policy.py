@@ -52,6 +52,7 @@ def corrected(
     `action`: what the policy does about the two. With recorded effects of the state, the process depends on the action
     about the shifted state in place of `first`: where the policy runs, it acts about that alone.
     """
+    action = jnp.where(jnp.isfinite(action), action, first)  # as it was, where the other is none
     base = linear.meant(family, correction.change.theta, before, action)
     more = correction.more(space, obs, base if has_effects(family) else first)
     return space.exp(base, correction.scale * (linear.basis(space, base) @ correction.change.action.T + more))

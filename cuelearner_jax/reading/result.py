@@ -18,10 +18,10 @@ from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.families import Family, unknowns_of
 from cuelearner_jax.reading.fitting import Fit
 from cuelearner_jax.reading.linear import SCALE
-from cuelearner_jax.spaces import Box, Space
+from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 
 Floats = np.ndarray
-NORMAL = 1.96  # half width of a 95% interval, in standard deviations
+NORMAL, SIDES = 1.96, np.array([-1, 0, 1])  # half width of a 95% interval, in standard deviations, and its places
 ALIKE = 0.98  # correlation of the effects of two entries that the policy cannot tell apart
 ALIKE_SITUATION = 0.5  # correlation of the process from which a situation is near a labelled one
 HARMONICS = ("cos of", "sin of", "cos of twice", "sin of twice")
@@ -98,7 +98,7 @@ def describe_fit(
     depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
     depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
     near = None
-    if len(walk):
+    if len(walk) and valid.any():
         alike = posterior.correlation(posterior.lengths(hyper), jnp.asarray(walk), inputs[valid])
         near = float((alike.max(1) >= ALIKE_SITUATION).mean())
     wrong = float(posterior.habits(hyper, 1 / SCALE).lapse)
@@ -142,10 +142,10 @@ def _changes_of_observation(
             continue
         parts = [("" if not k else " + " if share[k] > 0 else " - ") + names[m][0] for k, m in enumerate(members)]
         name, unit = "".join(parts), names[first][1]
-        ends = sorted(step[first] * np.array([value - NORMAL * deviation, value + NORMAL * deviation]))
-        estimates.append(
-            Estimate(f"{name} seen aside" if unit != "degrees" else name, unit, step[first] * value, *ends)
-        )
+        low, mid, high = sorted(step[first] * (value + NORMAL * deviation * SIDES))
+        if family and unknowns_of(family)[first].is_log:
+            low, mid, high = PER_CENT * np.expm1(np.array([low, mid, high]) / PER_CENT)
+        estimates.append(Estimate(f"{name} seen aside" if unit != "degrees" else name, unit, mid, low, high))
     return estimates
 
 
@@ -158,7 +158,7 @@ def _of_action(
     mean: Float[Floats, " w"], root: Float[Floats, "w p"], effect: Float[Floats, "n w"], space: Space, eps: float
 ) -> list[Estimate]:
     """Return changes of the action: the shift of each cue, and of a box the share of each entry in it."""
-    estimates, typical = [], np.sqrt((effect**2).mean(0))
+    estimates, typical = [], np.linalg.norm(effect, axis=0) / math.sqrt(max(len(effect), 1))
     numbers = linear.terms(len(space.cues), linear.basis_size(space)).T
     for (cue, term), value, row, size in zip(numbers, mean, root, typical, strict=True):
         deviation = float(np.linalg.norm(row))
@@ -169,8 +169,10 @@ def _of_action(
         if term and isinstance(space, Box):
             factor, unit, start = 2 * SCALE * eps * PER_CENT, "percent", PER_CENT if term - 1 == cue else 0.0
             name += ": gain" if term - 1 == cue else f": share of {space.cues[term - 1].name}"
-        elif term:
+        elif term and space == DIRECTIONS:
             name += f", times {HARMONICS[term - 1]} the action's angle"
-        ends = (start + factor * (value - NORMAL * deviation), start + factor * (value + NORMAL * deviation))
-        estimates.append(Estimate(name, unit, start + factor * value, *ends))
+        elif term:
+            name += f", times entry {term} of the action"
+        low, mid, high = start + factor * (value + NORMAL * deviation * SIDES)
+        estimates.append(Estimate(name, unit, mid, low, high))
     return estimates

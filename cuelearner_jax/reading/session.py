@@ -94,10 +94,9 @@ class Reading:
         self.situations = np.concatenate([self.situations.reshape(-1, obs.shape[1]), obs])[-MOST_SITUATIONS:]
         index = np.asarray(jax.random.choice(k_where, len(obs), (count,), replace=len(obs) < count))
         rows = jnp.asarray(np.asarray(obs)[index], jnp.float32)
-        if self.fit is None or self._reader is None:
-            base, spread = self._acts(rows), jnp.full((count, len(self.space.cues)), FIRST * self.eps)
-        else:
-            base, spread = self._reader.act(self.fit, rows), self._reader.spread(self.fit, rows)
+        base, spread = self.act(rows), jnp.full((count, len(self.space.cues)), FIRST * self.eps)
+        if self.fit is not None and self._reader is not None:
+            spread = self._reader.spread(self.fit, rows)
         asks = jnp.array([cue.is_asked for cue in self.space.cues])
         return index, np.asarray(_near(self.space, k_action, base, asks[None] * jnp.maximum(spread, self.eps / 2)))
 
@@ -111,10 +110,12 @@ class Reading:
         new = [np.asarray(part, np.float32) for part in (obs, action, answer)]
         if not len(new[0]):
             return
+        slots = max(len(new[0]), -(-self.slots // BATCHES))  # as for other batches: few programs are compiled
+        batch = _padded(new, slots)
+        self._acts(batch.obs)  # refuses a policy that has no action there
         reader = self._reader_of(new[0])
         if self.fits is not None:
-            slots = max(len(new[0]), -(-self.slots // BATCHES))  # as for other batches: few programs are compiled
-            self.evidence += float(reader.ratio(self.fits, _padded(new, slots)))
+            self.evidence += float(reader.ratio(self.fits, batch))
         if self.rows is not None:
             new = [np.concatenate(both) for both in zip(self.rows[:3], new, strict=True)]
         self.rows = RelativeLabels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]
@@ -131,11 +132,11 @@ class Reading:
             part = slice(start, start + size)
             self.learn(obs[part], action[part], answer[part])
 
-    def policy(self) -> ReadingPolicy:
+    def policy(self) -> Any:
         """Return the policy as corrected so far."""
-        size = sum(part.size for part in self.observation)
+        size = sum(part.size for part in self.observation) or self.situations.shape[1]
         if self.fit is None:
-            return unread(self.base, self.space, self.family, size)
+            return unread(self.base, self.space, self.family, size) if size else self.base
         correction = fitting.correction(self.fit, self.eps)
         return ReadingPolicy(self.base, correction, jnp.float32(jnp.inf), self.space, self.family)
 
@@ -163,25 +164,28 @@ class Reading:
 
     def act(self, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return actions of the policy as corrected so far."""
-        return self._acts(obs) if self.fit is None or self._reader is None else self._reader.act(self.fit, obs)
+        own = self._acts(obs)
+        return own if self.fit is None or self._reader is None else self._reader.act(self.fit, obs)
 
     def _reader_of(self, obs: np.ndarray) -> Reader:
         if self._reader is None:
-            step = None
-            if self.family:
-                step = steps_of(self.space, self.family, self._acts, jnp.asarray(obs), self.eps)
+            acts = acts_of(self.base, everywhere=False)
+            step = steps_of(self.space, self.family, acts, jnp.asarray(obs), self.eps) if self.family else None
             process = all(part.kind != PROPOSED for part in self.observation)
-            self._reader = Reader(self.space, self.family, self._acts, jnp.float32(self.eps), step, process=process)
+            self._reader = Reader(self.space, self.family, acts, jnp.float32(self.eps), step, process=process)
         return self._reader
 
 
-def acts_of(policy: Any) -> linear.Acts:
-    """Return a policy's actions as a function that refuses those that are none. Plain Python is not compiled in."""
+def acts_of(policy: Any, everywhere: bool = True) -> linear.Acts:
+    """Return a policy's actions as a function. Plain Python is not compiled in.
+
+    `everywhere`: refuse a policy without an action somewhere; False: actions are NaN there, where no world may lead.
+    """
     name, run = policy_name(policy), run_of(policy)
 
     def acts(obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         actions = jnp.asarray(run(jax.random.key(0), None, jnp.asarray(obs)))
-        user_code.check_actions(np.isfinite(np.asarray(actions)).all(), name)
+        user_code.check_actions(np.isfinite(np.asarray(actions)).all() or not everywhere, name)
         return actions
 
     return acts

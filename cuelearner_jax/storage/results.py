@@ -75,7 +75,6 @@ def check_complete(folder: Path, step: int, count: int, run: str) -> None:
 
     `run` is the key of the run, which tables of earlier versions lack. A missing table has no rows.
     """
-    rows = 0
     for schema in (GUIDES, SCHEMA):  # the results last: theirs are the rows that count
         rows = 0
         if path := schema.found_in(folder):

@@ -68,12 +68,6 @@ def _wants(config: ArmConfig) -> str:
     }[config.skill]
 
 
-def _rollout(*arguments: Any) -> dict[str, Any]:
-    from cuelearner_envs.arm.judged import rollout
-
-    return rollout(*arguments)
-
-
 def _pictures() -> Pictures:
     from cuelearner_envs.arm import recording
     from cuelearner_jax import pictures
@@ -93,7 +87,7 @@ GRIPPER = Body(
     name="gripper",
     about="three slides and two fingers with contacts, simulated by MJX",
     environment=make_environment,
-    engines={"mujoco": _rollout},
+    engines={"mujoco": "cuelearner_envs.arm.judged:rollout"},
     pictures=_pictures,
 )
 

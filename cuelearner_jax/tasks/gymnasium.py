@@ -228,9 +228,7 @@ def _as_json(arguments: dict[str, Any]) -> str:
     with contextlib.suppress(TypeError, ValueError):
         if json.loads(text := json.dumps(arguments, default=np.generic.item)) == arguments:
             return text
-    raise UserError(
-        f"arguments are {format_value(arguments)}, which JSON does not keep: wrap the environment in a function"
-    )
+    raise UserError(f"arguments are {format_value(arguments)}, which JSON does not keep: give a function that has them")
 
 
 def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:

@@ -58,12 +58,6 @@ def _legged(config: NavigationConfig, split: str, folder: Path | None = None) ->
     return make_environment(config, split, policy.load(folder) if folder else policy.load())
 
 
-def _rollout(*arguments: Any) -> dict[str, Any]:
-    from cuelearner_envs.anymal.judged import rollout
-
-    return rollout(*arguments)
-
-
 def _legged_pictures() -> Pictures:
     from cuelearner_envs.anymal import recording
 
@@ -86,8 +80,8 @@ def _anymal(folder: Path | None = None) -> Body:
         policy.load(folder)
         digest = hashlib.sha256((folder / policy.WEIGHTS).read_bytes()).hexdigest()[:12]
     about = "a quadruped with full physics; anymal:FOLDER walks by a policy that experiments/train_walking.py made"
-    environment = partial(_legged, folder=folder)
-    return Body("anymal", about, environment, {"mujoco": _rollout}, _legged_pictures, _anymal, digest)
+    environment, engines = partial(_legged, folder=folder), {"mujoco": "cuelearner_envs.anymal.judged:rollout"}
+    return Body("anymal", about, environment, engines, _legged_pictures, _anymal, digest)
 
 
 ANYMAL = _anymal()

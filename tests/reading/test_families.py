@@ -1,6 +1,7 @@
 """What an environment declares can have changed: each change is undone exactly, and none leaves everything alone."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,9 @@ from cuelearner_jax.reading.families import (
     undo_observation,
     unknowns_of,
 )
+from cuelearner_jax.reading.linear import steps_of
 from cuelearner_jax.reading.policy import unread
+from cuelearner_jax.reading.result import _changes_of_observation, _names
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
 from cuelearner_jax.spaces.directions import from_angle, retract, rotate
 
@@ -125,6 +128,21 @@ def test_a_change_of_the_sensors_is_undone(name, theta, change):
     np.testing.assert_allclose(before, changed(obs, **change), atol=1e-5)
 
 
+def test_a_step_stays_where_the_policy_has_actions():
+    family, obs = declared_distortions(Yard())[:1], drawn(jax.random.key(0), 8)
+    steps = steps_of(DIRECTIONS, family, lambda obs: jnp.where(jnp.abs(obs[:, :1]) < 2, aims(obs), jnp.nan), obs, 0.05)
+    np.testing.assert_array_equal(steps, steps_of(DIRECTIONS, family, aims, obs, 0.05))
+
+
+def test_a_gain_is_told_as_the_change_of_the_factor():
+    (gain,) = (one for one in declared_distortions(Yard()) if one.name.endswith("gain"))
+    own, theta, one = Distortion("own", (Unknown("own", "percent"),)), 100 * np.log([2.0]), np.ones((1, 1))
+    assert undo_observation((gain,), jnp.array(theta), jnp.full(42, 2.0))[0] == pytest.approx(1)
+    for family, told in (((gain,), [100, 100 * np.expm1((theta - 1.96) / 100)]), ((own,), [theta, theta - 1.96])):
+        (found,) = _changes_of_observation(theta, one, one, _names(family, 1, ()), family, np.ones(1))
+        assert (found.mean, found.low) == (pytest.approx(told[0]), pytest.approx(told[1]))
+
+
 class Table:
     """Two places that a camera tells, the difference of one from the hand, and the hand's own place."""
 
@@ -172,3 +190,11 @@ def test_families_that_make_no_sense_are_refused():
     ):
         with pytest.raises(UserError, match=message):
             check_family(family)
+    ball = Quantity("ball", 2, "m", origin=(0.0, 0.0))
+    for slices, message in (
+        ((Quantity("gravity", 3, "1", kind="directions"),), "'gravity' has 3 entries"),
+        ((ball, Quantity("away", 1, "m", follows="ball")), "'away' follows another but is not a place"),
+        ((ball, Quantity("speed", 2, "m/s", follows="ball")), "'speed' follows another but is not a place"),
+    ):
+        with pytest.raises(UserError, match=message):
+            declared_distortions(SimpleNamespace(observation=slices))

@@ -8,8 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.reading import Reading
-from cuelearner_jax.spaces import Box
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.reading import Reading, fitting
+from cuelearner_jax.reading.linear import RelativeLabels
+from cuelearner_jax.reading.result import _of_action
+from cuelearner_jax.spaces import Box, Choices, Cue
 
 LABELS, BATCHES, OBS, EPS = 48, 3, 8, 0.05
 BOX = Box((-1.0,) * 3, (1.0,) * 3)
@@ -18,8 +21,8 @@ ASIDE = np.array([0.25, 0.15, 0, 0, 0, 0, 0, 0], np.float32)
 
 @jax.jit
 def policy(obs):
-    """Move toward the goal: the first three entries, less the next three."""
-    return jnp.clip(4 * (obs[:, :3] - obs[:, 3:6]), -1.0, 1.0)
+    """Move toward the goal: the first three entries, less the next three. There is no action beyond 1 in the last."""
+    return jnp.where(jnp.abs(obs[:, 7:]) <= 1, jnp.clip(4 * (obs[:, :3] - obs[:, 3:6]), -1.0, 1.0), jnp.nan)
 
 
 def near(seed, count=40, away=0.25):
@@ -34,8 +37,8 @@ def moved(obs, factor=1.0, change=0.0):
     return np.clip(np.asarray(policy(obs)) * np.float32(factor) + np.float32(change), -1, 1)
 
 
-def read(right, **how):
-    """Read labels about the policy; `right`: observations -> right actions; None: answers are random."""
+def read(right, policy=policy, **how):
+    """Read labels about a policy; `right`: observations -> right actions; None: answers are random."""
     reading = Reading(policy, (), BOX, EPS, LABELS)
     for batch in range(BATCHES):
         obs = near(batch, **how)
@@ -90,11 +93,42 @@ def test_where_nothing_is_wrong_actions_stay_bitwise_as_they_were():
     reading = read(moved)
     result, obs = reading.result(), near(99)
     assert (result.used, result.changed, result.words()) == (False, False, ["The answers ask for no change."])
-    np.testing.assert_array_equal(result.policy.act(jax.random.key(0), None, jnp.asarray(obs)), policy(obs))
+    new, own = Reading(policy, (), BOX, EPS, LABELS), result.policy.correction
+    change = own.change.replace(theta=own.change.theta.at[7].set(-3.0))  # undone, it leaves where the policy acts
+    for unchanged in (result.policy, result.policy.replace(correction=own.replace(change=change)), new.policy()):
+        np.testing.assert_array_equal(unchanged.act(jax.random.key(0), None, jnp.asarray(obs)), policy(obs))
+    new.questions(obs, 1, jax.random.key(0))
+    np.testing.assert_array_equal(new.policy().act(jax.random.key(0), None, jnp.asarray(obs)), policy(obs))
+    with pytest.raises(UserError, match="actions that are not finite"):
+        new.learn(obs + 2, moved(obs), moved(obs))
+    fit = reading.fit.replace(hypothesis=reading.fit.hypothesis.replace(change=change))
+    assert np.isfinite(reading._reader.spread(fit, jnp.asarray(obs[:16]))).all()
+    assert reading._reader._frame(RelativeLabels(*map(jnp.asarray, reading.rows)))[1].all()
+    assert fit.frame.mixed[0] != 7  # on which no action depends
 
 
 def test_random_answers_use_no_correction():
-    assert not read(None).result().used
+    assert not read(None, policy=lambda obs: np.asarray(policy(obs))).result().used
+    jumping = jax.jit(lambda obs: jnp.sign(jnp.sin(1e4 * obs.sum(1, keepdims=True))) * jnp.ones((1, 3)))
+    assert read(None, policy=jumping).result().words() == ["The answers ask for no change."]
+
+
+def test_of_wide_observations_no_array_is_large():
+    reader, (plain, _) = fitting.Reader(BOX, (), lambda obs: obs[:, :3], EPS), fitting.unfitted(BOX, (), 1024)
+
+    def linearised(obs, action):
+        labels = RelativeLabels(obs, action, action, jnp.ones(100, bool))
+        frame, _ = reader._frame(labels)
+        return reader._data(frame, labels, action, reader._start(frame, labels, plain).change)
+
+    traced = jax.make_jaxpr(linearised)(jnp.zeros((100, 1024)), jnp.zeros((100, 3)))
+    assert max(value.aval.size for step in traced.eqns for value in step.outvars) < 2**26  # 256 MiB
+
+
+def test_of_choices_the_entry_that_matters_is_told():
+    gear = Choices(6, Cue("gear", ("higher", "lower"), (), "steps"))
+    *_, last = _of_action(np.ones(7), np.zeros((7, 1)), np.ones((4, 7)), gear, 1.0)
+    assert last.name == "action: gear, times entry 6 of the action"
 
 
 def test_a_cue_of_which_all_answers_name_the_same_way_is_told():

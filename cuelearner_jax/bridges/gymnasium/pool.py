@@ -15,7 +15,6 @@ import socket
 import subprocess
 import sys
 import threading
-from collections import OrderedDict
 from collections.abc import Mapping
 from ctypes.util import find_library
 from multiprocessing.connection import Connection
@@ -164,15 +163,14 @@ def drawing_variables() -> dict[str, str]:
     return {"MUJOCO_GL": "osmesa" if find_library("OSMesa") else "egl"}
 
 
-_pools: OrderedDict[Source, Pool] = OrderedDict()  # the one used last at the end
+_pools: dict[Source, Pool] = {}  # the one used last at the end
 
 
 def pool_of(source: Source) -> Pool:
     """Return the pool of a source, whose processes start when they are needed; close the pools unused for longest."""
-    pool = _pools.setdefault(source, Pool(source))
-    _pools.move_to_end(source)
+    pool = _pools[source] = _pools.pop(source, None) or Pool(source)
     while len(_pools) > MOST_POOLS:
-        _pools.popitem(last=False)[1].close()
+        _pools.pop(next(iter(_pools))).close()
     before, pool.spec = pool.spec, source.spec
     if before is not None and before is not pool.spec:  # the id is registered anew
         pool.close()
