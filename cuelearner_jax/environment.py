@@ -171,7 +171,7 @@ class WholeObservations(Described):
         metrics: Mapping[str, Float[Array, ""]],
         outcome: Mapping[str, Float[Array, ""]],
     ) -> tuple[EnvState, Step]:
-        """Return `step`'s result for the state `after` an action, by `observe`; a new episode follows an end."""
+        """Return state and result of a step to the state `after`; where that is an end, a new episode begins."""
         ended, final_obs, (start, first_obs) = terminated | truncated, self.observe(after), self.reset(key)
         obs = jnp.where(ended, first_obs, final_obs)
         step = Step(obs, final_obs, final_obs, reward, terminated, truncated, metrics, outcome)

@@ -66,8 +66,8 @@ def plugin_module(name):
 
 def said(space, actions, best, eps):
     """What a person says of actions who wants the best ones."""
-    told = jax.vmap(lambda action, best: relative_feedback(space, action, best, eps))
-    return np.array(told(jnp.asarray(actions), jnp.asarray(best, jnp.float32)))
+    answers = jax.vmap(lambda action, best: relative_feedback(space, action, best, eps))
+    return np.array(answers(jnp.asarray(actions), jnp.asarray(best, jnp.float32)))
 
 
 def write_labels(folder, config, space, eps, rows):

@@ -76,7 +76,7 @@ def adapt(
     of: ReadingAdaptation,
     lanes: Lanes,
     how: Judging,
-    teacher: Teacher | Any = None,
+    teacher: Teacher | None = None,
     labels: Label | None = None,
     watch: Callable[[str], Tell] = lambda what: ignore_progress,
 ) -> AdaptationResult:
@@ -90,6 +90,7 @@ def adapt(
         observation = getattr(of.env, "observation", ())
         reading = Reading(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation)
         if labels is None:
+            assert teacher is not None
             progress = lambda count, before=total_before: tell(before + count, total)  # noqa: E731
             own = ask_in_batches(reading, Walk(of.env, teacher, of.scalars), seed, budget, progress)
         else:

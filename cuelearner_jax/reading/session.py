@@ -110,8 +110,7 @@ class Reading:
         new = [np.asarray(part, np.float32) for part in (obs, action, answer)]
         if not len(new[0]):
             return
-        slots = max(len(new[0]), -(-self.slots // BATCHES))  # as for other batches: few programs are compiled
-        batch = _padded(new, slots)
+        batch = _padded(new, max(len(new[0]), -(-self.slots // BATCHES)))  # as others are: few programs are compiled
         self._acts(batch.obs)  # refuses a policy that has no action there
         reader = self._reader_of(new[0])
         if self.fits is not None:
@@ -185,7 +184,7 @@ def acts_of(policy: Any, everywhere: bool = True) -> linear.Acts:
 
     def acts(obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         actions = jnp.asarray(run(jax.random.key(0), None, jnp.asarray(obs)))
-        user_code.check_actions(np.isfinite(np.asarray(actions)).all() or not everywhere, name)
+        user_code.check_actions(not everywhere or np.isfinite(np.asarray(actions)).all(), name)
         return actions
 
     return acts

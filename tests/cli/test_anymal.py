@@ -28,7 +28,7 @@ def test_bad_combinations_are_refused(refused, tmp_path, monkeypatch, command, s
 
 def test_policies_of_two_robots_are_compared_on_one(tmp_path, monkeypatch):
     other, robots = shutil.copytree("docs/data/navigation_agent", tmp_path / "other"), []
-    edit_json(other / "config.json", lambda told: told.update(robot="anymal"))
+    edit_json(other / "config.json", lambda values: values.update(robot="anymal"))
     prepare = lambda source, request: robots.append(source.task.bodies[0].name) or (None, [])  # noqa: E731
     monkeypatch.setattr(evaluate, "prepare", prepare)
     assert main(["evaluate", "shipped:navigation", "--compare", str(other)]) == 0

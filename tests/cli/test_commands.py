@@ -101,8 +101,8 @@ def test_the_sweep_of_the_readme_would_begin(run_folder, monkeypatch, tmp_path):
     assert (grid.guidance[0], grid.labels, grid.seeds) == ("none", (50,), (5, 6))
     assert orders[1].config.schedule.total_steps == 60_000
     for command in (["sweep", BANDIT, "--seeds", "2"], ["train", BANDIT, "--seed", "2001"]):  # all labels of a file
-        given = ["--guidance", "relative", "--labels-from", str(run_folder / "relative" / "labels.parquet")]
-        assert main([*command, *given]) == 0
+        options = ["--guidance", "relative", "--labels-from", str(run_folder / "relative" / "labels.parquet")]
+        assert main([*command, *options]) == 0
         assert orders.pop().grid.labels == (20,)
 
 

@@ -23,9 +23,9 @@ class Gain:
 
 def test_code_without_a_hash_and_a_file_that_is_exported_again_act(tmp_path):
     onnx = pytest.importorskip("onnx").helper
-    given, made = (onnx.make_tensor_value_info(name, 1, ["n", 2]) for name in ("obs", "action"))
+    source, target = (onnx.make_tensor_value_info(name, 1, ["n", 2]) for name in ("obs", "action"))
     for operation, gain in (("Identity", 1.0), ("Neg", -1.0)):
-        graph = onnx.make_graph([onnx.make_node(operation, ["obs"], ["action"])], "policy", [given], [made])
+        graph = onnx.make_graph([onnx.make_node(operation, ["obs"], ["action"])], "policy", [source], [target])
         model = onnx.make_model(graph, opset_imports=[onnx.make_opsetid("", 18)], ir_version=8)
         (tmp_path / "policy.onnx").write_bytes(model.SerializeToString())
         for policy in (Gain(gain), tmp_path / "policy.onnx"):

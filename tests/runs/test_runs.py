@@ -113,7 +113,7 @@ def test_grids_that_make_no_sense_are_refused(grid, message, tmp_path):
 @pytest.mark.parametrize("name", ["failed", "step", "scalars.eps_deg", "reward"])
 def test_a_metric_that_is_called_as_another_column_is_refused(name, tmp_path, monkeypatch):
     usual, other = probes.Window.step, lambda after, step: (after, step.replace(metrics={name: step.reward}))
-    monkeypatch.setattr(probes.Window, "step", lambda *given: other(*usual(*given)))
+    monkeypatch.setattr(probes.Window, "step", lambda *arguments: other(*usual(*arguments)))
     with pytest.raises(UserError, match=f"a metric or outcome is called '{name}', as another column of results"):
         train.run(Order(TASK, probes.CONFIG, Grid(("none",), (0,), ()), tmp_path / "run"))
     assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,7 @@ import socket
 import subprocess
 import sys
 import threading
+from collections import OrderedDict
 from collections.abc import Mapping
 from ctypes.util import find_library
 from multiprocessing.connection import Connection
@@ -163,14 +164,15 @@ def drawing_variables() -> dict[str, str]:
     return {"MUJOCO_GL": "osmesa" if find_library("OSMesa") else "egl"}
 
 
-_pools: dict[Source, Pool] = {}  # the one used last at the end
+_pools: OrderedDict[Source, Pool] = OrderedDict()  # the one used last at the end
 
 
 def pool_of(source: Source) -> Pool:
     """Return the pool of a source, whose processes start when they are needed; close the pools unused for longest."""
-    pool = _pools[source] = _pools.pop(source, None) or Pool(source)
+    pool = _pools.setdefault(source, Pool(source))  # other threads may ask too: no step leaves it out
+    _pools.move_to_end(source)
     while len(_pools) > MOST_POOLS:
-        _pools.pop(next(iter(_pools))).close()
+        _pools.popitem(last=False)[1].close()
     before, pool.spec = pool.spec, source.spec
     if before is not None and before is not pool.spec:  # the id is registered anew
         pool.close()

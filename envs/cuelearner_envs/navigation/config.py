@@ -45,7 +45,7 @@ class NavigationConfig:
     goal_rotation_deg: float = 0.0
     """Changed world: the measured direction to the goal is rotated counterclockwise by this angle [deg]."""
     mirrors: bool = False
-    """Add the mirror images of transitions to replay, whatever the guidance; labels are not mirrored."""
+    """Add the mirror images of transitions to replay, unless lidar or goal are rotated; labels are not mirrored."""
     look_ahead: bool = False
     """Add the length of a second leg to the ways that guidance intent compares. Observations do not change."""
     preferred_side: Literal["none", "left", "right"] = "none"

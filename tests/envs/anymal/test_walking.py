@@ -32,10 +32,10 @@ def test_a_saved_policy_acts_as_before(tmp_path):
     rng, sizes = np.random.default_rng(0), (policy.OBS, 16, 8, robot.JOINTS)
     layers = [(rng.normal(size=pair) / 8, rng.normal(size=pair[1]) / 8) for pair in itertools.pairwise(sizes)]
     own = policy.WalkingPolicy(rng.normal(size=policy.OBS), rng.uniform(0.5, 2.0, policy.OBS), tuple(layers))
-    made = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), own)
-    policy.save(tmp_path / "kept", made, {"seed": 3})
+    single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), own)
+    policy.save(tmp_path / "kept", single, {"seed": 3})
     obs = jax.random.normal(jax.random.key(0), (100, policy.OBS))
-    np.testing.assert_allclose(policy.load(tmp_path / "kept")(obs), made(obs), atol=5e-3)  # kept in half precision
+    np.testing.assert_allclose(policy.load(tmp_path / "kept")(obs), single(obs), atol=5e-3)  # kept in half precision
     assert json.loads((tmp_path / "kept" / policy.ABOUT).read_text()) == {"seed": 3}
     assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == [policy.ABOUT, policy.WEIGHTS]
 

@@ -66,11 +66,11 @@ def test_noise_has_the_deviation_asked_for_and_no_bias():
 
 def test_drop_outs_read_the_range_at_the_share_asked_for():
     true = np.asarray(read_many(Lidar(), SQUARE, POSES))
-    seen = np.asarray(read_many(Lidar(dropout=0.2), SQUARE, POSES))
+    readings = np.asarray(read_many(Lidar(dropout=0.2), SQUARE, POSES))
     assert (true < 9.9).all()
-    gone = seen == 10.0
+    gone = readings == 10.0
     assert gone.mean() == pytest.approx(0.2, abs=0.01)  # its standard error is 0.17%
-    np.testing.assert_allclose(seen[~gone], true[~gone], rtol=1e-6)
+    np.testing.assert_allclose(readings[~gone], true[~gone], rtol=1e-6)
     blind = np.asarray(read_many(Lidar(dropout=1.0, max_range=7.0), SQUARE, POSES))
     np.testing.assert_array_equal(blind, 7.0)
 
