@@ -34,23 +34,28 @@ Tell = Callable[[dict[str, Any]], None]  # takes an evaluation: step, returns (s
 
 
 def evaluation(env: Any, functions: Any) -> Callable[[Any], jax.Array]:
-    """Return a function of lanes' parameters: the mean return of deterministic episodes of each."""
+    """Return a function of lanes' parameters: the mean return of deterministic episodes of each.
 
-    def one(params: Any) -> jax.Array:
-        state, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), EPISODES))
+    All step until the last episode ends: Gymnasium's environment plays a lane that stands still again at each step.
+    """
+
+    def play(params: Any) -> jax.Array:
+        shape = (len(jax.tree.leaves(params)[0]), EPISODES)
+        keys_of = lambda key: jnp.broadcast_to(jax.random.split(key, EPISODES), shape)  # noqa: E731
+        state, obs = jax.vmap(jax.vmap(env.reset))(keys_of(jax.random.key(1)))
 
         def step(carry: Any) -> Any:
             number, state, obs, running, total = carry
             key = jax.random.fold_in(jax.random.key(2), number)
-            actions = functions.act(env, params, obs, key)
-            state, after = jax.vmap(env.step)(jax.random.split(key, EPISODES), state, actions)
+            actions = jax.vmap(lambda own, obs: functions.act(env, own, obs, key))(params, obs)
+            state, after = jax.vmap(jax.vmap(env.step))(keys_of(key), state, actions)
             total = total + jnp.where(running, after.reward, 0.0)
             return number + 1, state, after.obs, running & ~(after.terminated | after.truncated), total
 
-        start = (0, state, obs, jnp.ones(EPISODES, bool), jnp.zeros(EPISODES))
-        return jax.lax.while_loop(lambda carry: (carry[0] < LONGEST) & carry[3].any(), step, start)[4].mean()
+        start = (0, state, obs, jnp.ones(shape, bool), jnp.zeros(shape))
+        return jax.lax.while_loop(lambda carry: (carry[0] < LONGEST) & carry[3].any(), step, start)[4].mean(-1)
 
-    return jax.jit(lambda params: jax.lax.map(one, params, batch_size=16))
+    return jax.jit(play)
 
 
 def environment(name: str, processes: int) -> Any:

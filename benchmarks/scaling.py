@@ -30,6 +30,7 @@ from matplotlib.figure import Figure
 from cuelearner_jax.report.figures import OTHER_COLOURS, STYLE, save_figure
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
 
@@ -68,9 +69,8 @@ def main() -> int:
             else _training(task, config, asked, axis, value)
         )
         contents["rows"].append({"axis": axis, "value": value, **figures})
-        temporary = asked.out.with_name(asked.out.name + ".tmp")  # in one step: a killed call leaves the points before
-        temporary.write_text(json.dumps(contents, indent=1) + "\n")
-        temporary.replace(asked.out)
+        with replacing(asked.out) as file:  # in one step: a killed call leaves the points before
+            file.write(json.dumps(contents, indent=1) + "\n")
     _print(contents["rows"])
     return 0
 
@@ -93,11 +93,6 @@ def _arguments() -> argparse.Namespace:
     asked = parser.parse_args()
     if asked.preset not in registry.find(asked.task).presets:
         parser.error(f"--preset: choose one of {', '.join(registry.find(asked.task).presets)}")
-    if min([1, asked.base_seeds, *asked.seeds, *asked.labels, *asked.directions, *asked.widths]) < 1:
-        parser.error("give positive numbers")
-    missing = [str(path) for path in asked.draw or () if not path.is_file()]
-    if missing:
-        parser.error(f"{missing[0]} does not exist")
     return asked
 
 

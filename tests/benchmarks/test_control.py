@@ -1,6 +1,7 @@
 """The benchmarks' classic control tasks are Gymnasium's, and soft actor-critic learns to swing the pendulum up."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -11,7 +12,9 @@ from _comparing import evaluation
 from _measuring import Timed
 from classic_control import TASKS, Episode
 
+import cuelearner_jax as cl
 from cuelearner_jax.agents import sac
+from cuelearner_jax.bridges.gymnasium.pool import pool_of
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.run_config import RunConfig
 
@@ -65,3 +68,11 @@ def test_soft_actor_critic_swings_it_up(changes, steps):
     timed.train(steps)
     returned = evaluation(PENDULUM, config.agent_in(PENDULUM))
     assert all((returned(block.agent.params) > -300).all() for block in timed.blocks)
+
+
+def test_no_episode_is_played_again_while_a_longer_one_goes_on():
+    env, gains = cl.from_gymnasium("CartPole-v1", processes=1).env, jnp.array([0.1, 0.5, 10.0, 2.0])
+    act = lambda env, balances, obs, key: jnp.eye(2)[((obs @ gains > 0) & balances).astype(int)]  # noqa: E731
+    falls, balances = evaluation(env, SimpleNamespace(act=act))(jnp.array([False, True]))
+    assert falls < 15 < balances == 500
+    assert pool_of(env.source).hosts[0].instances.replays == 0
