@@ -3,10 +3,10 @@
     PYTHON benchmarks/_peers.py WAY SETTING
 
 WAY is `SAC` or `CrossQ` (sbx), `rejax` (its SAC), `CleanRL` or `PureJaxQL`. SETTING is a JSON object: name (of the
-environment), seeds (a list), steps, evaluations, episodes; further layers, batch_size, prefill, discount, rate and
-polyak for SAC, and folder, that of a checkout, for the last two. One JSON object a line comes out for each evaluation:
-step, returns (of seeds, mean over episodes), seconds (of the training since the evaluation before). Nothing of this
-project is imported.
+environment), seeds (a list), steps, evaluations, episodes; further layers, batch_size, prefill, replay, discount, rate
+and polyak for SAC, and folder, that of a checkout, for the last two. One JSON object a line comes out for each
+evaluation: step, returns (of seeds, mean over episodes), seconds (of the training since the evaluation before). Nothing
+of this project is imported.
 """
 
 # Peers are installed by whoever compares with them.
@@ -47,7 +47,7 @@ def sbx(way: str, setting: dict[str, Any]) -> None:
     import sbx
 
     (seed,) = setting["seeds"]
-    shared = {"learning_starts": setting["prefill"], "buffer_size": setting["steps"], "seed": seed}
+    shared = {"learning_starts": setting["prefill"], "buffer_size": setting["replay"], "seed": seed}
     own = {
         "learning_rate": setting["rate"],
         "batch_size": setting["batch_size"],
@@ -80,7 +80,7 @@ def rejax(way: str, setting: dict[str, Any]) -> None:
         polyak=1 - setting["polyak"],
         batch_size=setting["batch_size"],
         fill_buffer=setting["prefill"],
-        buffer_size=setting["steps"],
+        buffer_size=setting["replay"],
         total_timesteps=every,
         eval_freq=every,
         skip_initial_evaluation=True,

@@ -12,6 +12,7 @@ here and there, but rejax takes its first steps by its policy; CrossQ has its ow
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from _comparing import compare, parser_of
@@ -20,36 +21,32 @@ from cuelearner_jax.agents.sac import SACConfig
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.run_config import RunConfig
 
-LAYERS = (256, 256)
-SETTING: dict[str, Any] = {"layers": LAYERS, "batch_size": 256, "discount": 0.99, "rate": 3e-4, "polyak": 0.005}
+LAYERS, MOST_KEPT = (256, 256), 2**20  # transitions in replay
+SETTING: dict[str, Any] = {"layers": LAYERS, "discount": 0.99, "polyak": 0.005}
 
 
 def main() -> None:
     """Measure, print and write."""
     parser = parser_of(__doc__, ["Pendulum-v1"], ["sac", "xqc", "SAC", "CrossQ", "rejax"], seeds=5)
     parser.add_argument("--prefill", type=int, default=5_000, help="random steps before the first update")
-    parser.add_argument("--envs", type=int, default=1, help="environments a seed here, with as many updates a step")
+    parser.add_argument("--batch-size", type=int, default=256, help="transitions in a minibatch")
+    parser.add_argument("--envs", type=int, default=1, help="environments a seed here")
+    parser.add_argument("--gradient-steps", type=int, default=0, help="after each step of all (0: as many as --envs)")
+    parser.add_argument("--rate", type=float, default=3e-4, help="Adam's step size")
+    parser.add_argument("--critic-layers", type=int, nargs="+", default=LAYERS, help="hidden layers of critics here")
     options = parser.parse_args()
-    setting = {**SETTING, "prefill": options.prefill, "envs": options.envs}
+    own = ("prefill", "batch_size", "envs", "gradient_steps", "rate", "critic_layers")
+    setting = {**SETTING, **{name: getattr(options, name) for name in own}, "replay": min(options.steps, MOST_KEPT)}
+    sizes = Sizes(num_envs=options.envs, gradient_steps=options.gradient_steps)
     schedule = Schedule(random_steps=options.prefill, learn_after=options.prefill, guidance_until=0)
     scalars = Scalars(discount=SETTING["discount"], max_grad_norm=1e9)  # the peers do not clip
-
-    def config(bins: bool) -> RunConfig:
-        agent = SACConfig(
-            actor_layers=LAYERS,
-            critic_layers=LAYERS,
-            bins=bins,
-            batch_size=SETTING["batch_size"],
-            replay_capacity=options.steps,
-            polyak=SETTING["polyak"],
-            actor_rate=SETTING["rate"],
-            critic_rate=SETTING["rate"],
-            temperature_rate=SETTING["rate"],
-        )
-        return RunConfig(None, Sizes(num_envs=options.envs), scalars, schedule, agent)
-
+    rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), options.rate)
+    layers = tuple(options.critic_layers)
+    base = SACConfig(LAYERS, layers, batch_size=options.batch_size, replay_capacity=setting["replay"], **rates)
+    agents = {"sac": base, "xqc": replace(base, bins=True)}
+    here = {way: RunConfig(None, sizes, scalars, schedule, agent) for way, agent in agents.items()}
     elsewhere: dict[str, dict[str, Any]] = {"SAC": {}, "CrossQ": {}, "rejax": {"together": True}}
-    compare(options, setting, {"sac": config(False), "xqc": config(True)}, elsewhere, base="SAC")
+    compare(options, setting, here, elsewhere, base="SAC")
 
 
 if __name__ == "__main__":

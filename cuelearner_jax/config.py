@@ -28,7 +28,6 @@ from types import UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -224,7 +223,9 @@ class Sizes(GuideSizes):
     """Static sizes: changing one compiles the program again."""
 
     num_envs: Annotated[int, POSITIVE] = 1
-    """Environments of one seed that step together before as many gradient steps follow."""
+    """Environments of one seed that step together before gradient steps follow."""
+    gradient_steps: Annotated[int, Bounds(0)] = 0
+    """Gradient steps after each step of all environments (0: as many as environments)."""
     lanes_per_block: Annotated[int, Bounds(0)] = 0
     """Seeds trained in one block, side by side (0: all) on an accelerator, one by one (0: a block a core) on a CPU."""
     ask_from: Literal["uniform", "middle"] = "uniform"
@@ -312,10 +313,6 @@ class Schedule:
     """Steps between two checkpoints; a killed run loses at most these."""
     guide_eval_every: Annotated[int, Bounds(0)] = 0
     """Labels between two evaluations of the guide alone (0: only after the last label)."""
-
-    def learned_from(self, step: Any) -> Any:
-        """Return the number of environment steps, of the first `step`, that gradient steps followed; traced or not."""
-        return jnp.maximum(step - self.learn_after, 0)
 
 
 for _group in (GuideScalars, TeacherFaults, Scalars, Schedule):

@@ -154,8 +154,8 @@ class Lane(NamedTuple):
 
     def advance(self, clock: Clock, schedule: Schedule) -> Clock:
         """Return the clock after one iteration."""
-        steps = self.sizes.num_envs
-        updates = jnp.where(clock.step + steps >= schedule.learn_after, steps, 0)
+        steps, updates = self.sizes.num_envs, self.sizes.gradient_steps or self.sizes.num_envs
+        updates = jnp.where(clock.step + steps >= schedule.learn_after, updates, 0)
         return clock.replace(step=clock.step + steps, update=clock.update + updates)
 
     def keys(self, clock: Clock, state: TrainState) -> Keys:
@@ -166,7 +166,7 @@ class Lane(NamedTuple):
     def iterate(
         self, env: Environment, settings: Settings, clock: Clock, state: TrainState
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-        """Make one step in each of the lane's environments, then as many gradient steps."""
+        """Make one step in each of the lane's environments, then gradient steps."""
         keys = self.keys(clock, state)
         acted = self.act(env, settings, clock, state, keys.act)
         k_envs = jax.random.split(keys.step, self.sizes.num_envs)
@@ -221,28 +221,28 @@ class Lane(NamedTuple):
     def learn(
         self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-        """Make as many gradient steps as environment steps, once replay holds enough."""
+        """Make gradient steps, once replay holds enough."""
         filled, agent, schedule = clock.step + self.sizes.num_envs, state.agent, settings.schedule
         memory = Memory(env, self.buffer, agent.replay, filled, self.sizes.num_envs, self.bootstraps, agent.guided)
         if (stored := state.guide.stored) is not None:
             labelled = Memory(env, self.buffer, stored, state.guide.asked, 1, self.bootstraps)
             memory = memory._replace(labelled=labelled)
 
-        def update(carry: tuple[Any, Any], key: PRNGKeyArray, index: Array) -> tuple[tuple[Any, Any], Any]:
+        def update(carry: tuple[Any, Any], index: Array) -> tuple[tuple[Any, Any], Any]:
             count, own = clock.update + index + 1, jax.random.fold_in(key, index)
             params, training, loss, norm = self.learner.update(
                 env, settings.agent, settings.scalars, count, *carry, memory, own
             )
             return (params, training), (loss, norm)
 
-        def updates(carry: tuple[Any, Any], key: PRNGKeyArray) -> tuple[tuple[Any, Any], Array, Array]:
-            one = lambda carry, index: update(carry, key, index)  # noqa: E731
-            carry, (losses, norms) = jax.lax.scan(one, carry, jnp.arange(self.sizes.num_envs))
+        def updates() -> tuple[tuple[Any, Any], Array, Array]:
+            indices = jnp.arange(self.sizes.gradient_steps or self.sizes.num_envs)
+            carry, (losses, norms) = jax.lax.scan(update, (agent.params, agent.training), indices)
             return carry, losses.mean(), all_finite((losses, norms))
 
         (params, training), loss, finite = jax.lax.cond(
             filled >= schedule.learn_after,
-            lambda: updates((agent.params, agent.training), key),
+            updates,
             lambda: ((agent.params, agent.training), jnp.zeros(()), jnp.array(True)),
         )
         agent = agent.replace(params=params, training=training)

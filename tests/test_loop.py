@@ -6,6 +6,7 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import probes
 import pytest
 
@@ -145,18 +146,20 @@ def test_an_episode_is_guided_as_a_whole():
     assert by_episode.mean() == pytest.approx(0.5, abs=0.08)
 
 
-@pytest.mark.parametrize(("learn_after", "updates"), [(49, 0), (48, 4), (44, 8)])
-def test_learning_begins_after_learn_after(learn_after, updates):
-    program = probes.window_program("none")
+@pytest.mark.parametrize(("learn_after", "steps", "updates"), [(49, 0, 0), (48, 0, 4), (44, 0, 8), (44, 2, 4)])
+def test_learning_begins_after_learn_after(learn_after, steps, updates):
+    """As many updates as environments, or as are asked for, from the iteration that reaches the step."""
+    config = dataclasses.replace(probes.CONFIG, sizes=dataclasses.replace(probes.SIZES, gradient_steps=steps))
+    program = probes.make_program(config, guidances.make("none", config.sizes, ENV), ENV, 0)
     state = probes.start(program, [0], [0])
     before = probes.lane(state.agent.params, 0)
     clock, state, _ = run(program, replaced(learn_after=learn_after), loop.start_clock(), state)
-    assert int(clock.update) == updates  # one for each of four environments, from the iteration that reaches the step
+    assert int(clock.update) == optax.tree.get(state.agent.training, "count")[0] == updates
     changed = jax.tree.map(lambda one, other: (one != other).any(), before, probes.lane(state.agent.params, 0))
     assert set(jax.tree.leaves(changed)) == {updates > 0}
 
 
-# Relative guidance.
+# Lanes.
 
 BUDGETS = [15, 15, LARGEST, LARGEST]
 SEEDS = [1, 2, 1, 2]
@@ -172,9 +175,6 @@ def labelled(program, seeds, budgets, rounds=LARGEST // 10, scalars=probes.SCALA
 def assert_equal(one, other):
     for mine, yours in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(mine, yours)
-
-
-# Lanes.
 
 
 def trained(program, seeds, budgets):
