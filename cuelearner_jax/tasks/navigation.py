@@ -95,6 +95,7 @@ NAVIGATION = Task(
     teacher=make_teacher,
     brief_teacher=make_brief_teacher,
     longest=lambda config: config.max_steps,
-    labels_hold=("worlds", "world_seed", "max_steps", "mirrors", "look_ahead"),  # a label depends on one scan only
+    # A label depends on one scan only.
+    labels_hold=("worlds", "world_seed", "max_steps", "mirrors", "look_ahead", "keep_scans"),
     **presets.read("navigation", NavigationConfig()),
 )

@@ -252,7 +252,7 @@ def test_the_probe_task_keeps_the_laws(tmp_path):
 @pytest.mark.parametrize(
     ("task", "small"),
     [
-        (NAVIGATION, {"worlds": 8, "max_steps": 12, "mirrors": True}),
+        (NAVIGATION, {"worlds": 8, "max_steps": 12, "mirrors": True, "keep_scans": True}),
         (BILLIARDS, {"table": "regulation", "mirrors": True, "search_directions": 24}),
     ],
     ids=["navigation", "billiards"],

@@ -72,14 +72,8 @@ class LeggedNavigation(Navigation, kw_only=True):
 
         start = (state.body, state.last_action, state.command, state.fallen)
         (body, last_action, command, fallen), _ = jax.lax.scan(one, start, length=CONTROL_STEPS)
-        return state.replace(
-            body=body,
-            last_action=last_action,
-            command=command,
-            previous=latest_first(action, state.previous),
-            steps=state.steps + 1,
-            fallen=fallen,
-        )
+        state = state.replace(body=body, last_action=last_action, command=command, fallen=fallen)
+        return state.replace(previous=latest_first(action, state.previous), steps=state.steps + 1)
 
     def act(
         self, body: AnymalState, last_action: Float[Array, "12"], before: Float[Array, "3"], heading: Float[Array, "2"]
@@ -131,17 +125,10 @@ class LeggedNavigation(Navigation, kw_only=True):
     ) -> LeggedWalker:
         """Return a state at rest with the trunk at a position."""
         body = standing(place[:2], 0.0)
-        return LeggedWalker(
-            body=body.replace(qpos=body.qpos.at[:7].set(place)),
-            last_action=jnp.zeros(robot.JOINTS),
-            command=jnp.zeros(3),
-            goal=goal,
-            previous=previous,
-            world=world,
-            route=route,
-            steps=jnp.zeros((), jnp.int32),
-            fallen=jnp.array(False),
-        )
+        body = body.replace(qpos=body.qpos.at[:7].set(place))
+        last_action, command = jnp.zeros(robot.JOINTS), jnp.zeros(3)
+        steps, fallen = jnp.zeros((), jnp.int32), jnp.array(False)
+        return LeggedWalker(body, last_action, command, goal, previous, world, route, steps, fallen)
 
 
 def make_environment(

@@ -43,7 +43,7 @@ AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal
 
 
 class Navigation(Described, struct.PyTreeNode):
-    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last three fields is traced."""
+    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last four fields is traced."""
 
     worlds: NavigationWorld  # leading axis: worlds
     robot: Robot = Robot()
@@ -55,6 +55,7 @@ class Navigation(Described, struct.PyTreeNode):
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the mirror image as data?
     sides: bool = struct.field(pytree_node=False, default=False)  # say on which side obstacles were passed?
     look_ahead: bool = struct.field(pytree_node=False, default=False)  # do aims tell where a second leg leads?
+    keep_scans: bool = struct.field(pytree_node=False, default=False)  # does replay store whole observations?
 
     observation = (
         Quantity(
@@ -94,10 +95,11 @@ class Navigation(Described, struct.PyTreeNode):
         after = self.counted(state, self.move(state, action))
         outcome, terminated, truncated = self.ends(after)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), self._start(key), after)
+        final_obs = self.observe(after)
         step = Step(
             obs=self.observe(following),
-            final_obs=self.observe(after),
-            aftermath=self.place(after),
+            final_obs=final_obs,
+            aftermath=final_obs if self.keep_scans else self.place(after),
             reward=10.0 * outcome["success"] - 10.0 * (terminated - outcome["success"]),
             terminated=terminated,
             truncated=truncated,
@@ -226,18 +228,25 @@ class Navigation(Described, struct.PyTreeNode):
         return jnp.where(which == 1, image, obs), jnp.where(which == 1, vector * sign, vector)
 
     def remember(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, " memory"]:
-        """Place, goal, previous actions and number of the world: what `observe` looks at, 9 entries and the place's."""
+        """Place, goal, previous actions and number of the world: what `observe` looks at, 9 entries and the place's.
+
+        With `keep_scans` the observation itself.
+        """
+        if self.keep_scans:
+            return obs
         world = state.world[None].astype(jnp.float32)
         return jnp.concatenate([self.place(state), state.goal, state.previous.ravel(), world])
 
     def recall(self, memory: Float[Array, " memory"]) -> Float[Array, " obs"]:
-        """The observation, its lidar scanned anew."""
-        return self.observe(self.placed(*_remembered(memory)))
+        """The observation, its lidar scanned anew unless it is stored."""
+        return memory if self.keep_scans else self.observe(self.placed(*_remembered(memory)))
 
     def recall_next(
         self, memory: Float[Array, " memory"], action: Float[Array, "2"], aftermath: Float[Array, " place"]
     ) -> Float[Array, " obs"]:
         """The observation after the action, at the place `aftermath`."""
+        if self.keep_scans:
+            return aftermath
         _, goal, previous, world, route = _remembered(memory)
         return self.observe(self.placed(aftermath, goal, latest_first(action, previous), world, route))
 
