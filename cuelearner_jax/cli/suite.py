@@ -11,13 +11,14 @@ import threading
 import time
 import tomllib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
+from filelock import FileLock, Timeout
 
 from cuelearner_jax import devices, signals
 from cuelearner_jax.cli.options import check_numbers, look_ahead, out, parse
@@ -26,7 +27,6 @@ from cuelearner_jax.config import plain
 from cuelearner_jax.errors import NotFinite, UserError, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.report import suite as page
-from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.studies import suite
 from cuelearner_jax.studies.suite import ADAPT, RIGHT, TABLE, Cell, World
@@ -51,8 +51,6 @@ class Suite:
     """Kinds of guidance beside those of the scale; your own as package.module:NAME."""
     minutes: float = float("inf")
     """Stop after so many minutes, with all work saved."""
-    shard: str | None = None
-    """Run only the cells of shard i of n, given as i/n; cells of one world and kind stay together."""
     processes: int = 0
     """Processes that divide the cells (0: on a CPU one a core, on an accelerator one)."""
     table: Path = TABLE
@@ -66,7 +64,7 @@ def run(arguments: list[str]) -> None:
     if options.scale not in table["scales"]:
         raise UserError(f"unknown scale {options.scale!r}{suggestion(options.scale, table['scales'])}")
     check_numbers(options, minutes=(0.1, float("inf")), processes=(0, 1_000))
-    scale, shard = table["scales"][options.scale], Shard.parse(options.shard or "1/1")
+    scale = table["scales"][options.scale]
     kinds = [guidances.resolve(kind).name for kind in (*scale.get("kinds", table["kinds"]), *options.guidance)]
     try:
         worlds = [_world(name, table["worlds"][name] | own) for name, own in scale["worlds"].items()]
@@ -76,14 +74,12 @@ def run(arguments: list[str]) -> None:
     obstacles = [cell.obstacle() for cell in cells]
     sensible = [cell for cell, obstacle in zip(cells, obstacles, strict=True) if obstacle is None]
     _claim(options.out, f"# {options.scale}\n{options.table.read_text(encoding='utf-8')}")
-    groups = list(dict.fromkeys((cell.world.name, cell.kind) for cell in sensible))
-    own = [c for c in sensible if groups.index((c.world.name, c.kind)) % shard.count == shard.index - 1]
-    left = {(cell.world.name, cell.kind) for cell in own if not suite.is_done(options.out, cell)}
+    left = {(cell.world.name, cell.kind) for cell in sensible if not suite.is_done(options.out, cell)}
     count = min(len(left), options.processes or (devices.CORES if jax.default_backend() == "cpu" else 1))
     if count > 1:
-        _run_in_processes(count, shard, arguments, options.out, os.environ | _compile_options(scale))
+        _run_in_processes(count, arguments, options.out, os.environ | _variables(scale))
     else:
-        _run_cells(own, options)
+        _run_cells(sensible, options)
     if WORKS_FOR in os.environ:
         return
     done = sum(suite.is_done(options.out, cell) for cell in sensible)
@@ -104,10 +100,19 @@ def run(arguments: list[str]) -> None:
 
 
 def _run_cells(cells: list[Cell], options: Suite) -> None:
-    """Run cells that are not done, until the time is over."""
+    """Run cells that are not done and whose world and kind no other process has taken, until the time is over."""
+    locks: dict[str, FileLock] = {}
+
+    def take(cell: Cell) -> bool:
+        name = f".{cell.world.name}_{cell.kind}.lock"  # held until this process ends
+        lock = locks.setdefault(name, FileLock(options.out / name, blocking=False))
+        with suppress(Timeout):
+            lock.acquire()
+        return lock.is_locked
+
     with _deadline(options.minutes) as is_over:
         for number, cell in enumerate(cells):
-            if suite.is_done(options.out, cell):
+            if not take(cell) or suite.is_done(options.out, cell):
                 continue
             if is_over():
                 break
@@ -122,27 +127,24 @@ def _run_cells(cells: list[Cell], options: Suite) -> None:
                     raise
 
 
-def _compile_options(scale: dict[str, Any]) -> dict[str, str]:
+def _variables(scale: dict[str, Any]) -> dict[str, str]:
     """Return variables of processes: a short scale compiles in half the time, and its programs run slower."""
-    flags = ["--xla_backend_optimization_level=0"]
-    if jax.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
+    flags = ["--xla_backend_optimization_level=0"] * scale.get("is_short", False)
+    if flags and jax.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
         flags.append("--xla_cpu_use_fusion_emitters=false")
-    return {"XLA_FLAGS": " ".join([*flags, os.environ.get("XLA_FLAGS", "")])} if scale.get("is_short") else {}
+    return {WORKS_FOR: str(os.getpid()), "XLA_FLAGS": " ".join([*flags, os.environ.get("XLA_FLAGS", "")])}
 
 
-def _run_in_processes(count: int, shard: Shard, arguments: list[str], folder: Path, variables: dict[str, str]) -> None:
-    """Run the command in processes that divide a shard; each writes a log into the folder.
+def _run_in_processes(count: int, arguments: list[str], folder: Path, variables: dict[str, str]) -> None:
+    """Run the command in processes that take its cells; each writes a log into the folder.
 
     Raises Interrupted after a signal, and UserError if a process failed.
     """
-    command = [sys.executable, "-u", "-m", "cuelearner_jax.cli", "suite", *arguments, "--processes", "1", "--shard"]
+    command = [sys.executable, "-u", "-m", "cuelearner_jax.cli", "suite", *arguments, "--processes", "1"]
     logs = [folder / f"process_{number}.log" for number in range(1, count + 1)]
     with ExitStack() as files, signals.interruptible("the work of all processes") as stopping:
-        shards = [f"{shard.index + number * shard.count}/{shard.count * count}" for number in range(count)]
-        writers = [files.enter_context(log.open("w", encoding="utf-8")) for log in logs]
-        environ = variables | {WORKS_FOR: str(os.getpid())}
-        start = partial(subprocess.Popen[bytes], stderr=subprocess.STDOUT, start_new_session=True, env=environ)
-        workers = [start([*command, one], stdout=file) for one, file in zip(shards, writers, strict=True)]
+        start = partial(subprocess.Popen[bytes], stderr=subprocess.STDOUT, start_new_session=True, env=variables)
+        workers = [start(command, stdout=files.enter_context(log.open("w", encoding="utf-8"))) for log in logs]
         out.print(f"{count} processes run the cells: {logs[0]} ...")
         while not stopping.is_set() and any(worker.poll() is None for worker in workers):
             time.sleep(0.5)
