@@ -40,7 +40,7 @@ def main() -> None:
     sizes = Sizes(num_envs=options.envs, gradient_steps=options.gradient_steps)
     schedule = Schedule(random_steps=options.prefill, learn_after=options.prefill, guidance_until=0)
     scalars = Scalars(discount=SETTING["discount"], max_grad_norm=1e9)  # the peers do not clip
-    rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), options.rate)
+    rates: dict[str, Any] = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), options.rate)
     layers = tuple(options.critic_layers)
     base = SACConfig(LAYERS, layers, batch_size=options.batch_size, replay_capacity=setting["replay"], **rates)
     agents = {"sac": base, "xqc": replace(base, bins=True)}
