@@ -41,8 +41,8 @@ def main() -> None:
     schedule = Schedule(random_steps=options.prefill, learn_after=options.prefill, guidance_until=0)
     scalars = Scalars(discount=SETTING["discount"], max_grad_norm=1e9)  # the peers do not clip
     rates: dict[str, Any] = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), options.rate)
-    layers = tuple(options.critic_layers)
-    base = SACConfig(LAYERS, layers, batch_size=options.batch_size, replay_capacity=setting["replay"], **rates)
+    base = SACConfig(LAYERS, tuple(options.critic_layers), polyak=SETTING["polyak"], **rates)
+    base = replace(base, batch_size=options.batch_size, replay_capacity=setting["replay"])
     agents = {"sac": base, "xqc": replace(base, bins=True)}
     here = {way: RunConfig(None, sizes, scalars, schedule, agent) for way, agent in agents.items()}
     elsewhere: dict[str, dict[str, Any]] = {"SAC": {}, "CrossQ": {}, "rejax": {"together": True}}

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from filelock import FileLock, Timeout
 
 from cuelearner_jax import devices, signals
 from cuelearner_jax.cli.options import check_numbers, look_ahead, out, parse
@@ -28,6 +27,7 @@ from cuelearner_jax.errors import NotFinite, UserError, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.report import suite as page
 from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage.whole import hold
 from cuelearner_jax.studies import suite
 from cuelearner_jax.studies.suite import ADAPT, RIGHT, TABLE, Cell, World
 from cuelearner_jax.task import QUICKSTART
@@ -101,16 +101,17 @@ def run(arguments: list[str]) -> None:
 
 def _run_cells(cells: list[Cell], options: Suite) -> None:
     """Run cells that are not done and whose world and kind no other process has taken, until the time is over."""
-    locks: dict[str, FileLock] = {}
+    own: set[str] = set()  # names of the locks that this process holds
+    with ExitStack() as locks, _deadline(options.minutes) as is_over:
 
-    def take(cell: Cell) -> bool:
-        name = f".{cell.world.name}_{cell.kind}.lock"  # held until this process ends
-        lock = locks.setdefault(name, FileLock(options.out / name, blocking=False))
-        with suppress(Timeout):
-            lock.acquire()
-        return lock.is_locked
+        def take(cell: Cell) -> bool:
+            name = f".{cell.world.name}_{cell.kind}.lock"
+            with suppress(UserError):  # another process holds it
+                if name not in own:
+                    locks.enter_context(hold(options.out / name, options.out))
+                    own.add(name)
+            return name in own
 
-    with _deadline(options.minutes) as is_over:
         for number, cell in enumerate(cells):
             if not take(cell) or suite.is_done(options.out, cell):
                 continue
@@ -128,7 +129,7 @@ def _run_cells(cells: list[Cell], options: Suite) -> None:
 
 
 def _variables(scale: dict[str, Any]) -> dict[str, str]:
-    """Return variables of processes: a short scale compiles in half the time, and its programs run slower."""
+    """Return variables of a process. Of a short scale it compiles in half the time, and its programs run slower."""
     flags = ["--xla_backend_optimization_level=0"] * scale.get("is_short", False)
     if flags and jax.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
         flags.append("--xla_cpu_use_fusion_emitters=false")

@@ -95,7 +95,6 @@ NAVIGATION = Task(
     teacher=make_teacher,
     brief_teacher=make_brief_teacher,
     longest=lambda config: config.max_steps,
-    # A label depends on one scan only.
-    labels_hold=("worlds", "world_seed", "max_steps", "mirrors", "look_ahead", "keep_scans"),
+    labels_hold=("worlds", "world_seed", "max_steps", "mirrors", "look_ahead", "keep_scans"),  # labels are of one scan
     **presets.read("navigation", NavigationConfig()),
 )

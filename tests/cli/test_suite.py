@@ -7,11 +7,11 @@ import tomllib
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from filelock import FileLock
 from small_runs import BANDIT, listing
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.cli import suite as command
+from cuelearner_jax.storage.whole import hold
 from cuelearner_jax.studies import suite
 
 TINY = f"""
@@ -66,7 +66,7 @@ def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys, monkeyp
     (table := tmp_path / "tiny.toml").write_text(TINY)
     words = ["suite", "--scale", "tiny", "--table", str(table), "--out", str(tmp_path / "out")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # of the processes
-    with FileLock(tmp_path / "out" / ".train_none.lock"):  # as another process does that has taken these cells
+    with hold(tmp_path / "out" / ".train_none.lock", tmp_path):  # as another process does that has taken these cells
         assert main([*words, "--processes", "2"]) == 0
     printed = capsys.readouterr().out
     assert "2 processes run the cells" in printed

@@ -244,7 +244,7 @@ class Navigation(Described, struct.PyTreeNode):
     def recall_next(
         self, memory: Float[Array, " memory"], action: Float[Array, "2"], aftermath: Float[Array, " place"]
     ) -> Float[Array, " obs"]:
-        """The observation after the action, at the place `aftermath`."""
+        """The observation after the action, at the place `aftermath`; with `keep_scans` that is the observation."""
         if self.keep_scans:
             return aftermath
         _, goal, previous, world, route = _remembered(memory)
