@@ -29,19 +29,19 @@ from cuelearner_jax.bridges.brax import from_brax
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.provenance import provenance
 
-EPISODES, LONGEST = 10, 1000  # of an evaluation; steps of the longest episode
+LONGEST = 1000  # steps of the longest episode
 Tell = Callable[[dict[str, Any]], None]  # takes an evaluation: step, returns (seeds), seconds of the stretch before it
 
 
-def evaluation(env: Any, functions: Any) -> Callable[[Any], jax.Array]:
+def evaluation(env: Any, functions: Any, episodes: int = 10) -> Callable[[Any], jax.Array]:
     """Return a function of lanes' parameters: the mean return of deterministic episodes of each.
 
     All step until the last episode ends: Gymnasium's environment plays a lane that stands still again at each step.
     """
 
     def play(params: Any) -> jax.Array:
-        shape = (len(jax.tree.leaves(params)[0]), EPISODES)
-        keys_of = lambda key: jnp.broadcast_to(jax.random.split(key, EPISODES), shape)  # noqa: E731
+        shape = (len(jax.tree.leaves(params)[0]), episodes)
+        keys_of = lambda key: jnp.broadcast_to(jax.random.split(key, episodes), shape)  # noqa: E731
         state, obs = jax.vmap(jax.vmap(env.reset))(keys_of(jax.random.key(1)))
 
         def step(carry: Any) -> Any:
@@ -72,7 +72,8 @@ def environment(name: str, processes: int) -> Any:
 def train_here(name: str, config: RunConfig, options: argparse.Namespace, tell: Tell) -> None:
     """Train with this package's loop, that of `cuelearner sweep`, all seeds side by side."""
     env = environment(name, options.processes)
-    lanes, returned = Timed(config, env, "none", options.seeds), evaluation(env, config.agent_in(env))
+    lanes = Timed(config, env, "none", options.seeds)
+    returned = evaluation(env, config.agent_in(env), options.episodes)
     every = options.steps // options.evaluations
     for number in range(options.evaluations):
         seconds = lanes.train(every // config.sizes.num_envs)
@@ -135,6 +136,7 @@ def parser_of(about: str | None, environments: list[str], ways: list[str], seeds
     parser.add_argument("--steps", type=int, default=500_000, help="of each training (default: 500,000)")
     parser.add_argument("--processes", type=int, default=1, help="that play our environments (default: 1)")
     parser.add_argument("--evaluations", type=int, default=5, help="of each training (default: 5)")
+    parser.add_argument("--episodes", type=int, default=10, help="of an evaluation, for each seed (default: 10)")
     parser.add_argument("--out", type=Path, help="JSON file to write, or to go on with")
     parser.add_argument("--table", type=Path, nargs="+", help="print the table of these files, and measure nothing")
     return parser
@@ -155,7 +157,7 @@ def compare(
         raise SystemExit("give at least two evaluations that divide --steps, each a multiple of --envs")
     rows = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
     rows = [row for row in rows if len(row["rows"]) == options.evaluations]
-    setting = {**setting, "steps": options.steps, "evaluations": options.evaluations, "episodes": EPISODES}
+    setting |= {name: getattr(options, name) for name in ("steps", "evaluations", "episodes")}
     for name in options.environments:
         for way in options.ways:
             if any((row["environment"], row["way"]) == (name, way) for row in rows):

@@ -12,17 +12,17 @@ here and there, but rejax takes its first steps by its policy; CrossQ has its ow
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any
 
 from _comparing import compare, parser_of
 
 from cuelearner_jax.agents.sac import SACConfig
-from cuelearner_jax.config import Scalars, Schedule, Sizes
+from cuelearner_jax.config import Scalars, Schedule, Sizes, plain
 from cuelearner_jax.run_config import RunConfig
 
-LAYERS, MOST_KEPT = (256, 256), 2**20  # transitions in replay
-SETTING: dict[str, Any] = {"layers": LAYERS, "discount": 0.99, "polyak": 0.005}
+SETTING: dict[str, Any] = {"layers": (256, 256), "polyak": 0.005}
 
 
 def main() -> None:
@@ -33,16 +33,18 @@ def main() -> None:
     parser.add_argument("--envs", type=int, default=1, help="environments a seed here")
     parser.add_argument("--gradient-steps", type=int, default=0, help="after each step of all (0: as many as --envs)")
     parser.add_argument("--rate", type=float, default=3e-4, help="Adam's step size")
-    parser.add_argument("--critic-layers", type=int, nargs="+", default=LAYERS, help="hidden layers of critics here")
+    parser.add_argument("--discount", type=float, default=0.99, help="of the next value")
+    parser.add_argument("--replay", type=int, default=2**20, help="transitions kept")
+    parser.add_argument("--agent", type=json.loads, default={}, help="options of `sac` here that differ, in JSON")
     options = parser.parse_args()
-    own = ("prefill", "batch_size", "envs", "gradient_steps", "rate", "critic_layers")
-    setting = {**SETTING, **{name: getattr(options, name) for name in own}, "replay": min(options.steps, MOST_KEPT)}
+    own = ("prefill", "batch_size", "envs", "gradient_steps", "rate", "discount", "agent")
+    setting = {**SETTING, **{name: getattr(options, name) for name in own}, "replay": min(options.steps, options.replay)}
     sizes = Sizes(num_envs=options.envs, gradient_steps=options.gradient_steps)
     schedule = Schedule(random_steps=options.prefill, learn_after=options.prefill, guidance_until=0)
-    scalars = Scalars(discount=SETTING["discount"], max_grad_norm=1e9)  # the peers do not clip
-    rates: dict[str, Any] = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), options.rate)
-    base = SACConfig(LAYERS, tuple(options.critic_layers), polyak=SETTING["polyak"], **rates)
-    base = replace(base, batch_size=options.batch_size, replay_capacity=setting["replay"])
+    scalars = Scalars(discount=options.discount, max_grad_norm=1e9)  # the peers do not clip
+    values: dict[str, Any] = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), options.rate)
+    values |= {"polyak": SETTING["polyak"], "batch_size": options.batch_size, "replay_capacity": setting["replay"]}
+    base = SACConfig(**values | {name: plain(value) for name, value in options.agent.items()})
     agents = {"sac": base, "xqc": replace(base, bins=True)}
     here = {way: RunConfig(None, sizes, scalars, schedule, agent) for way, agent in agents.items()}
     elsewhere: dict[str, dict[str, Any]] = {"SAC": {}, "CrossQ": {}, "rejax": {"together": True}}
