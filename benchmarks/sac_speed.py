@@ -22,8 +22,6 @@ from cuelearner_jax.agents.sac import SACConfig
 from cuelearner_jax.config import Scalars, Schedule, Sizes, plain
 from cuelearner_jax.run_config import RunConfig
 
-SETTING: dict[str, Any] = {"layers": (256, 256), "polyak": 0.005}
-
 
 def main() -> None:
     """Measure, print and write."""
@@ -38,12 +36,13 @@ def main() -> None:
     parser.add_argument("--agent", type=json.loads, default={}, help="options of `sac` here that differ, in JSON")
     options = parser.parse_args()
     own = ("prefill", "batch_size", "envs", "gradient_steps", "rate", "discount", "agent")
-    setting = {**SETTING, **{name: getattr(options, name) for name in own}, "replay": min(options.steps, options.replay)}
+    setting: dict[str, Any] = {"layers": (256, 256), "polyak": 0.005, "replay": min(options.steps, options.replay)}
+    setting |= {name: getattr(options, name) for name in own}
     sizes = Sizes(num_envs=options.envs, gradient_steps=options.gradient_steps)
     schedule = Schedule(random_steps=options.prefill, learn_after=options.prefill, guidance_until=0)
     scalars = Scalars(discount=options.discount, max_grad_norm=1e9)  # the peers do not clip
     values: dict[str, Any] = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), options.rate)
-    values |= {"polyak": SETTING["polyak"], "batch_size": options.batch_size, "replay_capacity": setting["replay"]}
+    values |= {"polyak": setting["polyak"], "batch_size": options.batch_size, "replay_capacity": setting["replay"]}
     base = SACConfig(**values | {name: plain(value) for name, value in options.agent.items()})
     agents = {"sac": base, "xqc": replace(base, bins=True)}
     here = {way: RunConfig(None, sizes, scalars, schedule, agent) for way, agent in agents.items()}

@@ -27,7 +27,7 @@ from cuelearner_jax.errors import NotFinite, UserError, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.report import suite as page
 from cuelearner_jax.storage import table as tables
-from cuelearner_jax.storage.whole import hold
+from cuelearner_jax.storage.whole import hold, replacing
 from cuelearner_jax.studies import suite
 from cuelearner_jax.studies.suite import ADAPT, RIGHT, TABLE, Cell, World
 from cuelearner_jax.task import QUICKSTART
@@ -83,8 +83,7 @@ def run(arguments: list[str]) -> None:
     if WORKS_FOR in os.environ:
         return
     done = sum(suite.is_done(options.out, cell) for cell in sensible)
-    more = "" if done == len(sensible) else "; the same command goes on"
-    out.print(f"{done} of {len(sensible)} cells are done{more}")
+    out.print(f"{done} of {len(sensible)} cells are done" + "; the same command goes on" * (done < len(sensible)))
     if done:
         rows = suite.collect(options.out, worlds)
         tables.write(options.out / "suite.parquet", rows)
@@ -190,10 +189,12 @@ def _world(name: str, values: dict[str, Any]) -> World:
 def _claim(folder: Path, text: str) -> None:
     """Write what a folder's suite is, or raise UserError if it is another one."""
     path = folder / "suite.toml"
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise UserError(f"{folder} holds a suite of another scale or table: give another --out")
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    if not path.exists():
+        with replacing(path) as file:  # another process may read it
+            file.write(text)
+    elif path.read_text(encoding="utf-8") != text:
+        raise UserError(f"{folder} holds a suite of another scale or table: give another --out")
 
 
 @contextmanager
@@ -202,8 +203,7 @@ def _deadline(minutes: float) -> Iterator[Any]:
     end, closed = time.monotonic() + 60 * minutes, threading.Event()
 
     def is_over() -> bool:
-        parent = str(os.getppid())
-        return time.monotonic() > end or os.environ.get(WORKS_FOR, parent) != parent
+        return time.monotonic() > end or os.environ.get(WORKS_FOR) not in (None, str(os.getppid()))
 
     def watch() -> None:
         while not closed.wait(0.5):
