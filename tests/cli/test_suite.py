@@ -55,7 +55,7 @@ def test_the_cells_of_every_scale_make_sense_for_their_worlds():
         assert (cells[f"{place}/right/reading"] is None) == (world.use == suite.ADAPT)
         assert (cells[f"{place}/right/heuristic"] is None) == (name != "zoo_region")
         assert (cells[f"{place}/one_cue/relative"] is None) == has_cues
-        assert cells[f"{place}/one_cue/scalar"] and cells[f"{place}/wrong/none"]
+        assert all(cells[f"{place}/{name}"] for name in ("one_cue/scalar", "wrong/none"))
         biased = suite.Cell(world, "biased", table["teachers"]["biased"], "relative", (25,), 1).config().scalars
         assert biased.teacher_bias_deg == biased.eps_deg > 0
         assert cells[f"{place}/wrong/scalar"] is None
