@@ -61,4 +61,4 @@ def check_actions(actions: Any, whose: str) -> None:
     tell()
     actions = np.asarray(actions)
     if not (actions if actions.dtype == bool else np.isfinite(actions)).all():
-        raise UserError(f"{whose} gave actions that are not finite, or zero: give a direction in every situation")
+        raise UserError(f"{whose} gave actions that are not finite, or directions of length 0: give actions everywhere")

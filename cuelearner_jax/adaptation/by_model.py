@@ -65,14 +65,14 @@ class AdaptationResult:
     @property
     def words(self) -> list[str]:
         """The result line by line: of each lane what a reading found, whether the correction is used, and why."""
-        lines, unit, valid = [], actions_of(self.of.env).unit, self.labels.valid
+        lines, space, valid = [], actions_of(self.of.env), self.labels.valid
         for lane in range(self.lanes.number):
             _, seed, budget, bound = (column[lane] for column in self.lanes)
             result = self.results[lane] if self.results else None
-            within = "" if result else f" within {bound:g} {unit}"
+            within = "" if result and bound >= space.reach else f" within {bound:g} {space.unit}"
             sentences = ["No question was answered."] if not valid[lane].any() else result.words() if result else []
             if result is None or result.changed:
-                sentences.append(self._verdict(lane, unit))
+                sentences.append(self._verdict(lane, space.unit))
             lane_of = f", seed {seed}" if self.lanes.number > 1 else ""
             lines += [f"{budget} labels{within}{lane_of}: {line}" for line in sentences]
         return lines

@@ -86,9 +86,10 @@ def adapt(
     """
     tell, total, space = watch("labels"), int(lanes.budget.sum()), actions_of(of.env)
     rows, results, total_before = [], [], 0
-    for base, seed, budget, _ in zip(*(column.tolist() for column in lanes), strict=True):
+    for base, seed, budget, bound in zip(*(column.tolist() for column in lanes), strict=True):
         observation = getattr(of.env, "observation", ())
-        reading = Reading(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation)
+        within = bound if bound < space.reach else np.inf
+        reading = Reading(of.bases.lane(base), of.family, space, float(of.scalars.eps_deg), budget, observation, within)
         if labels is None:
             assert teacher is not None
             progress = lambda count, before=total_before: tell(before + count, total)  # noqa: E731

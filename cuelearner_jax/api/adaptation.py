@@ -32,6 +32,7 @@ from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import ReadingGuide
 from cuelearner_jax.policies import ONNX, Common, policy_of
+from cuelearner_jax.policies.user import Foreign
 from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space, cues_from
@@ -104,10 +105,13 @@ class AdaptedPolicy(CallablePolicy):
         """
         if self.world is None:
             raise UserError("a policy folder names its world, and an environment has no name: adapt in one of cl.make")
-        base: Any = self.outcome.subject.bases
-        base = getattr(base.policy, "function", base.policy)
-        of = base if hasattr(base, "__qualname__") else type(base)
-        subject = self.outcome.subject._replace(origin={"code": f"{base.__module__}:{of.__qualname__}"})
+        base: Any = self.outcome.subject.bases.policy
+        while getattr(base, "base", None) is not None:
+            base = base.base
+        base = getattr(base, "function", base)
+        name = getattr(base, "__qualname__", type(base).__qualname__)  # of a foreign policy its file
+        origin = {"code": name if isinstance(base, Foreign) else f"{base.__module__}:{name}"}
+        subject = self.outcome.subject._replace(origin=origin)
         with policy_folders.place_of(Path(folder), overwrite) as place:
             self.outcome._replace(subject=subject).write(place)
 
@@ -142,14 +146,14 @@ def adapt(
         world: the world that the policy acts in; a bare environment will do.
         teacher: a teacher; or a function or a policy, which teaches what it does itself; None where labels are given.
         labels: number of questions (default: 100 of a reading, else 500); or labels: arrays, or a label file.
-        bound_deg: how far corrections may lead from the policy's own actions [deg] (default: the scenario's, as far as
-            given labels reach, or else 45).
+        bound_deg: how far corrections may lead from the policy's own actions [deg] (default: the scenario's; of a
+            reading none; else as far as given labels reach, or 45).
         eps_deg: strength of an answer [deg] (default: as labels, scenario or training had it).
         guidance: kind of guidance (default: the scenario's or "reading").
         sizes, scalars: settings of the model and its fitting, of refinement and of the teacher's faults.
         seed: seed of all random numbers.
-        judge_by: a metric, or "labels" (default: the scenario's or the task's; of a reading "labels"). Or a function of
-            two film files (.gif) of the same start: -1 where the left one is better, 1 where the right one is, else 0.
+        judge_by: a metric (more is better), or "labels" (default: the scenario's or the task's; of a reading "labels").
+            Or a function of two films (.gif) of one start: -1 where the left one is better, 1 the right one, else 0.
         judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
@@ -216,7 +220,7 @@ def correct(
             file in ONNX or of a folder of ours, or a policy.
         labels: `Labels(observations, actions, answers)` as arrays, or a label file.
         bound: how far corrections may lead from the policy's own actions, in shares of the range of each entry, or the
-            space's unit (default: as far as the labels reach).
+            space's unit (default: of a reading none, else as far as the labels reach).
         eps: strength of an answer, in the same unit (default: the file's, or 1/36 of the range).
         guidance: how answers are used: "reading" finds what changed, "relative" fits a network.
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
@@ -263,7 +267,7 @@ def agreement(
         policy: any policy that `correct` takes or returns.
         labels: answers that the policy was not corrected by, as `correct` takes them.
         base: the policy as it was (default: what a corrected policy corrects).
-        eps: strength of an answer (default: the file's, the corrected policy's, or 1/36 of the range).
+        eps: strength of an answer (default: the file's, that of `correct` or `adapt`, or 1/36 of the range).
         space: space of the actions (default: the file's, or that of the corrected policy).
     """
     own = as_policy(policy)
@@ -273,7 +277,8 @@ def agreement(
         space = policy.actions
     file = _labels(labels, space)
     if eps is None and (eps := file.eps) is None:
-        eps = float((getattr(own, "scalars", None) or plain_scalars(file.space)).eps_deg)
+        source = policy.outcome.request if isinstance(policy, AdaptedPolicy) else own
+        eps = float((getattr(source, "scalars", None) or plain_scalars(file.space)).eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base)
     base = None if base is None else policy_of(base, file.space)
     return agreement_of(policy_of(own, file.space), file.labels, file.space, eps, base)

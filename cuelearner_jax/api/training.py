@@ -55,7 +55,8 @@ class Run:
             raise UserError(f"no lane with seed {seed} and {labels} labels was trained")
         agent = training.policies(view_of(group.env)).lane(int(lanes[0]))
         lane = {"guidance": name, "labels": budget, "seed": seeds[0]}
-        return CallablePolicy(agent, self.world.observation, actions=self.world.actions, lane=lane)
+        world = self.world
+        return CallablePolicy(agent, world.observation, False, self.config, world.actions, world, lane)
 
 
 @user_code.report_user_errors

@@ -24,7 +24,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.task import PAPER, Body, Preset, Task
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.types import EnvState, Policy, Step, Teacher
+from cuelearner_jax.types import EnvState, Step, Teacher
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,12 +137,11 @@ def from_gymnasium(
 
 
 @user_code.report_user_errors
-def teacher_of(source: World | Policy) -> Teacher:
+def teacher_of(source: World | Any) -> Teacher:
     """Return the teacher of a world, or a teacher that shows what a given policy does."""
     if isinstance(source, World):
         return source.task.make_teacher(source.config, source.env)
-    # `CallablePolicy` is above this module, so its `policy` is looked up by name
-    return Teaching(policy_of(getattr(source, "policy", source)))
+    return Teaching(policy_of(source.policy if hasattr(source, "asks") else source))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,5 +171,4 @@ def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
 
 def teacher_of_world(value: Any, space: Space) -> Teacher:
     """Return a teacher: the given one, or one that shows what a given policy does itself."""
-    is_teacher = callable(getattr(value, "best_action", None))
-    return teaching(value if is_teacher else getattr(value, "policy", value), space)  # that of a `CallablePolicy`
+    return teaching(value.policy if hasattr(value, "asks") else value, space)  # `CallablePolicy` is above this module

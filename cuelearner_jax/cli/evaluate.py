@@ -196,6 +196,7 @@ def _verdict(difference: Difference) -> str:
     """Return a sentence on which metrics' differences exclude 0."""
     names = {"excludes": [], "includes": []}
     for name, less in difference.metrics.items():
-        names["excludes" if less.excludes_zero else "includes"].append(name)
+        if not np.isnan(less.lower):
+            names["excludes" if less.excludes_zero else "includes"].append(name)
     parts = [f"{verb} 0 for {', '.join(metrics)}" for verb, metrics in names.items() if metrics]
-    return f"The 95% interval of the difference {'; '.join(parts)}."
+    return f"The 95% interval of the difference {'; '.join(parts) or 'needs more episodes'}."

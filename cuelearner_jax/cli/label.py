@@ -149,7 +149,7 @@ def make_plan(task: Task, config: RunConfig, options: LabelOptions, source: Poli
     check_numbers(options, labels=(1, MOST_LABELS), seed=(0, LARGEST_SEED - 1), port=(0, 65535))
     if settings.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but the page takes situations as they come: leave it out")
-    usual, task = task.bodies[0].name, task.on(options.robot)
+    usual, task = task.bodies[0].name, task.on(options.robot or (source and source.task.robot) or None)
     body = task.bodies[0]
     if task.pictures(UNDRAWN).sketch is None:
         raise UserError(f"{task.name} has no sketch of a situation: {UNDRAWN}")
@@ -206,8 +206,8 @@ def _second(plan: SessionPlan, options: LabelOptions, path: Path) -> SessionPlan
         raise UserError(f"{path} was not written by the labelling page: its questions cannot be asked again")
     if options.policy is not None or options.seed or options.bound_deg is not None:
         raise UserError("--again repeats another page's questions: leave out the policy, --seed and --bound-deg")
-    world = file.task | {"robot": file.session.get("robot", "")}
-    for name, value in (plan.world | {"robot": plan.robot}).items():
+    world = file.task | {"robot": file.session.get("robot", ""), "answers": file.answers, "eps": file.eps}
+    for name, value in (plan.world | {"robot": plan.robot, "answers": plan.form.name, "eps": plan.eps}).items():
         if (before := world.get(name)) != value:
             raise UserError(f"{path} asked in a world with another {name} ({before!r}, not {value!r}): give the same")
     place = label_files.found_in(path)
@@ -293,15 +293,16 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
     if policy is None and options.questions == PROPOSED:
         return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'
     if policy is None:
-        words, place = ["train", name, "--preset", preset], "runs"
+        words, place, again = ["train", name, "--preset", preset], "runs", ("robot",)
         parts = {"task": task.config, "sizes": GuideSizes, "scalars": GuideScalars}
     else:
-        is_folder = shipped.is_shipped(policy) or Path(policy).exists()
-        words, place = ["adapt", policy, *([] if is_folder else ["--task", name])], "policies"
+        is_folder = shipped.is_shipped(policy) or Path(policy).is_dir()
+        words, place, again = ["adapt", policy], "policies", ("preset", "scenario", "robot", "changes")
+        words += [] if is_folder else ["--task", name]
+        lane = {key: value for key, value in vars(options.base).items() if value not in (None, ())}
+        words += as_options("base", lane)
         parts = {"task": task.config}
-        for option in ("scenario", "robot", "changes"):
-            if (value := getattr(options, option)) is not None:
-                words += [f"--{option}", value]
+    words += [word for option in again if (value := getattr(options, option)) for word in (f"--{option}", value)]
     words += ["--guidance", options.guidance, "--labels-from", out, "--labels", str(labels)]
     for part, kind in parts.items():
         before, now = (_values(kind, getattr(of, part)) for of in (config, options))

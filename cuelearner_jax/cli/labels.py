@@ -12,13 +12,12 @@ import tyro
 from rich.table import Table
 
 from cuelearner_jax.cli.options import Flag, out, parse
-from cuelearner_jax.config import Scalars, from_json
+from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError, one_line
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import UNDONE, UNSURE, LabelFile
-from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console
 
@@ -45,9 +44,7 @@ class Inspect:
         for name in dict.fromkeys(name for facts in columns for name in facts):
             table.add_row(name, *(one_line(facts.get(name, "")) for facts in columns))
         if len(files) == 2:
-            task = registry.find(str(files[0].task.get("name")))
-            env = shape_of(task, from_json(task.config, files[0].task))
-            table.add_row("agree with each other", str(comparing.between(files[0], files[1], env)))
+            table.add_row("agree with each other", str(comparing.between(*files)))
         out.print_table(table)
 
 

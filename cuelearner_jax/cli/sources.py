@@ -84,7 +84,7 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
     if word is not None:
         folder = shipped.folder_of(word)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
-        if holds or (folder.exists() and word not in registry.names()):
+        if holds or (folder.is_dir() and word not in registry.names()):
             source = source_in(folder, task, base, ahead.changes)
             return dataclasses.replace(source, task=_with_teacher(source.task, ahead.teacher))
         if is_code(word) and (task is not None or is_policy or ahead.labels_from is not None):
@@ -170,7 +170,9 @@ def _with_teacher(task: Task, reference: str | None) -> Task:
     if reference is None:
         return task
     code = plugins.load(reference, object, "a teacher")
-    return dataclasses.replace(task, teacher=lambda config, env: teaching(code, actions_of(env)), brief_teacher=None)
+    files = lambda config: {**task.files(config), "teacher": reference}  # noqa: E731
+    teacher = lambda config, env: teaching(code, actions_of(env))  # noqa: E731
+    return dataclasses.replace(task, teacher=teacher, brief_teacher=None, files=files)
 
 
 def is_code(word: str) -> bool:

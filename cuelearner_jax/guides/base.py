@@ -102,14 +102,19 @@ class Guide:
         return GuidanceModel(self.network.init(key), jnp.array(False))
 
     def examples(self, labels: Label, scalars: GuideScalars) -> Any:
-        """Return labels (slots, ...) with their targets; a label that names no cue is not valid."""
+        """Return labels (slots, ...) with their targets; a label that names no cue is not valid.
+
+        A cue that no label names counts in all of them, as no change: its output would keep its random start.
+        """
         targets = jax.vmap(lambda label: self.target(label, scalars))(labels)
         # Rounded here: fused with later operations, the targets' last bits would depend on the compiler.
         rows = Example(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
         if self.form is None or not self.form.by_eps or len(self.spaces.actions.cues) == 1:
             return rows
         cues = is_answered(labels.answer)
-        return rows.replace(valid=labels.valid & cues.any(-1), cues=cues, space=self.spaces.actions)
+        valid = labels.valid & cues.any(-1)
+        never = ~cues.any(0, where=valid[:, None], keepdims=True)
+        return rows.replace(valid=valid, cues=cues | never, space=self.spaces.actions)
 
     def augmented(self, key: PRNGKeyArray, batch: Any) -> Any:
         """Return the batch to train on in place of a batch (n, ...) of examples."""
@@ -138,7 +143,8 @@ class Guide:
         Source: DAgger (Ross, Gordon, Bagnell, 2011): what is asked about follows what will be met.
         """
         refines = jax.random.bernoulli(key, scalars.refined_fraction)
-        return self.act(model, env, obs[None], base[None], refines[None], scalars).actions[0]
+        after = self.act(model, env, obs[None], base[None], refines[None], scalars).actions
+        return self._in_question(base[None], after)[0]
 
     def disagreement(self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions) -> Float[Array, " n"]:
         """Return the variance of an ensemble's members, summed over their outputs."""
@@ -163,7 +169,12 @@ class Guide:
         """Return `act`, limited to within `bound` of the given actions for every kind."""
         space = self.spaces.actions
         refinement = self.act(model, env, obs, actions, active, bound_scalars(space, scalars, bound))
-        return refinement._replace(actions=space.clip(refinement.actions, actions, bound))
+        return refinement._replace(actions=self._in_question(actions, space.clip(refinement.actions, actions, bound)))
+
+    def _in_question(self, actions: Actions, after: Actions) -> Actions:
+        """Return actions after a correction; entries that nobody is asked about are as before."""
+        asks, by_eps = [cue.is_asked for cue in self.spaces.actions.cues], self.form is not None and self.form.by_eps
+        return after if all(asks) or not by_eps else jnp.where(jnp.array(asks)[None], after, actions)
 
     def refined(
         self,

@@ -156,8 +156,9 @@ class Clic(Guide):
     def examples(self, labels: Label, scalars: GuideScalars) -> Contrast:
         """Return labels (slots, ...) as contrasts; a label that names no cue is not valid."""
         numbers, valid = jnp.arange(len(labels.valid)), says_something(labels.answer) | self.form.is_action
-        base = labels.action if labels.base is None else labels.base
-        return Contrast(labels.obs, labels.action, labels.answer, labels.valid & valid, numbers, base)
+        base, valid = labels.action if labels.base is None else labels.base, labels.valid & valid
+        never = ~is_answered(labels.answer).any(0, where=valid[:, None], keepdims=True) & (not self.form.is_action)
+        return Contrast(labels.obs, labels.action, jnp.where(never, 0.0, labels.answer), valid, numbers, base)
 
     def augmented(self, key: PRNGKeyArray, batch: Contrast) -> Contrast:
         """Return the batch with new random streams for sampling."""

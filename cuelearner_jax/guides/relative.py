@@ -8,7 +8,7 @@ directions and for choices in a row. Of a label (s, a, h), h of each cue in {-1,
     a <- clip(retract(a + phi(s, a)), a_0, tau_max), until a pass moves a by less than tau, K_max passes at most (`act`)
 
 The network predicts corrections in units of eps, so that a small eps fits as easily as a large one. A cue of which
-nothing was said adds no loss: "not said" is no "right".
+nothing was said adds no loss: "not said" is no "right". Only a cue that no label names counts as no change.
 """
 
 from __future__ import annotations

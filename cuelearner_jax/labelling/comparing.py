@@ -60,10 +60,10 @@ def with_teacher(
     guides = [(situations[item], items[item][1]) for item in file.people.item]
     about = zip(guides, answers, strict=True)
     theirs = np.stack([one(env, teacher, guide.env, guide.obs, action, answer) for (guide, action), answer in about])
-    return agreement(form, env, answers, theirs)
+    return agreement(form, file.space, answers, theirs)
 
 
-def between(one: LabelFile, other: LabelFile, env: Any) -> AnswerAgreement:
+def between(one: LabelFile, other: LabelFile) -> AnswerAgreement:
     """Return how well two files agree on the questions both answered (equal observation and action)."""
     form = form_of(one)
     if form is None or (one.answers, one.space, one.eps) != (other.answers, other.space, other.eps):
@@ -74,7 +74,7 @@ def between(one: LabelFile, other: LabelFile, env: Any) -> AnswerAgreement:
     mine, theirs = (dict(zip(_questions(file), np.asarray(file.labels.answer), strict=True)) for file in (one, other))
     pairs = [(mine[question], theirs[question]) for question in mine if question in theirs]
     both = np.array(pairs, np.float32).reshape(-1, 2, form.width(one.space))
-    return agreement(form, env, both[:, 0], both[:, 1])
+    return agreement(form, one.space, both[:, 0], both[:, 1])
 
 
 def _questions(file: LabelFile) -> list[bytes]:

@@ -26,7 +26,7 @@ from cuelearner_jax.feedback.answers import AnswerForm
 from cuelearner_jax.guides.fitting import held_out
 from cuelearner_jax.labelling.plan import SessionKeys, SessionPlan
 from cuelearner_jax.reading import Reading
-from cuelearner_jax.spaces import UNSAID
+from cuelearner_jax.spaces import UNSAID, Space
 from cuelearner_jax.types import EnvState, Label, Teacher
 
 Row = tuple[np.ndarray, np.ndarray, np.ndarray]  # observation, action and answer of a label
@@ -51,17 +51,17 @@ class AnswerAgreement(NamedTuple):
         return f"{self.value:.3g} {self.unit} apart over {self.count}"
 
 
-def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.ndarray) -> AnswerAgreement:
+def agreement(form: AnswerForm, space: Space, one: np.ndarray, other: np.ndarray) -> AnswerAgreement:
     """Compare answers (n, width) to the same questions; a cue counts where both sets say something."""
-    space = actions_of(env)
     if form.is_action:
         values = np.asarray(space.to_unit(space.distance(jnp.asarray(one), jnp.asarray(other))))
+    elif form.by_eps and len(space.cues) > 1:
+        both = (one != UNSAID) & (other != UNSAID)
+        values = ((one == other) | ~both).all(-1)[both.any(-1)]
     else:
-        alike = one == other
-        if form.by_eps and len(space.cues) > 1:
-            alike |= (one == UNSAID) | (other == UNSAID)
-        values = alike.all(-1)
-    return AnswerAgreement(float(values.mean()) if len(one) else 0.0, len(one), space.unit if form.is_action else "%")
+        values = (one == other).all(-1)
+    unit = space.unit if form.is_action else "%"
+    return AnswerAgreement(float(values.mean()) if len(values) else 0.0, len(values), unit)
 
 
 def as_teacher(
@@ -176,7 +176,8 @@ class Learner:
         if not all_finite(model):
             return self.newest._replace(labels=count, problem="the last fit diverged")
         apart = labels.valid & held_out(len(labels.valid))
-        quality = agreement(plan.form, of.env, np.asarray(answers(of, model, labels))[apart], labels.answer[apart])
+        predicted = np.asarray(answers(of, model, labels))[apart]
+        quality = agreement(plan.form, actions_of(of.env), predicted, labels.answer[apart])
         return Fitted(model, count, self.newest.number + 1, quality if quality.count else None)
 
     def _reading_of(self, rows: Sequence[Row]) -> Fitted:

@@ -53,6 +53,7 @@ class Reading:
         labels: expected number of labels, for which programs are compiled.
         observation: slices of the observation, for words. Where one is an action proposed elsewhere, there is no
             process, since what the proposal depends on, such as pictures, is not seen.
+        bound_deg: largest distance from the policy's own action, in use and in questions, in the space's unit.
     """
 
     def __init__(
@@ -63,11 +64,13 @@ class Reading:
         eps_deg: float,
         labels: int,
         observation: Sequence[Quantity] = (),
+        bound_deg: float = np.inf,
     ) -> None:
         if not space.cues:
             raise UserError(f"actions of {space.name} have no order, so no answer says more or less: give them cues")
         self.base, self.family, self.space = policy_of(policy, space), family, space
         self.eps, self.observation = float(space.from_unit(eps_deg)), tuple(observation)
+        self.bound = jnp.float32(space.from_unit(bound_deg))
         self.slots = labels
         self.rows: RelativeLabels | None = None  # all answers so far
         self.fits: Fit | None = None  # all hypotheses
@@ -98,7 +101,10 @@ class Reading:
         if self.fit is not None and self._reader is not None:
             spread = self._reader.spread(self.fit, rows)
         asks = jnp.array([cue.is_asked for cue in self.space.cues])
-        return index, np.asarray(_near(self.space, k_action, base, asks[None] * jnp.maximum(spread, self.eps / 2)))
+        action = _near(self.space, k_action, base, asks[None] * jnp.maximum(spread, self.eps / 2))
+        if np.isfinite(self.bound):
+            action = self.space.clip(action, self._acts(rows), self.bound)
+        return index, np.asarray(action)
 
     def learn(
         self,
@@ -137,7 +143,7 @@ class Reading:
         if self.fit is None:
             return unread(self.base, self.space, self.family, size) if size else self.base
         correction = fitting.correction(self.fit, self.eps)
-        return ReadingPolicy(self.base, correction, jnp.float32(jnp.inf), self.space, self.family)
+        return ReadingPolicy(self.base, correction, self.bound, self.space, self.family)
 
     def result(self) -> Result:
         """Return the verdict."""

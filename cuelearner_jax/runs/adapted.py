@@ -103,7 +103,8 @@ def open_folder(
     values = formats.read("policy", path)
     task, world = world_of(values["task"], find, path)
     *columns, in_use = (np.array(values["lanes"][name]) for name in COLUMNS)
-    return task, world, AdaptedLanes(folder, values, Lanes(*columns), in_use, values["rows"], code, changes)
+    lanes = AdaptedLanes(folder, values, Lanes(*columns), in_use, values["rows"], code, changes)
+    return task.on(values.get("robot")), world, lanes
 
 
 def write(

@@ -87,8 +87,8 @@ class AdaptRequest:
     labels: tuple[int, ...] = (500,)
     """Label budgets (default with --labels-from: all labels in the file)."""
     bound_deg: tuple[float, ...] = ()
-    """How far corrections may lead from the policy's own actions [deg]. One bound or several (default: the scenario's,
-    as far as the labels of a file reach, or else a quarter of the space's reach, 45)."""
+    """How far corrections may lead from the policy's own actions [deg]. One bound or several (default: the scenario's;
+    of `reading` none; else as far as the labels of a file reach, or a quarter of the space's reach, 45)."""
     seeds: str = "1"
     """Number of seeds, or a range such as 0:16, without its end. Several base policies are each adapted with their own
     seed, so leave this out then."""
@@ -97,8 +97,8 @@ class AdaptRequest:
     labels_from: Path | None = None
     """Label file to use instead of asking the teacher."""
     judge_by: str = "reward"
-    """What decides whether the correction is used: labels (default of `reading`), a metric such as success on tuning
-    episodes, or person: you, by films of both policies side by side. What is not shown to be better is not used."""
+    """What decides whether the correction is used: labels (default of `reading`), a metric of which more is better,
+    as success on tuning episodes, or person: you, by films. What is not shown to be better is not used."""
     judge_episodes: int = 50
     """Largest number of tuning episodes for judging a policy; 100 steps each where the task counts steps."""
     judge_bounds: tuple[float, ...] = ()
@@ -247,6 +247,8 @@ class AdaptRequest:
         names = ["reward", *step.metrics, *step.outcome, LABELS, PERSON]
         if by not in names:
             raise UserError(f"judge_by is {by!r}, which is not a metric of {task.name}{suggestion(by, names)}")
+        if by in judging.LESS:
+            raise UserError(f"judge_by is {by!r}, of which less is better: give one of which more is, as reward")
         if by != LABELS:
             env = task.environment(self.task, judging.SPLIT)
         if by == PERSON:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
@@ -174,12 +175,25 @@ def test_training_from_python_gives_what_the_command_gives(folder):
     how = {"guidance": ["relative"], "labels": [10], "seeds": [3, 5], "progress": False}
     run = cl.train(WORLD, TEACHER, probes.CONFIG, **how)
     assert rows_of(run.results.to_pylist(), COLUMNS) == rows_of(results.read(folder).to_pylist(), COLUMNS)
-    assert run.policy(guidance="relative", seed=5)(SEEN).shape == (200, 2)
+    policy = run.policy(guidance="relative", seed=5)
+    assert policy(SEEN).shape == (200, 2)
+    assert (policy.trained, policy.world) == (run.config, WORLD)
     assert cl.read_run(folder).equals(results.read(folder))
     last = {row["seed"]: row["reward"] for row in run.results.sort_by("step").to_pylist()}
     assert run.policy().lane == {"guidance": "relative", "labels": 10, "seed": max(last, key=last.get)}
     with pytest.raises(cl.UserError, match="no lane with seed 9"):
         run.policy(seed=9)
+
+
+def test_a_teacher_is_asked_itself_whatever_it_calls_policy():
+    class Turning:
+        policy = staticmethod(lambda obs: obs)
+
+        def __call__(self, obs):
+            return -np.asarray(obs)
+
+    for teacher in (cl.teacher_of(Turning()), cl.api.worlds.teacher_of_world(Turning(), WORLD.actions)):
+        np.testing.assert_array_equal(teacher.best_action(None, jnp.asarray(SEEN[0])), -SEEN[0])
 
 
 def test_what_is_left_out_of_a_training_is_as_the_preset_has_it(monkeypatch):

@@ -1,6 +1,7 @@
 """A policy corrected by labels alone: better on other situations, saved and loaded, judged by answers it never saw."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -79,6 +80,10 @@ def test_it_agrees_with_more_answers_that_it_never_saw(better):
     assert found.difference[0] == pytest.approx(found.policy[0] - found.base[0])
     assert found.right[0] == pytest.approx((asked(100, seed=5).answer == 0).mean(), abs=1e-6)
     assert any("always already right" in line for line in found.words())
+    reads = better.outcome.request
+    other = better.outcome._replace(request=dataclasses.replace(reads, scalars=Scalars(eps_deg=2 * EPS)))
+    twice = dataclasses.replace(better, outcome=other)  # as of a reading, what corrects knows no strength of answers
+    assert cl.agreement(twice, asked(100, seed=5)) == cl.agreement(better, asked(100, seed=5), eps=2 * EPS)
 
 
 def test_agreement_counts_what_was_said_alone():
@@ -117,6 +122,8 @@ def test_it_can_be_corrected_again(better, tmp_path):
     how = {"eps": EPS, "bound": 0.1, "scalars": FAST, **NETWORK}
     again = cl.correct(better, asked(60, seed=3), **how)
     again.save(tmp_path / "again")
+    named = json.loads((tmp_path / "again" / "policy.json").read_text())["of"]
+    assert named == {"code": f"{off.__module__}:off"}
     np.testing.assert_allclose(cl.load_policy(tmp_path / "again", base=off)(OTHERS), again(OTHERS), atol=1e-6)
     with pytest.raises(cl.UserError, match="corrected with other bounds or cues before"):
         cl.correct(better, asked(60), low=LOW, high=(1.0, 1.0, 1.0), **how)

@@ -304,6 +304,13 @@ def test_what_is_no_environment_is_told_in_one_line(make, words):
         cl.from_gymnasium(make, num_envs=1, processes=1)
 
 
+def test_an_instance_cannot_be_given_in_place_of_a_class():
+    one = Adder()
+    world = cl.from_gymnasium(lambda: one, processes=1)
+    with pytest.raises(UserError, match="the same instance each time: let the function make a new environment"):
+        cl.measure(lambda obs: 0 * obs[:, :1], world, episodes=2)
+
+
 def test_episodes_that_all_begin_alike_are_told_once(capsys):
     cl.from_gymnasium(World, num_envs=1, processes=1)
     assert capsys.readouterr().err.count("all episodes begin alike, whatever their seed") == 1

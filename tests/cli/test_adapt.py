@@ -157,6 +157,9 @@ def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path, capsys):
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
     refused([*plain, "--judge-by", "hits"], "not a metric of turned, did you mean 'hit'", tmp_path)
     refused([*plain, "--judge-bounds", "0.5", "--judge-by", "labels"], "judge_bounds needs episodes", tmp_path)
+    refused(["adapt", "shipped:arm", "--judge-by", "distance", *new], "of which less is better", tmp_path)
+    (tmp_path / "policy.onnx").touch()
+    refused(["adapt", tmp_path / "policy.onnx", *TASK, *new], "policy.onnx", tmp_path)
     refused([*plain, "--base.seed", "3"], "leave out the options that choose a lane", tmp_path)
     refused([*CODE, "--out", adapted], "is not empty: give --overwrite", adapted)
     refused([*CODE, "--out", adapted.parent, "--overwrite"], "is not a policy folder", adapted)
@@ -175,6 +178,9 @@ def test_what_cannot_be_is_refused(adapted, forget, refused, tmp_path, capsys):
     values = {name: value for name, value in told.items() if name not in ("format", "digest")}
     formats.write("policy", mixed / "policy.json", {**values, "arrays": "0" * len(told["arrays"])})
     with pytest.raises(cl.UserError, match="holds the arrays of another policy"):
+        load(mixed)
+    formats.write("policy", mixed / "policy.json", {**values, "robot": "legs"})
+    with pytest.raises(cl.UserError, match="has no robots to choose from"):  # it is read
         load(mixed)
 
 

@@ -140,10 +140,13 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
     assert words[:5] == ["cuelearner", "adapt", *POLICY, "--scenario", "turned_lidar"]
     assert "--task.lidar-rotation-deg" not in words
     assert asked.labels == 500
-    asked, _, commands = asked_for(monkeypatch, "navigation", *policy)
+    asked, _, commands = asked_for(monkeypatch, "navigation", *policy, "--base.seed", "3", "--robot", "anymal")
     assert (asked.labels, asked.bound_deg, asked.scalars.eps_deg) == (100, None, 2.0)
     words = shlex.split(commands.following(7))
-    assert words[words.index("--guidance") + 1] == "reading"
+    for pair in (["--guidance", "reading"], ["--base.seed", "3"], ["--robot", "anymal"]):
+        assert words[words.index(pair[0]) + 1] == pair[1]
+    _, _, commands = asked_for(monkeypatch, "navigation", "--robot", "anymal", "--out", str(tmp_path))
+    assert "--robot anymal" in commands.following(7)
 
 
 def test_a_run_of_another_task_is_no_policy_here(run_folder, refused, tmp_path):

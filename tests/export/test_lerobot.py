@@ -135,11 +135,11 @@ def test_a_checkpoint_of_another_robot_is_refused(robot, more, told, env, policy
     assert not (tmp_path / "after").exists()
 
 
-def evaluation(folder, successes):
-    """Write what `lerobot-eval` writes of one task."""
+def evaluation(folder, *each):
+    """Write what `lerobot-eval` writes of tasks with these successes."""
     folder.mkdir()
-    task = {"task_group": "pusht", "task_id": 0, "metrics": {"successes": successes}}
-    (folder / "eval_info.json").write_text(json.dumps({"per_task": [task]}))
+    tasks = [{"task_group": "pusht", "task_id": n, "metrics": {"successes": own}} for n, own in enumerate(each)]
+    (folder / "eval_info.json").write_text(json.dumps({"per_task": tasks}))
     return folder
 
 
@@ -150,6 +150,11 @@ def test_paired_episodes_tell_which_checkpoint_is_better(tmp_path):
     after = evaluation(tmp_path / "after", [True] * 10)
     assert judging.judge(before, after) == "better after 8 of 10 pairs of episodes: success 0.10 -> 1.00"
     assert judging.judge(after, before).startswith("worse after 8 of 10")
+    lost, won = [[False] * 10], [[True] * 10]  # the first of ten tasks is won, the others are lost
+    pair = evaluation(tmp_path / "one", *lost, *9 * won), evaluation(tmp_path / "other", *won, *9 * lost)
+    told = judging.judge(*pair)
+    assert told.startswith("worse")
+    assert told.endswith("of 10 pairs of episodes of each task: success 0.90 -> 0.10")
     with pytest.raises(SystemExit, match="evaluate both alike"):
         judging.judge(before, evaluation(tmp_path / "short", [True] * 3))
     with pytest.raises(SystemExit, match="holds no results"):

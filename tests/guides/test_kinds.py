@@ -15,7 +15,7 @@ from scipy.stats import spearmanr
 from cuelearner_jax import asking
 from cuelearner_jax.guides import dcoach, registry, scalar
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.spaces import DIRECTIONS, directions
+from cuelearner_jax.spaces import DIRECTIONS, UNSAID, Box, Cue, directions
 from cuelearner_jax.types import Label
 
 ENV = probes.Window()
@@ -149,6 +149,22 @@ def test_answers_that_are_missing_are_no_corrections():
     moved = jax.tree.map(lambda leaf: leaf[order], given)
     chex.assert_trees_all_equal(gaps, fit(KEY, ENV, first(20, moved), fresh, SCALARS))
     assert not bool(fit(KEY, ENV, first(0, given), fresh, SCALARS).fitted)
+
+
+@pytest.mark.parametrize("kind", ["relative", "clic"])
+def test_entries_that_nobody_is_asked_about_stay_and_those_of_which_nothing_is_said_hardly_move(kind):
+    words = {"x": ("right", "left"), "y": ("", ""), "z": ("up", "down")}
+    space = Box((-1.0,) * 3, (1.0,) * 3, tuple(Cue(name, both, (), "shares") for name, both in words.items()))
+    env, random = SimpleNamespace(actions=space, obs_size=3), np.random.default_rng(0)
+    guide, obs = registry.make(kind, SIZES, env), random.uniform(-1, 1, (60, 3)).astype(np.float32)
+    action = obs / 2  # the policy's own
+    answer = np.stack([np.sign(obs[:, 0] - action[:, 0]), *np.full((2, 60), UNSAID)], -1).astype(np.float32)
+    given, scalars = labels(*map(jnp.asarray, (answer, obs, action))), dataclasses.replace(SCALARS, eps_deg=0.1)
+    model = guide.fit(KEY, env, given, guide.init(KEY), scalars)
+    acted = guide.act_within(jnp.array(0.5), model, env, given.obs, given.action, given.valid, scalars).actions
+    moved = np.abs(np.asarray(acted) - action).mean(0)
+    assert moved[1] == 0
+    assert 0 < moved[2] < 0.1 * moved[0]
 
 
 def test_a_correction_moves_the_policy_its_way_by_eps(monkeypatch):

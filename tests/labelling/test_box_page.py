@@ -97,9 +97,9 @@ def test_what_a_page_cannot_ask_is_refused():
 
 
 def test_agreement_counts_the_cues_of_which_both_say_something():
-    env = TASK.environment(TASK.presets["paper"].config.task)
-    one = np.array([[1, 0, UNSAID], [1, 0, 0], [0, 0, 0]], np.float32)
-    other = np.array([[1, UNSAID, -1], [1, 0, -1], [0, 0, 0]], np.float32)
-    assert str(agreement(RELATIVE, env, one, other)) == "67% of 3"
-    apart = agreement(DEMONSTRATION, env, np.zeros((1, 3), np.float32), np.array([[0.0, 1.0, 0.0]], np.float32))
+    space = TASK.environment(TASK.presets["paper"].config.task).actions
+    one = np.array([[1, 0, UNSAID], [1, 0, 0], [0, 0, 0], [1, UNSAID, UNSAID]], np.float32)
+    other = np.array([[1, UNSAID, -1], [1, 0, -1], [0, 0, 0], [UNSAID, 1, UNSAID]], np.float32)  # the last share no cue
+    assert str(agreement(RELATIVE, space, one, other)) == "67% of 3"
+    apart = agreement(DEMONSTRATION, space, np.zeros((1, 3), np.float32), np.array([[0.0, 1.0, 0.0]], np.float32))
     assert str(apart) == "0.25 shares apart over 1"

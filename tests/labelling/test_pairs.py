@@ -77,9 +77,9 @@ def test_pairs_of_a_page_are_those_of_a_simulated_teacher_and_train_an_agent(ope
     for name in ("obs", "action", "answer"):
         np.testing.assert_allclose(getattr(file.labels, name), getattr(after.labels, name)[:10], atol=1e-6)
     labels = str(tmp_path / "labels")
-    assert str(comparing.between(file, file, ENV)) == "100% of 10"
+    assert str(comparing.between(file, file)) == "100% of 10"
     other = file._replace(labels=file.labels.replace(answer=file.labels.answer * np.float32([1, -1, -1])))
-    assert comparing.between(file, other, ENV).count == 0  # of the same first actions, but other pairs
+    assert comparing.between(file, other).count == 0  # of the same first actions, but other pairs
     train = ["train", OWN, "--preset", "paper", "--labels", "10", "--labels-from", labels, "--guidance"]
     assert main([*train, "preference", "--out", str(tmp_path / "run")]) == 0
     again = label_files.read(tmp_path / "run" / "preference")

@@ -113,6 +113,12 @@ def test_random_answers_use_no_correction():
     assert read(None, policy=jumping).result().words() == ["The answers ask for no change."]
 
 
+def test_questions_stay_within_a_bound():
+    reading, obs = Reading(policy, (), BOX, EPS, LABELS, bound_deg=EPS), near(0)
+    index, action = reading.questions(obs, 40, jax.random.key(0))
+    assert np.abs(BOX.log(policy(obs[index]), action)).max() == pytest.approx(EPS, abs=1e-5)
+
+
 def test_of_wide_observations_no_array_is_large():
     reader, (plain, _) = fitting.Reader(BOX, (), lambda obs: obs[:, :3], EPS), fitting.unfitted(BOX, (), 1024)
 

@@ -51,6 +51,8 @@ def test_a_share_of_all_episodes_has_an_interval():
     lost = row._replace(metrics={"success": np.zeros(2)}, each={"success": np.zeros((2, 50))})
     assert measurements.spread(lost, "success") == pytest.approx((0, 0, 0.019), abs=1e-3)
     assert measurements.spread(row._replace(is_shared=True), "success") == pytest.approx((1, 0.962, 1), abs=1e-3)
+    sums = measured([1])._replace(metrics={"return": np.zeros(1)}, each={"return": np.zeros((1, 50))})  # no share
+    assert measurements.spread(sums, "return") == (0, 0, 0)
 
 
 def test_a_difference_of_two_policies_is_paired_by_episode():

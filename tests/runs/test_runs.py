@@ -6,6 +6,7 @@ import numpy as np
 import probes
 import pytest
 
+from cuelearner_jax.cli.sources import _with_teacher
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import grid as runs
@@ -61,6 +62,9 @@ def test_a_run_of_another_robot_is_described_and_comes_back_on_that_robot(out, t
     assert runs.load(out, lambda name: two)[0] is two
     with pytest.raises(UserError, match="was run with other values of robot: give the same options"):
         check_folder(out, described(task=two.on("other")), resume=True, overwrite=False)
+    taught = _with_teacher(TASK, "probes:Expert")
+    with pytest.raises(UserError, match="was run with other values of files"):
+        check_folder(out, described(task=taught), resume=True, overwrite=False)
 
 
 @pytest.mark.parametrize(

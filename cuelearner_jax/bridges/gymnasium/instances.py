@@ -294,6 +294,9 @@ class Instances:
 
     def _new(self) -> Running:
         one = Running(self.make, self.whose, self.max_steps)
+        inner = lambda each: getattr(each.env, "unwrapped", each.env)  # noqa: E731
+        if any(inner(one) is inner(other) for other in self.running):
+            raise UserError(f"{one.whose} is the same instance each time: let the function make a new environment")
         size = sum(leaf.size for leaf in one.leaves)
         if size != self.size:
             raise UserError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 
 STAKES = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9)  # of the test's bets, as shares of its capital
@@ -20,14 +21,19 @@ def judge(before: Path, after: Path) -> str:
     sizes = [{task: len(each) for task, each in one.items()} for one in pair]
     if sizes[0] != sizes[1]:
         raise SystemExit(f"{before} and {after} hold other tasks or numbers of episodes: evaluate both alike")
-    wins = [b - a for task in pair[0] for a, b in zip(pair[0][task], pair[1][task], strict=True)]
-    verdict, episodes = decide(wins)
-    rates = [sum(map(sum, one.values())) / len(wins) for one in pair]
-    return f"{verdict} after {episodes} of {len(wins)} pairs of episodes: success {rates[0]:.2f} -> {rates[1]:.2f}"
+    each = [[b - a for a, b in zip(pair[0][task], pair[1][task], strict=True)] for task in pair[0]]
+    rounds = [[win for win in wins if win is not None] for wins in zip_longest(*each)]  # an episode of each task
+    verdict, episodes = decide([sum(wins) / len(wins) for wins in rounds])
+    rates, of_each = (
+        [sum(map(sum, one.values())) / sum(map(len, each)) for one in pair],
+        " of each task" * (len(each) > 1),
+    )
+    what = f"{verdict} after {episodes} of {len(rounds)} pairs of episodes{of_each}"
+    return f"{what}: success {rates[0]:.2f} -> {rates[1]:.2f}"
 
 
-def decide(wins: Sequence[int]) -> tuple[str, int]:
-    """Return the verdict over differences of success (-1, 0 or 1) in their order, and after how many it stood."""
+def decide(wins: Sequence[float]) -> tuple[str, int]:
+    """Return the verdict over differences of success (-1 to 1) in their order, and after how many it stood."""
     better, worse = [1.0] * len(STAKES), [1.0] * len(STAKES)
     for number, win in enumerate(wins, 1):
         better = [product * (1 + stake * win) for product, stake in zip(better, STAKES, strict=True)]
