@@ -125,13 +125,14 @@ def _defaults(
     adapts = policy is not None or task.proposed is not None
     usual = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
     request = AdaptRequest.of(task, config, ahead.scenario, ahead.guidance[0] if ahead.guidance else kind)
+    bounds = request.bound_deg if adapts and not guidances.find(request.guidance).by_evidence else ()
     return LabelOptions(
         task=request.task if ahead.cues is None else with_cues(task, request.task, ahead.cues),
         sizes=GuideSizes(**_values(GuideSizes, (request if adapts else config).sizes)),
         scalars=GuideScalars(**_values(GuideScalars, (request if adapts else config).scalars)),
         out=Path("labels") / task.name,
         guidance=kind,
-        bound_deg=next(iter(request.bound_deg), None) if adapts else None,
+        bound_deg=next(iter(bounds), None),
         labels=max(preset.labels) if policy is None else request.labels[0],
         questions=usual if policy is None else UNIFORM,
     )
