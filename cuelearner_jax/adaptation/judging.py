@@ -259,7 +259,7 @@ def judge_by_labels(of: Adaptation, block: LaneState) -> tuple[np.ndarray, np.nd
     if np.asarray(block.guide.labels.valid).sum(-1)[~failed].min(initial=HELD_OUT) < HELD_OUT:
         raise UserError(f"fewer than {HELD_OUT} labels cannot judge a model: give more, or --judge-by a metric")
     zero, right = jax.device_get(_predicted(of, block))
-    return zero, right, ~failed & (right >= zero)
+    return zero, right, ~failed & (right > zero)
 
 
 @jax.jit

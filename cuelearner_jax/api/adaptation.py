@@ -34,7 +34,6 @@ from cuelearner_jax.guides.base import ReadingGuide
 from cuelearner_jax.policies import ONNX, Common, policy_of
 from cuelearner_jax.policies.user import Foreign
 from cuelearner_jax.reading import Estimate, Result
-from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space, cues_from
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.storage.label_files import LabelFile
@@ -188,7 +187,7 @@ def adapt(
         raise UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")
     if not result.judgement.in_use.all():
         warnings.warn(result.words[-1], stacklevel=3)
-    about = {"trained": RunConfig(config.task), "actions": own_world.actions}
+    about = {"trained": config, "actions": own_world.actions}
     about["world"] = None if own_world is not world else world
     return AdaptedPolicy(result.policy(env).lane(0), getattr(env, "observation", ()), **about, outcome=outcome)
 
@@ -212,8 +211,8 @@ def correct(
 ) -> AdaptedPolicy:
     """Correct a policy by relative labels, as `cuelearner adapt --labels-from` does, without a task.
 
-    Every fifth answer is held out; a model that predicts fewer of these than "already right" always is not used, with a
-    warning.
+    Every fifth answer is held out; a model that predicts no more of these than "already right" always is not used,
+    with a warning.
 
     Args:
         policy: a function of a batch of observations, a module of PyTorch, a model of Stable-Baselines3, the path of a

@@ -73,6 +73,6 @@ def _named_again(options: Adapt, task: Task, code: str | None) -> list[str]:
         "--robot": options.robot,
         "--agent": options.agent_part,
         "--arbiter": options.arbiter_part,
-        "--labels-from": options.labels_from if task.name == logs.NAME else None,
+        "--labels-from": "OTHER_LABELS" if task.name == logs.NAME else None,  # not those that made it
     }
     return [str(word) for name, value in again.items() if value for word in (name, value)]

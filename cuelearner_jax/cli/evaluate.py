@@ -25,6 +25,7 @@ from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
 from cuelearner_jax.tasks import shipped
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
+FEWEST = 6  # differences that are all alike and that a two-sided sign test tells from 0
 SHARES = "where all are 0, or all are 1, Jeffreys' interval"
 
 
@@ -130,8 +131,8 @@ def _other(source: PolicySource, options: Evaluate, name: str) -> tuple[PolicySo
     """
     folder = shipped.folder_of(name)
     if folder.exists():
-        code = source.adapted.code if source.adapted and policy_folders.is_one(folder) else None
-        other = replace(source_in(folder, source.task, code, None), task=source.task)
+        code = (source.adapted.code if source.adapted else source.code) if policy_folders.is_one(folder) else None
+        other = replace(source_in(folder, source.task, code, options.changes), task=source.task)
         policy = other.default_policy
     elif name in POLICIES:
         other, policy = source, name
@@ -196,7 +197,8 @@ def _verdict(difference: Difference) -> str:
     """Return a sentence on which metrics' differences exclude 0."""
     names = {"excludes": [], "includes": []}
     for name, less in difference.metrics.items():
-        if not np.isnan(less.lower):
+        few = less.lower == less.upper != 0 and difference.row.each[name].size < FEWEST  # all alike: a sign test
+        if not (few or np.isnan(less.lower)):
             names["excludes" if less.excludes_zero else "includes"].append(name)
     parts = [f"{verb} 0 for {', '.join(metrics)}" for verb, metrics in names.items() if metrics]
     return f"The 95% interval of the difference {'; '.join(parts) or 'needs more episodes'}."

@@ -59,6 +59,8 @@ class LabelOptions(NewWorld):
 
     policy: Annotated[Word, tyro.conf.arg(metavar="POLICY")] = None
     """Policy to ask about: a run folder, a policy folder, a shipped agent, or package.module:NAME of a function."""
+    code: Annotated[str | None, tyro.conf.arg(name="base")] = None
+    """Code of a policy folder's base policy: package.module:NAME."""
     sizes: GuideSizes = field(default_factory=GuideSizes)
     scalars: GuideScalars = field(default_factory=GuideScalars)
     out: Path = Path("labels/NAME")
@@ -100,7 +102,8 @@ def run(arguments: list[str]) -> None:
     name, preset = preset_of(task, ahead.preset, usual)
     source = None
     if policy is not None and not is_code(policy):
-        source = source_in(shipped.folder_of(policy), task, None, ahead.changes)
+        base = None if ahead.base is None else code_of(ahead.base)
+        source = source_in(shipped.folder_of(policy), task, base, ahead.changes)
     default = _defaults(task, preset, source, ahead, policy)
     options = parse(LabelOptions, arguments, "label", default, about(LabelOptions, task, preset=usual))
     plan = make_plan(task, preset.config, options, source)
@@ -299,7 +302,8 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
     else:
         is_folder = shipped.is_shipped(policy) or Path(policy).is_dir()
         words, place, again = ["adapt", policy], "policies", ("preset", "scenario", "robot", "changes")
-        words += [] if is_folder else ["--task", name]
+        words += [] if is_folder and ":" not in name else ["--task", name]
+        words += ["--base", options.code] if options.code else []
         lane = {key: value for key, value in vars(options.base).items() if value not in (None, ())}
         words += as_options("base", lane)
         parts = {"task": task.config}

@@ -48,6 +48,7 @@ class Guide:
     moves: ClassVar[bool] = True  # False if it never changes an action
     outputs: ClassVar[int | None] = None  # of its network, such as 1 for a value; None: a vector added to an action
     sees_base: ClassVar[bool] = False  # True if it needs a finished policy's actions; it then serves adaptation only
+    compares: ClassVar[bool] = False  # True if labels tell its outputs' differences between actions alone
     by_cues: ClassVar[bool] = False  # True if its model measures along cues, whatever its answers say
     by_evidence: ClassVar[bool] = False  # True if `reading` reads its answers; it then serves adaptation only
     # From the above: whether it asks a teacher, needs a space with cues, corrects finished policies only
@@ -143,12 +144,12 @@ class Guide:
         Source: DAgger (Ross, Gordon, Bagnell, 2011): what is asked about follows what will be met.
         """
         refines = jax.random.bernoulli(key, scalars.refined_fraction)
-        after = self.act(model, env, obs[None], base[None], refines[None], scalars).actions
-        return self._in_question(base[None], after)[0]
+        return self.act(model, env, obs[None], base[None], refines[None], scalars).actions[0]
 
     def disagreement(self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions) -> Float[Array, " n"]:
         """Return the variance of an ensemble's members, summed over their outputs."""
-        return self.network.disagreement(env, model.params, obs, actions)
+        less = jnp.broadcast_to(self.spaces.actions.spread(2)[:1], actions.shape) if self.compares else None
+        return self.network.disagreement(env, model.params, obs, actions, less)
 
     def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Rows, scalars: GuideScalars
@@ -169,9 +170,9 @@ class Guide:
         """Return `act`, limited to within `bound` of the given actions for every kind."""
         space = self.spaces.actions
         refinement = self.act(model, env, obs, actions, active, bound_scalars(space, scalars, bound))
-        return refinement._replace(actions=self._in_question(actions, space.clip(refinement.actions, actions, bound)))
+        return refinement._replace(actions=space.clip(refinement.actions, actions, bound))
 
-    def _in_question(self, actions: Actions, after: Actions) -> Actions:
+    def in_question(self, actions: Actions, after: Actions) -> Actions:
         """Return actions after a correction; entries that nobody is asked about are as before."""
         asks, by_eps = [cue.is_asked for cue in self.spaces.actions.cues], self.form is not None and self.form.by_eps
         return after if all(asks) or not by_eps else jnp.where(jnp.array(asks)[None], after, actions)
@@ -184,11 +185,15 @@ class Guide:
         scalars: GuideScalars,
         k_max: Int[Array, ""] | int | None = None,
     ) -> Refinement:
-        """Return `refine` within the limits of the scalars; `k_max`: another largest number of passes."""
+        """Return `refine` of the entries that are asked about, within the limits of the scalars.
+
+        `k_max`: another largest number of passes.
+        """
         space = self.spaces.actions
         limits = {"tau": space.from_unit(scalars.tau_deg), "tau_max": space.from_unit(scalars.tau_max_deg)}
         most = scalars.k_max if k_max is None else k_max
-        return refine(residual, actions, active, space=space, **limits, k_max=most)
+        change = lambda current: self.in_question(jnp.zeros_like(current), residual(current))  # noqa: E731
+        return refine(change, actions, active, space=space, **limits, k_max=most)
 
 
 def replaced(others: Actions, actions: Actions, rows: Rows) -> Refinement:

@@ -84,7 +84,8 @@ def log_desired(
     half = log_nearer(_size(x), _size(x - gamma * h), SOFTNESS)
     if len(h) > 1:
         worse = jax.vmap(lambda u: _size(x - gamma * h - (1 - gamma) * u))(implicit)
-        half = (log_nearer(worse, _size(x - h), SOFTNESS).mean() + FIRST_PAIRS * half) / (1 + FIRST_PAIRS)
+        both = (log_nearer(worse, _size(x - h), SOFTNESS).mean() + FIRST_PAIRS * half) / (1 + FIRST_PAIRS)
+        half = jnp.where(spoken.sum() > 1, both, half)  # along one cue alone there are no other directions
     right = [log_nearer(jnp.abs(x - side), jnp.abs(x), SOFTNESS) for side in (1.0, -1.0)]
     still, moving = spoken & (h == 0), (h != 0).sum()
     held = jnp.sum((right[0] + right[1]) / 2, where=still)
@@ -115,7 +116,7 @@ class Clic(Guide):
     name, title = "clic", "CLIC"
     about = "an energy over actions, low in the sets that corrections leave possible"
     form: ClassVar[Any] = RELATIVE
-    colour, outputs = "#117733", 1  # minus the energy of an action
+    colour, outputs, compares = "#117733", 1, True  # minus the energy of an action
 
     def energy(
         self, env: Any, params: Params, obs: Observation, actions: Actions, base: Action | None, scalars: GuideScalars
@@ -196,7 +197,7 @@ class Clic(Guide):
             return self.minimise_energy(env, model.params, own_obs, base, scalars)
 
         best = each_in_portions(choose, jnp.concatenate([obs, actions], -1), SEARCHED)
-        return replaced(best, actions, active & model.fitted)
+        return replaced(self.in_question(actions, best), actions, active & model.fitted)
 
 
 class ClicShown(Clic):

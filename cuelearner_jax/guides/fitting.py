@@ -37,7 +37,7 @@ class GuideModel(NamedTuple):
 
     init: Init
     predict: Predict  # the members' mean; of parameters with any number of members
-    disagreement: Predict  # the variance of several members, summed over outputs (n,)
+    disagreement: Callable[..., Array]  # the variance of several members, summed over outputs (n,)
 
 
 def ensemble(members: int, init: Init, predict: Predict) -> GuideModel:
@@ -47,8 +47,11 @@ def ensemble(members: int, init: Init, predict: Predict) -> GuideModel:
     def mean(env: Any, params: Params, obs: Array, actions: Array) -> Array:
         return each(env, params, obs, actions).mean(0)
 
-    def disagreement(env: Any, params: Params, obs: Array, actions: Array) -> Float[Array, " n"]:
-        return jnp.sum(each(env, params, obs, actions).var(0), -1)
+    def disagreement(
+        env: Any, params: Params, obs: Array, actions: Array, less: Array | None = None
+    ) -> Float[Array, " n"]:
+        values = each(env, params, obs, actions) - (0.0 if less is None else each(env, params, obs, less))
+        return jnp.sum(values.var(0), -1)
 
     return GuideModel(lambda key: for_each(members, init, key), predict if members == 1 else mean, disagreement)
 

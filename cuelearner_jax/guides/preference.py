@@ -32,7 +32,7 @@ class Preference(Scalar):
     """A guide that executes the action of largest utility."""
 
     name, about = "preference", "a utility of actions by which of two the teacher prefers"
-    form, colour = PREFERENCE, "#882255"
+    form, colour, compares = PREFERENCE, "#882255", True
 
     def losses(self, env: Any, scalars: GuideScalars, params: Params, rows: Example) -> Float[Array, " n"]:
         """Return -log of the probability of each choice by the model of Bradley and Terry."""

@@ -81,8 +81,11 @@ class ReadingPolicy(PolicyNode):
         own = self.correction
         if not (np.any(np.asarray(own.change.theta)) or np.any(np.asarray(own.change.mix))):
             return 0
-        bounded = np.any(np.asarray(self.bound) < np.asarray(self.space.from_unit(self.space.reach)))
-        return 1 + bool((bounded or np.any(np.asarray(own.alpha))) and not has_effects(self.family))
+        return 1 + bool((self._is_bounded or np.any(np.asarray(own.alpha))) and not has_effects(self.family))
+
+    @property
+    def _is_bounded(self) -> bool:
+        return bool(np.any(np.asarray(self.bound) < np.asarray(self.space.from_unit(self.space.reach))))
 
     @property
     def LANES(self) -> tuple[str, ...]:
@@ -91,7 +94,7 @@ class ReadingPolicy(PolicyNode):
 
     def describe(self) -> dict[str, Any]:
         """Return the sizes of the correction's arrays, the family's unknowns with their values, and the base."""
-        own = self.correction
+        own, radius = self.correction, float(self.space.to_unit(np.max(self.bound), np))
         values = zip(unknowns_of(self.family), np.asarray(own.change.theta).T.tolist(), strict=False)
         return {
             "policy": KIND,
@@ -102,6 +105,7 @@ class ReadingPolicy(PolicyNode):
             "labels": int(own.known.shape[-2]),
             "mixed": int(own.frame.mixed.shape[-1]),
             "base": describe(self.base),
+            **({"bounded": True, "clip_radius_deg": radius} if self._is_bounded else {}),
         }
 
 

@@ -122,6 +122,7 @@ def test_it_can_be_corrected_again(better, tmp_path):
     how = {"eps": EPS, "bound": 0.1, "scalars": FAST, **NETWORK}
     again = cl.correct(better, asked(60, seed=3), **how)
     again.save(tmp_path / "again")
+    assert better.trained.scalars.eps_deg == pytest.approx(1 / 36)  # what a second correction begins with
     named = json.loads((tmp_path / "again" / "policy.json").read_text())["of"]
     assert named == {"code": f"{off.__module__}:off"}
     np.testing.assert_allclose(cl.load_policy(tmp_path / "again", base=off)(OTHERS), again(OTHERS), atol=1e-6)

@@ -54,6 +54,8 @@ def test_an_ensemble_predicts_its_members_mean_and_tells_their_variance():
     np.testing.assert_allclose(several.predict(None, params, OBS, BASE), linear(None, 3.0, OBS, BASE), rtol=1e-6)
     apart = several.disagreement(None, params, OBS, BASE)
     np.testing.assert_allclose(apart, 14 / 3 * (OBS[:, 0] ** 2 + BASE[:, 0] ** 2), rtol=1e-5)
+    less = several.disagreement(None, params, OBS, BASE, 0 * BASE)  # what members add in a situation falls out
+    np.testing.assert_allclose(less, 14 / 3 * BASE[:, 0] ** 2, rtol=1e-5)
     assert len(set(np.asarray(several.init(jax.random.key(0))).tolist())) == 3
 
 

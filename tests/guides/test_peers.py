@@ -51,6 +51,8 @@ def test_a_half_space_along_one_cue_ends_halfway_to_the_better_action():
     found = log_desired(x, jnp.array([1.0]), jnp.ones((4, 1)), gamma=1.0)
     np.testing.assert_allclose(found, log_sigmoid([-2.0, 0.0, 1.0, 2.0]), atol=1e-5)
     np.testing.assert_allclose(log_desired(-x, jnp.array([-1.0]), -jnp.ones((4, 1)), 1.0), found, atol=1e-6)
+    beside = jnp.concatenate([x, jnp.ones((4, 1))], 1)  # of several cues one is named
+    np.testing.assert_allclose(log_desired(beside, jnp.array([1.0, UNSAID]), jnp.ones((4, 2)), 1.0), found, atol=1e-6)
     near = log_desired(x, jnp.array([1.0]), jnp.ones((4, 1)), gamma=0.1)  # the edge lies at 0.05
     np.testing.assert_allclose(near, log_sigmoid([-0.2, 0.2, 0.2, 0.2]), atol=1e-5)
 

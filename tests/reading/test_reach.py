@@ -117,6 +117,8 @@ def test_questions_stay_within_a_bound():
     reading, obs = Reading(policy, (), BOX, EPS, LABELS, bound_deg=EPS), near(0)
     index, action = reading.questions(obs, 40, jax.random.key(0))
     assert np.abs(BOX.log(policy(obs[index]), action)).max() == pytest.approx(EPS, abs=1e-5)
+    bounded = reading.policy().replace(bound=jnp.float32([EPS, 1.0])).describe()  # of two lanes
+    assert (bounded["bounded"], bounded["clip_radius_deg"]) == (True, 1.0)
 
 
 def test_of_wide_observations_no_array_is_large():
