@@ -187,4 +187,4 @@ def test_a_reading_names_who_fails_and_tells_that_nobody_answers():
             read(**failing)
     with pytest.raises(UserError, match="this world gave an observation"):
         asking.blame(ENV, None, begun().replace(obs=jnp.full(2, jnp.inf)))
-    assert read(silence=1.0).words == ["20 labels: No question was answered."]
+    assert read(silence=1.0).words == ["20 labels within 60 degrees: No question was answered."]
