@@ -141,7 +141,7 @@ def teacher_of(source: World | Any) -> Teacher:
     """Return the teacher of a world, or a teacher that shows what a given policy does."""
     if isinstance(source, World):
         return source.task.make_teacher(source.config, source.env)
-    return Teaching(policy_of(source.policy if hasattr(source, "asks") else source))
+    return Teaching(policy_of(source.policy if isinstance(source, Teaching) or hasattr(source, "trained") else source))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,4 +171,6 @@ def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
 
 def teacher_of_world(value: Any, space: Space) -> Teacher:
     """Return a teacher: the given one, or one that shows what a given policy does itself."""
-    return teaching(value.policy if hasattr(value, "asks") else value, space)  # `CallablePolicy` is above this module
+    return teaching(
+        value.policy if hasattr(value, "trained") else value, space
+    )  # `CallablePolicy` is above this module

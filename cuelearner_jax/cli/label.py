@@ -104,6 +104,8 @@ def run(arguments: list[str]) -> None:
     if policy is not None and not is_code(policy):
         base = None if ahead.base is None else code_of(ahead.base)
         source = source_in(shipped.folder_of(policy), task, base, ahead.changes)
+    elif ahead.base is not None:
+        raise UserError("--base names the code in a policy folder: give that folder, or leave it out")
     default = _defaults(task, preset, source, ahead, policy)
     options = parse(LabelOptions, arguments, "label", default, about(LabelOptions, task, preset=usual))
     plan = make_plan(task, preset.config, options, source)
@@ -128,14 +130,13 @@ def _defaults(
     adapts = policy is not None or task.proposed is not None
     usual = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
     request = AdaptRequest.of(task, config, ahead.scenario, ahead.guidance[0] if ahead.guidance else kind)
-    bounds = request.bound_deg if adapts and not guidances.find(request.guidance).by_evidence else ()
     return LabelOptions(
         task=request.task if ahead.cues is None else with_cues(task, request.task, ahead.cues),
         sizes=GuideSizes(**_values(GuideSizes, (request if adapts else config).sizes)),
         scalars=GuideScalars(**_values(GuideScalars, (request if adapts else config).scalars)),
         out=Path("labels") / task.name,
         guidance=kind,
-        bound_deg=next(iter(bounds), None),
+        bound_deg=next(iter(request.bound_deg), None) if adapts else None,
         labels=max(preset.labels) if policy is None else request.labels[0],
         questions=usual if policy is None else UNIFORM,
     )
@@ -194,8 +195,6 @@ def _check_guidance(guidance: Guide, task: Task, options: LabelOptions, space: S
         has_proposals = options.questions == PROPOSED and _has_proposals(task, options.task)
         if (options.policy is None and not has_proposals) or options.again is not None:
             raise UserError("guidance reading asks about a policy: name one after the task, and leave out --again")
-        if options.bound_deg is not None:
-            raise UserError("bound_deg is given, but guidance reading asks without a bound: leave bound_deg out")
 
 
 def _has_proposals(task: Task, config: Any) -> bool:

@@ -18,7 +18,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
-from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, squared_errors
+from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, held_out, squared_errors
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
@@ -26,6 +26,9 @@ from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Para
 Observations = Float[Array, "n obs"]
 Actions = Float[Array, "n action"]
 Rows = Bool[Array, " n"]  # which rows
+
+
+REFERENCES = 16  # actions over which the mean of an output is taken that labels do not tell
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ class Guide:
             return rows
         cues = is_answered(labels.answer)
         valid = labels.valid & cues.any(-1)
-        never = ~cues.any(0, where=valid[:, None], keepdims=True)
+        never = ~cues.any(0, where=(valid & ~held_out(len(valid)))[:, None], keepdims=True)  # of those to fit
         return rows.replace(valid=valid, cues=cues | never, space=self.spaces.actions)
 
     def augmented(self, key: PRNGKeyArray, batch: Any) -> Any:
@@ -148,7 +151,7 @@ class Guide:
 
     def disagreement(self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions) -> Float[Array, " n"]:
         """Return the variance of an ensemble's members, summed over their outputs."""
-        less = jnp.broadcast_to(self.spaces.actions.spread(2)[:1], actions.shape) if self.compares else None
+        less = self.spaces.actions.spread(REFERENCES) if self.compares else None
         return self.network.disagreement(env, model.params, obs, actions, less)
 
     def refine_labelled_actions(

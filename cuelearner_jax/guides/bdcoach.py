@@ -18,7 +18,8 @@ What differs, and why: that code takes 500 such turns at the end of an episode, 
 one; here each label has its turns, since rounds of questions are no episodes. "Already right" is an answer here, on
 which H is trained towards 0; there it is silence, and the label is left out. H gives vectors in units of eps, in the
 frame in which networks of this package see, as the model of `relative` does; and no step is longer than eps along any
-cue, as no answer is. A cue of which nothing was said teaches H nothing, and H then says what the policy learns of it.
+cue, as no answer is. A cue of which nothing was said teaches H nothing, and H then says what the policy learns of it;
+one that no label names counts as "already right".
 """
 
 from __future__ import annotations

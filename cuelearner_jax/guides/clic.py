@@ -21,7 +21,8 @@ fitted from scratch in each round; there one network goes on. There b are drawn 
 uniform and half lie around a, so that a fit takes seconds on a CPU, and no penalty on the energy's gradient is needed.
 There one b is drawn to act; here the least energy is searched, first over `space.spread`, then around the best so far
 in ever smaller boxes: no random number, no gradient, and a graph that can be exported. "Already right" is an answer
-here where silence is meant there. A cue of which nothing was said is no part of any distance.
+here where silence is meant there. A cue of which nothing was said is no part of any distance; one that no label names
+stays where it is.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
+from cuelearner_jax.guides.fitting import held_out
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Box, is_answered, says_something
 from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
@@ -64,6 +66,7 @@ class Contrast(struct.PyTreeNode):
     valid: Bool[Array, ""]
     draw: Int[Array, ""]  # number of its random stream for sampling
     base: Action  # the finished policy's action, where labels keep it; else the action asked about
+    never: Bool[Array, " answer"]  # cues that no label names: they stay
 
 
 def log_nearer(apart: Float[Array, "..."], closer: Float[Array, "..."], softness: float) -> Float[Array, "..."]:
@@ -86,10 +89,15 @@ def log_desired(
         worse = jax.vmap(lambda u: _size(x - gamma * h - (1 - gamma) * u))(implicit)
         both = (log_nearer(worse, _size(x - h), SOFTNESS).mean() + FIRST_PAIRS * half) / (1 + FIRST_PAIRS)
         half = jnp.where(spoken.sum() > 1, both, half)  # along one cue alone there are no other directions
-    right = [log_nearer(jnp.abs(x - side), jnp.abs(x), SOFTNESS) for side in (1.0, -1.0)]
     still, moving = spoken & (h == 0), (h != 0).sum()
-    held = jnp.sum((right[0] + right[1]) / 2, where=still)
+    held = jnp.sum(log_still(x), where=still)
     return (moving * half + held) / jnp.maximum(moving + still.sum(), 1)
+
+
+def log_still(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the mean log-probability that x is nearer to 0 than to 1 and to -1."""
+    right = [log_nearer(jnp.abs(x - side), jnp.abs(x), SOFTNESS) for side in (1.0, -1.0)]
+    return (right[0] + right[1]) / 2
 
 
 def direction_at(key: PRNGKeyArray, h: Float[Array, " cues"], angle: Array | float) -> Float[Array, " cues"]:
@@ -132,7 +140,8 @@ class Clic(Guide):
         x = space.log(jnp.broadcast_to(row.action, actions.shape), actions) / space.from_unit(scalars.eps_deg)
         angle, keys = jnp.deg2rad(ANGLE), jax.random.split(key, PAIRS)
         implicit = jax.vmap(lambda key: direction_at(key, row.answer, angle))(keys)
-        return SHARPNESS * jax.vmap(lambda x: log_desired(x, row.answer, implicit, GAMMA))(x)
+        beside = jnp.sum(log_still(x), -1, where=row.never[None])
+        return SHARPNESS * (jax.vmap(lambda x: log_desired(x, row.answer, implicit, GAMMA))(x) + beside)
 
     def sample_actions(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Actions:
         """Return the sampled actions of one label: two known ones, uniform ones, and ones near a."""
@@ -158,8 +167,9 @@ class Clic(Guide):
         """Return labels (slots, ...) as contrasts; a label that names no cue is not valid."""
         numbers, valid = jnp.arange(len(labels.valid)), says_something(labels.answer) | self.form.is_action
         base, valid = labels.action if labels.base is None else labels.base, labels.valid & valid
-        never = ~is_answered(labels.answer).any(0, where=valid[:, None], keepdims=True) & (not self.form.is_action)
-        return Contrast(labels.obs, labels.action, jnp.where(never, 0.0, labels.answer), valid, numbers, base)
+        says = is_answered(labels.answer).any(0, where=(valid & ~held_out(len(valid)))[:, None], keepdims=True)
+        never = jnp.broadcast_to(~says & self.form.by_eps, labels.answer.shape)
+        return Contrast(labels.obs, labels.action, labels.answer, valid, numbers, base, never)
 
     def augmented(self, key: PRNGKeyArray, batch: Contrast) -> Contrast:
         """Return the batch with new random streams for sampling."""

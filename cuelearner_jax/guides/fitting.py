@@ -50,7 +50,10 @@ def ensemble(members: int, init: Init, predict: Predict) -> GuideModel:
     def disagreement(
         env: Any, params: Params, obs: Array, actions: Array, less: Array | None = None
     ) -> Float[Array, " n"]:
-        values = each(env, params, obs, actions) - (0.0 if less is None else each(env, params, obs, less))
+        values = each(env, params, obs, actions)
+        if less is not None:  # the mean over these actions (m, action)
+            about = lambda action: each(env, params, obs, jnp.broadcast_to(action, actions.shape))  # noqa: E731
+            values = values - jax.lax.map(about, less).mean(0)
         return jnp.sum(values.var(0), -1)
 
     return GuideModel(lambda key: for_each(members, init, key), predict if members == 1 else mean, disagreement)

@@ -139,8 +139,8 @@ class Learner:
 
     def _unread(self) -> Reading:
         plan, env = self._plan, self._of.env
-        eps = plan.config.scalars.eps_deg
-        return Reading(plan.base.policy, plan.family, actions_of(env), eps, plan.labels, env.observation)
+        eps, bound = plan.config.scalars.eps_deg, np.inf if plan.bound_deg is None else plan.bound_deg
+        return Reading(plan.base.policy, plan.family, actions_of(env), eps, plan.labels, env.observation, bound)
 
     def question(self, guide: GuideState, keys: Any) -> Float[np.ndarray, " action"]:
         """Return the action to ask about in a situation."""

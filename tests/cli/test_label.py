@@ -146,7 +146,7 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
     for pair in (["--guidance", "reading"], ["--base.seed", "3"], ["--robot", "anymal"]):
         assert words[words.index(pair[0]) + 1] == pair[1]
     asked, *_ = asked_for(monkeypatch, "billiards", "shipped:billiards", "--scenario", "tilted_table")
-    assert (asked.guidance, asked.bound_deg) == ("reading", None)
+    assert (asked.guidance, asked.bound_deg) == ("reading", 0.3)
     _, _, commands = asked_for(monkeypatch, "navigation", "--robot", "anymal", "--out", str(tmp_path))
     assert "--robot anymal" in commands.following(7)
 

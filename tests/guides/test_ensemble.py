@@ -54,8 +54,9 @@ def test_an_ensemble_predicts_its_members_mean_and_tells_their_variance():
     np.testing.assert_allclose(several.predict(None, params, OBS, BASE), linear(None, 3.0, OBS, BASE), rtol=1e-6)
     apart = several.disagreement(None, params, OBS, BASE)
     np.testing.assert_allclose(apart, 14 / 3 * (OBS[:, 0] ** 2 + BASE[:, 0] ** 2), rtol=1e-5)
-    less = several.disagreement(None, params, OBS, BASE, 0 * BASE)  # what members add in a situation falls out
-    np.testing.assert_allclose(less, 14 / 3 * BASE[:, 0] ** 2, rtol=1e-5)
+    some = jnp.array([[1.0, 0.0], [-3.0, 0.0]])  # -1 in the mean; what members add in a situation falls out
+    less = several.disagreement(None, params, OBS, BASE, some)
+    np.testing.assert_allclose(less, 14 / 3 * (BASE[:, 0] + 1) ** 2, rtol=1e-4, atol=1e-6)
     assert len(set(np.asarray(several.init(jax.random.key(0))).tolist())) == 3
 
 
