@@ -42,7 +42,6 @@ AT_ONCE = 10  # episodes between two looks
 STAKES = np.array([0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # lambda of the sequential test
 DECIDED = 20.0  # value of the test martingale that decides
 SHARES = ("success", "finished", PERSON)  # values within [0, 1]
-LESS = ("distance", "collision", "timeout", "duration", "foul", "error", "cost")  # metrics of which less is better
 
 # films of the same start -> -1: the left one is better, 0: neither, 1: the right one
 Prefer = Callable[[Path, Path], int]

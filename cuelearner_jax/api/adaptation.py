@@ -31,7 +31,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import ReadingGuide
-from cuelearner_jax.policies import ONNX, Common, policy_of
+from cuelearner_jax.policies import ONNX, Common, innermost, policy_of
 from cuelearner_jax.policies.user import Foreign
 from cuelearner_jax.reading import Estimate, Result
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space, cues_from
@@ -104,9 +104,7 @@ class AdaptedPolicy(CallablePolicy):
         """
         if self.world is None:
             raise UserError("a policy folder names its world, and an environment has no name: adapt in one of cl.make")
-        base: Any = self.outcome.subject.bases.policy
-        while getattr(base, "base", None) is not None:
-            base = base.base
+        base = innermost(self.outcome.subject.bases.policy)
         base = getattr(base, "function", base)
         name = getattr(base, "__qualname__", type(base).__qualname__)  # of a foreign policy its file
         origin = {"code": name if isinstance(base, Foreign) else f"{base.__module__}:{name}"}

@@ -18,7 +18,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
-from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, held_out, squared_errors
+from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, silent_cues, squared_errors
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
@@ -26,7 +26,6 @@ from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Para
 Observations = Float[Array, "n obs"]
 Actions = Float[Array, "n action"]
 Rows = Bool[Array, " n"]  # which rows
-
 
 REFERENCES = 16  # actions over which the mean of an output is taken that labels do not tell
 
@@ -117,8 +116,7 @@ class Guide:
             return rows
         cues = is_answered(labels.answer)
         valid = labels.valid & cues.any(-1)
-        never = ~cues.any(0, where=(valid & ~held_out(len(valid)))[:, None], keepdims=True)  # of those to fit
-        return rows.replace(valid=valid, cues=cues | never, space=self.spaces.actions)
+        return rows.replace(valid=valid, cues=cues | silent_cues(labels.answer, valid), space=self.spaces.actions)
 
     def augmented(self, key: PRNGKeyArray, batch: Any) -> Any:
         """Return the batch to train on in place of a batch (n, ...) of examples."""
@@ -188,10 +186,7 @@ class Guide:
         scalars: GuideScalars,
         k_max: Int[Array, ""] | int | None = None,
     ) -> Refinement:
-        """Return `refine` of the entries that are asked about, within the limits of the scalars.
-
-        `k_max`: another largest number of passes.
-        """
+        """Return `refine` of the entries in question, within the scalars' limits; `k_max`: other passes at most."""
         space = self.spaces.actions
         limits = {"tau": space.from_unit(scalars.tau_deg), "tau_max": space.from_unit(scalars.tau_max_deg)}
         most = scalars.k_max if k_max is None else k_max

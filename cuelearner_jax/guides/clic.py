@@ -38,7 +38,7 @@ from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
-from cuelearner_jax.guides.fitting import held_out
+from cuelearner_jax.guides.fitting import silent_cues
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Box, is_answered, says_something
 from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
@@ -167,8 +167,7 @@ class Clic(Guide):
         """Return labels (slots, ...) as contrasts; a label that names no cue is not valid."""
         numbers, valid = jnp.arange(len(labels.valid)), says_something(labels.answer) | self.form.is_action
         base, valid = labels.action if labels.base is None else labels.base, labels.valid & valid
-        says = is_answered(labels.answer).any(0, where=(valid & ~held_out(len(valid)))[:, None], keepdims=True)
-        never = jnp.broadcast_to(~says & self.form.by_eps, labels.answer.shape)
+        never = jnp.broadcast_to(silent_cues(labels.answer, valid) & self.form.by_eps, labels.answer.shape)
         return Contrast(labels.obs, labels.action, labels.answer, valid, numbers, base, never)
 
     def augmented(self, key: PRNGKeyArray, batch: Contrast) -> Contrast:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 from cuelearner_jax.agents import networks
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.spaces import Space
+from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import GuidanceModel, Params
 
 Init = Callable[[PRNGKeyArray], Params]
@@ -47,9 +47,7 @@ def ensemble(members: int, init: Init, predict: Predict) -> GuideModel:
     def mean(env: Any, params: Params, obs: Array, actions: Array) -> Array:
         return each(env, params, obs, actions).mean(0)
 
-    def disagreement(
-        env: Any, params: Params, obs: Array, actions: Array, less: Array | None = None
-    ) -> Float[Array, " n"]:
+    def disagreement(env: Any, params: Params, obs: Array, actions: Array, less: Array | None = None) -> Array:
         values = each(env, params, obs, actions)
         if less is not None:  # the mean over these actions (m, action)
             about = lambda action: each(env, params, obs, jnp.broadcast_to(action, actions.shape))  # noqa: E731
@@ -135,6 +133,11 @@ def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
 def held_out(count: int) -> Bool[np.ndarray, " count"]:
     """Return which of so many labels are held out for validation."""
     return np.arange(count) % VALIDATION_STRIDE == VALIDATION_STRIDE - 1
+
+
+def silent_cues(answers: Float[Array, "n cues"], valid: Bool[Array, " n"]) -> Bool[Array, "1 cues"]:
+    """Return the cues that no label to fit names."""
+    return ~is_answered(answers).any(0, where=(valid & ~held_out(len(valid)))[:, None], keepdims=True)
 
 
 def fit_model(

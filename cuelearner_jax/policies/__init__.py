@@ -22,6 +22,7 @@ from cuelearner_jax.policies.policy import (
     best_actions,
     call_policy,
     describe,
+    innermost,
     lanes_in,
     layers,
     policy_name,

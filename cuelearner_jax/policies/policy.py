@@ -89,10 +89,16 @@ def code_name(code: Any) -> str:
     return getattr(code, "__qualname__", type(code).__qualname__).replace("<locals>.", "")
 
 
-def policy_name(policy: Any) -> str:
-    """Return a policy's name for a message: that of the user's function or class below all layers."""
+def innermost(policy: Any) -> Any:
+    """Return the policy below all layers."""
     while (below := getattr(policy, "base", None) or getattr(policy, "policy", None)) is not None:
         policy = below
+    return policy
+
+
+def policy_name(policy: Any) -> str:
+    """Return a policy's name for a message: that of the user's function or class below all layers."""
+    policy = innermost(policy)
     return f"policy {code_name(policy)}"
 
 

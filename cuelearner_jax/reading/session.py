@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.environment import PROPOSED, Quantity
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import policy_name, policy_of
+from cuelearner_jax.policies import innermost, policy_name, policy_of
 from cuelearner_jax.reading import fitting, linear
 from cuelearner_jax.reading.families import Family
 from cuelearner_jax.reading.fitting import Fit, Reader
@@ -198,10 +198,7 @@ def acts_of(policy: Any, everywhere: bool = True) -> linear.Acts:
 
 def run_of(policy: Any) -> Any:
     """Return a policy's `act`, compiled unless plain Python acts: that may call JAX itself, and would deadlock."""
-    innermost = policy
-    while (base := getattr(innermost, "base", None)) is not None:
-        innermost = base
-    return policy.act if getattr(innermost, "on_host", False) else partial(_act, policy)
+    return policy.act if getattr(innermost(policy), "on_host", False) else partial(_act, policy)
 
 
 @partial(jax.jit, static_argnums=0)

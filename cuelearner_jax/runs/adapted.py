@@ -159,10 +159,7 @@ def write(
 
 
 def _write_labels(folder: Path, result: AdaptationResult, task: Task, world: Any) -> None:
-    """Write one label file per bound: for each seed the largest budget's set.
-
-    It starts with the smaller sets, but for a reading, whose batches depend on the budget.
-    """
+    """Write one label file per bound: each seed's largest set, which starts with the smaller ones but in readings."""
     of, lanes = result.of, result.lanes
     form: AnswerForm | None = of.guidance.form
     assert form is not None

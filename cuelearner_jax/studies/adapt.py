@@ -247,7 +247,7 @@ class AdaptRequest:
         names = ["reward", *step.metrics, *step.outcome, LABELS, PERSON]
         if by not in names:
             raise UserError(f"judge_by is {by!r}, which is not a metric of {task.name}{suggestion(by, names)}")
-        if by in judging.LESS:
+        if by in task.less_is_better:
             raise UserError(f"judge_by is {by!r}, of which less is better: give one of which more is, as reward")
         if by != LABELS:
             env = task.environment(self.task, judging.SPLIT)

@@ -113,6 +113,7 @@ BILLIARDS = Task(
     bodies=(PLAYER,),
     teacher=make_teacher,
     files=_files,
+    less_is_better=("foul",),
     labels_hold=("mirrors", *TEACHERS),
     **presets.read("billiards", BilliardsConfig()),
 )

@@ -152,9 +152,9 @@ def test_paired_episodes_tell_which_checkpoint_is_better(tmp_path):
     assert judging.judge(after, before).startswith("worse after 8 of 10")
     lost, won = [[False] * 10], [[True] * 10]  # the first of ten tasks is won, the others are lost
     pair = evaluation(tmp_path / "one", *lost, *9 * won), evaluation(tmp_path / "other", *won, *9 * lost)
-    told = judging.judge(*pair)
-    assert told.startswith("worse")
-    assert told.endswith("of 10 pairs of episodes of each task: success 0.90 -> 0.10")
+    line = judging.judge(*pair)
+    assert line.startswith("worse")
+    assert line.endswith("of 10 pairs of episodes of each task: success 0.90 -> 0.10")
     with pytest.raises(SystemExit, match="evaluate both alike"):
         judging.judge(before, evaluation(tmp_path / "short", [True] * 3))
     with pytest.raises(SystemExit, match="holds no results"):

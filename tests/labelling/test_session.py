@@ -215,9 +215,9 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
         second.answer(item.number, turned)
     assert second.is_done
     theirs = label_files.read(tmp_path / "second")
-    found = comparing.between(file, theirs)
+    both = comparing.between(file, theirs)
     same = sum(bool(expert(item)[0] == (1 - abs(expert(item)[0]))) for item in items[6:])
-    assert (found.count, found.value) == (8, (6 + same) / 8)
+    assert (both.count, both.value) == (8, (6 + same) / 8)
     assert theirs.people.who.tolist() == ["other"] * 8
     merged, left_out = comparing.merge([file, theirs])
     assert (merged.people.item.tolist(), left_out) == (list(range(16)), 0)

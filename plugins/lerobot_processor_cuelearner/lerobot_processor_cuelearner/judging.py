@@ -24,11 +24,8 @@ def judge(before: Path, after: Path) -> str:
     each = [[b - a for a, b in zip(pair[0][task], pair[1][task], strict=True)] for task in pair[0]]
     rounds = [[win for win in wins if win is not None] for wins in zip_longest(*each)]  # an episode of each task
     verdict, episodes = decide([sum(wins) / len(wins) for wins in rounds])
-    rates, of_each = (
-        [sum(map(sum, one.values())) / sum(map(len, each)) for one in pair],
-        " of each task" * (len(each) > 1),
-    )
-    what = f"{verdict} after {episodes} of {len(rounds)} pairs of episodes{of_each}"
+    rates = [sum(map(sum, one.values())) / sum(map(len, each)) for one in pair]
+    what = f"{verdict} after {episodes} of {len(rounds)} pairs of episodes" + " of each task" * (len(each) > 1)
     return f"{what}: success {rates[0]:.2f} -> {rates[1]:.2f}"
 
 
