@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from cuelearner_jax.agents.networks import RATE
 from cuelearner_jax.types import Params
 
 BINS = np.linspace(-5.0, 5.0, 101, dtype=np.float32)  # their values, in units
 ROOM = 2.0  # the bin of a value of rms(reward) / (1 - discount); the largest bin is 2.5 times that
 FIRST = 0.2  # scale of the first distribution [units], Student's t of 3 degrees: narrow, with tails that can grow
-RATE = 1e-3  # share of a new batch in the mean square of rewards; the first 1 / RATE batches count alike
 
 
 class CategoricalCritic(nn.Module):

@@ -17,12 +17,15 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_jax.config import Frame, Start
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Params
+
+RATE = 1e-3  # share of a new batch in running means
+FARTHEST = 10.0  # the largest normalised observation, in standard deviations
 
 
 class Joined(nn.Module):
@@ -82,6 +85,24 @@ def initializers(start: Start, inputs: int) -> tuple[nn.initializers.Initializer
         return nn.initializers.xavier_uniform(), nn.initializers.zeros
     within = partial(jax.random.uniform, minval=-(inputs**-0.5), maxval=inputs**-0.5)
     return within, within
+
+
+def next_moments(before: Params, obs: Float[Array, "batch obs"], count: Int[Array, ""]) -> Params:
+    """Return mean and variance of observations after batch number `count` (from 1).
+
+    The first 1 / `RATE` batches count alike. Both are exact for any mean, as after Welford (1962).
+    """
+    rate = jnp.maximum(1 / count, RATE)
+    change = obs.mean(0) - before["mean"]
+    variance = (1 - rate) * (before["variance"] + rate * change**2) + rate * obs.var(0)
+    return {"mean": before["mean"] + rate * change, "variance": variance}
+
+
+def normalised(obs: Float[Array, "... obs"], moments: Params | None) -> Float[Array, "... obs"]:
+    """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without."""
+    if moments is None:
+        return obs
+    return jnp.clip((obs - moments["mean"]) / jnp.sqrt(moments["variance"] + 1e-8), -FARTHEST, FARTHEST)
 
 
 def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm: bool = False) -> MLP:

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from cuelearner_jax.agents import categorical
 from cuelearner_jax.agents.categorical import CategoricalCritic
 from cuelearner_jax.agents.ddqn import optimizer
-from cuelearner_jax.agents.networks import q_network
+from cuelearner_jax.agents.networks import next_moments, normalised, q_network
 from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
@@ -57,6 +57,8 @@ class SACConfig:
     """Normalise the critics' hidden layers, which keeps the values of untried actions from growing."""
     bins: bool = False
     """Critics of XQC: a distribution over bins of value, by batch and weight normalisation and cross-entropy."""
+    normalise_obs: bool = False
+    """Networks see observations less their mean, over their standard deviation, as minibatches so far have them."""
     batch_size: Annotated[int, POSITIVE] = 256
     """Transitions in a minibatch."""
     updates_per_step: Annotated[int, POSITIVE] = 1
@@ -136,7 +138,10 @@ class SACState(struct.PyTreeNode):
 
 @dataclass(frozen=True)
 class SoftActorCritic:
-    """The functions of SAC (`protocol.AgentFunctions`); parameters are a dictionary of `actor` and `critics`."""
+    """The functions of SAC (`protocol.AgentFunctions`).
+
+    Parameters are a dictionary of `actor`, `critics` and, where observations are normalised, `obs`.
+    """
 
     options: SACConfig
     frame: Frame
@@ -154,17 +159,20 @@ class SoftActorCritic:
         log_temperature = jnp.zeros(())
         opt_states = (optimizer("adam", 0.0, 0.0).init(leaf) for leaf in (actor, critics, log_temperature))
         copy = jax.tree.map(jnp.copy, critics) if self.bootstraps else None
-        return {"actor": actor, "critics": critics}, SACState(copy, log_temperature, *opt_states)
+        params: Params = {"actor": actor, "critics": critics}
+        if own.normalise_obs:
+            params["obs"] = {"mean": obs, "variance": jnp.ones_like(obs)}
+        return params, SACState(copy, log_temperature, *opt_states)
 
     def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
         """Return the squashed mean of the Gaussian."""
-        return self.in_box(jnp.tanh(self._gaussian(params["actor"], obs)[0]))
+        return self.in_box(jnp.tanh(self._gaussian(params["actor"], normalised(obs, params.get("obs")))[0]))
 
     def explore(
         self, env: Any, options: SACConfig, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
         """Return actions drawn from the squashed Gaussian."""
-        return self.in_box(self.draw(params["actor"], obs, key).unit)
+        return self.in_box(self.draw(params["actor"], normalised(obs, params.get("obs")), key).unit)
 
     def in_unit(self, actions: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
         """Return actions of the box in unit coordinates."""
@@ -209,10 +217,14 @@ class SoftActorCritic:
         k_critics, k_actor = jax.random.split(key)
         temperature = options.first_temperature * jnp.exp(rest.log_temperature)
 
-        def minibatch(carry: tuple[Params, Any, Params, Array], key: PRNGKeyArray) -> tuple[Any, tuple[Array, Array]]:
-            critics, opt_state, target_critics, _ = carry
+        def minibatch(carry: tuple[Any, ...], key: PRNGKeyArray) -> tuple[Any, tuple[Array, Array]]:
+            critics, opt_state, target_critics, moments, _ = carry
             k_batch, k_target = jax.random.split(key)
             (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
+            if own.normalise_obs:
+                moments = next_moments(moments, batch.obs, count)
+                after = normalised(batch.next_obs, moments) if self.bootstraps else batch.next_obs
+                batch = batch.replace(obs=normalised(batch.obs, moments), next_obs=after)
             behind = scalars.discount, actor, target_critics, temperature, batch, k_target
             if own.bins:
                 error = self._binned_error(*behind, critics, count)
@@ -224,12 +236,12 @@ class SoftActorCritic:
             critics = categorical.with_unit_weights({**critics, **news}) if own.bins else critics
             if self.bootstraps:
                 target_critics = optax.incremental_update(critics, target_critics, options.polyak)
-            return (critics, opt_state, target_critics, batch.obs), (loss, optax.tree.norm(gradient))
+            return (critics, opt_state, target_critics, moments, batch.obs), (loss, optax.tree.norm(gradient))
 
         none = jnp.zeros((own.batch_size, self.spaces.obs_size))
-        start = params["critics"], rest.critics_opt, rest.target_critics, none
+        start = params["critics"], rest.critics_opt, rest.target_critics, params.get("obs"), none
         keys = jax.random.split(k_critics, own.updates_per_step)
-        (critics, critics_opt, target_critics, obs), (losses, norms) = jax.lax.scan(minibatch, start, keys)
+        (critics, critics_opt, target_critics, moments, obs), (losses, norms) = jax.lax.scan(minibatch, start, keys)
 
         climbed = jax.value_and_grad(self.actor_loss, has_aux=True)(actor, critics, temperature, obs, k_actor)
         (_, log_density), gradient = climbed
@@ -240,7 +252,8 @@ class SoftActorCritic:
         )
         state = SACState(target_critics, log_temperature, actor_opt, critics_opt, temperature_opt)
         norm = jnp.maximum(norms.max(), optax.tree.norm(gradient))
-        return {"actor": actor, "critics": critics}, state, losses.mean(), norm
+        params = {**params, "actor": actor, "critics": critics} | ({} if moments is None else {"obs": moments})
+        return params, state, losses.mean(), norm
 
     def actor_loss(
         self,
