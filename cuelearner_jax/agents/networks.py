@@ -102,7 +102,8 @@ def normalised(obs: Float[Array, "... obs"], moments: Params | None) -> Float[Ar
     """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without."""
     if moments is None:
         return obs
-    return jnp.clip((obs - moments["mean"]) / jnp.sqrt(moments["variance"] + 1e-8), -FARTHEST, FARTHEST)
+    mean, variance = (jnp.broadcast_to(moments[name], obs.shape) for name in ("mean", "variance"))
+    return jnp.clip((obs - mean) / jnp.sqrt(variance + 1e-8), -FARTHEST, FARTHEST)
 
 
 def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm: bool = False) -> MLP:

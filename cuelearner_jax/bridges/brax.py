@@ -21,6 +21,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box, Cue, Space, box
 from cuelearner_jax.types import Step
 
+PRIVILEGED = "privileged_state"  # Playground's entry of an observation for critics
 Heuristic = Callable[[Float[Array, " obs"]], Float[Array, " action"]]
 
 
@@ -96,7 +97,7 @@ def layout_of(simulator: Any, name: str) -> Interface:
         raise UserError(f"{name}: it is a batch of shape {shapes.reward.shape}: give a single environment")
     if "first_obs" in shapes.info:
         raise UserError(f"{name}: AutoResetWrapper hides the last observation of an episode: pass what it wraps")
-    leaves = jax.tree_util.tree_leaves_with_path(shapes.obs)
+    leaves = jax.tree_util.tree_leaves_with_path(_without_privileged(shapes.obs))
     slices = [("/".join(str(part.key) for part in path) or name.lower(), leaf.shape) for path, leaf in leaves]
     for part, shape in slices:
         if len(shape) > 1 or part.startswith("pixels"):
@@ -107,8 +108,13 @@ def layout_of(simulator: Any, name: str) -> Interface:
 
 def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:
     """Return an observation as one vector; the slices of a dictionary stand in the order of their names."""
-    leaves = [jnp.ravel(leaf).astype(jnp.float32) for leaf in jax.tree.leaves(obs)]
+    leaves = [jnp.ravel(leaf).astype(jnp.float32) for leaf in jax.tree.leaves(_without_privileged(obs))]
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+
+
+def _without_privileged(obs: Any) -> Any:
+    """Return an observation without what Playground gives to critics alone, since a real robot lacks it."""
+    return {name: part for name, part in obs.items() if name != PRIVILEGED} if isinstance(obs, Mapping) else obs
 
 
 def model_of(simulator: Any) -> Any:
@@ -133,7 +139,7 @@ def from_brax(
     """Return an environment of brax or MuJoCo Playground as one of ours, with its whole box [-1, 1]^n of actions.
 
     `env` becomes a constant of what is compiled, `max_steps` is traced. Observations in a dictionary become one vector,
-    with a slice for each entry of the dictionary, in the order of their names.
+    with a slice for each entry of the dictionary, in the order of their names, without Playground's `privileged_state`.
 
     Args:
         env: bare, or in brax's `EpisodeWrapper`, whose truncations are then truncations here.

@@ -1,7 +1,6 @@
-"""Environments of brax and MuJoCo Playground's dm_control tasks by name: `brax:pusher`, `playground:CartpoleBalance`.
+"""Environments of brax and MuJoCo Playground by name: `brax:pusher`, `playground:CartpoleBalance`.
 
-Written for playground 0.2.0. Its locomotion and manipulation tasks download their robots when they are made: they are
-not offered by name, and `bridges.brax.from_brax` takes one that the caller made.
+Written for playground 0.2.0, which downloads the robots of its locomotion and manipulation tasks at the first of them.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from cuelearner_jax.config import EPISODE, check_part
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity
 from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.task import QUICKSTART, Body, Task
-from cuelearner_jax.tasks.presets import quickstart
+from cuelearner_jax.tasks.presets import quickstart, read
 
 Backend = Literal["generalized", "spring", "positional", "mjx"]
 
@@ -97,14 +96,13 @@ def _from_brax(name: str, backend: str) -> Any:
 
 def _from_playground(name: str) -> Any:
     try:
-        from mujoco_playground import dm_control_suite  # pyright: ignore[reportMissingImports]
+        from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         raise UserError("tasks of playground need an extra: pip install 'cuelearner-jax[playground]'") from None
-    if name not in dm_control_suite.ALL_ENVS:
-        near = suggestion(name, dm_control_suite.ALL_ENVS)
-        raise UserError(f"playground has no dm_control task {name!r}{near}; pass others to from_brax")
+    if name not in registry.ALL_ENVS:
+        raise UserError(f"playground has no environment {name!r}{suggestion(name, registry.ALL_ENVS)}")
     try:
-        return dm_control_suite.load(name, config_overrides={"impl": "jax"})
+        return registry.load(name, config_overrides={"impl": "jax"})
     except AttributeError as error:  # MuJoCo's own interface has changed
         raise UserError(f"playground:{name} fails with the installed MuJoCo ({error}): choose another task") from error
 
@@ -133,7 +131,7 @@ def _family(name: str, about: str, physics: str, config: type, *labels_hold: str
 BRAX = _family("brax", "brax's environments, each as brax:NAME, brax:pusher", "brax's own", BraxConfig, "backend")
 PLAYGROUND = _family(
     "playground",
-    "MuJoCo Playground's dm_control tasks, each as playground:NAME, playground:CartpoleBalance",
+    "MuJoCo Playground's environments, each as playground:NAME, playground:CartpoleBalance",
     "MJX, MuJoCo in JAX",
     SimulatorConfig,
 )
@@ -144,9 +142,9 @@ def _task_of(family: Task, name: str) -> Task:
     layout = _layout(family.name, name, getattr(family.config, "backend", ""))
     names, sizes, *_ = zip(*layout.observation, strict=True)
     config = family.config(name, slices=names, slice_sizes=sizes, entries=layout.entries)
-    preset = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
-    about = f"{family.name}'s {name}"
-    return dataclasses.replace(family, about=about, default=config, presets={QUICKSTART: preset})
+    presets = read("other", config, layout.box())["presets"]
+    presets[QUICKSTART] = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
+    return dataclasses.replace(family, about=f"{family.name}'s {name}", default=config, presets=presets)
 
 
 brax_task, playground_task = partial(_task_of, BRAX), partial(_task_of, PLAYGROUND)

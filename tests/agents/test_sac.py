@@ -13,6 +13,7 @@ from walk_task import BOX, SMALL, Walk
 
 from cuelearner_jax.agents import sac
 from cuelearner_jax.agents.categorical import BINS, ROOM, next_unit, project
+from cuelearner_jax.agents.networks import next_moments
 from cuelearner_jax.agents.replay import Memory, Transition, buffer_for, count_guided, stored_step
 from cuelearner_jax.config import static
 from cuelearner_jax.environment import Spaces, spaces_of
@@ -141,13 +142,14 @@ GUIDED = np.arange(16) % 5 == 0  # steps 0, 5, 10, 15
 
 
 @cache
-def memory():
-    """The first steps of sixteen walks, whose actions are their numbers."""
+def memory(factor=1.0, shift=0.0):
+    """The first steps of sixteen walks, whose actions are their numbers; observations in other units, if given."""
     buffer, keys = buffer_for(ENV, True), jax.random.split(KEY, 16)
     state, obs = jax.vmap(ENV.reset)(keys)
     _, step = jax.vmap(ENV.step)(keys, state, BOX.sample(KEY, (16,)))
     numbers = jnp.arange(16.0)[:, None].repeat(2, 1)
-    stored = jax.vmap(partial(stored_step, bootstraps=True))(obs, numbers, step)
+    step = step.replace(aftermath=step.aftermath * factor + shift)
+    stored = jax.vmap(partial(stored_step, bootstraps=True))(obs * factor + shift, numbers, step)
     rows = buffer.add(buffer.empty(96), jnp.array(0), stored)
     counts = count_guided(jnp.zeros((96, 1), jnp.int32), jnp.array(0), jnp.asarray(GUIDED))
     return Memory(ENV, buffer, rows, jnp.array(16), 16, True, counts)
@@ -218,6 +220,29 @@ def test_at_discount_zero_targets_are_rewards():
     batch = batch_of()
     found = agent.targets(0.0, params["actor"], None, 1.0, batch.replace(next_obs=jnp.zeros((6, 0))), KEY)
     np.testing.assert_array_equal(found, batch.reward)
+
+
+# Normalised observations.
+
+
+def test_moments_of_the_first_batches_are_those_of_all_rows():
+    batches = 5000 + np.random.default_rng(0).normal(size=(3, 8, 2)).astype(np.float32)
+    found = {"mean": jnp.zeros(2), "variance": jnp.ones(2)}
+    for count, batch in enumerate(batches, 1):
+        found = next_moments(found, jnp.asarray(batch), jnp.array(count))
+    rows = batches.reshape(-1, 2).astype(float)
+    np.testing.assert_allclose(found["mean"], rows.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(found["variance"], rows.var(0), rtol=1e-2)
+
+
+def test_with_normalised_observations_an_agent_learns_and_acts_alike_in_any_units():
+    agent, obs = agent_of(dataclasses.replace(SMALL, normalise_obs=True)), jax.random.normal(KEY, (5, 2))
+    before, scalars = agent.init(KEY), dataclasses.replace(probes.SCALARS, discount=0.9)
+    learned = lambda kept: agent.update(ENV, agent.options, scalars, jnp.array(1), *before, kept, KEY)[0]  # noqa: E731
+    plain, odd = (jax.jit(partial(learned, memory(*units)))() for units in ((), (1e3, 7.0)))
+    expected = agent.act(None, plain, obs, KEY)
+    np.testing.assert_allclose(agent.act(None, odd, obs * 1e3 + 7, KEY), expected, atol=1e-3)
+    assert np.abs(expected - agent.act(None, plain, obs * 1e3 + 7, KEY)).max() > 0.01
 
 
 # Critics over bins of value.

@@ -88,15 +88,15 @@ def test_actions_are_the_whole_box_with_names_of_the_model_or_cues_of_the_caller
     assert [cue.name for cue in named.cues] == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
 
 
-def test_observations_in_a_dictionary_are_one_vector_with_named_slices():
+def test_observations_in_a_dictionary_are_one_vector_with_named_slices_but_those_for_critics():
     class Parts(Field):
         def reset(self, rng):
             state = super().reset(rng)
-            return state.replace(obs={"place": state.obs, "angle": state.obs[0]})
+            return state.replace(obs={"place": state.obs, "angle": state.obs[0], "privileged_state": state.obs})
 
         def step(self, state, action):
             after = super().step(state.replace(obs=state.obs["place"]), action)
-            return after.replace(obs={"place": after.obs, "angle": after.obs[0]})
+            return after.replace(obs={"place": after.obs, "angle": after.obs[0], "privileged_state": after.obs})
 
     env = from_brax(Parts())
     assert [(part.name, part.size) for part in env.observation] == [("angle", 1), ("place", 2)]
