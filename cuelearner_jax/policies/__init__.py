@@ -13,7 +13,6 @@ from cuelearner_jax.policies.policy import (
     Corrected,
     Guided,
     Heuristic,
-    Middle,
     NearAims,
     PolicyNode,
     Taught,
