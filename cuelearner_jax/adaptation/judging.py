@@ -273,7 +273,7 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
         others = labels.replace(valid=labels.valid & ~held)
         model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
-        refined = guidance.refine_labelled_actions(model, env, labels, held, one_pass).actions
+        refined = guidance.act(model, env, labels.obs, labels.action, held, one_pass).actions
         moves = space.log(labels.action, refined) / space.from_unit(of.scalars.eps_deg)
         # words about one cue each; of the other cues nothing is compared
         counts = is_answered(labels.answer) & held[:, None]

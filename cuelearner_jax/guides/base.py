@@ -152,12 +152,6 @@ class Guide:
         less = self.spaces.actions.spread(REFERENCES) if self.compares else None
         return self.network.disagreement(env, model.params, obs, actions, less)
 
-    def refine_labelled_actions(
-        self, model: GuidanceModel, env: Any, labels: Label, active: Rows, scalars: GuideScalars
-    ) -> Refinement:
-        """Return what `act` makes of the actions that labels (n, ...) are about."""
-        return self.act(model, env, labels.obs, labels.action, active, scalars)
-
     def act_within(
         self,
         bound: Float[Array, ""],
