@@ -75,7 +75,7 @@ class Runner:
         """Restore the newest checkpoint, or start afresh; drop the rows after it."""
         last_step = last_round = -1
         if store.latest() is None:
-            self.training.begin()
+            self.training.blocks = self.group.start()
         else:
             self.training.restore(store)
             self.failed = self.training.failed

@@ -67,10 +67,6 @@ class Training:
         self.blocks: list[TrainState] = []
         self.wall = 0.0  # seconds of labelling and training so far
 
-    def begin(self) -> None:
-        """Start fresh lanes."""
-        self.blocks = self.group.start()
-
     def restore(self, store: Checkpoints) -> None:
         """Continue from the newest checkpoint, in this group's cut of the lanes. Raises as `Checkpoints.restore`."""
         group, (clock, self.wall, count, size) = self.group, restore_clock(store)

@@ -120,7 +120,7 @@ def in_memory(
     with progress_bars(visible=progress) as bars:
         for group in groups:
             name, training = group.guidance.name, Training(group, examined, request.split)
-            training.begin()
+            training.blocks = group.start()
             if not training.labelled and labels is not None:
                 training.take(labels)
             bar = bars.add_task(name, total=request.config.schedule.total_steps, note="")
