@@ -59,8 +59,6 @@ class LabelOptions(NewWorld):
 
     policy: Annotated[Word, tyro.conf.arg(metavar="POLICY")] = None
     """Policy to ask about: a run folder, a policy folder, a shipped agent, or package.module:NAME of a function."""
-    code: Annotated[str | None, tyro.conf.arg(name="base")] = None
-    """Code of a policy folder's base policy: package.module:NAME."""
     sizes: GuideSizes = field(default_factory=GuideSizes)
     scalars: GuideScalars = field(default_factory=GuideScalars)
     out: Path = Path("labels/NAME")

@@ -109,14 +109,13 @@ class NewWorld(Outside):
     changes: str | None = None
     """Distortions of your own that a reading of answers knows, in place of those that the world declares:
     package.module:NAME."""
+    code: Annotated[str | None, tyro.conf.arg(name="base")] = None
+    """Code of a policy folder's base policy: package.module:NAME."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finished(NewWorld, RunParts):
     """A finished policy's code, which is never loaded because a file names it, and its world."""
-
-    code: Annotated[str | None, tyro.conf.arg(name="base")] = None
-    """Code of a policy folder's base policy: package.module:NAME."""
 
 
 ONE = ("teacher", "preset", "scenario", "agent", "arbiter", "base", "changes", "labels-from", "judge-by", "cues")
