@@ -99,11 +99,6 @@ class Lane(NamedTuple):
     largest_budget: int
 
     @property
-    def counts_guided(self) -> bool:
-        """Whether replay counts guided steps: for an agent that draws them separately, under a guide that acts."""
-        return getattr(self.learner.options, "SORTS", False) and self.guidance.moves and not self.stores
-
-    @property
     def stores(self) -> bool:
         """Whether labelled steps are kept for the agent to learn from."""
         return self.sizes.store_labelled and self.guidance.asks
@@ -115,7 +110,9 @@ class Lane(NamedTuple):
         params, training = self.learner.init(k_agent)
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, self.sizes.num_envs))
         capacity = self.learner.options.replay_capacity
-        guided = jnp.zeros((capacity, 1), jnp.int32) if self.counts_guided else None
+        # Guided steps are counted for an agent that draws them separately, under a guide that acts.
+        counts = getattr(self.learner.options, "SORTS", False) and self.guidance.moves and not self.stores
+        guided = jnp.zeros((capacity, 1), jnp.int32) if counts else None
         guide = asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes)
         return TrainState(
             agent=AgentState(params, training, self.buffer.empty(capacity), env_state, obs, guided),
