@@ -78,10 +78,7 @@ def as_teacher(
     return form.answer(jax.random.key(0), env, teacher, state, obs, action, scalars, *second)[0]
 
 
-@jax.jit
-def question(of: asking.Inquiry, guide: GuideState, keys: Any) -> Array:
-    """Return the action to ask about (action,)."""
-    return asking.question(of, guide, keys)[0]
+question = jax.jit(asking.question)
 
 
 @jax.jit
@@ -146,7 +143,7 @@ class Learner:
         """Return the action to ask about in a situation."""
         if self._reads:
             return self.newest.model.questions(np.asarray(guide.obs)[None], 1, keys.question)[1][0]
-        return np.asarray(question(self._of, guide.replace(model=self.newest.model), keys))
+        return np.asarray(question(self._of, guide.replace(model=self.newest.model), keys)[0])
 
     def refine(self, obs: Float[Array, " obs"], action: np.ndarray) -> Float[np.ndarray, " action"]:
         """Return an action refined by the newest model; of a reading the corrected policy's action."""
