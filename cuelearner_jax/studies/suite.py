@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -164,10 +164,7 @@ def collect(out: Path, worlds: list[World]) -> pa.Table:
     A row is a lane and evaluation. `score` is its world's metric between `ends`; `rewarded_steps` are those of the
     training so far, or of judging a correction.
     """
-    return pa.concat_tables(_collected(out, worlds), promote_options="permissive")
-
-
-def _collected(out: Path, worlds: list[World]) -> Iterator[pa.Table]:
+    parts = []
     for world in worlds:
         for file in sorted((out / world.use / world.name).rglob(results.PARQUET)):
             rows = results.read(file).drop_columns(["folder"])
@@ -180,7 +177,8 @@ def _collected(out: Path, worlds: list[World]) -> Iterator[pa.Table]:
                 rows = rows.append_column("rewarded_steps", pc.cast(rows["step"], pa.float64()))
             for end in ("", "_each"):
                 rows = rows.append_column(f"score{end}", _scores(rows[world.metric + end].combine_chunks(), world.ends))
-            yield rows
+            parts.append(rows)
+    return pa.concat_tables(parts, promote_options="permissive")
 
 
 def _scores(values: Any, ends: tuple[float, float]) -> Any:
