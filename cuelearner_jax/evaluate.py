@@ -138,9 +138,7 @@ RESAMPLES = 2_000
 DRAWN_TOGETHER = 1 << 18  # values, at most: small arrays take no loop in Python, and large ones little memory
 
 
-def mean_interval(
-    values: Float[np.ndarray, "*lanes n"], resamples: int = RESAMPLES, seed: int = 0
-) -> Float[np.ndarray, "3 *lanes"]:
+def mean_interval(values: Float[np.ndarray, "*lanes n"], resamples: int = RESAMPLES) -> Float[np.ndarray, "3 *lanes"]:
     """Return the mean of independent values and its 95% percentile bootstrap interval (NaN for a single value).
 
     The same values give the same interval. For the difference of two policies, pass each environment's difference.
@@ -149,7 +147,7 @@ def mean_interval(
     count, mean = values.shape[-1], values.mean(-1)
     if count == 1:
         return np.stack([mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)])
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     together = max(1, DRAWN_TOGETHER // max(1, values.size))
     means = []
     for first in range(0, resamples, together):
