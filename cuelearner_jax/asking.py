@@ -119,9 +119,7 @@ def start(
 def question(
     of: Inquiry, guide: GuideState, keys: QuestionKeys
 ) -> tuple[Float[Array, "*candidates action"], Float[Array, "*candidates action"]]:
-    """Return the action to ask about in the guide's situation, or in each of its candidates, and the base policy's
-    action.
-    """
+    """Return the action to ask about in the guide's situation, or in each candidate, and the base policy's action."""
     space, scalars, several = actions_of(of.env), of.scalars, guide.obs.ndim > 1
     first = call_policy(of.base, keys.base, *_situations(guide), space)
     first = first if several else first[0]

@@ -39,8 +39,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def write(policy: Any, env: Any, names: tuple[str, ...], checkpoint: Path, out: Path, hand: dict[str, Any]) -> Path:
-    """Write a checkpoint with the correction of proposed actions; the folder appears completely or not at all.
-    Return its path.
+    """Write a checkpoint with the correction of proposed actions, completely or not at all; return its path.
 
     `env`: the policy's situations. `names`: of the action's entries; empty: not known. `hand`: the robot's kinematics
     where actions are positions of its hand, as `storage.situations`; else empty.

@@ -55,9 +55,8 @@ def intended_action(
 ) -> Action:
     """Return the action that a teacher intends in place of `action`, apart from its bias.
 
-    The intended action is the teacher's best one or, with `scalars.answer` "nearest", the nearest good one.
-
-    The nearest good action is the paper's Eq. 2 to the letter, whose answers follow a local gradient.
+    The intended action is the teacher's best one or, with `scalars.answer` "nearest", the nearest good one: the paper's
+    Eq. 2 to the letter, whose answers follow a local gradient.
     """
     if scalars.answer != "nearest":
         return _taught(space, teacher, teacher.best_action(state, obs), action)
