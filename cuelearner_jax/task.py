@@ -141,7 +141,6 @@ class Task:
     judge_by: Callable[[Any], str] = lambda config: "reward"
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a part that cannot work."""
         fields = {entry.name for entry in dataclasses.fields(self.config)}
         if not self.name.isidentifier() or "name" in fields:
             raise ValueError(f"task {self.name!r}: its name must be an identifier, and no field of its configuration")

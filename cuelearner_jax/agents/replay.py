@@ -72,7 +72,6 @@ class RingBuffer:
     """Pure functions over rows (capacity, width) of packed steps. `step`: all rows written so far, overwritten too."""
 
     def __init__(self, example: StoredStep) -> None:
-        """Make the buffer for steps shaped like `example`."""
         row, self._unravel = ravel_pytree(example)
         self.width = row.shape[0]
         self._reward_column = example.obs.size + example.action.size  # the fields lie in the order of their declaration

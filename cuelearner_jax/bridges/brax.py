@@ -74,7 +74,6 @@ class FixedSimulator(NamedTuple):
     simulator: Any
 
     def __call__(self) -> Any:
-        """Return the simulator."""
         return self.simulator
 
 

@@ -313,5 +313,4 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
 
 
 def _values(kind: type, config: Any) -> dict[str, Any]:
-    """Return the values of a configuration for the fields of `kind`."""
     return {entry.name: getattr(config, entry.name) for entry in dataclasses.fields(kind)}

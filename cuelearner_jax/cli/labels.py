@@ -80,7 +80,6 @@ def run(arguments: list[str]) -> None:
 
 
 def _facts(file: LabelFile) -> dict[str, str]:
-    """Return the facts about a label file, by name."""
     own = {name: value for name, value in file.task.items() if name not in ("name", "from")}
     world = ", ".join(f"{name} {value}" for name, value in own.items() if not isinstance(value, dict | list))
     strength = "" if file.eps is None else f", by {file.eps:g} {file.space.unit}"

@@ -123,7 +123,6 @@ ONE = ("teacher", "preset", "scenario", "agent", "arbiter", "base", "changes", "
 
 class _Ahead(argparse.ArgumentParser):
     def error(self, message: str) -> Any:
-        """Raise UserError."""
         raise UserError(message.removeprefix("argument "))
 
 

@@ -95,7 +95,6 @@ class Builder:
     """Collects the operations of a graph."""
 
     def __init__(self) -> None:
-        """Start with an empty graph."""
         self.ops: list[list[Any]] = []
         self.constants: dict[str, np.ndarray] = {}
         self.kinds: dict[str, str] = {}

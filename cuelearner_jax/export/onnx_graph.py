@@ -106,7 +106,6 @@ class _Writer:
         return self.constant(np.array(value, np.float32))
 
     def cast(self, value: str, kind: str) -> str:
-        """Cast a value to another type."""
         return self.node("Cast", value, to=self.kinds[kind])
 
     def _loop(

@@ -140,7 +140,6 @@ class Intent(Guide):
         rows = jax.vmap(lambda label: evidence_of(env.aims(label.obs), self.spaces.actions, label, scalars))(labels)
 
         def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
-            """Return -log of the probability of each answer."""
             share = self.network.predict(None, params, rows.features, rows.possible)
             return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
 

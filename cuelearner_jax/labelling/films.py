@@ -45,7 +45,6 @@ class _Desk:
             raise Interrupted("stopped before it was decided: nothing is written")
 
     def page(self, request: Request) -> Response:
-        """Return the page of the moment."""
         if self.over:
             self.last_shown.set()
         if self.over or not self.films:
@@ -58,7 +57,6 @@ class _Desk:
         return HTMLResponse(LOOK(head="", body=body))
 
     def film(self, request: Request) -> Response:
-        """Return a film of the pair that is shown."""
         file = self.films.get(request.path_params["side"]) if request.path_params["number"] == self.number else None
         return FileResponse(file) if file else PlainTextResponse("this film is no longer shown\n", 404)
 

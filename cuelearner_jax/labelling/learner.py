@@ -121,7 +121,6 @@ class Learner:
     """The model of a session's answers: a guide fitted from scratch to all labels, or a reading of new ones."""
 
     def __init__(self, plan: SessionPlan, env: Any, keys: SessionKeys) -> None:
-        """Begin without labels."""
         slots = asking.label_slots(plan.labels, plan.config.sizes)
         self._blank = asking.start(plan.guidance, env, slots, plan.labels, keys.model, keys.start)
         self._plan, self._key = plan, keys.session

@@ -160,7 +160,6 @@ class Page:
             return str(error) or type(error).__name__
 
     def _script(self, code: str) -> None:
-        """Run a script in the browser."""
         with self._client:
             ui.run_javascript(code)
 

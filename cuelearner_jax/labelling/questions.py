@@ -52,7 +52,6 @@ class Questions:
     """Makes items, and holds the model that later items are asked by."""
 
     def __init__(self, plan: SessionPlan, env: Any) -> None:
-        """Make the model that later items are asked by."""
         self.plan, self.env, self.pictures, self.space = plan, env, plan.task.pictures(), actions_of(env)
         self.keys = keys_of(plan.seed)
         self.learner = Learner(plan, env, self.keys)

@@ -194,7 +194,6 @@ class Session(AbstractContextManager[Any, None]):
             self._next = self._ahead.submit(self._prepare, number + 1)
 
     def _fit(self) -> None:
-        """Fit the model to the answers so far, if that is still due."""
         labels = self.record.labels()
         if not self._learner.is_due(len(labels)):
             return

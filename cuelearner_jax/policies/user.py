@@ -253,7 +253,6 @@ class Foreign:
         self.__qualname__ = str(path or type(model).__qualname__)
 
     def __call__(self, obs: Float[np.ndarray, "n obs"]) -> Any:
-        """Return actions for observations."""
         return self._act(self.model, obs)
 
     def __eq__(self, other: object) -> bool:

@@ -101,7 +101,6 @@ class Runner:
             raise Interrupted(f"stopped at step {step} of {self.name}; go on with the same command and --resume")
 
     def _tell_failed(self, when: str) -> None:
-        """Print a line if lanes have newly failed."""
         new, group = self.training.failed & ~self.failed, self.group
         if new.any():
             names = name_lanes(group.seeds[new], group.budgets[new])

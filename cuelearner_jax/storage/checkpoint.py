@@ -27,7 +27,6 @@ from cuelearner_jax.errors import UserError, first_line
 
 MOST_CHECKPOINTS = 2  # number of checkpoints of a run that stay on disk
 DIGESTS = "digests"
-# Remedy in the message about a checkpoint that cannot be read.
 REMEDY = (
     "if it is of another configuration or version of the program, use that one; if it is damaged, move its folder away "
     "to return to the checkpoint before it"

@@ -137,7 +137,6 @@ def _flat(names: Any) -> list[str]:
 
 
 def _frames(path: Path, features: dict[str, Any], table: pa.Table, key: str) -> Frames:
-    """Return a function from a row to its camera picture."""
     if features[key]["dtype"] == "image":
         return lambda row: _read_embedded(path, table[key][row].as_py())
     names = [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]

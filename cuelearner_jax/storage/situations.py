@@ -177,7 +177,6 @@ def _table_in(path: Path) -> Path:
 
 
 def _columns(table: Path) -> dict[str, Any]:
-    """Return the columns of a table by name."""
     try:
         if table.suffix == ".npz":
             with np.load(table, allow_pickle=False) as arrays:

@@ -103,7 +103,6 @@ def _walk(env: Any, key: PRNGKeyArray, steps: int) -> dict[str, Any]:
 
 
 def _check_steps(laws: Laws, env: Environment, path: dict[str, Any], steps: int) -> None:
-    """Check the laws of the steps."""
     step = path["step"]
     laws.actions(actions_of(env), path["actions"], "what its actions' `sample` draws")
     values = {"obs": step.obs, "final_obs": step.final_obs, "reward": step.reward, **step.metrics, **step.outcome}

@@ -73,7 +73,6 @@ def _fitted(laws: Laws, guide: Guide, env: Any, model: GuidanceModel, labels: La
 def _check_act(
     laws: Laws, guide: Guide, env: Any, unfitted: GuidanceModel, fitted: GuidanceModel, obs: Array, actions: Array
 ) -> None:
-    """Check the changes to a batch of actions."""
     active, act = jnp.arange(ROWS) % 2 == 0, jax.jit(guide.act)
     refined, passes = act(fitted, env, obs, actions, active, SCALARS)
     alone = act(unfitted, env, obs, actions, jnp.ones(ROWS, bool), SCALARS).actions
