@@ -171,6 +171,5 @@ def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
 
 def teacher_of_world(value: Any, space: Space) -> Teacher:
     """Return a teacher: the given one, or one that shows what a given policy does itself."""
-    return teaching(
-        value.policy if hasattr(value, "trained") else value, space
-    )  # `CallablePolicy` is above this module
+    # only a `CallablePolicy`, whose module is above this one, has `trained`
+    return teaching(value.policy if hasattr(value, "trained") else value, space)

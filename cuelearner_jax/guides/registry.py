@@ -46,10 +46,7 @@ def find(name: str) -> type[Guide]:
 
 
 def resolve(text: str) -> type[Guide]:
-    """Return the kind that a user or caller names: by its name, or as `package.module:CLASS`, whose code is loaded.
-
-    Never pass text from a file. Raises UserError if there is no such kind.
-    """
+    """Return the kind that a user or caller names, never a file (`plugins.resolve`). Raises UserError if none is."""
     return plugins.resolve(guides(), text, "guidance")
 
 
