@@ -68,7 +68,6 @@ __all__ = [*_PLACES]  # noqa: PLE0604  # pyright: ignore[reportUnsupportedDunder
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name, whose module is loaded at first use."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)

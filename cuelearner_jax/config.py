@@ -49,7 +49,6 @@ class Bounds(NamedTuple):
     above: bool = False  # True if `least` itself is excluded
 
     def __contains__(self, number: object) -> bool:
-        """Whether a number is within the bounds."""
         assert isinstance(number, int | float)
         return self.least <= number <= self.most and not (self.above and number == self.least)
 

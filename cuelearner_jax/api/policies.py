@@ -56,7 +56,6 @@ class CallablePolicy:
         object.__setattr__(self, "policy", policy_of(self.policy, self.actions))
 
     def __repr__(self) -> str:
-        """Return one line: the policy's name, the sizes of observation and action, its world and its lane."""
         sizes = f"obs ({sum(quantity.size for quantity in self.observation) or '?'},) -> action ({self.actions.size},)"
         where = [self.world.task.name] if self.world else []
         where += [f"{name}={value!r}" for name, value in self.lane.items()]
