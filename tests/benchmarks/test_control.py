@@ -19,6 +19,15 @@ from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.run_config import RunConfig
 
 PENDULUM = TASKS["Pendulum-v1"]
+
+
+class UnlikeUnits(type(PENDULUM)):
+    """The pendulum, with observations in units that are a million apart."""
+
+    def observe(self, state):
+        return super().observe(state) * jnp.array([1e3, 1e-3, 1.0]) + jnp.array([500.0, 0.0, 0.0])
+
+
 CASES = {  # policy of the second episode, in the first the action is 0; steps of both, and whether time ended them
     "CartPole-v1": (lambda obs: int(obs @ np.array([0.1, 0.5, 10.0, 2.0]) > 0), [(9, False), (500, True)]),
     "MountainCar-v0": (lambda obs: 2 * int(obs[1] > 0), [(200, True), (153, False)]),
@@ -58,15 +67,23 @@ REDQ = {"critics": 4, "layer_norm": True, "updates_per_step": 4, "batch_size": 6
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("changes", "steps"), [({}, 5_000), (REDQ, 3_000), ({"bins": True}, 5_000)])
-def test_soft_actor_critic_swings_it_up(changes, steps):
+@pytest.mark.parametrize(
+    ("env", "changes", "steps"),
+    [
+        (PENDULUM, {}, 5_000),
+        (PENDULUM, REDQ, 3_000),
+        (PENDULUM, {"bins": True}, 5_000),
+        (UnlikeUnits(), {"normalise_obs": True}, 7_000),  # without, it earns about -1,500
+    ],
+)
+def test_soft_actor_critic_swings_it_up(env, changes, steps):
     """A random policy earns about -1,200 an episode, one that holds the pole up about -150."""
     schedule = Schedule(random_steps=500, learn_after=500, guidance_until=0)
     scalars = Scalars(discount=0.99, max_grad_norm=1e6)
     config = RunConfig(None, Sizes(num_envs=1), scalars, schedule, dataclasses.replace(AGENT, **changes))
-    timed = Timed(config, PENDULUM, "none", 2)
+    timed = Timed(config, env, "none", 2)
     timed.train(steps)
-    returned = evaluation(PENDULUM, config.agent_in(PENDULUM))
+    returned = evaluation(env, config.agent_in(env))
     assert all((returned(block.agent.params) > -300).all() for block in timed.blocks)
 
 
