@@ -160,8 +160,10 @@ GROUPS = 20  # most groups of episodes whose means an evaluation keeps
 
 
 def group_means(values: Float[np.ndarray, "*lanes envs"]) -> Float[np.ndarray, "*lanes groups"]:
-    """Return means over up to `GROUPS` groups of environments, equal in size within one."""
-    return np.stack([part.mean(-1) for part in np.array_split(values, min(GROUPS, values.shape[-1]), axis=-1)], -1)
+    """Return means over up to `GROUPS` groups of environments, of equal size where at least ten groups can be."""
+    count = values.shape[-1]
+    number = next((n for n in range(GROUPS, 9, -1) if count % n == 0), min(GROUPS, count))
+    return np.stack([part.mean(-1) for part in np.array_split(values, number, axis=-1)], -1)
 
 
 MOST_STRETCHES = 25  # most stretches of a roll-out with progress

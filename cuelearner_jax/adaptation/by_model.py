@@ -141,17 +141,19 @@ def result_of(judge: Judge, block: Any, count: int, results: tuple[Result, ...] 
     return AdaptationResult(judge.of, lanes, block, judgement, results)
 
 
-def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars | None) -> None:
+def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars | None, tries: bool = True) -> None:
     """Raise UserError for bounds that no action reaches, and answers from which nothing could be learned within them.
 
-    `scalars`: None where answers of any strength say something.
+    `scalars`: None where nothing is known of answers. `tries`: whether a pass moves actions by them.
     """
     if not all(0 < bound <= space.reach for bound in bounds) or len(set(bounds)) < len(bounds):  # NaN is neither
         text = " ".join(f"{bound:g}" for bound in bounds)
         raise UserError(f"bound_deg is {text}: give numbers above 0, up to {space.reach:g} ({space.unit}), each once")
-    if scalars is None:
+    eps = 0.0 if scalars is None else scalars.eps_deg
+    if eps > space.reach:
+        raise UserError(f"scalars.eps_deg is {eps:g} {space.unit}, beyond all actions: give at most {space.reach:g}")
+    if scalars is None or not tries:
         return
-    eps = scalars.eps_deg
     if not space.grain <= eps <= min(bounds):
         raise UserError(
             f"labels of {eps:g} {space.unit} say nothing within a bound of {min(bounds):g}: give a scalars.eps_deg "

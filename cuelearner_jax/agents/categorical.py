@@ -4,9 +4,10 @@ Source: Palenicek et al., "XQC: Well-conditioned optimization accelerates deep r
 arXiv:2509.25174, 2025. The projection onto bins: Bellemare et al., "A distributional perspective on reinforcement
 learning", ICML 2017. One batch for steps and next steps, also in the target: Bhatt et al., "CrossQ", ICLR 2024.
 
-Bins are in units of rms(reward) / (1 - discount) / `ROOM`, so that no option depends on the scale of rewards. XQC
-divides rewards by a running deviation of returns instead, which a minibatch of steps does not show. The first
-distribution is narrow: from equal logits, which hold all values alike, agents learn the pendulum later.
+Bins are in units of rms(reward) / (1 - discount) / `ROOM`. Values beyond the last bin count as it: those of rare large
+rewards, and of entropy that is worth more than rewards (`first_temperature`). XQC divides rewards by a running
+deviation of returns instead, which a minibatch of steps does not show. The first distribution is narrow: from equal
+logits, which hold all values alike, agents learn the pendulum later.
 """
 
 from __future__ import annotations

@@ -217,17 +217,17 @@ class SoftActorCritic:
         k_critics, k_actor = jax.random.split(key)
         temperature = options.first_temperature * jnp.exp(rest.log_temperature)
 
-        def minibatch(carry: tuple[Any, ...], key: PRNGKeyArray) -> tuple[Any, tuple[Array, Array]]:
-            critics, opt_state, target_critics, moments, _ = carry
+        def minibatch(carry: tuple[Any, ...], own_key: tuple[PRNGKeyArray, Array]) -> tuple[Any, Any]:
+            (critics, opt_state, target_critics, moments, _), (key, number) = carry, own_key
             k_batch, k_target = jax.random.split(key)
             (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
             if own.normalise_obs:
-                moments = next_moments(moments, batch.obs, count)
+                moments = next_moments(moments, batch.obs, number)
                 after = normalised(batch.next_obs, moments) if self.bootstraps else batch.next_obs
                 batch = batch.replace(obs=normalised(batch.obs, moments), next_obs=after)
             behind = scalars.discount, actor, target_critics, temperature, batch, k_target
             if own.bins:
-                error = self._binned_error(*behind, critics, count)
+                error = self._binned_error(*behind, critics, number)
             else:
                 targets, unit = self.targets(*behind)[None], self.in_unit(batch.action)
                 error = lambda params: (jnp.mean((self.values(params, batch.obs, unit) - targets) ** 2), {})  # noqa: E731
@@ -241,7 +241,10 @@ class SoftActorCritic:
         none = jnp.zeros((own.batch_size, self.spaces.obs_size))
         start = params["critics"], rest.critics_opt, rest.target_critics, params.get("obs"), none
         keys = jax.random.split(k_critics, own.updates_per_step)
-        (critics, critics_opt, target_critics, moments, obs), (losses, norms) = jax.lax.scan(minibatch, start, keys)
+        numbers = (count - 1) * own.updates_per_step + 1 + jnp.arange(own.updates_per_step)
+        (critics, critics_opt, target_critics, moments, obs), (losses, norms) = jax.lax.scan(
+            minibatch, start, (keys, numbers)
+        )
 
         climbed = jax.value_and_grad(self.actor_loss, has_aux=True)(actor, critics, temperature, obs, k_actor)
         (_, log_density), gradient = climbed

@@ -163,6 +163,8 @@ def adapt(
     env, task, config = own_world.env, own_world.task, config_of(policy, own_world)
     file = Path(labels) if isinstance(labels, str | os.PathLike) else None
     rows = rows_of(labels) if isinstance(labels, tuple) else None
+    if teacher is not None and (file is not None or rows is not None):
+        raise UserError("labels answer in place of a teacher: give teacher or labels, not both")
     if teacher is not None:
         teacher = teacher_of_world(teacher, own_world.actions)
     elif file is None and rows is None:

@@ -55,9 +55,9 @@ def rows_of(labels: Labels) -> Label:
 
 
 def labels_from_file(path: Path) -> LabelFile:
-    """Return the labels of a file's first seed. Raises UserError for a file of other answers."""
+    """Return the labels of a file, of all its seeds. Raises UserError for a file of other answers."""
     file = label_files.read(path)
     if file.answers != RELATIVE.name:
         raise UserError(f"{path} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
     external_labels.check_file(file, None, RELATIVE, str(path))
-    return file._replace(labels=jax.tree.map(lambda leaf: leaf[file.seeds == file.seeds[0]], file.labels))
+    return file

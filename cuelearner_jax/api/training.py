@@ -6,6 +6,7 @@ import dataclasses
 import os
 import warnings
 from collections.abc import Sequence
+from numbers import Integral
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,8 @@ def train(
     teacher: Teacher | Any = None,
     config: RunConfig | str = "quickstart",
     *,
-    guidance: Sequence[str] = (),
-    labels: Sequence[int] | str | os.PathLike[str] | None = None,
+    guidance: str | Sequence[str] = (),
+    labels: int | Sequence[int] | str | os.PathLike[str] | None = None,
     seeds: int | Sequence[int] | None = None,
     split: str = "validation",
     progress: bool = True,
@@ -104,8 +105,10 @@ def train(
     if isinstance(labels, str | os.PathLike):
         labels = (label_files.read(Path(labels)).budget,)
     seeds = usual.seeds if seeds is None else seeds
-    own = seeds_of(0, seeds) if isinstance(seeds, int) else tuple(map(index, seeds))
-    kinds = tuple(guidance) or tuple(kind for kind in usual.guidance if kind in possible)
+    own = seeds_of(0, int(seeds)) if isinstance(seeds, Integral) else tuple(map(index, seeds))
+    labels = (labels,) if isinstance(labels, Integral) else labels
+    chosen = (guidance,) if isinstance(guidance, str) else tuple(guidance)
+    kinds = chosen or tuple(kind for kind in usual.guidance if kind in possible)
     grid = Grid(kinds, own, usual.labels if labels is None else tuple(map(index, labels)))
     config = dataclasses.replace(config, task=world.config)
     request = TrainRequest(task, config, grid, labels_from=file, split=split)

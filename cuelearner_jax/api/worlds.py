@@ -72,7 +72,7 @@ class World:
     ) -> tuple[EnvState, Step]:
         """Execute an action. Where an episode ends, a new one begins automatically.
 
-        Raises UserError for an action outside the space.
+        Raises UserError for an action of another shape, or of numbers that the space cannot use.
         """
         space = self.actions
         if not isinstance(action, Tracer):
@@ -123,8 +123,8 @@ def from_gymnasium(
         max_steps: an episode is truncated after so many (default: as the environment says, or 1,000).
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         observation: a name, a number of entries and a unit for each slice of the flattened observation,
-            [("gripper", 3, "m"), ("goal", 3, "m")] (default: its entries by the names of its space). A description, a
-            kind and degrees between beams may follow.
+            [("gripper", 3, "m", "", "own"), ("goal", 3, "m")] (default: its entries by the names of its space). A
+            description, a kind ("own": measured by the robot itself) and degrees between beams may follow.
         units: units of slices by name, in place of `observation`; a reading may shift slices in "m" and "rad".
         processes: number of processes that play (0: one for each processor; 1: this process plays).
         arguments: arguments of the environment.

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import AnswerForm
+from cuelearner_jax.spaces import Box, Space
 from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.types import Label
 
-ACTION_ERROR = 1e-3  # largest error of an entry of an action
+ACTION_ERROR = 1e-3  # largest error of an entry of an action; in a box, of half its range
+
+
+def action_error(space: Space) -> Any:
+    """Return the largest error of each entry of an action of a space."""
+    return ACTION_ERROR * (np.subtract(space.high, space.low) / 2 if isinstance(space, Box) else 1.0)
 
 
 def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, source: str) -> None:
@@ -39,8 +47,8 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, source: str = 
     ends_in_action = form is not None and (form.is_action or form.second is not None)
     for name in ("actions", "answers") if ends_in_action else ("actions",):
         action = np.asarray(rows[name])[:, -spaces.actions.size :]
-        off = np.abs(np.asarray(spaces.actions.retract(jnp.asarray(action))) - action) > ACTION_ERROR
         space = spaces.actions
+        off = np.abs(np.asarray(space.retract(jnp.asarray(action))) - action) > action_error(space)
         _refuse(off, f"{source}: {name} are no {space.about}", f"the space {space.name} gives the nearest by `retract`")
     if form is not None and form.values is not None:
         values = form.values(spaces.actions)

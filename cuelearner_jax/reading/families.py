@@ -105,16 +105,17 @@ def check_family(family: Sequence[Distortion]) -> Family:
 def declared_distortions(env: Any) -> Family:
     """Derive the distortions of what is seen from what an environment declares of its observation; empty: nothing.
 
-    Slices in metres or radians of the same size shift together, and those in metres may be scaled. Beams at equal
-    angles roll. Directions turn, and places with an `origin` turn about that. A change of the actions needs no
-    declaration. Of actions that are proposed elsewhere the robot's state is seen aside where its effect is recorded,
+    Places in metres of the same size shift together and may be scaled, and so do several angles; a slice of one entry
+    shifts by itself. Beams at equal angles roll. Directions turn, and places with an `origin` turn about that. A change
+    of the actions needs no declaration. Of actions that are proposed elsewhere the robot's state is seen aside where
+    its effect is recorded,
     or else nothing: they alone may have changed.
     """
     if any(quantity.kind == PROPOSED for quantity in env.observation):
         return (_state(env),) if any(quantity.kind == EFFECT for quantity in env.observation) else ACTIONS_ALONE
     places = _places(env.observation)
     distortions: list[Distortion] = []
-    for (unit, size), slices in _alike(places).items():
+    for (unit, size, _), slices in _alike(places).items():
         distortions.append(_shift(unit, size, slices))
         if unit == "m":
             distortions.append(_gain(slices))
@@ -149,12 +150,13 @@ def _places(observation: Sequence[Quantity]) -> list[tuple[Quantity, int]]:
     return list(zip(observation, starts, strict=True))
 
 
-def _alike(places: list[tuple[Quantity, int]]) -> dict[tuple[str, int], list[tuple[Quantity, int]]]:
-    """Return the slices that a displaced sensor shifts together: those of one unit and size."""
-    groups: dict[tuple[str, int], list[tuple[Quantity, int]]] = {}
+def _alike(places: list[tuple[Quantity, int]]) -> dict[tuple[str, int, int], list[tuple[Quantity, int]]]:
+    """Return the slices that a displaced sensor shifts together: those of one unit and size, or a single entry."""
+    groups: dict[tuple[str, int, int], list[tuple[Quantity, int]]] = {}
     for quantity, start in places:
         if quantity.unit in SHIFTING and not quantity.kind:
-            groups.setdefault((quantity.unit, quantity.size), []).append((quantity, start))
+            alone = start if quantity.size == 1 else -1
+            groups.setdefault((quantity.unit, quantity.size, alone), []).append((quantity, start))
     return groups
 
 

@@ -193,7 +193,7 @@ def cell(row: Row, name: str, form: str) -> str:
     value, low, high, lower, upper = (row.get(name + end) for end in ("", "_above", "_below", "_lower", "_upper"))
     if (value is None and low is None) or value == np.inf:
         return ""
-    if name.endswith("_ratio") and upper == np.inf and float(lower or 0) <= 1:
+    if name.endswith("_ratio") and upper == np.inf and float(lower or 0) < 1:
         return "not told apart"
     text_of = lambda number: form.format(number) if number != np.inf else "no bound"  # noqa: E731
     if value is not None:
@@ -201,7 +201,7 @@ def cell(row: Row, name: str, form: str) -> str:
     elif high == np.inf:
         text = f"above {text_of(low)}" if low else "not known"
     else:
-        text = f"{text_of(low)} to {text_of(high)}" if low else f"below {text_of(high)}"
+        text = f"{text_of(low)} to {text_of(high)}" if low else f"at most {text_of(high)}"
     return text if lower is None else f"{text} [{text_of(lower)}, {text_of(upper)}]"
 
 

@@ -101,10 +101,13 @@ def _short(table: pa.Table, variants: Sequence[Variant]) -> list[str]:
         if furthest > last:
             words = f"the curve ends at {last:,}, the last step of all seeds"
             lines.append(f"{variant.name}: some seeds have reached step {furthest:,}; {words}")
+        evaluations = {step for step in rows["step"].to_pylist() if step <= last}
+        if left_out := len(evaluations) - len(variant.steps):
+            lines.append(f"{variant.name}: {left_out} evaluations that not all seeds have are left out")
         if len(variant.seeds) == 1:
             lines.append(f"{variant.name}: a single seed, so there is no interval")
         elif not variant.episodes:
-            words = "the run keeps no results of episodes, so intervals leave out the evaluation's error"
+            words = "not all seeds keep results of equally many episodes, so intervals leave out the evaluation's error"
             lines.append(f"{variant.name}: {words}")
     if len(hashes := sorted(set(table["config_hash"].to_pylist()))) > 1:
         where, names = f" of {variants[0].run}" if variants and variants[0].run else "", ", ".join(hashes)

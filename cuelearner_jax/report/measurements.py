@@ -33,14 +33,14 @@ def spread(row: Measured, metric: str) -> Interval | None:
     """Return one policy's mean over episodes, or the interquartile mean over seeds; None if a value is not finite.
 
     The interval of several seeds draws seeds and episodes. Where all episodes succeed, or all fail, resampling has no
-    spread: the interval of a share is then by Jeffreys' prior.
+    spread: the interval of a share is then by Jeffreys' prior, from the episodes of one seed, which all seeds share.
     """
     if not np.isfinite(row.metrics[metric]).all():
         return None
     each = row.each[metric][:1] if is_single(row) else row.each[metric]
     no_shares = ("reward", "return") if "return" in row.metrics else ()
-    if metric not in no_shares and each.min() == each.max() and each.min() in (0, 1) and each.size > 1:
-        certain = float(scipy.stats.beta.ppf(0.05, each.size + 0.5, 0.5))
+    if metric not in no_shares and each.min() == each.max() and each.min() in (0, 1) and each.shape[-1] > 1:
+        certain = float(scipy.stats.beta.ppf(0.05, each.shape[-1] + 0.5, 0.5))
         return Interval(*map(np.asarray, (1.0, certain, 1.0) if each.min() else (0.0, 0.0, 1 - certain)))
     return Interval(*mean_interval(each[0])) if is_single(row) else interval(row.metrics[metric], group_means(each))
 

@@ -169,9 +169,11 @@ def group_of(name: str, metric: str, key: dict[str, Any], every: pa.Table, guide
     setting = {option: "-" if value is None else value for option, value in key.items() if option != "task"}
     name = ", ".join(dict.fromkeys(filter(None, (name, results.setting_name(setting)))))
     marks = every[results.FAILED].to_pylist() if results.FAILED in every.column_names else []
-    lost = {lane for lane, is_failed in zip(_lanes(every), marks, strict=False) if is_failed}
-    of_failed = np.array([lane in lost for lane in _lanes(every)], bool)
-    rows, failed = every.filter(pa.array(~of_failed)), every.filter(pa.array(of_failed))
+    lanes, size = _lanes(every), len(results.LANE)
+    lost = {lane for lane, is_failed in zip(lanes, marks, strict=False) if is_failed}
+    rows = every.filter(pa.array([lane not in lost for lane in lanes], pa.bool_()))
+    again = {lane[:size] for lane in _lanes(rows)}  # some of them failed, and were trained again in another folder
+    failed = every.filter(pa.array([lane in lost and lane[:size] not in again for lane in lanes], pa.bool_()))
     table = rows.filter(pc.field(metric).is_valid())
     guides = guides and rows_of(guides, {**key, "split": every["split"][0].as_py()})
     return Group(key["task"], name, table, failed, rows.num_rows - table.num_rows, every, guides)

@@ -12,7 +12,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars
-from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.guides import registry as guidances
@@ -65,6 +65,13 @@ def resolve_request(request: RequestT) -> RequestT:
     request = replace(request, grid=with_control(replace(request.grid, guidance=names)))
     check_grid(request.grid)
     request.task.check_evaluations(request.config)
+    space, eps = actions_of(shape_of(request.task, request.config.task)), request.config.scalars.eps_deg
+    asks = [kind for kind in request.grid.guidance if guidances.find(kind).needs_cues]
+    if asks and not space.grain <= eps <= space.reach:
+        raise UserError(
+            f"scalars.eps_deg is {eps:g} {space.unit}, and every answer of {asks[0]} would be the same: give "
+            f"{space.grain:g} to {space.reach:g}"
+        )
     return request
 
 

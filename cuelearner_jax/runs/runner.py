@@ -147,8 +147,10 @@ class Runner:
     def _train(self, store: Checkpoints, writer: TableWriter, log: tracking.Log | None) -> None:
         now, schedule = self.training, self.group.config.schedule
         self.bars.reset(self._bar, completed=now.step, begun=now.step, ahead=self._ahead, note="")
+        never_acts = self.group.guidance.moves and now.step == 0
         for row in now.stretches():
             writer.append(**row)
+            never_acts &= not np.any(row.get("train_guided_share", 0))
             if log is not None:
                 log(now.step, tracking.means(row))
             self._tell_failed(f"at step {now.step:,}")
@@ -158,3 +160,6 @@ class Runner:
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(store)
             self._stop_on_signal(store)
+        if never_acts:
+            until = f"before step {schedule.guidance_until:,}, where guidance ends"
+            console.print(f"{self.name}: no guided episode began {until}: it never acted")

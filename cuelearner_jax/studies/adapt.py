@@ -230,7 +230,7 @@ class AdaptRequest:
         else:
             reach = by_model.reach(space, subject.bases.policy, file.labels.obs, file.labels.action)
             bounds = (max(reach, self.scalars.eps_deg),)
-        by_model.check_amounts(space, bounds, None if guidance.by_evidence else self.scalars)
+        by_model.check_amounts(space, bounds, self.scalars, tries=not guidance.by_evidence)
         return bounds
 
     def _judging(self, subject: Subject, lanes: int) -> Judging:

@@ -144,12 +144,13 @@ class Cell(NamedTuple):
 
 def cells_of(table: dict[str, Any], scale: dict[str, Any], worlds: list[World], kinds: list[str]) -> list[Cell]:
     """Return all cells of a scale, also those that make no sense (`Cell.obstacle`)."""
+    faults = {teacher: table["teachers"][teacher] for teacher in scale["teachers"]}
+    labels = {name: tuple(scale["fault_labels"] if own else scale["labels"]) for name, own in faults.items()}
     return [
-        Cell(world, teacher, faults, kind, tuple(scale["fault_labels"] if faults else scale["labels"]), scale["seeds"])
+        Cell(world, teacher, own, kind, labels[teacher], scale["seeds"])
         for world in worlds
         for kind in kinds
-        for teacher, faults in table["teachers"].items()  # innermost, since another teacher mostly compiles nothing
-        if teacher in scale["teachers"]
+        for teacher, own in faults.items()  # innermost, since another teacher mostly compiles nothing
     ]
 
 

@@ -36,6 +36,7 @@ from cuelearner_jax.terminal import console
 FAMILY = "gymnasium"
 FRAMES = "cuelearner_jax.tasks.frames"  # whose Pillow is not loaded for every command
 NUM_ENVS = 8
+FIRST_EPISODES = 1_600  # most steps of all first episodes of quickstart, which are never guided
 UNLIMITED = 1_000  # steps of an episode, where neither environment nor caller gives a limit
 TRIED = 1_000  # most steps of an episode, to find out whether the environment reports success
 
@@ -192,11 +193,11 @@ def task_from(
             "gives environments"
         )
     text = _as_json(dict(arguments or {}))
-    actions, slices, limit, succeeds, ends = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
-    if not max_steps and not limit and not ends:
+    actions, slices, limit, succeeds = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
+    if not max_steps and not limit:
         console.print(
-            f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,}, or after "
-            "--task.max-steps (in Python max_steps)"
+            f"environment {name} has no limit of steps: an episode that goes on is truncated after {UNLIMITED:,}, or "
+            "after --task.max-steps (in Python max_steps)"
         )
     slices = _with_names(name, slices, observation or fetch, units or {})
     pairs = cues.split(";") if isinstance(cues, str) else cues
@@ -219,7 +220,8 @@ def task_from(
     )
     _ = config.observation  # raises for units or kinds that do not fit
     lanes: dict[str, Any] = {"guidance": ("none", "relative"), "labels": (100,), "seeds": 1}
-    preset = quickstart(config, config.space, num_envs, 10 * config.max_steps, (64, 64), **lanes)
+    several = min(num_envs, max(1, FIRST_EPISODES // config.max_steps))
+    preset = quickstart(config, config.space, several, 10 * config.max_steps, (64, 64), **lanes)
     changes: dict[str, Any] = {"default": config, "bodies": (_body(factory),), "presets": {QUICKSTART: preset}}
     return dataclasses.replace(GYMNASIUM, about=f"Gymnasium's {name}", **changes)
 
@@ -231,11 +233,10 @@ def _as_json(arguments: dict[str, Any]) -> str:
     raise UserError(f"arguments are {format_value(arguments)}, which JSON does not keep: give a function that has them")
 
 
-def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
+def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
     """Play an episode of one instance.
 
-    Return its actions, the slices of an observation, the limit of steps (0: none), whether it reports success, and
-    whether the episode ended by itself.
+    Return its actions, the slices of an observation, the limit of steps (0: none), and whether it reports success.
     """
     from gymnasium.spaces import flatten
 
@@ -256,7 +257,7 @@ def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool, bool]:
             console.print(f"{one.whose}: all episodes begin alike, whatever their seed; results hold for this start")
     finally:
         one.close()
-    return one.actions, slices, limit, one.reports_success, ended
+    return one.actions, slices, limit, one.reports_success
 
 
 def _limit(env: Any) -> int:

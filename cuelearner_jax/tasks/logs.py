@@ -27,6 +27,7 @@ from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import BASE, EFFECT, PROPOSED, Features, Quantity, WholeObservations, offers
 from cuelearner_jax.errors import UserError, suggestion
+from cuelearner_jax.feedback.external_labels import action_error
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.policies import Heuristic, PolicyNode
 from cuelearner_jax.run_config import RunConfig
@@ -215,9 +216,9 @@ def task_of(
         spread=spread,
         hand=json.dumps(recording.about["hand"]) if "hand" in recording.about else "",
     )
-    space, near = space_of(config), 1e-3 * max(1.0, float(np.abs(recording.actions).max()))
-    # what `retract` makes NaN is not close either
-    if space.size != size or not np.allclose(space.retract(recording.actions), recording.actions, rtol=0, atol=near):
+    space = space_of(config)
+    near = space.size == size and np.abs(space.retract(recording.actions) - recording.actions) <= action_error(space)
+    if not np.all(near):  # what `retract` makes NaN is not near either
         remedy = "bounds that hold the recorded actions" if actions == "box" else "another kind of actions"
         raise UserError(
             f"{folder}: its actions are not all {space.about} ({space.name}, {space.size} entries): give {remedy}"
