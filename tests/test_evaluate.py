@@ -38,6 +38,11 @@ def rolled(num_envs, steps, env=ENV):
     return jax.device_get(evaluate.evaluate_policy(env, Uniform(), KEY, num_envs, num_envs * steps))
 
 
+@pytest.mark.parametrize(("count", "groups"), [(100, 20), (32, 16), (10, 10), (7, 7), (23, 20)])
+def test_episodes_are_kept_as_means_of_groups(count, groups):
+    assert evaluate.group_means(np.arange(float(count))[None]).shape == (1, groups)
+
+
 def test_means_over_first_episodes_are_of_all_of_them_or_of_none():
     whole = rolled(400, LONGEST)
     assert whole["finished"] == 1

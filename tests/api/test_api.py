@@ -147,6 +147,8 @@ WRONG = [
     (lambda: cl.adapt(policy, WORLD, TEACHER, guidance="none"), "asks no questions"),
     (lambda: cl.adapt(policy, WORLD, TEACHER, judge_bounds=[2.0], guidance="relative"), "judge_bounds is 2"),
     (lambda: cl.adapt(policy, WORLD), "teacher is None: give one"),
+    (lambda: cl.adapt(policy, WORLD, TEACHER, labels="some.parquet"), "give teacher or labels, not both"),
+    (lambda: cl.adapt(policy, WORLD, TEACHER, eps_deg=200), "scalars.eps_deg is 200"),
     (lambda: cl.measure(policy, WORLD, steps=30, envs=4), "steps is 30: give a positive multiple of envs"),
     (lambda: cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], seeds=1), "asks a teacher: give one"),
     (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, guidance=["telepathy"]), "unknown guidance 'telepathy'"),
@@ -172,7 +174,7 @@ COLUMNS = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_
 
 
 def test_training_from_python_gives_what_the_command_gives(folder):
-    how = {"guidance": ["relative"], "labels": [10], "seeds": [3, 5], "progress": False}
+    how = {"guidance": "relative", "labels": 10, "seeds": [3, 5], "progress": False}
     run = cl.train(WORLD, TEACHER, probes.CONFIG, **how)
     assert rows_of(run.results.to_pylist(), COLUMNS) == rows_of(results.read(folder).to_pylist(), COLUMNS)
     policy = run.policy(guidance="relative", seed=5)

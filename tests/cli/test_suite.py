@@ -48,6 +48,8 @@ def test_the_cells_of_every_scale_make_sense_for_their_worlds():
     assert {"smoke", "quick", "paper"} == set(table["scales"])
     scale = table["scales"]["paper"]
     assert set(scale["worlds"]) == set(table["worlds"])
+    with pytest.raises(KeyError, match="wronng"):
+        suite.cells_of(table, scale | {"teachers": ["wronng"]}, [], [])
     for name in ("billiards_one_ball", "arm_reach_turned_camera", "zoo_region"):
         world = command._world(name, table["worlds"][name])
         cells = {cell.name: cell.obstacle() for cell in suite.cells_of(table, scale, [world], table["kinds"])}

@@ -190,6 +190,9 @@ def test_families_that_make_no_sense_are_refused():
     ):
         with pytest.raises(UserError, match=message):
             check_family(family)
+    joints = (Quantity("hip", 1, "rad"), Quantity("knee", 1, "rad"))  # each encoder has an offset of its own
+    names = [one.name for one in unknowns_of(declared_distortions(SimpleNamespace(observation=joints)))]
+    assert names == ["hip: shift", "knee: shift"]
     ball = Quantity("ball", 2, "m", origin=(0.0, 0.0))
     for slices, message in (
         ((Quantity("gravity", 3, "1", kind="directions"),), "'gravity' has 3 entries"),

@@ -78,6 +78,7 @@ def test_a_curve_that_never_gets_there_is_a_bound_and_no_number():
     assert row["reached"] == 0.0
     assert cell(row, "steps_ratio", "{:.1f}") == "above 2.0 [2.0, no bound]"
     assert cell(row | {"steps_ratio_lower": 0.9}, "steps_ratio", "{:.1f}") == "not told apart"
+    assert cell(row | {"steps_ratio_lower": 1.0}, "steps_ratio", "{:.1f}") == "above 2.0 [1.0, no bound]"
     # Unguided agents that never get there: the others need less than their share of all steps.
     variants = [same("none", 0, 0.3), same("relative", 100, 1.0)]
     row = efficiency_of(variants, Question(level=0.5)).tables["efficiency"][1]

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import probes
 import pytest
+import walk_task
 
 from cuelearner_jax.cli.sources import _with_teacher
 from cuelearner_jax.errors import UserError
@@ -112,6 +113,12 @@ def test_grids_that_make_no_sense_are_refused(grid, message, tmp_path):
     with pytest.raises(UserError, match=message):
         train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_answers_that_could_never_differ_are_refused(tmp_path):
+    config = walk_task.config(scalars={"eps_deg": 5.0})
+    with pytest.raises(UserError, match="eps_deg is 5 shares, and every answer of relative would be the same"):
+        train.run(Order(walk_task.TASK, config, GRID, tmp_path / "run"))
 
 
 @pytest.mark.parametrize("name", ["failed", "step", "scalars.eps_deg", "reward"])
