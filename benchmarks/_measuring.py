@@ -1,4 +1,4 @@
-"""Shared parts of benchmarks: what training costs on this machine, rounds of labels, the share of the matmul rate.
+"""Shared parts of benchmarks: what training costs on this machine, and rounds of labels.
 
 Training is unguided, with the program of `cuelearner sweep`, learning from the first step on. Compilation and the first
 stretch are apart; figures are medians over stretches of some iterations.
@@ -14,10 +14,9 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from _flops import step_operations
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place
-from cuelearner_jax.environment import Environment, spaces_of
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
@@ -83,8 +82,7 @@ def measure(env: Callable[[], Environment], config: RunConfig, seeds: int, secon
         `steps_a_second` (environment steps of all seeds), `ms_a_step` (one step of every seed), `mb_a_seed` (at rest)
         and `peak_gb` (of the first device in this process so far; None where unknown). Further `first_step_s`
         (environment, compilation and first step, without imports), `seeds`, `devices`, `stretches` and `spread`
-        (slowest less fastest stretch, over their median). Of operations `gflops`, `matmul_gflops` of the machine in
-        the same run, and `share_of_matmul`.
+        (slowest less fastest stretch, over their median).
     """
     began = time.perf_counter()
     group = Timed(learning(config), env(), "none", seeds)
@@ -98,12 +96,9 @@ def measure(env: Callable[[], Environment], config: RunConfig, seeds: int, secon
     typical = statistics.median(stretches)
     step = typical / iterations / config.sizes.num_envs
     memory = jax.local_devices()[0].memory_stats() or {}
-    devices = group.group.mesh.size
-    peak = matmul_rate() * (devices if jax.default_backend() != "cpu" else 1)
-    flops = seeds / step * step_operations(config, spaces_of(group.group.env)).total
     return {
         "seeds": seeds,
-        "devices": devices,
+        "devices": group.group.mesh.size,
         "steps_a_second": seeds / step,
         "ms_a_step": 1e3 * step,
         "mb_a_seed": at_rest / 1e6,
@@ -111,20 +106,4 @@ def measure(env: Callable[[], Environment], config: RunConfig, seeds: int, secon
         "first_step_s": first - (iterations - 1) / iterations * typical,
         "stretches": len(stretches),
         "spread": (max(stretches) - min(stretches)) / typical,
-        "gflops": flops / 1e9,
-        "matmul_gflops": peak / 1e9,
-        "share_of_matmul": flops / peak,
     }
-
-
-def matmul_rate() -> float:
-    """Large matrix products on one device [operations/s], best of three; a CPU is one device with all its cores.
-
-    Float32 is computed as JAX does by default, as in training.
-    """
-    size, queued = (2048, 1) if jax.default_backend() == "cpu" else (8192, 10)
-    a, b = (jax.random.normal(jax.random.key(k), (size, size)) for k in (0, 1))
-    product = jax.jit(jnp.matmul)
-    product(a, b).block_until_ready()
-    best = min(timed(lambda: [product(a, b) for _ in range(queued)])[0] for _ in range(3))
-    return queued * 2 * size**3 / best

@@ -231,6 +231,10 @@ def correct(
         policy = load_policy(policy)
     before = getattr(getattr(policy, "trained", None), "task", None)
     before = before if isinstance(before, LogsConfig) else None
+    is_file = isinstance(labels, str | os.PathLike)
+    says_space = is_file or any(one is not None for one in (cues or None, low, high, before))
+    if space is None and not says_space and isinstance(policy, CallablePolicy) and policy.observation:
+        space = policy.actions
     file = _labels(labels, space, cues, low, high, before)
     if eps is not None and file.eps is not None and not math.isclose(eps, file.eps, rel_tol=1e-6):
         raise UserError(f"the label file holds answers of {file.eps:g} {file.space.unit}: leave out eps")
