@@ -125,7 +125,7 @@ class Task:
     # configuration -> steps of its longest episode, where episodes count (`Step.outcome`); None: steps count
     longest: Callable[[Any], int] | None = None
     # metrics of which less is better, by which no correction is judged
-    less_is_better: tuple[str, ...] = ("distance", "collision", "error", "cost")
+    less_is_better: tuple[str, ...] = ("collision", "cost", "distance", "error", "foul", "timeout")
     wants: Callable[[Any], str] = lambda config: ""  # configuration -> the instruction for a person, a sentence
     # environment -> default policy whose actions people are asked about; None: uniform actions
     proposed: Callable[[Any], Policy] | None = None

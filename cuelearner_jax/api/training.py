@@ -6,7 +6,6 @@ import dataclasses
 import os
 import warnings
 from collections.abc import Sequence
-from numbers import Integral
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -105,10 +104,10 @@ def train(
     if isinstance(labels, str | os.PathLike):
         labels = (label_files.read(Path(labels)).budget,)
     seeds = usual.seeds if seeds is None else seeds
-    own = seeds_of(0, int(seeds)) if isinstance(seeds, Integral) else tuple(map(index, seeds))
-    labels = (labels,) if isinstance(labels, Integral) else labels
-    chosen = (guidance,) if isinstance(guidance, str) else tuple(guidance)
-    kinds = chosen or tuple(kind for kind in usual.guidance if kind in possible)
+    own = seeds_of(0, int(seeds)) if isinstance(seeds, int | np.integer) else tuple(map(index, seeds))
+    labels = (labels,) if isinstance(labels, int | np.integer) else labels
+    own_kinds = (guidance,) if isinstance(guidance, str) else tuple(guidance)
+    kinds = own_kinds or tuple(kind for kind in usual.guidance if kind in possible)
     grid = Grid(kinds, own, usual.labels if labels is None else tuple(map(index, labels)))
     config = dataclasses.replace(config, task=world.config)
     request = TrainRequest(task, config, grid, labels_from=file, split=split)

@@ -20,7 +20,6 @@ from cuelearner_jax.report.tables import code, markdown
 from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
 from cuelearner_jax.task import Task
-from cuelearner_jax.tasks import registry
 
 FILES = [f"{name}.{suffix}" for name in ("curves", "label_efficiency", "profiles") for suffix in ("png", "svg")]
 FILES += [f"{name}.csv" for name in ("summary", "curves", "efficiency", "equal_area", "aggregates", "profiles")]
@@ -48,7 +47,7 @@ class ReportRequest(Question):
     split: str = "validation"
     """Evaluation episodes to report: validation or tuning."""
     lower_is_better: bool = False
-    """Smaller values of the metric are better, also where the task does not say so."""
+    """Smaller values of the metric are better (default: of collision, distance, error, cost, foul and timeout)."""
     by_run: bool = False
     """Report each folder separately, under its name, for runs of different configurations. Each is compared with its
     own unguided agents or, without any, with those of the first folder that has some."""
@@ -79,8 +78,8 @@ class Contents(NamedTuple):
 def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Contents:
     """Read the results of run folders, or of folders above them, and compute what a report shows."""
     metric, split = request.metric, request.split
+    lower_is_better = request.lower_is_better or metric in Task.less_is_better
     groups = read_groups(folders, metric, split, request.by_run, guidance=request.guidance, labels=request.labels)
-    lower_is_better = request.lower_is_better or any(metric in _less_is_better(group.task) for group in groups)
     variants = variants_of(groups, metric)
     over = answer = None
     if len({variant.task for variant in variants}) > 1:
@@ -93,11 +92,6 @@ def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Co
     missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
     missing += over.missing if over else []
     return Contents(groups, variants, tables.summary(variants, lower_is_better), missing, answer, every, over)
-
-
-def _less_is_better(task: str) -> tuple[str, ...]:
-    """Return the metrics of a task of which less is better; of a task that is not known here, the usual ones."""
-    return (registry.find(task) if task in registry.names() else Task).less_is_better
 
 
 def report(

@@ -113,7 +113,6 @@ BILLIARDS = Task(
     bodies=(PLAYER,),
     teacher=make_teacher,
     files=_files,
-    less_is_better=("foul",),
     labels_hold=("mirrors", *TEACHERS),
     **presets.read("billiards", BilliardsConfig()),
 )

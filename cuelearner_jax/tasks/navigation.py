@@ -95,7 +95,7 @@ NAVIGATION = Task(
     teacher=make_teacher,
     brief_teacher=make_brief_teacher,
     longest=lambda config: config.max_steps,
-    less_is_better=("collision", "timeout", "duration"),
+    less_is_better=(*Task.less_is_better, "duration"),
     labels_hold=("worlds", "world_seed", "max_steps", "mirrors", "look_ahead", "keep_scans"),  # labels are of one scan
     **presets.read("navigation", NavigationConfig()),
 )
