@@ -108,8 +108,7 @@ def declared_distortions(env: Any) -> Family:
     Places in metres of the same size shift together and may be scaled, and so do several angles; a slice of one entry
     shifts by itself. Beams at equal angles roll. Directions turn, and places with an `origin` turn about that. A change
     of the actions needs no declaration. Of actions that are proposed elsewhere the robot's state is seen aside where
-    its effect is recorded,
-    or else nothing: they alone may have changed.
+    its effect is recorded, or else nothing: they alone may have changed.
     """
     if any(quantity.kind == PROPOSED for quantity in env.observation):
         return (_state(env),) if any(quantity.kind == EFFECT for quantity in env.observation) else ACTIONS_ALONE

@@ -67,8 +67,8 @@ def aggregates_of(variants: Sequence[Variant], level: float | None, lower_is_bet
         raise UserError(f"{', '.join(tasks)} share no guidance with equal labels: report each task by itself")
     names = [replace(own[0], task="").name for own in each.values() if own not in shared]
     missing = [f"{name}: not in all tasks, so not among the aggregates" for name in names]
-    if run := (unguided_of(variants[0], variants) or variants[0]).run:
-        missing.append(f"scores of all settings are 0 for the unguided agents of {run}")
+    if len({one.run for one in variants}) > 1 and (unguided := unguided_of(variants[0], variants)):
+        missing.append(f"scores of all settings are 0 for the unguided agents of {unguided.run}")
     return Aggregates([_aggregate(own, variants, ends) for own in shared], ends, missing)
 
 

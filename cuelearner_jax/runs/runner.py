@@ -147,7 +147,8 @@ class Runner:
     def _train(self, store: Checkpoints, writer: TableWriter, log: tracking.Log | None) -> None:
         now, schedule = self.training, self.group.config.schedule
         self.bars.reset(self._bar, completed=now.step, begun=now.step, ahead=self._ahead, note="")
-        never_acts = self.group.guidance.moves and now.step == 0
+        is_to_act = self.group.guidance.moves and schedule.guidance_until and not self.group.config.sizes.store_labelled
+        never_acts = is_to_act and now.step == 0
         for row in now.stretches():
             writer.append(**row)
             never_acts &= not np.any(row.get("train_guided_share", 0))

@@ -227,19 +227,19 @@ def test_at_discount_zero_targets_are_rewards():
 
 def test_moments_of_the_first_batches_are_those_of_all_rows():
     batches = 5000 + np.random.default_rng(0).normal(size=(3, 8, 2)).astype(np.float32)
-    found = {"mean": jnp.zeros(2), "variance": jnp.ones(2)}
+    moments = {"mean": jnp.zeros(2), "variance": jnp.ones(2)}
     for count, batch in enumerate(batches, 1):
-        found = next_moments(found, jnp.asarray(batch), jnp.array(count))
+        moments = next_moments(moments, jnp.asarray(batch), jnp.array(count))
     rows = batches.reshape(-1, 2).astype(float)
-    np.testing.assert_allclose(found["mean"], rows.mean(0), rtol=1e-6)
-    np.testing.assert_allclose(found["variance"], rows.var(0), rtol=1e-2)
+    np.testing.assert_allclose(moments["mean"], rows.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(moments["variance"], rows.var(0), rtol=1e-2)
 
 
 def test_with_normalised_observations_an_agent_learns_and_acts_alike_in_any_units():
     agent, obs = agent_of(dataclasses.replace(SMALL, normalise_obs=True)), jax.random.normal(KEY, (5, 2))
     before, scalars = agent.init(KEY), dataclasses.replace(probes.SCALARS, discount=0.9)
-    learned = lambda kept: agent.update(ENV, agent.options, scalars, jnp.array(1), *before, kept, KEY)[0]  # noqa: E731
-    plain, odd = (jax.jit(partial(learned, memory(*units)))() for units in ((), (1e3, 7.0)))
+    update = lambda of: agent.update(ENV, agent.options, scalars, jnp.array(1), *before, of, KEY)[0]  # noqa: E731
+    plain, odd = (jax.jit(partial(update, memory(*units)))() for units in ((), (1e3, 7.0)))
     expected = agent.act(None, plain, obs, KEY)
     np.testing.assert_allclose(agent.act(None, odd, obs * 1e3 + 7, KEY), expected, atol=1e-3)
     assert np.abs(expected - agent.act(None, plain, obs * 1e3 + 7, KEY)).max() > 0.01
