@@ -193,6 +193,8 @@ class GuideSizes:
     frame: Frame = "raw"
     """Inputs of networks: raw, the observation and the action; action, the observation as seen from the action (a guide
     then predicts a turn from there)."""
+    normalise_obs: bool = True
+    """Guides' networks see raw observations less their labels' mean, over their standard deviation."""
     feedback_layers: Layers = (400, 400, 300, 300)
     """Hidden layers of the guidance model."""
     feedback_start: Start = "xavier"

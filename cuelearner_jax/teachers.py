@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.agents.networks import all_finite, as_function, network_inputs, q_network
 from cuelearner_jax.config import from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.checkpoint import Checkpoints
@@ -31,14 +32,15 @@ TRAIN = "python experiments/train_teacher.py"  # folder of the repository, for m
 
 def init_params(layers: tuple[int, ...], env: Any, key: PRNGKeyArray) -> Params:
     """Return random weights of a teacher's network."""
-    return q_network(layers).init(key, *network_inputs("action", env, jnp.zeros(env.obs_size), jnp.array([1.0, 0.0])))
+    obs, action = jnp.zeros(env.obs_size), jnp.array([1.0, 0.0])
+    return q_network(layers).init(key, *network_inputs("action", DIRECTIONS, env, obs, action))
 
 
 def expected_reward(
     layers: tuple[int, ...], env: Any, params: Params, obs: Observation, actions: Float[Array, "*n 2"]
 ) -> Float[Array, "*n"]:
     """Return the reward that a teacher's network expects of actions in one situation."""
-    return as_function(q_network(layers))(params, *network_inputs("action", env, obs, actions))[..., 0]
+    return as_function(q_network(layers))(params, *network_inputs("action", DIRECTIONS, env, obs, actions))[..., 0]
 
 
 class LearnedTeacher(struct.PyTreeNode):

@@ -147,7 +147,7 @@ class DoubleDQN:
         look = as_function(q_network(layers, jnp.dtype(own.coarse_dtype)))
         return best_near_peaks(
             partial(self.value, env, params),
-            lambda one, actions: look(rough, *network_inputs(self.frame, env, one, actions))[:, 0],
+            lambda one, actions: look(rough, *network_inputs(self.frame, self.spaces.actions, env, one, actions))[:, 0],
             self._directions,
             obs,
             own.coarse_directions,
@@ -159,7 +159,7 @@ class DoubleDQN:
     ) -> Float[Array, "*m"]:
         """Return Q of each action; `obs` is one situation for all actions, or one for each."""
         network = as_function(q_network(self.options.q_layers))
-        return network(params, *network_inputs(self.frame, env, obs, actions))[..., 0]
+        return network(params, *network_inputs(self.frame, self.spaces.actions, env, obs, actions))[..., 0]
 
     def update(
         self,

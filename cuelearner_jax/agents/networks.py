@@ -1,6 +1,6 @@
 """MLPs of an observation and an action, for action values and feedback models; and their inputs.
 
-Inputs are observation and action as they are, or the observation as it looks from the action. In the action's frame
+Inputs are observation and action, or the observation as it looks from the action. In the action's frame
 (`frame` "action"), situations that differ by a rotation have the same inputs, and a network's output for one holds for
 all of them. This is equivariance by the input (Wang, Walters, Platt, "SO(2)-equivariant reinforcement learning", ICLR
 2022; van der Pol et al., "MDP homomorphic networks", NeurIPS 2020).
@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from cuelearner_jax.config import Frame, Start
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Params
 
 RATE = 1e-3  # share of a new batch in running means
@@ -98,6 +99,15 @@ def next_moments(before: Params, obs: Float[Array, "batch obs"], count: Int[Arra
     return {"mean": before["mean"] + rate * change, "variance": variance}
 
 
+def moments_of(obs: Float[Array, "rows obs"], valid: Bool[Array, " rows"]) -> Params:
+    """Return mean and variance of observations in some rows, for `normalised`; that of a constant entry is 1."""
+    where = jnp.broadcast_to(valid[:, None], obs.shape)
+    count = jnp.maximum(valid.sum(), 1)
+    mean = jnp.sum(obs, 0, where=where) / count
+    variance = jnp.sum(jnp.square(obs - mean[None]), 0, where=where) / count
+    return {"mean": mean, "variance": jnp.where(variance > jnp.square(1e-6 * mean), variance, 1.0)}
+
+
 def normalised(obs: Float[Array, "... obs"], moments: Params | None) -> Float[Array, "... obs"]:
     """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without."""
     if moments is None:
@@ -117,15 +127,15 @@ def as_function(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Ar
 
 
 def network_inputs(
-    frame: Frame, env: Any, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
+    frame: Frame, space: Space, env: Any, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
 ) -> tuple[Float[Array, "*n own"], Float[Array, "*m turned"]]:
     """Return a network's inputs for observation and action.
 
-    `frame`: "raw": the two as they are; "action": the features of `env`. `obs`: one observation (obs,) with any number
-    of actions (*m, action), or n observations with one action each.
+    `frame`: "raw": the two, a box's actions from -1 to 1; "action": the features of `env`. `obs`: one observation
+    (obs,) with any number of actions (*m, action), or n observations with one action each.
     """
     if frame == "raw":
-        return obs, actions
+        return obs, space.even(actions)
     features = env.features(obs, actions) if obs.ndim == 1 else jax.vmap(env.features)(obs, actions)
     return features.own, features.turned
 

@@ -176,7 +176,7 @@ class SoftActorCritic:
 
     def in_unit(self, actions: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
         """Return actions of the box in unit coordinates."""
-        return 2 * self.spaces.actions.log(self._box.middle(), actions)
+        return self._box.even(actions)
 
     def in_box(self, unit: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
         """Return actions in unit coordinates as actions of the box."""

@@ -18,7 +18,15 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
-from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, silent_cues, squared_errors
+from cuelearner_jax.guides.fitting import (
+    Example,
+    GuideModel,
+    fit_model,
+    guide_model,
+    silent_cues,
+    squared_errors,
+    with_moments,
+)
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
@@ -111,12 +119,13 @@ class Guide:
         """
         targets = jax.vmap(lambda label: self.target(label, scalars))(labels)
         # Rounded here: fused with later operations, the targets' last bits would depend on the compiler.
-        rows = Example(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
+        space = self.spaces.actions if self.outputs is None else None
+        rows = Example(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid, space=space)
         if self.form is None or not self.form.by_eps or len(self.spaces.actions.cues) == 1:
             return rows
         cues = is_answered(labels.answer)
         valid = labels.valid & cues.any(-1)
-        return rows.replace(valid=valid, cues=cues | silent_cues(labels.answer, valid), space=self.spaces.actions)
+        return rows.replace(valid=valid, cues=cues | silent_cues(labels.answer, valid))
 
     def augmented(self, key: PRNGKeyArray, batch: Any) -> Any:
         """Return the batch to train on in place of a batch (n, ...) of examples."""
@@ -130,7 +139,8 @@ class Guide:
         Examples are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
         answer in the mirror image is mostly not the mirror image of its answer.
         """
-        rows, losses, init = self.examples(labels, scalars), partial(self.losses, env, scalars), self.network.init
+        rows, losses = self.examples(labels, scalars), partial(self.losses, env, scalars)
+        init = lambda key: with_moments(self.network.init(key), labels.obs, labels.valid)  # noqa: E731
         return fit_model(key, rows, scalars, init=init, losses=losses, sizes=self.sizes, augment=self.augmented)
 
     def losses(self, env: Any, scalars: GuideScalars, params: Params, rows: Any) -> Float[Array, " n"]:

@@ -52,7 +52,7 @@ class BatchCoach(DeepCoach):
     """A guide that acts as a cloned policy does, and learns from a model of its teacher."""
 
     name, about, title = "bdcoach", "a policy moved by a model of its teacher", "BD-COACH"
-    colour = "#CC6677"
+    colour, learners = "#CC6677", ("policy", "human")
 
     def begin(self, key: PRNGKeyArray) -> BatchCoached:
         """Return one member's policy without corrections, and its untrained human model."""

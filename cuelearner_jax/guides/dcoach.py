@@ -22,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Actions, Observations, Rows
 from cuelearner_jax.guides.demonstration import Demonstration
-from cuelearner_jax.guides.fitting import Example, for_each, optimizer, squared_errors
+from cuelearner_jax.guides.fitting import Example, for_each, optimizer, squared_errors, with_moments
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -58,6 +58,7 @@ class DeepCoach(Demonstration):
 
     name, about, title = "dcoach", "a policy moved by each correction", "deep COACH"
     form, colour = RELATIVE, "#56B4E9"
+    learners: ClassVar[tuple[str, ...]] = ("policy",)  # the networks of `Coached`
 
     @cached_property
     def member(self) -> DeepCoach:
@@ -86,8 +87,13 @@ class DeepCoach(Demonstration):
         order, count = jnp.argsort(~rows.valid, stable=True), rows.valid.sum()
         correct = self.correction(env, labels, rows, order, scalars)
 
+        def one(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
+            so_far = jnp.arange(len(order)) <= number
+            seen = {name: with_moments(getattr(coached, name), rows.obs[order], so_far) for name in self.learners}
+            return correct(key, number, coached.replace(**seen))
+
         def learn(key: PRNGKeyArray, coached: Coached) -> Coached:
-            return jax.lax.fori_loop(coached.learned, count, partial(correct, key), coached)
+            return jax.lax.fori_loop(coached.learned, count, partial(one, key), coached)
 
         return GuidanceModel(for_each(self.sizes.ensemble, learn, key, former.params), former.fitted | (count > 0))
 

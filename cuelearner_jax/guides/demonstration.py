@@ -41,7 +41,8 @@ class Demonstration(Guide):
     def predict(self, env: Any, params: Params, obs: Observations, actions: Actions) -> Actions:
         """Return the policy's action, seen from `actions`."""
         if not self.looks_again:
-            return self.network.predict(env, params, obs, jnp.zeros_like(actions))
+            middle = self._middle(actions)
+            return middle + self.network.predict(env, params, obs, middle)
         return actions + self.network.predict(env, params, obs, actions)
 
     def augmented(self, key: PRNGKeyArray, batch: Example) -> Example:
@@ -65,4 +66,9 @@ class Demonstration(Guide):
 
     def disagreement(self, model: GuidanceModel, env: Any, obs: Observations, actions: Actions) -> Float[Array, " n"]:
         """Return the variance of the members' vectors, summed over their entries."""
-        return super().disagreement(model, env, obs, actions if self.looks_again else jnp.zeros_like(actions))
+        return super().disagreement(model, env, obs, actions if self.looks_again else self._middle(actions))
+
+    def _middle(self, like: Actions) -> Actions:
+        """Return the middle of the space for every row; zeros where there is none."""
+        middle = self.spaces.actions.middle()
+        return jnp.zeros_like(like) if middle is None else jnp.broadcast_to(middle, like.shape)

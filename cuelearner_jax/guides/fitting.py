@@ -63,29 +63,34 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     `outputs`: their number, such as 1 for an action's value; None: a vector to be added to the action, whichever frame
     it is seen in. `beside`: entries of actions, at their end, that the networks see beside observation and action.
     """
-    size = spaces.actions.size
+    space, size, is_raw = spaces.actions, spaces.actions.size, sizes.frame == "raw"
     network = networks.MLP(sizes.feedback_layers, size if outputs is None else outputs, start=sizes.feedback_start)
     own, turned = networks.widths(sizes.frame, spaces)
 
     def init(key: PRNGKeyArray) -> Params:
-        return network.init(key, jnp.zeros(own), jnp.zeros(turned + beside))
+        params = network.init(key, jnp.zeros(own), jnp.zeros(turned + beside))
+        if not (is_raw and sizes.normalise_obs):
+            return params
+        return {**params, "obs": {"mean": jnp.zeros(own), "variance": jnp.ones(own)}}
 
     def predict(
         env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "m action"]
     ) -> Float[Array, "m outputs"]:
         """Return predictions for m situations with an action each, or for one situation with m actions."""
         bare, base = jnp.split(actions, [size], -1)
-        of_obs, of_action = networks.network_inputs(sizes.frame, env, obs, bare)
+        obs = networks.normalised(obs, jax.lax.stop_gradient(params.get("obs")))
+        of_obs, of_action = networks.network_inputs(sizes.frame, space, env, obs, bare)
         of_action = jnp.concatenate([of_action, base], -1) if beside else of_action
         return networks.as_function(network)(params, of_obs, of_action)
 
     model = ensemble(sizes.ensemble, init, predict)
-    if outputs is not None or sizes.frame == "raw":
+    if outputs is not None:
         return model
 
     def residual(env: Any, params: Params, obs: Array, actions: Array) -> Array:
-        """Return the outputs, which are turns from the action, as vectors to add to it."""
-        return spaces.actions.outward(model.predict(env, params, obs, actions), actions[..., :size])
+        """Return the outputs, which are half ranges or turns from the action, as vectors to add to it."""
+        vector = model.predict(env, params, obs, actions)
+        return vector * space.half_ranges(vector) if is_raw else space.outward(vector, actions[..., :size])
 
     return model._replace(predict=residual)
 
@@ -108,18 +113,18 @@ class Example(struct.PyTreeNode):
     target: Float[Array, " outputs"]
     valid: Bool[Array, ""]
     cues: Bool[Array, " cues"] | None = None  # the cues along which errors count; None: errors count as a whole
-    space: Space | None = struct.field(pytree_node=False, default=None)  # the space of these cues
+    space: Space | None = struct.field(pytree_node=False, default=None)  # of a target that is an action or a change
 
 
 def squared_errors(rows: Example, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
-    """Return the squared errors of predictions, L = |f - y|^2 (paper, Eq. 3).
+    """Return the squared errors of predictions, L = |f - y|^2 (paper, Eq. 3), in half ranges where entries have bounds.
 
     Where labels may leave cues out, L is the sum over the cues of which something was said of (d log (f - y))^2, the
     error along that cue in the space's unit. A cue of which nothing was said adds nothing, whatever is predicted.
     """
     off = predicted - rows.target
     if rows.cues is None:
-        return jnp.sum(jnp.square(off), -1)
+        return jnp.sum(jnp.square(off if rows.space is None else off / rows.space.half_ranges(off)), -1)
     assert rows.space is not None  # `Guide.examples` gives both
     along = jax.vmap(rows.space.along)(rows.action[..., : rows.space.size], off)
     return jnp.sum(jnp.square(along), -1, where=rows.cues)
@@ -138,6 +143,14 @@ def held_out(count: int) -> Bool[np.ndarray, " count"]:
 def silent_cues(answers: Float[Array, "n cues"], valid: Bool[Array, " n"]) -> Bool[Array, "1 cues"]:
     """Return the cues that no label to fit names."""
     return ~is_answered(answers).any(0, where=(valid & ~held_out(len(valid)))[:, None], keepdims=True)
+
+
+def with_moments(params: Params, obs: Float[Array, "n obs"], rows: Bool[Array, " n"]) -> Params:
+    """Return parameters of a network that sees normalised observations with the moments of some; others as they are."""
+    if "obs" not in params:
+        return params
+    shaped = lambda new, old: jnp.broadcast_to(new, old.shape)  # noqa: E731
+    return {**params, "obs": jax.tree.map(shaped, networks.moments_of(obs, rows), params["obs"])}
 
 
 def fit_model(

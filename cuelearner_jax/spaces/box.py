@@ -23,10 +23,7 @@ KEYS = ("qa", "ed", "rf", "tg", "yh", "uj", "ik", "ol", "zx", "cv", "bn", "mp", 
 
 @dataclass(frozen=True)
 class Box(Space):
-    """Vectors between `low` and `high`. A change along a cue counts in shares of the cue's range, `high` less `low`.
-
-    Networks see actions as they are: choose units in which bounds are of the order of one.
-    """
+    """Vectors between `low` and `high`. A change along a cue counts in shares of the cue's range, `high` less `low`."""
 
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -81,7 +78,11 @@ class Box(Space):
 
     def even(self, action: Vectors) -> Float[Array, "... action"]:
         """Return the entries from -1 at the lower bound to 1 at the upper."""
-        return 2 * (jnp.asarray(action) - _row(self.low, action)) / _row(self._range, action) - 1
+        return 2 * self.log(self.middle(), action)
+
+    def half_ranges(self, like: Vectors) -> Float[Array, "... action"]:
+        """Return half of each entry's range, in the shape of an array of actions."""
+        return _row(self._range / 2, like)
 
     def outward(self, vector: Vectors, action: Vectors) -> Float[Array, "... action"]:
         """Return a vector given in shares of the ranges as a vector to be added to the action."""

@@ -90,6 +90,10 @@ class Space:
         """Return an action with entries of the order of one."""
         return jnp.asarray(action)
 
+    def half_ranges(self, like: Vectors) -> Float[Array, "... action"]:
+        """Return half of each entry's range, in the shape of an array of actions; 1 where entries have no bounds."""
+        return jnp.ones_like(like)
+
     def to_json(self) -> dict[str, Any]:
         """Describe the space for a file; see `spaces.from_json`."""
         return {

@@ -24,7 +24,7 @@ from cuelearner_jax.errors import UserError, first_line
 from cuelearner_jax.storage.whole import replacing
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
-FORMATS = {"config": 1, "labels": 1, "teacher": 1, "policy": 1}
+FORMATS = {"config": 2, "labels": 1, "teacher": 1, "policy": 2}
 REMEDIES = {  # the remedy in the message about a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",

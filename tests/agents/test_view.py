@@ -9,6 +9,7 @@ from cuelearner_jax.agents import ddqn, networks
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Features, spaces_of
 from cuelearner_jax.guides.fitting import guide_model
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces import directions as geometry
 
 ENV = probes.Window()
@@ -25,7 +26,7 @@ class Turned(probes.Window):
 
 
 def test_rows_are_seen_each_from_its_own_action():
-    own, turned = networks.network_inputs("action", ENV, OBS, CHOSEN)
+    own, turned = networks.network_inputs("action", DIRECTIONS, ENV, OBS, CHOSEN)
     for row in range(3):
         alone = ENV.features(OBS[row], CHOSEN[row])
         np.testing.assert_allclose(own[row], alone.own, atol=1e-6)

@@ -129,6 +129,27 @@ def test_a_kind_leads_a_policy_that_misses_toward_its_goal(kind, space, says, mo
     assert left(kind, space, says=says) < most
 
 
+@pytest.mark.parametrize("kind", ["relative", long("demonstration"), long("bdcoach")])
+def test_a_kind_learns_alike_in_any_units(kind):
+    plain, scalars = Box((-1.0,) * 2, (1.0,) * 2), scalars_of(SPACES["1"])
+
+    def shares(space, unit, zero):
+        """What a guide changes [ranges] where actions lie in a box, and observations have this unit and zero."""
+        guide = registry.make(kind, SIZES, Anywhere(space))
+        moved = lambda actions: space.exp(space.middle(), plain.log(plain.middle(), actions))  # noqa: E731
+        rows = told(plain, scalars, guide.form.name, 100)
+        answer = moved(rows.answer) if guide.form.is_action else rows.answer
+        rows = rows.replace(obs=zero + unit * rows.obs, action=moved(rows.action), answer=answer, base=moved(rows.base))
+        model = guide.fit(KEY, guide, rows, guide.init(KEY), scalars)
+        acted = guide.act(model, guide, rows.obs, rows.base, jnp.ones(100, bool), scalars).actions
+        return space.log(rows.base, acted)
+
+    ours = jax.jit(partial(shares, plain, 1.0, 0.0))()
+    theirs = jax.jit(partial(shares, Box((5.0, -1e-3), (10.0, 1e-3)), 1000.0, 3e4))()
+    assert np.abs(ours).mean() > 0.05
+    np.testing.assert_allclose(ours, theirs, atol=0.02)
+
+
 def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
     """Ranges 2, 4, 2: errors of 0.2 and 0.4 of said entries are 0.1 of the range each; the other one does not count."""
     space = SPACES["3"]
