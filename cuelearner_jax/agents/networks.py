@@ -93,27 +93,40 @@ def next_moments(before: Params, obs: Float[Array, "batch obs"], count: Int[Arra
 
     The first 1 / `RATE` batches count alike. Both are exact for any mean, as after Welford (1962).
     """
-    rate = jnp.maximum(1 / count, RATE)
-    change = obs.mean(0) - before["mean"]
-    variance = (1 - rate) * (before["variance"] + rate * change**2) + rate * obs.var(0)
+    rate, now = jnp.maximum(1 / count, RATE), moments_of(obs, jnp.ones(len(obs), bool))
+    change = now["mean"] - before["mean"]
+    variance = (1 - rate) * (before["variance"] + rate * change**2) + rate * now["variance"]
     return {"mean": before["mean"] + rate * change, "variance": variance}
 
 
 def moments_of(obs: Float[Array, "rows obs"], valid: Bool[Array, " rows"]) -> Params:
-    """Return mean and variance of observations in some rows, for `normalised`; that of a constant entry is 1."""
-    where = jnp.broadcast_to(valid[:, None], obs.shape)
-    count = jnp.maximum(valid.sum(), 1)
-    mean = jnp.sum(obs, 0, where=where) / count
-    variance = jnp.sum(jnp.square(obs - mean[None]), 0, where=where) / count
-    return {"mean": mean, "variance": jnp.where(variance > jnp.square(1e-6 * mean), variance, 1.0)}
+    """Return mean and variance of observations in some rows, for `normalised`.
+
+    Rows are added in pairs, so that a seed's last bits do not depend on the seeds beside it.
+    """
+
+    def mean(rows: Float[Array, "rows obs"]) -> Float[Array, " obs"]:
+        rows = jax.lax.optimization_barrier(jnp.where(valid[:, None], rows, 0.0))
+        while len(rows) > 1:
+            half = (len(rows) + 1) // 2
+            rows = rows[:half] + jnp.pad(rows[half:], ((0, 2 * half - len(rows)), (0, 0)))
+        return rows[0] / jnp.maximum(valid.sum(), 1)
+
+    middle = mean(obs)
+    return {"mean": middle, "variance": mean(jnp.square(obs - middle[None]))}
 
 
 def normalised(obs: Float[Array, "... obs"], moments: Params | None) -> Float[Array, "... obs"]:
-    """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without."""
+    """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without.
+
+    An entry that was constant so far is 0: nothing is known of it.
+    """
     if moments is None:
         return obs
     mean, variance = (jnp.broadcast_to(moments[name], obs.shape) for name in ("mean", "variance"))
-    return jnp.clip((obs - mean) / jnp.sqrt(variance + 1e-8), -FARTHEST, FARTHEST)
+    varies = variance > jnp.square(1e-6 * mean)
+    away = (obs - mean) / jnp.sqrt(jnp.where(varies, variance, 1.0))
+    return jnp.where(varies, jnp.clip(away, -FARTHEST, FARTHEST), 0.0)
 
 
 def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm: bool = False) -> MLP:

@@ -89,8 +89,8 @@ class DeepCoach(Demonstration):
 
         def one(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
             so_far = jnp.arange(len(order)) <= number
-            seen = {name: with_moments(getattr(coached, name), rows.obs[order], so_far) for name in self.learners}
-            return correct(key, number, coached.replace(**seen))
+            fresh = {name: with_moments(getattr(coached, name), rows.obs[order], so_far) for name in self.learners}
+            return correct(key, number, coached.replace(**fresh))
 
         def learn(key: PRNGKeyArray, coached: Coached) -> Coached:
             return jax.lax.fori_loop(coached.learned, count, partial(one, key), coached)

@@ -27,7 +27,7 @@ SINGLE = single_file.Config(
     layers=(8, 8), search_directions=90, labels=20, fit_steps=40, fit_batch_size=16, directions=24, batch_size=8
 )
 ENV = Billiards(Table.one_ball(), max_shots=1)
-SIZES = Sizes(feedback_layers=(8, 8), fit_steps=40, fit_batch_size=16)
+SIZES = Sizes(normalise_obs=False, feedback_layers=(8, 8), fit_steps=40, fit_batch_size=16)
 SCALARS = Scalars(eps_deg=2.0, k_max=100)
 GUIDE = guides.make("relative", SIZES, ENV)
 

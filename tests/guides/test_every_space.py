@@ -129,23 +129,30 @@ def test_a_kind_leads_a_policy_that_misses_toward_its_goal(kind, space, says, mo
     assert left(kind, space, says=says) < most
 
 
-@pytest.mark.parametrize("kind", ["relative", long("demonstration"), long("bdcoach")])
-def test_a_kind_learns_alike_in_any_units(kind):
+# The last two turn on the last bits, so their units are powers of two.
+OTHER, POWERS = (Box((5.0, -1e-3), (10.0, 1e-3)), 1e3, 3e4), (Box((-4.0, -(2**-9)), (4.0, 2**-9)), 2.0**10, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "units"),
+    [("relative", OTHER), long("demonstration", OTHER), long("bdcoach", POWERS), long("clic", POWERS)],
+)
+def test_a_kind_learns_alike_in_any_units(kind, units):
     plain, scalars = Box((-1.0,) * 2, (1.0,) * 2), scalars_of(SPACES["1"])
 
     def shares(space, unit, zero):
         """What a guide changes [ranges] where actions lie in a box, and observations have this unit and zero."""
         guide = registry.make(kind, SIZES, Anywhere(space))
-        moved = lambda actions: space.exp(space.middle(), plain.log(plain.middle(), actions))  # noqa: E731
+        into = lambda actions: space.exp(space.middle(), plain.log(plain.middle(), actions))  # noqa: E731
         rows = told(plain, scalars, guide.form.name, 100)
-        answer = moved(rows.answer) if guide.form.is_action else rows.answer
-        rows = rows.replace(obs=zero + unit * rows.obs, action=moved(rows.action), answer=answer, base=moved(rows.base))
+        answer = into(rows.answer) if guide.form.is_action else rows.answer
+        rows = rows.replace(obs=zero + unit * rows.obs, action=into(rows.action), answer=answer, base=into(rows.base))
         model = guide.fit(KEY, guide, rows, guide.init(KEY), scalars)
         acted = guide.act(model, guide, rows.obs, rows.base, jnp.ones(100, bool), scalars).actions
         return space.log(rows.base, acted)
 
     ours = jax.jit(partial(shares, plain, 1.0, 0.0))()
-    theirs = jax.jit(partial(shares, Box((5.0, -1e-3), (10.0, 1e-3)), 1000.0, 3e4))()
+    theirs = jax.jit(partial(shares, *units))()
     assert np.abs(ours).mean() > 0.05
     np.testing.assert_allclose(ours, theirs, atol=0.02)
 
