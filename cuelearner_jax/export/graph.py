@@ -192,19 +192,15 @@ class Builder:
         operations, self.ops = self.ops, outer
         self._earlier = before  # operations inside are not available outside
         names = [value.name for value in carried]
-        return Graph(names, [self.name(result) for result in results], self._loop_operations(operations, set(names)))
-
-    def _loop_operations(self, ops: list[list[Any]], changing: set[str]) -> list[list[Any]]:
-        """Return the operations that every pass must repeat; loop-invariant ones are moved before the loop."""
-        inside = []
-        for op in ops:
+        changing, inside = set(names), []  # what every pass must repeat; loop-invariant operations move before the loop
+        for op in operations:
             name, inputs, outputs, _ = op
             if name == "while" or changing & set(inputs):
                 inside.append(op)
-                changing = changing | set(outputs)
+                changing |= set(outputs)
             else:
                 self.ops.append(op)
-        return inside
+        return Graph(names, [self.name(result) for result in results], inside)
 
 
 def _evaluate(equation: Any, inputs: list[Any], origin: Any) -> list[Any]:

@@ -74,8 +74,7 @@ class _Writer:
             if op == "while":
                 self._loop(operands, results, **attributes)
             else:
-                last = NODES[op](self, *operands, **attributes)
-                self._append("Identity", [last], results[0])
+                self._append("Identity", [NODES[op](self, *operands, **attributes)], results[0])
         nodes, self._nodes = self._nodes, outer
         return nodes
 

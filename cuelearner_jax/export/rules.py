@@ -24,6 +24,8 @@ SAME += ("sqrt", "rsqrt", "square", "logistic", "is_finite", "add", "sub", "mul"
 # of numbers, of booleans
 REDUCTIONS = {"reduce_sum": ("sum", ""), "reduce_max": ("largest", "any"), "reduce_min": ("smallest", "all")}
 REDUCTIONS |= {"reduce_and": ("", "all"), "reduce_or": ("", "any"), "max": ("max", "or"), "min": ("min", "and")}
+REDUCTIONS |= {name: ("", name) for name in ("and", "or", "xor", "not")}
+ENDS = ("start_indices", "limit_indices", "strides")  # of a slice
 MOST_UNROLLED = 64  # passes of a scan
 
 Shape = tuple[int, ...]
@@ -65,13 +67,6 @@ one("clamp")(lambda b, e, x, shape, kind: b.add("min", [b.add("max", x[1::-1], s
 one("copy", "copy_p", "stop_gradient")(lambda b, equation, inputs, shape, kind: inputs[0])
 one(*SAME)(lambda b, equation, inputs, shape, kind: b.add(equation.primitive.name, inputs, shape, kind))
 one("select_n")(lambda b, equation, inputs, shape, kind: select_case(b, inputs[0], inputs[1:], shape, kind))
-
-
-@one("and", "or", "xor", "not")
-def _logic(builder: Builder, equation: Any, inputs: list[Operand], shape: Shape, kind: str) -> Operand:
-    if kind != "bool":
-        raise NotImplementedError("bitwise logic of integers")
-    return builder.add(equation.primitive.name, inputs, shape, kind)
 
 
 @one("lt", "le", "gt", "ge", "argmax", "argmin")
@@ -179,6 +174,7 @@ def _round(builder: Builder, equation: Any, inputs: list[Operand], shape: Shape,
 several("optimization_barrier")(lambda builder, equation, inputs: inputs)
 one("reshape", "squeeze", "expand_dims")(lambda b, equation, inputs, shape, kind: b.reshaped(inputs[0], shape))
 one("transpose")(lambda b, equation, inputs, shape, kind: b.transposed(inputs[0], equation.params["permutation"]))
+one("slice")(lambda b, equation, inputs, shape, kind: _cut(b, inputs[0], *map(equation.params.get, ENDS)))
 
 
 @one("concatenate", "stack")
@@ -208,16 +204,9 @@ def _cut(builder: Builder, value: Operand, start: Any, stop: Any, step: Any = No
 
 
 def _part(builder: Builder, value: Operand, axis: int, first: int, last: int) -> Operand:
-    """Slice from `first` to before `last` along one axis."""
     start, stop = [0] * len(value.shape), list(value.shape)
     start[axis], stop[axis] = first, last
     return _cut(builder, value, start, stop)
-
-
-@one("slice")
-def _slice(builder: Builder, equation: Any, inputs: list[Operand], shape: Shape, kind: str) -> Operand:
-    ends = (equation.params[name] for name in ("start_indices", "limit_indices", "strides"))
-    return _cut(builder, inputs[0], *ends)
 
 
 @several("split")
