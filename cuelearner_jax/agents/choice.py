@@ -46,15 +46,7 @@ def best_near_peaks(
         near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride)[None], len(options)).ravel()
         return options[near][jnp.argmax(value(one, options[near]))]
 
-    return each_in_portions(choose, obs, values_per_choice(len(options), coarse, peaks))
-
-
-def values_per_choice(options: int, coarse: int, peaks: int) -> int:
-    """Return how many action values one choice takes, in a search near the peaks of a coarse first look.
-
-    `coarse` 0: all actions of the set are valued.
-    """
-    return coarse + peaks * (2 * options // coarse - 1) if coarse else options
+    return each_in_portions(choose, obs, coarse + peaks * (2 * stride - 1))
 
 
 def each_in_portions(choose: Callable[[Array], ChoiceT], obs: Float[Array, "n obs"], looked: int) -> ChoiceT:

@@ -182,9 +182,8 @@ class DoubleDQN:
             return loss(self.value(env, params, batch.obs, batch.action), targets)
 
         value, gradient = jax.value_and_grad(loss_of)(params)
-        change, opt_state = optimizer(own.optimizer, options.learning_rate, scalars.max_grad_norm).update(
-            gradient, rest.opt_state, params
-        )
+        descent = optimizer(own.optimizer, options.learning_rate, scalars.max_grad_norm)
+        change, opt_state = descent.update(gradient, rest.opt_state, params)
         params = optax.apply_updates(params, change)
         if self.bootstraps:
             target_params = jax.lax.cond(

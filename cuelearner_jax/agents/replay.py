@@ -55,7 +55,6 @@ class LaterSteps(NamedTuple):
 def _write(
     rows: Num[Array, "*lanes capacity width"], packed: Num[Array, "*lanes n width"], start: Int[Array, ""]
 ) -> Num[Array, "*lanes capacity width"]:
-    """Return the rows with `packed` written from row `start` on."""
     zero = jnp.zeros_like(start)
     return jax.lax.dynamic_update_slice(rows, packed, (*[zero] * (rows.ndim - 2), start, zero))
 
@@ -202,8 +201,7 @@ def count_guided(
 
     `counts`: 0 at first; `step`: see `RingBuffer`; `guided`: which of the steps being added the guide chose.
     """
-    before = counts[jnp.mod(step - 1, counts.shape[0]), 0]
-    added = before + jnp.cumsum(guided.astype(counts.dtype))
+    added = counts[jnp.mod(step - 1, counts.shape[0]), 0] + jnp.cumsum(guided.astype(counts.dtype))
     return _write(counts, added[:, None], jnp.mod(step, counts.shape[0]))
 
 

@@ -242,12 +242,16 @@ class SoftActorCritic:
         start = params["critics"], rest.critics_opt, rest.target_critics, params.get("obs"), none
         keys = jax.random.split(k_critics, own.updates_per_step)
         numbers = (count - 1) * own.updates_per_step + 1 + jnp.arange(own.updates_per_step)
-        (critics, critics_opt, target_critics, moments, obs), (losses, norms) = jax.lax.scan(
-            minibatch, start, (keys, numbers)
-        )
+        last, (losses, norms) = jax.lax.scan(minibatch, start, (keys, numbers))
+        critics, critics_opt, target_critics, moments, obs = last
 
-        climbed = jax.value_and_grad(self.actor_loss, has_aux=True)(actor, critics, temperature, obs, k_actor)
-        (_, log_density), gradient = climbed
+        def actor_loss(actor: Params) -> tuple[Array, Array]:
+            draws = self.draw(actor, obs, k_actor)
+            values = self.values(critics, obs, draws.unit)
+            value = values.mean(0) if own.critics > own.target_critics else values.min(0)
+            return (temperature * draws.log_density - value).mean(), draws.log_density.mean()
+
+        (_, log_density), gradient = jax.value_and_grad(actor_loss, has_aux=True)(actor)
         actor, actor_opt = optimizer_step(options.actor_rate, most, gradient, rest.actor_opt, actor)
         surplus = -log_density - options.target_entropy * self.spaces.actions.size
         log_temperature, temperature_opt = optimizer_step(
@@ -257,20 +261,6 @@ class SoftActorCritic:
         norm = jnp.maximum(norms.max(), optax.tree.norm(gradient))
         params = {**params, "actor": actor, "critics": critics} | ({} if moments is None else {"obs": moments})
         return params, state, losses.mean(), norm
-
-    def actor_loss(
-        self,
-        actor: Params,
-        critics: Params,
-        temperature: Float[Array, ""] | float,
-        obs: Float[Array, "n obs"],
-        key: PRNGKeyArray,
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Return the means of temperature * log p(a) - Q(s, a) and of log p(a) over the actor's draws."""
-        draws = self.draw(actor, obs, key)
-        values = self.values(critics, obs, draws.unit)
-        value = values.mean(0) if self.options.critics > self.options.target_critics else values.min(0)
-        return (temperature * draws.log_density - value).mean(), draws.log_density.mean()
 
     def targets(
         self,
