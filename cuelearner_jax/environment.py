@@ -260,7 +260,6 @@ def spaces_of(env: Any) -> Spaces:
 
 
 def _classes(structure: Any) -> tuple[Any, ...]:
-    """Return the class of every node of a tree."""
     data = structure.node_data()
     inner = (kind for child in structure.children() for kind in _classes(child))
     return () if data is None else (data[0], *inner)

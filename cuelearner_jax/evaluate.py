@@ -72,7 +72,6 @@ _begin = jax.jit(_begun, static_argnames="num_envs")
 
 
 def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, indices: Array) -> _Walk:
-    """Return the roll-out after the steps of these numbers."""
     _, k_run = jax.random.split(key)
     num_envs, once = walk.first.shape[0], plays_once(env)
 

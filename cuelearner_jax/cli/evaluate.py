@@ -180,7 +180,6 @@ def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
 
 
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
-    """Return a table of two policies side by side, with their difference."""
     both = difference.row, difference.other
     over = f"{episodes}, paired" if difference.over == "episodes" else f"seeds and {episodes} (interquartile means)"
     names = zip((title, other), map(measurements.variant, both), strict=True)
@@ -194,7 +193,6 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
 
 
 def _verdict(difference: Difference) -> str:
-    """Return a sentence on which metrics' differences exclude 0."""
     names = {"excludes": [], "includes": []}
     for name, less in difference.metrics.items():
         few = less.lower == less.upper != 0 and difference.row.each[name].size < FEWEST  # all alike: a sign test

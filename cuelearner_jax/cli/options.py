@@ -35,8 +35,6 @@ Kinds = Annotated[dict[str, Any], unprefixed]  # options of kinds of guidance, n
 
 
 class _Output(Console):
-    """Standard output."""
-
     def on_broken_pipe(self) -> None:
         """Raise BrokenPipeError: the reader of the output has gone."""
         raise BrokenPipeError

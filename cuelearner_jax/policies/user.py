@@ -154,7 +154,6 @@ def _valid(actions: Space, vectors: Array) -> Array:
 
 
 def _call_user(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function. Raises UserError for any exception."""
     try:
         return function(*arguments)
     except UserError:

@@ -146,7 +146,6 @@ class Reader:
         return _worth(self.space, self.family, changes, labels, before, self._ask(before), self.eps)
 
     def _fit(self, frame: ObservationFrame, labels: RelativeLabels, hypothesis: Hypothesis) -> Fit:
-        """Return stacked hypotheses fitted to labels."""
         own = self._ask(labels.obs)
         rows = self._data(frame, labels, own, hypothesis.change)
         posteriors = _unread(rows, hypothesis.hyper)

@@ -106,7 +106,6 @@ def describe_fit(
 
 
 def _names(family: Family, count: int, observation: Sequence[Quantity]) -> list[tuple[str, str]]:
-    """Return name and unit of each unknown."""
     if family:
         return [(one.name, one.unit) for one in unknowns_of(family)]
     names = [(f"obs[{number}]", "") for number in range(count)]

@@ -139,7 +139,6 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
 
 
 def _draw_budgets(axes: Any, means: Sequence[tuple[Variant, Interval]]) -> None:
-    """Draw variants' intervals over their label budgets."""
     for place, kind in enumerate(dict.fromkeys(variant.guidance for variant, _ in means)):
         look: dict[str, Any] = {"color": colour_of(kind), "label": guidance_name(kind)}
         points = np.array([(one.labels, *mean) for one, mean in means if one.guidance == kind], float)

@@ -198,7 +198,6 @@ class PolicySource:
         )
 
     def _policy(self, name: str, block: Block, view: Any, teacher: Teacher | None) -> Any:
-        """Return a trained policy of a run's lanes (`lanes_of`)."""
         config = self.config
         agent = Agent(block.policy["params"], config.agent_in(view), view)
         if name == "agent":

@@ -118,5 +118,4 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
 
 
 def _concatenate(trees: Any) -> Any:
-    """Concatenate trees of arrays along the lanes, their leading axis."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)

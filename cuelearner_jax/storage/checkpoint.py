@@ -44,8 +44,6 @@ def _flat(tree: Any) -> dict[str, Any]:
 
 
 def _unflat(flat: dict[str, Any], like: Any) -> Any:
-    """Rebuild a tree of the structure of `like` from `_flat`'s leaves."""
-
     def leaf(path: Any, kind: Any) -> Any:
         if 0 in kind.shape:
             return jnp.zeros(kind.shape, kind.dtype)
@@ -55,8 +53,6 @@ def _unflat(flat: dict[str, Any], like: Any) -> Any:
 
 
 def _digests(flat: dict[str, Any]) -> dict[str, str]:
-    """Return the SHA-256 of each array's shape, type and values."""
-
     def sha256(leaf: Any) -> str:
         hasher = hashlib.sha256(f"{leaf.shape} {leaf.dtype}".encode())
         hasher.update(np.ascontiguousarray(leaf).data)

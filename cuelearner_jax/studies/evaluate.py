@@ -197,8 +197,6 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
 
 
 def _answers_of(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarray, "labels cues"]:
-    """Return the answers that a policy would give about the labels' actions."""
-
     @jax.jit
     def answered(policy: Any, obs: Any, action: Any) -> Any:
         own = space.only_actions(policy.act(jax.random.key(0), None, obs))

@@ -136,7 +136,6 @@ def in_memory(
 
 
 def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
-    """Return the columns of one evaluation as a table with a row per lane."""
     columns = {"guidance": group.guidance.name, **row}
     arrays = {name: np.broadcast_to(value, np.shape(value) or len(group.seeds)) for name, value in columns.items()}
     lists = {name: values if values.ndim == 1 else list(values) for name, values in arrays.items()}

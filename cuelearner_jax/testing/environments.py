@@ -124,7 +124,6 @@ def _check_steps(laws: Laws, env: Environment, path: dict[str, Any], steps: int)
 
 
 def _check_features(laws: Laws, together: Any, each: Any) -> None:
-    """Check that features of many actions are those of each, and that `own` does not depend on the action."""
     (own, turned), (owns, singly) = together, each
     alike = np.ndim(own) == 1 and laws.same(np.broadcast_to(own, np.shape(owns)), owns)
     laws.hold(alike, "`features` hold values in `own` that depend on the action: move them to `turned`")
@@ -133,7 +132,6 @@ def _check_features(laws: Laws, together: Any, each: Any) -> None:
 
 
 def _check_aims(laws: Laws, env: Environment, aims: Aims) -> None:
-    """Check that aims are actions with features, as many in every situation."""
     rows = np.shape(aims.possible)
     fits = len(rows) == 2 and np.shape(aims.actions)[:-1] == rows and np.shape(aims.features)[:-1] == rows
     laws.hold(fits, "`aims` have other lengths: give a row of actions, of features, and a bool, for every aim")
@@ -143,7 +141,6 @@ def _check_aims(laws: Laws, env: Environment, aims: Aims) -> None:
 
 
 def _check_mirrors(laws: Laws, path: dict[str, Any]) -> None:
-    """Check that symmetries form a group of linear isometries with 0 as identity."""
     (obs, vectors), plain, twice = path["images"], (path["obs"], path["actions"]), path["twice"]
     same = np.shape(obs)[1:] == np.shape(plain[0]) and np.shape(vectors)[1:] == np.shape(plain[1])
     laws.hold(same, "`mirror` changes a shape: an image is an observation and a vector of the same sizes")

@@ -41,7 +41,6 @@ def check_guidance(kind: type[Guide], env: Environment, sizes: GuideSizes = SMAL
 
 
 def _labels(laws: Laws, guide: Guide, env: Any, states: Any, obs: Array, actions: Array) -> Label:
-    """Return labels (rows, ...) of a simulated teacher."""
     space, form = actions_of(env), guide.form
     assert form is not None
     teacher: Any = SimpleNamespace(best_action=lambda state, obs: space.spread(8)[3])

@@ -57,7 +57,6 @@ def check_task(task: Task, small: Any = None, steps: int = 64, pictures: Path | 
 
 
 def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
-    """Check the teacher's actions, and that the longest episode is known where episodes have outcomes."""
     state, obs = jax.jit(env.reset)(jax.random.key(0))
     action = actions_of(env).sample(jax.random.key(0), ())
     outcomes = sorted(jax.eval_shape(env.step, jax.random.key(0), state, action)[1].outcome)
@@ -81,7 +80,6 @@ def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
 
 
 def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
-    """Check a film, a still and a question of a few random steps."""
     pictures, env = task.pictures(), task.environment(config, "validation")
     film, still, question = files = filming.files(folder, task.name, "gif")
     rewards = filming.film(pictures, env, uniform_in(env), 0, FILMED, film, still)

@@ -213,7 +213,6 @@ class Running:
         return number
 
     def _vector(self, obs: Any) -> np.ndarray:
-        """Return an observation as a vector (obs,) of float32."""
         try:
             return np.concatenate([leaf.vector(obs) for leaf in self.leaves])
         except (KeyError, IndexError, TypeError, ValueError) as error:
