@@ -77,7 +77,7 @@ def run(arguments: list[str]) -> None:
     left = {(cell.world.name, cell.kind) for cell in sensible if not suite.is_done(options.out, cell)}
     count = min(len(left), options.processes or (devices.CORES if jax.default_backend() == "cpu" else 1))
     if count > 1:
-        _run_in_processes(count, arguments, options.out, os.environ | _variables(scale))
+        _run_in_processes(count, arguments, options.out, scale.get("is_short", False))
     else:
         _run_cells(sensible, options)
     if WORKS_FOR in os.environ:
@@ -127,19 +127,17 @@ def _run_cells(cells: list[Cell], options: Suite) -> None:
                     raise
 
 
-def _variables(scale: dict[str, Any]) -> dict[str, str]:
-    """Return variables of a process. Of a short scale it compiles in half the time, and its programs run slower."""
-    flags = ["--xla_backend_optimization_level=0"] * scale.get("is_short", False)
-    if flags and jax.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
-        flags.append("--xla_cpu_use_fusion_emitters=false")
-    return {WORKS_FOR: str(os.getpid()), "XLA_FLAGS": " ".join([*flags, os.environ.get("XLA_FLAGS", "")])}
-
-
-def _run_in_processes(count: int, arguments: list[str], folder: Path, variables: dict[str, str]) -> None:
+def _run_in_processes(count: int, arguments: list[str], folder: Path, is_short: bool) -> None:
     """Run the command in processes that take its cells; each writes a log into the folder.
 
-    Raises Interrupted after a signal, and UserError if a process failed.
+    Those of a short scale compile in half the time, and their programs run slower. Raises Interrupted after a signal,
+    and UserError if a process failed.
     """
+    flags = ["--xla_backend_optimization_level=0"] * is_short
+    if is_short and jax.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    xla_flags = " ".join([*flags, os.environ.get("XLA_FLAGS", "")])
+    variables = {**os.environ, WORKS_FOR: str(os.getpid()), "XLA_FLAGS": xla_flags}
     command = [sys.executable, "-u", "-m", "cuelearner_jax.cli", "suite", *arguments, "--processes", "1"]
     logs = [folder / f"process_{number}.log" for number in range(1, count + 1)]
     with ExitStack() as files, signals.interruptible("the work of all processes") as stopping:

@@ -192,8 +192,12 @@ class Page:
             self._item = item
             self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
             self._note.text = "" if item is None else view.note(item, *how)
-        self._parts_about(self.session.number)
-        self._mark()
+        parts = self._parts_about(self.session.number)
+        names = {one.name for one in self._picks if one.answer == (parts.get(one.cue or 0, UNSAID),)}
+        for control, button in self._picks.items():  # highlights the parts chosen so far, where there are several cues
+            button.classes(**{"add" if control.name in names else "remove": "picked"})
+        if self._picks:
+            self._script(f"cue.mark({json.dumps(sorted(names))})")
         if "film-refined" in self._tools:
             self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
         if item is None:
@@ -211,14 +215,6 @@ class Page:
             self._parts, self._parts_of = {}, number
         return self._parts
 
-    def _mark(self) -> None:
-        """Highlight the parts chosen so far, where there are several cues."""
-        names = {one.name for one in self._picks if one.answer == (self._parts.get(one.cue or 0, UNSAID),)}
-        for control, button in self._picks.items():
-            button.classes(**{"add" if control.name in names else "remove": "picked"})
-        if self._picks:
-            self._script(f"cue.mark({json.dumps(sorted(names))})")
-
     def _show_progress(self, status: Status) -> None:
         unsure = f", {status.unsure} not known" if status.unsure else ""
         self._count.text = f"{status.answered} of {status.labels}{unsure}"
@@ -226,8 +222,7 @@ class Page:
         self._pace.text = f"{status.per_minute:.0f} labels a minute" if status.per_minute else "no labels yet"
         minutes, newest = status.minutes_left, status.newest
         self._minutes.text = f"{max(minutes, 1):.0f} min left" if minutes else ""
-        by_evidence = self.session.plan.guidance.by_evidence
-        what, doing = ("estimate", "reading") if by_evidence else ("model", "fitting")
+        what, doing = ("estimate", "reading") if self.session.plan.guidance.by_evidence else ("model", "fitting")
         state = f"{what} {newest.number}, of {newest.labels} labels" if newest.number else f"no {what} yet"
         now = newest.problem or (f"{doing} the next" if status.fitting else "")
         self._model.text = f"{state}; {now}" if now else state

@@ -111,16 +111,11 @@ def angle_of(action: np.ndarray) -> float:
     return math.degrees(math.atan2(float(action[1]), float(action[0])))
 
 
-def _farthest(item: Item) -> float:
-    """Return the largest factor on the reach of turned arrows."""
-    return BESIDE_TRAILS if item.trails else TURNED_REACH[1]
-
-
 def magnification_of(item: Item, eps_deg: float) -> int:
     """Return the factor by which turns of an item's action are magnified, so that a turn by eps is visible."""
     sketch = item.sketch
     assert sketch is not None
-    _, far = _ends(sketch, angle_of(item.action), _farthest(item))
+    _, far = _ends(sketch, angle_of(item.action), BESIDE_TRAILS if item.trails else TURNED_REACH[1])
     visible = min(math.degrees(math.asin(min(TIPS * sketch.box[2] * HAIR / far, 1.0))), STEEPEST)
     return math.ceil(visible / eps_deg) if eps_deg < 0.75 * visible else 1
 
@@ -130,7 +125,7 @@ def _arrows(sketch: Sketch, item: Item, form: AnswerForm, eps_deg: float) -> lis
     parts, angle, times = [], angle_of(item.action), magnification_of(item, eps_deg) if form.by_eps else 1
     if form.by_eps:
         turn = times * eps_deg
-        longer = min(max(APART / turn, TURNED_REACH[0]), _farthest(item))
+        longer = min(max(APART / turn, TURNED_REACH[0]), BESIDE_TRAILS if item.trails else TURNED_REACH[1])
         for one in controls.answers(form, DIRECTIONS):
             if one.answer and one.answer[0]:
                 parts.append(arrow(sketch, angle + one.answer[0] * turn, one.colour, longer, one.first_key))

@@ -118,16 +118,20 @@ class Reading:
             return
         batch = _padded(new, max(len(new[0]), -(-self.slots // BATCHES)))  # as others are: few programs are compiled
         self._acts(batch.obs)  # refuses a policy that has no action there
-        reader = self._reader_of(new[0])
+        if self._reader is None:
+            acts = acts_of(self.base, everywhere=False)
+            step = steps_of(self.space, self.family, acts, jnp.asarray(new[0]), self.eps) if self.family else None
+            process = all(part.kind != PROPOSED for part in self.observation)
+            self._reader = Reader(self.space, self.family, acts, jnp.float32(self.eps), step, process=process)
         if self.fits is not None:
-            self.evidence += float(reader.ratio(self.fits, batch))
+            self.evidence += float(self._reader.ratio(self.fits, batch))
         if self.rows is not None:
             new = [np.concatenate(both) for both in zip(self.rows[:3], new, strict=True)]
         self.rows = RelativeLabels(new[0], new[1], new[2], np.ones(len(new[0]), bool))  # pyright: ignore[reportArgumentType]
         self.slots = max(self.slots, -(-len(new[0]) // self.slots) * self.slots)
         former, size = self.fits, new[0].shape[1]
         start = fitting.unfitted(self.space, self.family, size) if former is None else fitting.again(former)
-        self.fits = reader.read(_padded(new, self.slots), *start)
+        self.fits = self._reader.read(_padded(new, self.slots), *start)
         self.fit = fitting.pick(self.fits, int(fitting.best_of(self.fits)))
 
     def read_in_batches(self, obs: np.ndarray, action: np.ndarray, answer: np.ndarray) -> None:
@@ -142,8 +146,7 @@ class Reading:
         size = sum(part.size for part in self.observation) or self.situations.shape[1]
         if self.fit is None:
             return unread(self.base, self.space, self.family, size) if size else self.base
-        correction = fitting.correction(self.fit, self.eps)
-        return ReadingPolicy(self.base, correction, self.bound, self.space, self.family)
+        return ReadingPolicy(self.base, fitting.correction(self.fit, self.eps), self.bound, self.space, self.family)
 
     def result(self) -> Result:
         """Return the verdict."""
@@ -172,14 +175,6 @@ class Reading:
         own = self._acts(obs)
         return own if self.fit is None or self._reader is None else self._reader.act(self.fit, obs)
 
-    def _reader_of(self, obs: np.ndarray) -> Reader:
-        if self._reader is None:
-            acts = acts_of(self.base, everywhere=False)
-            step = steps_of(self.space, self.family, acts, jnp.asarray(obs), self.eps) if self.family else None
-            process = all(part.kind != PROPOSED for part in self.observation)
-            self._reader = Reader(self.space, self.family, acts, jnp.float32(self.eps), step, process=process)
-        return self._reader
-
 
 def acts_of(policy: Any, everywhere: bool = True) -> linear.Acts:
     """Return a policy's actions as a function. Plain Python is not compiled in.
@@ -207,9 +202,7 @@ def _near(space: Space, key: Any, actions: Array, spread: Array) -> Array:
     return space.exp(actions, spread * jax.random.normal(key, spread.shape))
 
 
-@jax.jit
-def _act(policy: Any, key: PRNGKeyArray, states: Any, obs: Array) -> Array:
-    return policy.act(key, states, obs)
+_act = jax.jit(lambda policy, key, states, obs: policy.act(key, states, obs))
 
 
 def _padded(rows: Sequence[np.ndarray], slots: int) -> RelativeLabels:

@@ -64,9 +64,7 @@ def _adjacent(count: int, situations: Any) -> Any:
     return jax.tree.map(lambda *rows: jnp.stack(rows, 1).reshape(-1, *rows[0].shape[1:])[:count], *situations)
 
 
-@jax.jit
-def _start(env: Any, keys: Any) -> Any:
-    return jax.vmap(env.reset)(keys)
+_start = jax.jit(lambda env, keys: jax.vmap(env.reset)(keys))
 
 
 @jax.jit

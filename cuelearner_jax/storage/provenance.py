@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 import warnings
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -19,22 +20,17 @@ def provenance() -> dict[str, str]:
 
     from cuelearner_jax.devices import numerics
 
-    packages = ("cuelearner-jax", "jax", "jaxlib", "flax", "optax", "numpy")
-    pairs = [(name, _version(name)) for name in packages]
+    versions = [f"python {sys.version.split()[0]}"]
+    for name in ("cuelearner-jax", "jax", "jaxlib", "flax", "optax", "numpy"):
+        with suppress(metadata.PackageNotFoundError):
+            versions.append(f"{name} {metadata.version(name)}")
     kinds = [device.device_kind for device in jax.devices()]
     return {
         "commit": _commit(),
-        "versions": ", ".join([f"python {sys.version.split()[0]}", *(f"{n} {v}" for n, v in pairs if v), numerics()]),
+        "versions": ", ".join([*versions, numerics()]),
         "hardware": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in dict.fromkeys(kinds)),
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     }
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
 
 
 def _commit() -> str:

@@ -99,15 +99,11 @@ def _filmed_episodes(env: Any, states: Sequence[Any], actions: Sequence[Any]) ->
     return [frame for first, end in episodes for frame in _replayed(env, states[first][0], actions[first:end], 0)]
 
 
-def _points(env: Any) -> tuple[tuple[float, float] | None, ...]:
-    return () if env.source.factory else fetch_layout.points_of(env.source.name, env.source.arguments)
-
-
 GYMNASIUM = pictures_of(
     _drawn_instance,
     lambda state: (state.seed, state.steps),
     _filmed_episodes,
-    _points,
+    lambda env: () if env.source.factory else fetch_layout.points_of(env.source.name, env.source.arguments),
     check=lambda env: _replayed(env, 0, (), 0),
 )
 

@@ -131,7 +131,10 @@ class Pool:
         with self.lock:
             try:
                 for number, arguments in calls.items():
-                    self._host(number).send(method, *arguments)
+                    if number not in self.hosts or self.hosts[number].is_gone:
+                        # Drawn instances need a process of their own: OpenGL does not work across threads.
+                        self.hosts[number] = (Process if self.source.draws or self.count > 1 else Here)(self.source)
+                    self.hosts[number].send(method, *arguments)
                 answers = [self.hosts[number].receive() for number in calls]
             except BaseException:  # such as an interrupt, after which answers would stay unread
                 self.close()
@@ -139,12 +142,6 @@ class Pool:
         if fault := next((one for one in answers if isinstance(one, str)), None):
             raise UserError(fault)
         return answers
-
-    def _host(self, number: int) -> Process | Here:
-        if number not in self.hosts or self.hosts[number].is_gone:
-            # Drawn instances need a process of their own: OpenGL does not work across threads.
-            self.hosts[number] = (Process if self.source.draws or self.count > 1 else Here)(self.source)
-        return self.hosts[number]
 
     def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
         """Return pictures of an episode from step `first` on. Raises UserError if there are none."""
