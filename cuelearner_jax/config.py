@@ -94,9 +94,8 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
     """
     fields = [field.name for field in dataclasses.fields(group) if field.init]
     kinds = get_type_hints(type(group))
-    values = {
-        name: plain(value) for name, value in (changes or {name: getattr(group, name) for name in fields}).items()
-    }
+    own = changes or {name: getattr(group, name) for name in fields}
+    values = {name: plain(value) for name, value in own.items()}
     for name, value in values.items():
         if name not in fields:
             raise UserError(f"{prefix} has no field {format_value(name)}{suggestion(name, fields)}")

@@ -114,9 +114,8 @@ def _apart(policy: PolicyNode) -> tuple[Any, Any]:
 
 def _together(each: Any, shared: Any) -> Any:
     """Join what `_apart` split, also with one lane's leaves."""
-    return jax.tree.map(
-        lambda own, common: common if own is None else own, each, shared, is_leaf=lambda leaf: leaf is None
-    )
+    join = lambda own, common: common if own is None else own  # noqa: E731
+    return jax.tree.map(join, each, shared, is_leaf=lambda leaf: leaf is None)
 
 
 @partial(jax.jit, static_argnames=("num_envs", "steps"))
@@ -203,9 +202,8 @@ def rollout_lanes(
     """
     lanes = lanes_in(policy)
     if lanes is None:
-        return jax.tree.map(
-            lambda leaf: np.asarray(leaf)[None], rollout_with_progress(env, policy, key, num_envs, steps, tell)
-        )
+        alone = rollout_with_progress(env, policy, key, num_envs, steps, tell)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], alone)
     each, shared = _apart(policy)
     if mesh is not None:
         return jax.device_get(_on_mesh(env, each, shared, key, mesh=mesh, num_envs=num_envs, steps=steps))

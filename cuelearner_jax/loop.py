@@ -144,9 +144,8 @@ class Lane(NamedTuple):
         """
         learned_state = lambda lane: (lane.agent.params, lane.agent.training)  # noqa: E731
         failed = state.failed | ~all_finite(learned_state(state))
-        params, training = jax.tree.map(
-            lambda new, old: jnp.where(failed, old, new), learned_state(state), learned_state(before)
-        )
+        keep = lambda new, old: jnp.where(failed, old, new)  # noqa: E731
+        params, training = jax.tree.map(keep, learned_state(state), learned_state(before))
         return state.replace(agent=state.agent.replace(params=params, training=training), failed=failed)
 
     def advance(self, clock: Clock, schedule: Schedule) -> Clock:

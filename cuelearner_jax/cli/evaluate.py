@@ -63,9 +63,8 @@ def run(arguments: list[str]) -> None:
     requests += [_other(source, options, options.compare)] if options.compare else []
     plans = [evaluate.prepare(*request) for request in requests]
     if options.compare:  # what cannot be compared is not measured first
-        measurements.differences(
-            *([row for block in lanes for row in evaluate.variants(env, block)] for env, lanes in plans)
-        )
+        rows = ([row for block in lanes for row in evaluate.variants(env, block)] for env, lanes in plans)
+        measurements.differences(*rows)
     with progress_bars() as bars:
         watch = watched_by(bars)
         measured = [evaluate.run(*request, watch, plan) for request, plan in zip(requests, plans, strict=True)]

@@ -89,9 +89,8 @@ class Opaque(PolicyNode):
     def _called(self, rows: np.ndarray) -> np.ndarray:
         """Call the function with a batch of any leading axes. Raises UserError for any exception of the function."""
         flat = rows.reshape(-1, rows.shape[-1])
-        return self._checked(_call_user(self.function, flat), len(flat), np.asarray).reshape(
-            *rows.shape[:-1], self.actions.size
-        )
+        actions = self._checked(_call_user(self.function, flat), len(flat), np.asarray)
+        return actions.reshape(*rows.shape[:-1], self.actions.size)
 
     def _checked(self, result: Any, rows: int, as_array: Callable[..., Any]) -> Any:
         """Return the function's result as an array of real numbers.

@@ -165,6 +165,5 @@ def resampled(
     for at in range(0, resamples, batch):
         rows = slice(at, at + batch)
         curves = np.tensordot(weights[rows], each, axes=(1, 1)) if each.shape[1] > 1 else each[None, :, 0]
-        sample = curves[np.arange(len(curves))[:, None], seeds[rows]]
-        parts.append(mean(of(sample), axis=1))
+        parts.append(mean(of(curves[np.arange(len(curves))[:, None], seeds[rows]]), axis=1))
     return np.concatenate(parts)

@@ -33,8 +33,7 @@ def variants(table: pa.Table, use: str, teacher: str, right: str) -> list[Varian
     own = table.filter((pc.field("use") == use) & meets)
     names = sorted(set(own.filter(pc.field("teacher") == teacher)["task"].to_pylist()))
     groups = [group_of("", SCORE, {"task": name}, own.filter(pc.field("task") == name), None) for name in names]
-    each = variants_of(groups, SCORE)
-    return [replace(one, task=one.task or names[0]) for one in each]
+    return [replace(one, task=one.task or names[0]) for one in variants_of(groups, SCORE)]
 
 
 def write(out: Path, table: pa.Table, right: str, lines: Sequence[str], command: str) -> Path:

@@ -46,8 +46,7 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
     for variant in variants:
         unguided = unguided_of(variant, variants)
         steps, estimate, lower, upper = variant.curve
-        goodness = sign * estimate
-        best = int(goodness.argmax())
+        best = int((sign * estimate).argmax())
         row: Row = {**identity(variant), "seeds": len(variant.seeds), "failed": len(variant.failed)}
         row |= {"episodes": variant.episodes or "not known"}
         row |= {"last_step": steps[-1], "final": estimate[-1], "final_lower": lower[-1], "final_upper": upper[-1]}

@@ -35,9 +35,8 @@ class LaneGroup:
         # By default all lanes at once; on one CPU an equal share for each core.
         takers = CORES if jax.default_backend() == "cpu" and self.mesh.size == 1 else 1
         self.lanes_per_block = config.sizes.lanes_per_block or -(-len(self.seeds) // takers)
-        self.program: Program = make_program(
-            config, guidance, env, self.largest_budget, self.mesh, lanes=self.cut.shape[1] // self.mesh.size
-        )
+        lanes = self.cut.shape[1] // self.mesh.size
+        self.program: Program = make_program(config, guidance, env, self.largest_budget, self.mesh, lanes)
 
     @property
     def rounds(self) -> int:
@@ -116,9 +115,8 @@ class LaneGroup:
 
     def take_labels(self, labels: list[Label], blocks: list[TrainState]) -> list[TrainState]:
         """Take labels (lanes, slots, ...) of each block from elsewhere and fit the guides to them."""
-        return self.each(
-            lambda rows, block: self.program.take_labels(self.env, self.config.scalars, rows, block), labels, blocks
-        )
+        take = lambda rows, block: self.program.take_labels(self.env, self.config.scalars, rows, block)  # noqa: E731
+        return self.each(take, labels, blocks)
 
     def evaluate(
         self, policy_of: Any, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int, blocks: list[TrainState]
@@ -134,6 +132,5 @@ class LaneGroup:
 
     def columns(self, blocks: list[Any]) -> dict[str, np.ndarray]:
         """Join per-block dictionaries of (lanes,) arrays into columns with one row per lane."""
-        return {
-            name: np.concatenate([np.asarray(block[name]) for block in blocks])[: len(self.seeds)] for name in blocks[0]
-        }
+        whole = {name: np.concatenate([np.asarray(block[name]) for block in blocks]) for name in blocks[0]}
+        return {name: column[: len(self.seeds)] for name, column in whole.items()}

@@ -104,9 +104,8 @@ class Runner:
         new, group = self.training.failed & ~self.failed, self.group
         if new.any():
             names = name_lanes(group.seeds[new], group.budgets[new])
-            console.print(
-                f"{self.name}: {names} no longer finite {when}: kept at the last finite state, marked as failed"
-            )
+            outcome = "kept at the last finite state, marked as failed"
+            console.print(f"{self.name}: {names} no longer finite {when}: {outcome}")
         self.failed = self.training.failed
 
     def _label(

@@ -123,8 +123,7 @@ class Training:
             for seeds, budgets in group.blocks()
         ]
         self.blocks = group.take_labels(rows, self.blocks)
-        clock = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
-        self.clock = place(group.mesh, clock, SHARED)
+        self.clock = place(group.mesh, self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32)), SHARED)
 
     def guides(self, before: int) -> dict[str, Any]:
         """Return the columns of an evaluation of the guides alone after the rounds since `before`.

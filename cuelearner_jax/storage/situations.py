@@ -86,14 +86,10 @@ def read(path: Path) -> Situations:
         return situations._replace(picture=picture) if picture else situations
     table = _table_in(path)
     columns = _columns(table)
+    known, advice = (OBSERVATION, ACTION, PICTURE, TEXT, *NUMBERS), f"name it {OBSERVATION}.NAME or {ACTION}.NAME"
     for name in columns:
-        if name not in (OBSERVATION, ACTION, PICTURE, TEXT, *NUMBERS) and not name.startswith(
-            ("observation.", "action.")
-        ):
-            raise UserError(
-                f"{table} has an unknown column {format_value(name)}: name it {OBSERVATION}.NAME or {ACTION}.NAME, "
-                "or leave it out"
-            )
+        if name not in known and not name.startswith(("observation.", "action.")):
+            raise UserError(f"{table} has an unknown column {format_value(name)}: {advice}, or leave it out")
     if len({len(values) for values in columns.values()}) > 1:
         raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
     observations, names = _matrix(table, columns, OBSERVATION)
@@ -185,9 +181,8 @@ def _columns(table: Path) -> dict[str, Any]:
     except (pa.ArrowException, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         why = " ".join(str(error).split())[:120]
         raise UserError(f"{table} cannot be read ({why}): write it anew, without Python objects in it") from error
-    columns: dict[str, Any] = {
-        name.strip(): column.to_pylist() for name, column in zip(rows.column_names, rows.columns, strict=True)
-    }
+    pairs = zip(rows.column_names, rows.columns, strict=True)
+    columns: dict[str, Any] = {name.strip(): column.to_pylist() for name, column in pairs}
     if len(columns) < rows.num_columns:
         raise UserError(f"{table} has two columns of one name: give each column a name of its own")
     for name in columns.keys() & {OBSERVATION, ACTION} if table.suffix == ".csv" else ():

@@ -128,9 +128,8 @@ class TableWriter(contextlib.AbstractContextManager):
         (count,) = {len(arrays[name]) for name in many} or {1}
         # tolist() turns NumPy and JAX values into plain Python values, with one transfer per column.
         values = {name: plain(array.tolist()) for name, array in arrays.items()}
-        self._put(
-            {name: value[row] if name in many else value for name, value in values.items()} for row in range(count)
-        )
+        value_in = lambda name, row: values[name][row] if name in many else values[name]  # noqa: E731
+        self._put({name: value_in(name, row) for name in values} for row in range(count))
 
     def _put(self, rows: Iterable[Row]) -> None:
         """Append lines, on disk when this returns; after an error the file is as before."""

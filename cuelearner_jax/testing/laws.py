@@ -31,9 +31,8 @@ class Laws:
     def same(self, one: Any, other: Any) -> bool:
         """Return whether two trees of arrays are equal, within the tolerance. Keys are compared by their words."""
         pairs = zip(*(map(_numbers, jax.tree.leaves(tree)) for tree in (one, other)), strict=True)
-        return all(
-            a.shape == b.shape and np.allclose(a, b, self.tolerance, self.tolerance, equal_nan=True) for a, b in pairs
-        )
+        near = lambda a, b: np.allclose(a, b, self.tolerance, self.tolerance, equal_nan=True)  # noqa: E731
+        return all(a.shape == b.shape and near(a, b) for a, b in pairs)
 
     def actions(self, space: Space, actions: Any, subject: str) -> None:
         """Raise AssertionError unless rows (..., size) are actions of a space."""

@@ -73,8 +73,7 @@ def _check_teacher(laws: Laws, task: Task, config: Any, env: Any) -> None:
             return best
         return {**best, "nearest good action": teacher.nearest_good(state, obs, best["best action"], 0.0, 1.0)}
 
-    actions = answers(env)
-    for name, one in actions.items():
+    for name, one in answers(env).items():
         laws.hold(one.ndim == 1, f"its teacher's {name} has shape {one.shape}: give one action")
         laws.actions(actions_of(env), one, f"its teacher's {name}")
 
