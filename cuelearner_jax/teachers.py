@@ -135,10 +135,8 @@ def digest(folder: Path) -> str:
 def read_about(folder: Path) -> dict[str, Any]:
     """Return the content of teacher.json. Raises UserError if it is missing or damaged."""
     if not (folder / ABOUT).is_file():
-        raise UserError(
-            f"no teacher in {folder}: train one with `{TRAIN}` and give its folder "
-            "(--task.teacher FOLDER), or use the search teacher (--task.teacher search)"
-        )
+        advice = f"train one with `{TRAIN}` and give its folder (--task.teacher FOLDER)"
+        raise UserError(f"no teacher in {folder}: {advice}, or use the search teacher (--task.teacher search)")
     return formats.read("teacher", folder / ABOUT)
 
 

@@ -160,10 +160,8 @@ def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars | None
             f"from {space.grain:g} on, about a tenth of the bound"
         )
     if scalars.tau_deg >= eps:
-        raise UserError(
-            f"scalars.tau_deg is {scalars.tau_deg:g} and a pass moves an action by {eps:g}, after which refinement "
-            f"would stop: give scalars.tau_deg {eps / PASSES:g}"
-        )
+        why = f"a pass moves an action by {eps:g}, after which refinement would stop"
+        raise UserError(f"scalars.tau_deg is {scalars.tau_deg:g} and {why}: give scalars.tau_deg {eps / PASSES:g}")
 
 
 def reach(space: Space, policy: Policy, obs: Any, action: Any) -> float:

@@ -80,10 +80,8 @@ class DDQNConfig:
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
         """Raise UserError for options that do not work together."""
         if self.coarse_directions and (self.coarse_directions < 3 or self.directions % self.coarse_directions):
-            raise UserError(
-                f"agent.coarse_directions is {self.coarse_directions}: give a divisor of agent.directions "
-                f"({self.directions}) above 2, or 0 to value all of them"
-            )
+            advice = f"give a divisor of agent.directions ({self.directions}) above 2, or 0 to value all of them"
+            raise UserError(f"agent.coarse_directions is {self.coarse_directions}: {advice}")
         if self.coarse_directions and self.peaks > self.coarse_directions:
             raise UserError(f"agent.peaks is {self.peaks}: give at most agent.coarse_directions")
         if self.n_step * sizes.num_envs > self.replay_capacity:

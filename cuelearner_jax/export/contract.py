@@ -126,10 +126,8 @@ def _artefact(
         about = {"needs": "jax", "jax": jax.__version__, "platforms": list(PLATFORMS)}
         return "decision.stablehlo", bytes(exported.serialize()), about
     if traced.missing:
-        raise UserError(
-            f"--format {format} does not support {', '.join(traced.missing)}, which this policy needs: "
-            "give --format stablehlo"
-        )
+        missing = f"{', '.join(traced.missing)}, which this policy needs"
+        raise UserError(f"--format {format} does not support {missing}: give --format stablehlo")
     if format == "onnx":
         contents = onnx_graph.serialize(traced, inputs, outputs)
         about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET}

@@ -136,10 +136,8 @@ def golden_cases(policy: Policy, candidates: Float[np.ndarray, "n obs"], traced:
             steady[place] &= actions[place].any() and is_steady(traced, obs[place])
     count, extreme = int(steady[: len(candidates)].sum()), int(steady[len(candidates) :].sum())
     if not count:
-        raise UserError(
-            f"all {len(candidates)} decisions change with the last digits of their observation, so none can serve as a "
-            "golden case"
-        )
+        why = f"all {len(candidates)} decisions change with the last digits of their observation"
+        raise UserError(f"{why}, so none can serve as a golden case")
     places = np.flatnonzero(steady)
     places = np.concatenate([places[:count][: most - extreme], places[count:]])
     return Golden(obs[places], actions[places], len(candidates), count, extreme)

@@ -151,10 +151,8 @@ def _check(checkpoint: Path, config: dict[str, Any], sizes: dict[str, int], name
     for name, size in sizes.items():
         if (shape := features.get(name, {}).get("shape")) != [size]:
             own = f"has {shape[0]} entries" if shape else "is missing"
-            raise UserError(
-                f"{name} {own} in {checkpoint}, and {size} in the correction: give the checkpoint whose actions were "
-                "labelled"
-            )
+            advice = "give the checkpoint whose actions were labelled"
+            raise UserError(f"{name} {own} in {checkpoint}, and {size} in the correction: {advice}")
     own = tuple(config.get("action_feature_names") or ())
     if own and names and own != names:
         raise UserError(
@@ -166,10 +164,8 @@ def _check_steps(checkpoint: Path, pre: dict[str, Any], post: dict[str, Any]) ->
     """Raise UserError for processors that a correction cannot join."""
     steps = [*pre["steps"], *post["steps"]]
     if any(step.get("registry_name") == RELATIVE and step.get("config", {}).get("enabled") for step in steps):
-        raise UserError(
-            f"{checkpoint} has relative actions, whose chunks a correction would lead astray: give a policy of "
-            "absolute actions"
-        )
+        why = "whose chunks a correction would lead astray"
+        raise UserError(f"{checkpoint} has relative actions, {why}: give a policy of absolute actions")
     if any(step.get("class", "").startswith(STEPS) for step in steps):
         raise UserError(f"{checkpoint} holds a correction already: give the checkpoint that it was made from")
     for name, of, normaliser in ((PRE, pre, NORMALIZER), (POST, post, UNNORMALIZER)):

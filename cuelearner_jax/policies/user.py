@@ -141,10 +141,9 @@ def _try(policy: Opaque, size: int) -> None:
         (alone, batch[:2], BATCHED, f"in a batch of {TRIED}"),
     ):
         if (np.abs(np.asarray(space.retract(actions)) - np.asarray(space.retract(others))) > most * entries).any():
-            raise UserError(
-                f"{policy_name(policy)} does not repeat itself: the same observation gets another action {when}; give "
-                "a policy without memory and sampling, as model.predict(obs, deterministic=True)"
-            )
+            advice = "give a policy without memory and sampling, as model.predict(obs, deterministic=True)"
+            why = f"the same observation gets another action {when}"
+            raise UserError(f"{policy_name(policy)} does not repeat itself: {why}; {advice}")
 
 
 @partial(jax.jit, static_argnums=0)
@@ -197,10 +196,8 @@ def policy_of(source: Any, space: Space | None = None) -> Any:
     model = getattr(policy.function, "model", None)
     own, other = action_words(getattr(model, "action_space", None)), action_words(space)
     if own and other and own != other:
-        raise UserError(
-            f"{policy_name(policy)} gives actions {own}, this world takes actions {other}: give a world with the "
-            "policy's actions, or a function that converts them"
-        )
+        advice = "give a world with the policy's actions, or a function that converts them"
+        raise UserError(f"{policy_name(policy)} gives actions {own}, this world takes actions {other}: {advice}")
     return policy.replace(actions=space)
 
 
@@ -316,10 +313,8 @@ def _predicted(model: Any, obs: np.ndarray) -> Any:
     counts = {key: discrete(part) if hasattr(part, "start") else [] for key, part in parts.items()}
     ends = np.cumsum([sum(counts[key]) or np.prod(part.shape, dtype=int) for key, part in parts.items()])
     if obs.shape[1] != ends[-1]:
-        raise UserError(
-            f"{name} takes observations of {ends[-1]} entries, these have {obs.shape[1]}: give the observations that "
-            "it was trained on"
-        )
+        advice = "give the observations that it was trained on"
+        raise UserError(f"{name} takes observations of {ends[-1]} entries, these have {obs.shape[1]}: {advice}")
     values: Any = {}
     for (key, part), rows in zip(parts.items(), np.split(np.array(obs), ends[:-1], axis=1), strict=True):
         if counts[key]:

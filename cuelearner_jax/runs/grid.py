@@ -78,10 +78,8 @@ def check_grid(grid: Grid, adapts: bool = False) -> None:
         if not _all_differ(grid.labels):
             raise UserError("--labels: give each budget once, and at least one")
         if min(grid.labels) < 1:
-            raise UserError(
-                f"a label budget of {min(grid.labels)} teaches nothing: give --labels of at least 1, "
-                "or, in training, 0 for the unguided agent"
-            )
+            advice = "give --labels of at least 1, or, in training, 0 for the unguided agent"
+            raise UserError(f"a label budget of {min(grid.labels)} teaches nothing: {advice}")
 
 
 def _all_differ(values: tuple[Any, ...]) -> bool:

@@ -68,10 +68,8 @@ def resolve_request(request: RequestT) -> RequestT:
     space, eps = actions_of(shape_of(request.task, request.config.task)), request.config.scalars.eps_deg
     asks = [kind for kind in request.grid.guidance if guidances.find(kind).needs_cues]
     if asks and not space.grain <= eps <= space.reach:
-        raise UserError(
-            f"scalars.eps_deg is {eps:g} {space.unit}, and every answer of {asks[0]} would be the same: give "
-            f"{space.grain:g} to {space.reach:g}"
-        )
+        why = f"every answer of {asks[0]} would be the same"
+        raise UserError(f"scalars.eps_deg is {eps:g} {space.unit}, and {why}: give {space.grain:g} to {space.reach:g}")
     return request
 
 
@@ -151,10 +149,8 @@ def read_labels(
     for kind in asking:
         form: Any = kind.form
         if form.name != file.answers:
-            raise UserError(
-                f"{path} holds {file.answers} answers, but guidance {kind.name} needs {form.name} answers: "
-                "give fitting labels"
-            )
+            needs = f"guidance {kind.name} needs {form.name} answers"
+            raise UserError(f"{path} holds {file.answers} answers, but {needs}: give fitting labels")
         external_labels.check_file(file, spaces_of(env), form, str(path))
     if file.eps is not None and not math.isclose(file.eps, scalars.eps_deg, rel_tol=1e-6):
         raise UserError(

@@ -63,10 +63,8 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
     first, of_seed, pieces = formats.read("config", folders[0] / CONFIG), {}, []
     for one in folders:
         if names := shards.differing_options(first, formats.read("config", one / CONFIG)):
-            raise UserError(
-                f"{folders[0]} and {one} are shards of different sweeps (they differ in {names}): "
-                "give the folder of one of them"
-            )
+            both = f"{folders[0]} and {one} are shards of different sweeps"
+            raise UserError(f"{both} (they differ in {names}): give the folder of one of them")
         pieces.append(Piece(one, load(one, find)[2]))
         for seed in pieces[-1].grid.seeds:
             if (other := of_seed.setdefault(seed, one)) != one:

@@ -41,17 +41,13 @@ class Shard(NamedTuple):
             raise UserError(f"{out} holds a run that is not cut into shards: give another --out")
         for folder in sorted(out.glob("shard-*-of-*")):
             if not folder.name.endswith(f"-of-{self.count}"):
-                raise UserError(
-                    f"{folder} is a shard of another division, whose seeds would count twice: "
-                    f"use as many shards as before, or give another --out"
-                )
+                advice = "use as many shards as before, or give another --out"
+                raise UserError(f"{folder} is a shard of another division, whose seeds would count twice: {advice}")
             if folder == self.folder(out) or not (folder / CONFIG).is_file():
                 continue
             if names := differing_options(formats.read("config", folder / CONFIG), contents):
-                raise UserError(
-                    f"{folder} is a shard of a sweep with another {names}: give the same options for all shards, or "
-                    "another --out"
-                )
+                advice = "give the same options for all shards, or another --out"
+                raise UserError(f"{folder} is a shard of a sweep with another {names}: {advice}")
 
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shard's share of a sweep's seeds; shares differ by at most one seed."""

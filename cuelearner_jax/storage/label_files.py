@@ -218,10 +218,8 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
                 "give --seeds (train: --seed) for these, or the labels of another run"
             )
         if len(rows) < budget:
-            raise UserError(
-                f"the label file has {len(rows)} labels for seed {seed}, the budget is {budget}: "
-                "lower --labels or collect more"
-            )
+            there = f"the label file has {len(rows)} labels for seed {seed}, the budget is {budget}"
+            raise UserError(f"{there}: lower --labels or collect more")
         pad = lambda leaf, own=rows[:budget]: np.pad(leaf[own], [(0, slots - len(own)), *[(0, 0)] * (leaf.ndim - 1)])  # noqa: E731
         sets.append(jax.tree.map(pad, file.labels))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)

@@ -188,10 +188,8 @@ def task_from(
         factory, code = source, getattr(source, "func", source)
         name = called or f"{getattr(code, '__module__', '')}:{getattr(code, '__qualname__', type(code).__name__)}"
     else:
-        raise UserError(
-            f"env is {format_value(source)}: give an id of Gymnasium's registry, or a class or function that "
-            "gives environments"
-        )
+        advice = "give an id of Gymnasium's registry, or a class or function that gives environments"
+        raise UserError(f"env is {format_value(source)}: {advice}")
     text = _as_json(dict(arguments or {}))
     actions, slices, limit, succeeds = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
     if not max_steps and not limit:
@@ -284,8 +282,6 @@ def _with_names(
     if total != size:
         raise UserError(f"observation names {total} entries, and {name} has {size}: name each entry once")
     if unknown := sorted(set(units) - {quantity.name for quantity in own}):
-        raise UserError(
-            f"units names {unknown[0]!r}, the slices are {', '.join(quantity.name for quantity in own)}: name one of "
-            "them"
-        )
+        there = ", ".join(quantity.name for quantity in own)
+        raise UserError(f"units names {unknown[0]!r}, the slices are {there}: name one of them")
     return tuple(quantity._replace(unit=units.get(quantity.name, quantity.unit)) for quantity in own)

@@ -206,10 +206,8 @@ class Running:
         except (TypeError, ValueError):
             number = math.nan
         if not math.isfinite(number):
-            raise UserError(
-                f"{self.whose} gave {called} of {format_value(value)} in {self._when}: give a finite number, True or "
-                "False"
-            )
+            advice = "give a finite number, True or False"
+            raise UserError(f"{self.whose} gave {called} of {format_value(value)} in {self._when}: {advice}")
         return number
 
     def _vector(self, obs: Any) -> np.ndarray:
