@@ -70,9 +70,8 @@ class ArmConfig:
 def _reel(env, state, action):
     """Film without motion; its words give the action's distance from the goal."""
     x, y = map(float, state)
-    return Reel(
-        0.05, [{"dot": (x, -y, 0.0)}], f"{float(env.actions.distance(env.best(state), jnp.asarray(action))):.2f}"
-    )
+    away = float(env.actions.distance(env.best(state), jnp.asarray(action)))
+    return Reel(0.05, [{"dot": (x, -y, 0.0)}], f"{away:.2f}")
 
 
 def _trails(env, state, actions):

@@ -78,9 +78,8 @@ def pytest_terminal_summary(terminalreporter, exitstatus, config):
             seconds[file] += report.duration
             tests[file] += report.when == "call"
     versions = f"jax {jaxlib.version.__version__}, Python {sys.version.split()[0]}, {os.cpu_count()} cores"
-    head = (
-        f"# {sum(tests.values()):,} tests, {sum(seconds.values()):,.0f} s over all workers; {versions}; make durations"
-    )
+    total = f"{sum(tests.values()):,} tests, {sum(seconds.values()):,.0f} s over all workers"
+    head = f"# {total}; {versions}; make durations"
     lines = [f"{spent:8.1f} {tests[file]:5} {file}" for file, spent in seconds.most_common()]
     path.write_text("\n".join([head, "# seconds tests file", *lines, ""]), encoding="utf-8")
 

@@ -65,9 +65,8 @@ def test_lanes_are_side_by_side_on_an_accelerator_alone(monkeypatch, lanes, back
 
 
 def measured(folder):
-    rows = sorted(
-        results.read(folder).to_pylist(), key=lambda row: (row["guidance"], row["labels"], row["seed"], row["step"])
-    )
+    order = lambda row: (row["guidance"], row["labels"], row["seed"], row["step"])  # noqa: E731
+    rows = sorted(results.read(folder).to_pylist(), key=order)
     names = [name for name in rows[0] if isinstance(rows[0][name], int | float) and name != "wall_s"]
     return {name: np.array([np.nan if row[name] is None else row[name] for row in rows], float) for name in names}
 

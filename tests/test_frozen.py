@@ -116,9 +116,8 @@ def test_a_killed_sweep_goes_on_to_the_same_bits(tmp_path):
     sweep += ["--schedule.total-steps", 2400, "--schedule.guidance-until", 1200, "--schedule.checkpoint-every", 480]
     run(*sweep, "--out", tmp_path / "whole")
     killed = tmp_path / "killed"
-    process = subprocess.Popen(
-        [ENTRY, *map(str, sweep), "--out", killed], cwd=Path(__file__).parent, stderr=subprocess.DEVNULL
-    )
+    command = [ENTRY, *map(str, sweep), "--out", killed]
+    process = subprocess.Popen(command, cwd=Path(__file__).parent, stderr=subprocess.DEVNULL)
     growing = killed / "relative" / "results.jsonl"
     while process.poll() is None and not (growing.exists() and '"step": 960' in growing.read_text()):
         time.sleep(0.02)

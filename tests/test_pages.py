@@ -14,9 +14,8 @@ PACKAGES = [ROOT / "cuelearner_jax", ROOT / "envs" / "cuelearner_envs"]
 
 FENCED = re.compile(r"^( *(?:- )?)(```|~~~).*?^ *\2", re.MULTILINE | re.DOTALL)
 APART = re.compile(r"^ *(\||>>>|<!--|:::|\$\$).*$", re.MULTILINE)  # a table, an example, a directive, an equation
-ITEM = re.compile(
-    r"^\s*([-*+]|\d+\.|#+|\?\?\?\+?|!!!|===|[\w*,. ]+(\(\w+\))?:)(\s|$)"
-)  # or "name: text" of a docstring
+# or "name: text" of a docstring
+ITEM = re.compile(r"^\s*([-*+]|\d+\.|#+|\?\?\?\+?|!!!|===|[\w*,. ]+(\(\w+\))?:)(\s|$)")
 CODE, LINK = re.compile(r"`[^`]+`"), re.compile(r"!?\[([^\[\]]*)\]\([^()\s]*(?:\s\"[^\"]*\")?\)")
 END = re.compile(r"(?<!e\.g)(?<!i\.e)(?<! al)(?<! cf)[.!?][\"')*_]*\s+(?=[\"'(\[*_]*[A-Z0-9`])")
 

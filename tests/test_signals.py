@@ -21,9 +21,8 @@ def started():
     processes = []
 
     def start(script):
-        process = subprocess.Popen(
-            [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        process = subprocess.Popen([sys.executable, "-c", script], text=True, **pipes)
         processes.append(process)
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"

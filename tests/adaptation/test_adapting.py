@@ -77,9 +77,8 @@ def errors(policy, lane):
 
 def test_lanes_are_every_combination_or_one_each():
     assert LANES.number == 8
-    assert {*zip(*(column.tolist() for column in LANES), strict=True)} == {
-        (base, 3, budget, bound) for base in (0, 1) for budget in (30, 80) for bound in (10.0, 60.0)
-    }
+    every = {(base, 3, budget, bound) for base in (0, 1) for budget in (30, 80) for bound in (10.0, 60.0)}
+    assert {*zip(*(column.tolist() for column in LANES), strict=True)} == every
     each = product(3, (4, 7, 9), (30,), (60.0,), one_each=True)
     assert (each.base.tolist(), each.seed.tolist()) == ([0, 1, 2], [4, 7, 9])
 

@@ -127,9 +127,8 @@ def test_transitions_out_of_the_ring_buffer_are_those_of_a_walk_along_each_envir
 
 def constant(value):
     """Parameters of a value function that is `value` everywhere."""
-    params = jax.tree.map(
-        jnp.zeros_like, q_network(OPTIONS.q_layers).init(jax.random.key(0), jnp.zeros(2), jnp.zeros(2))
-    )
+    params = q_network(OPTIONS.q_layers).init(jax.random.key(0), jnp.zeros(2), jnp.zeros(2))
+    params = jax.tree.map(jnp.zeros_like, params)
     layer = params["params"][f"Dense_{len(OPTIONS.q_layers)}"]
     return {"params": {**params["params"], f"Dense_{len(OPTIONS.q_layers)}": {**layer, "bias": jnp.array([value])}}}
 
@@ -137,9 +136,8 @@ def constant(value):
 @pytest.mark.parametrize(("weight", "expected"), [(0.0, [5.0, 2.0]), (1.0, [4.0, 3.0]), (0.25, [4.75, 2.25])])
 def test_the_target_lies_between_that_of_one_step_and_that_of_many_by_the_weight(weight, expected):
     def batch(reward, discount):
-        return Transition(
-            jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.array(reward), jnp.array(discount), jnp.ones((2, 2))
-        )
+        zeros = jnp.zeros((2, 2))
+        return Transition(zeros, zeros, jnp.array(reward), jnp.array(discount), 1 + zeros)
 
     # Value 8 to the target network, which is what counts, and -3 to the online one. One step: 1 + 0.5 * 8 and a
     # termination with 2; three steps: 3 + 0.5 * 0.25 * 8 and 3 with a termination.

@@ -82,9 +82,8 @@ def by_hand(critics, number, obs, unit):
     dense = critics["params"]
     hidden = np.concatenate([obs, unit], -1) @ np.asarray(dense["Dense_0"]["kernel"][number])
     hidden = np.maximum(hidden + np.asarray(dense["Dense_0"]["bias"][number]), 0)
-    return (hidden @ np.asarray(dense["Dense_1"]["kernel"][number]) + np.asarray(dense["Dense_1"]["bias"][number]))[
-        :, 0
-    ]
+    values = hidden @ np.asarray(dense["Dense_1"]["kernel"][number]) + np.asarray(dense["Dense_1"]["bias"][number])
+    return values[:, 0]
 
 
 def batch_of(size=6):

@@ -57,9 +57,8 @@ def roll(env, lanes=5, steps=8):
     def rolled():
         def one(states, number):
             actions = env.actions.sample(jax.random.fold_in(KEY, number), (lanes,))
-            after, step = jax.vmap(env.step)(
-                jax.random.split(jax.random.fold_in(KEY, 99 - number), lanes), states, actions
-            )
+            keys = jax.random.split(jax.random.fold_in(KEY, 99 - number), lanes)
+            after, step = jax.vmap(env.step)(keys, states, actions)
             return after, step.final_obs
 
         states, _ = jax.vmap(env.reset)(jax.random.split(KEY, lanes))

@@ -20,10 +20,9 @@ def grid(tmp_path_factory):
     """A grid of two settings, and beside it a sweep of each; and how many programs the grid took."""
     folder, compiled = tmp_path_factory.mktemp("settings"), []
     make = program.make_program
+    recorded = lambda *a, **b: compiled.append(make(*a, **b)) or compiled[-1]  # noqa: E731
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "cuelearner_jax.runs.lanes.make_program", lambda *a, **b: compiled.append(make(*a, **b)) or compiled[-1]
-        )
+        patch.setattr("cuelearner_jax.runs.lanes.make_program", recorded)
         assert main([*GRID, "--out", str(folder / "grid")]) == 0
     assert len(compiled) == 2
     assert compiled[0] is compiled[1]

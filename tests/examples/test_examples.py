@@ -187,9 +187,8 @@ def test_the_soft_agent_learns_the_soft_values_of_a_chain():
 
 @pytest.mark.long
 def test_the_parts_keep_the_laws(tmp_path):
-    reach, clone, brax, policy = (
-        importlib.import_module(f"examples.{name}") for name in ("reach", "clone", "brax_task", "policy")
-    )
+    names = ("reach", "clone", "brax_task", "policy")
+    reach, clone, brax, policy = (importlib.import_module(f"examples.{name}") for name in names)
     config = reach.ReachConfig(max_steps=8, mirrors=True)
     check_task(reach.TASK, config, pictures=tmp_path)
     env = reach.make_environment(config)
@@ -222,9 +221,8 @@ def test_a_constant_error_in_a_gymnasium_class_of_ones_own_falls_to_a_fifth():
 
 
 def test_the_shots_that_the_page_on_billiards_shows_are_won(capsys):
-    (shown,) = re.findall(
-        r"```python\n(.*?)```", (ROOT / "docs" / "billiards.md").read_text(encoding="utf-8"), re.DOTALL
-    )
+    page = (ROOT / "docs" / "billiards.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     told: dict = {}
     exec(shown, told)
     printed = capsys.readouterr().out

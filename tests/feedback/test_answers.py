@@ -205,9 +205,7 @@ def test_a_teacher_of_one_cue_speaks_of_each_as_often_and_rightly():
 def test_no_teacher_speaks_of_a_cue_that_people_are_not_asked_about(says):
     space = Box((-1.0, -1.0), (1.0, 1.0), cues_from("x=left,right", ("x", "y")))
     scalars = dataclasses.replace(SCALARS, eps_deg=0.1, says=says)
-    keys = jax.random.split(KEY, 9)
-    answers, answered = jax.vmap(lambda key: human_answer(key, space, jnp.zeros(2), jnp.array([0.0, 1.0]), scalars))(
-        keys
-    )
+    answer = lambda key: human_answer(key, space, jnp.zeros(2), jnp.array([0.0, 1.0]), scalars)  # noqa: E731
+    answers, answered = jax.vmap(answer)(jax.random.split(KEY, 9))
     np.testing.assert_array_equal(answers, [[0, UNSAID]] * 9)
     assert answered.all()

@@ -41,9 +41,8 @@ def test_indifference_widens_what_is_right_and_never_narrows_it():
 def test_feedback_is_the_turn_that_comes_nearest(eps_deg):
     rng = np.random.default_rng(int(eps_deg * 10))
     action, best = rng.uniform(-math.pi, math.pi, (2, 2000))
-    h = jax.vmap(partial(relative_feedback, DIRECTIONS), (0, 0, None))(
-        directions.from_angle(jnp.array(action)), directions.from_angle(jnp.array(best)), jnp.array(eps_deg * DEG)
-    )
+    both = (directions.from_angle(jnp.array(angles)) for angles in (action, best))
+    h = jax.vmap(partial(relative_feedback, DIRECTIONS), (0, 0, None))(*both, jnp.array(eps_deg * DEG))
     turns = np.array([-1, 0, 1])
     left = np.abs(np.angle(np.exp(1j * (best[:, None] - action[:, None] - turns * eps_deg * DEG))))
     two_best = np.sort(left, axis=1)[:, :2]

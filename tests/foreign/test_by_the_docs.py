@@ -72,9 +72,8 @@ def place(tmp_path, monkeypatch):
 
     table = tmp_path / "situations/situations.parquet"
     columns = pq.read_table(table).to_pydict()
-    columns |= {
-        f"action.{name}": values for name, values in zip(recorded.ENTRIES, acted(POLICY, observations).T, strict=True)
-    }
+    names = (f"action.{name}" for name in recorded.ENTRIES)
+    columns |= dict(zip(names, acted(POLICY, observations).T, strict=True))
     pq.write_table(pa.table(columns), table)
     return POLICY
 

@@ -174,9 +174,8 @@ def stored(tmp_path):
         nodes = [helper.make_node("MatMul", [inputs[0], "w"], [name]) for name in outputs]
         given = [helper.make_tensor_value_info(name, real, [rows, 3]) for name in inputs]
         made = [helper.make_tensor_value_info(name, real, [rows, 2]) for name in outputs]
-        model = helper.make_model(
-            helper.make_graph(nodes, "policy", given, made, [weights]), opset_imports=[helper.make_opsetid("", 18)]
-        )
+        graph = helper.make_graph(nodes, "policy", given, made, [weights])
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)])
         model.ir_version = 8
         path = tmp_path / "policy.onnx"
         path.write_bytes(model.SerializeToString())

@@ -130,9 +130,8 @@ def test_every_candidate_is_asked_about_at_once_within_the_budget():
     guide = asking.start(single, ENV, slots, 21, jax.random.key(1), jax.random.key(2), sizes)
     keys = asking.question_keys(key, 12)
     proposed = Uniform().act(keys.base, guide.env, guide.obs)
-    after = asking.ask(
-        asking.Inquiry(single, ENV, probes.SCALARS, Uniform()), expert, guide, key, jnp.asarray(12), every=True
-    )
+    of = asking.Inquiry(single, ENV, probes.SCALARS, Uniform())
+    after = asking.ask(of, expert, guide, key, jnp.asarray(12), every=True)
     np.testing.assert_array_equal(after.labels.obs[12:18], guide.obs)
     np.testing.assert_array_equal(after.labels.action[12:18], proposed)
     errors = jax.vmap(directions.difference)(proposed, jax.vmap(ENV.best)(guide.obs))

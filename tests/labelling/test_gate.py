@@ -43,9 +43,8 @@ def test_the_token_of_the_address_lets_in_and_a_cookie_carries_it_on():
     later = talk(host=HOST, cookie=f"other=1; {COOKIE}")
     assert later[0]["status"] == 200
     assert b"set-cookie" not in dict(later[0]["headers"])
-    assert talk("websocket", host="localhost:8123", origin="http://localhost:8123", cookie=COOKIE) == [
-        {"type": "websocket.accept"}
-    ]
+    opened = talk("websocket", host="localhost:8123", origin="http://localhost:8123", cookie=COOKIE)
+    assert opened == [{"type": "websocket.accept"}]
 
 
 @pytest.mark.parametrize(

@@ -89,9 +89,8 @@ def test_pictures_of_a_camera_that_moved_are_moved_back_without_labels(tmp_path)
     camera = ["-m", "lerobot_processor_cuelearner", "camera", "--before", "data", "--policy"]
     line = run(tmp_path, *camera, checkpoint, "--after", "later", "--out", "back")
     assert line.startswith("observation.image: the picture moved by 7.3% to the right and 3.")
-    (step,) = [
-        one for one in json.loads((tmp_path / "back/policy_preprocessor.json").read_text())["steps"] if one.get("class")
-    ]
+    steps = json.loads((tmp_path / "back/policy_preprocessor.json").read_text())["steps"]
+    (step,) = [one for one in steps if one.get("class")]
     places = step["config"]["places"]["observation.image"]
     np.testing.assert_allclose(places, [[1, 0, 14 / 96], [0, 1, 6 / 96]], atol=4e-3)
     run(tmp_path, "lerobot-eval", "--policy.path=back", "--output_dir=evaluated", *EVALUATE.split())

@@ -47,9 +47,8 @@ def test_one_policy_has_an_interval_over_episodes_and_several_over_seeds():
 
 def test_a_share_of_all_episodes_has_an_interval():
     row = measured([1, 2])._replace(metrics={"success": np.ones(2)}, each={"success": np.ones((2, 50))})
-    assert measurements.spread(row, "success") == pytest.approx(
-        (1, 0.962, 1), abs=1e-3
-    )  # Jeffreys, 50 of 50 that both share
+    # Jeffreys, 50 of 50 that both share
+    assert measurements.spread(row, "success") == pytest.approx((1, 0.962, 1), abs=1e-3)
     lost = row._replace(metrics={"success": np.zeros(2)}, each={"success": np.zeros((2, 50))})
     assert measurements.spread(lost, "success") == pytest.approx((0, 0, 0.038), abs=1e-3)
     assert measurements.spread(row._replace(is_shared=True), "success") == pytest.approx((1, 0.962, 1), abs=1e-3)

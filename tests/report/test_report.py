@@ -164,9 +164,7 @@ def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path)
     lose(runs / "scalar", "scalar", 100, seeds=[0, 1])
     text = report([runs], tmp_path / "after").read_text()
     before, after = summary(tmp_path / "before"), summary(tmp_path / "after")
-    assert {name: row for name, row in after["relative", 500].items() if name != "failed"} == {
-        name: row for name, row in before["relative", 500].items() if name != "failed"
-    }
+    assert after["relative", 500] | {"failed": ""} == before["relative", 500] | {"failed": ""}
     assert [after[key]["failed"] for key in before] == ["0", "0", "3"]
     assert after.keys() == before.keys()
     assert "| relative | 500 | 8 of 11, 3 failed | 30 |" in text

@@ -6,6 +6,7 @@ import numpy as np
 import probes
 import pytest
 import walk_task
+from small_policies import TASK, find
 
 from cuelearner_jax.cli.sources import _with_teacher
 from cuelearner_jax.errors import UserError
@@ -16,19 +17,11 @@ from cuelearner_jax.runs.order import Order
 from cuelearner_jax.storage.folders import check_folder, prepare_folder
 from cuelearner_jax.studies import train
 
-TASK = probes.make_task()
 GRID = Grid(("none", "relative"), seeds=(4, 9), labels=(10, 15))
 
 
 def described(config=probes.CONFIG, grid=GRID, split="tuning", task=TASK):
     return runs.describe(task, config, grid, split)
-
-
-def find(name):
-    """The one task that is known here."""
-    if name != TASK.name:
-        raise UserError(f"unknown task {name!r}")
-    return TASK
 
 
 @pytest.fixture

@@ -62,9 +62,8 @@ def test_the_newest_comes_back_bit_by_bit(saved):
     found = restore(saved, {"policy": shapes(state()), "rest": state()}, run="mine")
     assert_bitwise(found, {"policy": state(12), "rest": state(112)})
     # A key that came back draws what it would have drawn.
-    assert jax.random.uniform(found["policy"]["block"][1]["keys"][1]) == jax.random.uniform(
-        state(12)["block"][1]["keys"][1]
-    )
+    mine, its = (of["block"][1]["keys"][1] for of in (found["policy"], state(12)))
+    assert jax.random.uniform(mine) == jax.random.uniform(its)
     assert sorted(path.name for path in saved.iterdir()) == ["12", "5"]
     assert MOST_CHECKPOINTS == 2
 

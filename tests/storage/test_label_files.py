@@ -97,10 +97,8 @@ def test_no_file_and_a_file_without_labels_are_refused(path):
     for missing in (path, path.parent):
         with pytest.raises(UserError, match="no label file"):
             files.read(missing)
-    labels = label_sets()
-    files.write(
-        path, TASK, "relative", DIRECTIONS, EPS, np.array([4, 9]), labels.replace(valid=np.zeros((2, 20), bool))
-    )
+    labels = label_sets().replace(valid=np.zeros((2, 20), bool))
+    files.write(path, TASK, "relative", DIRECTIONS, EPS, np.array([4, 9]), labels)
     with pytest.raises(UserError, match="holds no labels"):
         files.read(path)
 

@@ -86,9 +86,8 @@ def test_proposed_actions_are_part_of_what_is_observed(tmp_path):
     bounds = json.dumps({"low": [-1.0], "high": [2.0]})
     columns = GOOD | {"phase": [0.0, 0.5], "text": ["pick", ""]}
     (tmp_path / "there").mkdir()
-    pq.write_table(
-        pa.table(columns).replace_schema_metadata({"cuelearner": bounds}), tmp_path / "there/situations.parquet"
-    )
+    stored = pa.table(columns).replace_schema_metadata({"cuelearner": bounds})
+    pq.write_table(stored, tmp_path / "there/situations.parquet")
     found = situations.read(tmp_path / "there")
     np.testing.assert_array_equal(found.observations, [[0.0, 1.0, 0.0, 0.5], [2.0, 3.0, 0.5, 0.25]])
     assert [(one.name, one.size) for one in found.slices] == [("observation", 2), ("phase", 1), (BASE, 1)]

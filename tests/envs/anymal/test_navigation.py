@@ -37,9 +37,8 @@ def walked(env):
     qpos = np.array(state.body.qpos)
     qpos[2, 0] = 50.0
     qpos[3, 3:7] = np.cos(0.8), np.sin(0.8), 0, 0
-    state = state.replace(
-        body=state.body.replace(qpos=jnp.asarray(qpos)), goal=state.goal.at[1].set(state.body.qpos[1, :2])
-    )
+    goal = state.goal.at[1].set(state.body.qpos[1, :2])
+    state = state.replace(body=state.body.replace(qpos=jnp.asarray(qpos)), goal=goal)
     told = jnp.tile(jnp.array([1.0, 0.0]), (WALKERS, 1))
     step = jax.jit(jax.vmap(env.step))
     keys = jax.random.split(jax.random.key(1), WALKERS)
@@ -101,9 +100,8 @@ def test_a_tilted_sensor_reads_what_mujocos_rays_do(env):
             turn = tilted(rng.uniform(-3, 3), *rng.uniform(-0.08, 0.08, 2))
             origin = np.array([*start, 0.52])
             ours = np.asarray(look(world, jnp.asarray(origin, jnp.float32), jnp.asarray(turn)))
-            beams = np.stack(
-                [np.cos(mujoco_world.ANGLES), np.sin(mujoco_world.ANGLES), np.zeros(271)], -1
-            ) @ turn.T.astype(float)
+            level = np.stack([np.cos(mujoco_world.ANGLES), np.sin(mujoco_world.ANGLES), np.zeros(271)], -1)
+            beams = level @ turn.T.astype(float)
             hit = np.zeros(1, np.int32)
             found = np.array([mujoco.mj_ray(model, data, origin, beam, None, 1, -1, hit) for beam in beams])
             down = np.where(beams[:, 2] < 0, -0.52 / np.minimum(beams[:, 2], -1e-9), np.inf)  # the floor

@@ -37,9 +37,8 @@ def scenes(env):
     qpos[5, :7] = [0, 0, 0.6, np.cos(0.7), np.sin(0.7), 0, 0]
     qpos[6, 2] = 0.25
     qvel[7, 0] = np.nan
-    ground = AnymalGround(
-        friction=jnp.array([0.8, 0.8, 0.8, 0.3, 0.8, 0.8, 0.8, 0.8]), payload=jnp.array([0, 0, 0, 0, 6.0, 0, 0, 0])
-    )
+    friction = jnp.array([0.8, 0.8, 0.8, 0.3, 0.8, 0.8, 0.8, 0.8])
+    ground = AnymalGround(friction=friction, payload=jnp.array([0, 0, 0, 0, 6.0, 0, 0, 0]))
     walk = state.pipeline_state
     body = walk.body.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
     state = state.replace(pipeline_state=walk.replace(body=body, ground=ground))

@@ -61,6 +61,5 @@ def test_a_pocketed_ball_is_no_aim_and_in_nobodys_way():
     gone = between.at[8].set(0.5)
     blocked, free = (by_ball(aims_seen(REGULATION, seen)) for seen in (between, gone))
     assert not free[2][1].any()
-    assert (
-        blocked[1][0, UP, 7] < -0.5 < 0.9 < free[1][0, UP, 7]
-    )  # clearance of the cue ball's way, in diameters, less 1
+    # clearance of the cue ball's way, in diameters, less 1
+    assert blocked[1][0, UP, 7] < -0.5 < 0.9 < free[1][0, UP, 7]

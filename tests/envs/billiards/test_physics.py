@@ -81,9 +81,8 @@ def test_collision_keeps_momentum_and_reverses_the_normal_speed(friction, restit
     (p0, l0, e0), (p1, l1, e1) = totals(before, table.ball_radius), totals(after, table.ball_radius)
     np.testing.assert_allclose(p1, p0, atol=1e-6)
     np.testing.assert_allclose(l1, l0, atol=1e-7)
-    closing = [
-        ((np.stack([m.ux, m.uy], -1)[:, 0] - np.stack([m.ux, m.uy], -1)[:, 1]) * n).sum(-1) for m in (before, after)
-    ]
+    velocities = [np.stack([m.ux, m.uy], -1) for m in (before, after)]
+    closing = [((u[:, 0] - u[:, 1]) * n).sum(-1) for u in velocities]
     firm = closing[0] > 2e-3  # softer impacts are elastic, whatever the restitution
     np.testing.assert_allclose(closing[1][firm], -restitution * closing[0][firm], atol=3e-6)
     if friction == 0.0:

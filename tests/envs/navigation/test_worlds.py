@@ -66,9 +66,8 @@ def joined(free, first, starts, goals):
 
 def each(many):
     """Used boxes, used circles, starts, goals and extent, world by world."""
-    for boxes, circles, starts, goals, extent in zip(
-        many.boxes, many.circles, many.starts, many.goals, many.extent, strict=True
-    ):
+    rows = zip(many.boxes, many.circles, many.starts, many.goals, many.extent, strict=True)
+    for boxes, circles, starts, goals, extent in rows:
         yield used(boxes), used(circles), starts, goals, extent
 
 

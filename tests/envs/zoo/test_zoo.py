@@ -46,9 +46,8 @@ def test_the_right_action_has_the_effect_that_the_unchanged_policys_has():
     @jax.jit
     def found():
         effects = jax.vmap(execute)(worlds, states.position, jax.vmap(zoo.right)(worlds, states))
-        return effects, zoo.policy(
-            robot, encode(robot, sight_of(*jax.tree.map(lambda leaf: leaf[0], (worlds, states))))
-        )
+        sight = sight_of(*jax.tree.map(lambda leaf: leaf[0], (worlds, states)))
+        return effects, zoo.policy(robot, encode(robot, sight))
 
     effects, wanted = found()
     for name, effect, other in zip(zoo.ERRORS, effects, worlds.other, strict=True):
