@@ -91,9 +91,7 @@ def optimise_readings():
 
     from cuelearner_jax.reading import fitting
 
-    options = {"xla_backend_optimization_level": 1}
-    update = jax.jit(fitting._update.__wrapped__, compiler_options=options)
-    fitting._update = update
+    fitting._update = jax.jit(fitting._update.__wrapped__, compiler_options={"xla_backend_optimization_level": 1})
 
 
 @pytest.hookimpl(tryfirst=True)

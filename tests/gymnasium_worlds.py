@@ -37,8 +37,7 @@ class Adder(gymnasium.Env):
 
 def start_of(seed):
     """Return the number that `Adder` starts from, for a seed."""
-    env = Adder()
-    return env.reset(seed=int(seed))[0][0]
+    return Adder().reset(seed=int(seed))[0][0]
 
 
 class Nested(gymnasium.Env):

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import math
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -249,8 +249,7 @@ def label_set(obs, action, answer, valid):
 
 def lane(tree, index):
     """Return one lane of a block as NumPy arrays."""
-    raw = partial(jax.tree.map, lambda leaf: words(leaf)[index])
-    return jax.tree.map(np.asarray, raw(tree))
+    return jax.tree.map(lambda leaf: np.asarray(words(leaf)[index]), tree)
 
 
 def words(leaf):

@@ -73,8 +73,7 @@ def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     agents = Agent(probes.start(program, [0, 1, 2], [0, 0, 0]).agent.params, probes.FUNCTIONS)
     told = []
     watched = evaluate.rollout_lanes(ENV, agents, KEY, 10, 120, lambda *given: told.append(given))
-    mesh = lane_mesh(jax.local_devices()[:1])
-    whole = evaluate.rollout_lanes(ENV, agents, KEY, 10, 120, mesh=mesh).means
+    whole = evaluate.rollout_lanes(ENV, agents, KEY, 10, 120, mesh=lane_mesh(jax.local_devices()[:1])).means
     for name, value in whole.items():
         np.testing.assert_array_equal(watched.means[name], value, strict=True)
     assert len(set(watched.means["reward"])) > 1

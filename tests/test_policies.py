@@ -73,8 +73,7 @@ def test_under_relative_guidance_every_action_is_refined_once_the_model_is_fitte
     guided = Guided(AGENT, model, ENV, probes.SCALARS, relative)
     np.testing.assert_array_equal(act(guided), act(AGENT))
     model = model.replace(fitted=jnp.array(True))
-    everywhere = jnp.ones(len(OBS), bool)
-    refined = relative.act(model, ENV, OBS, AGENT.act(KEY, OBS, OBS), everywhere, probes.SCALARS)
+    refined = relative.act(model, ENV, OBS, AGENT.act(KEY, OBS, OBS), jnp.ones(len(OBS), bool), probes.SCALARS)
     np.testing.assert_array_equal(act(guided.replace(model=model)), refined.actions)
     assert np.abs(act(guided) - np.asarray(refined.actions)).max(-1).min() > 0
 
@@ -195,8 +194,7 @@ def block():
 
 
 def guided(base):
-    relative = guidances.make("relative", probes.SIZES, ENV)
-    return Guided(base, block().guide.model, ENV, probes.SCALARS, relative)
+    return Guided(base, block().guide.model, ENV, probes.SCALARS, guidances.make("relative", probes.SIZES, ENV))
 
 
 def agents():

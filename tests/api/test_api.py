@@ -121,8 +121,7 @@ def test_the_shipped_agent_is_loaded_without_worlds_and_without_a_training_progr
 
 def test_labels_about_a_policys_own_actions_alone_lead_no_farther_than_they_reach():
     assert errors(policy) == pytest.approx(ERROR, abs=0.01)
-    careful = correct(own_labels())
-    assert errors(careful) == pytest.approx(ERROR - 5.0, abs=0.5)
+    assert errors(correct(own_labels())) == pytest.approx(ERROR - 5.0, abs=0.5)
 
 
 def changed(**parts):

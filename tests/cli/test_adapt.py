@@ -127,8 +127,7 @@ def test_lanes_of_a_run_are_adapted_one_each_and_again(home, tmp_path):
     assert main([*adapt, "--base.seed", "1", "0", "--out", str(out)]) == 0
     values = json.loads((out / "policy.json").read_text())
     assert (values["lanes"]["seeds"], values["lanes"]["base"], values["rows"]) == ([1, 0], [0, 1], 2)
-    of = {"folder": "run", "guidance": "none", "labels": 0, "policy": "agent", "seeds": [1, 0]}
-    assert values["of"] == of
+    assert values["of"] == {"folder": "run", "guidance": "none", "labels": 0, "policy": "agent", "seeds": [1, 0]}
     (row,) = measured(tmp_path, out)
     (alone,) = measured(tmp_path, run, "--scenario", "aslant")
     (base,) = measured(tmp_path, out, "--policy", "base")

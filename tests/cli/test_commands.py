@@ -115,8 +115,7 @@ def test_a_report_has_curves_and_tables(run_folder, tmp_path, capsys):
     assert main(["report", str(run_folder), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["guidance"], row["labels"]) for row in rows] == [("none", 0), ("relative", 10), ("relative", 20)]
-    table = (out / "report.md").read_text()
-    assert "| relative | 20 | 2 |" in table
+    assert "| relative | 20 | 2 |" in (out / "report.md").read_text()
     assert (out / "label_efficiency.png").exists()
 
 

@@ -88,13 +88,10 @@ NUMBERS = np.array([*NUMBERS, 2.0**32, np.inf, -np.inf, np.nan], np.float32)
 ROWS = np.random.default_rng(4).integers(len(NUMBERS), size=(200, 5))
 KINDS = {"float32": lambda x: x, "int32": lambda x: x.astype(jnp.int32), "bool": lambda x: x > 0.7}
 COMPARED = {name: getattr(lax, name) for name in ("eq", "ne", "lt", "le", "gt", "ge")}
+UNARY = "neg abs sign floor ceil exp log log1p expm1 sin cos tan tanh atan sqrt rsqrt square logistic is_finite"
 SINGLE = {
     "float32": {
-        **{
-            name: getattr(lax, name) for name in ("neg", "abs", "sign", "floor", "ceil", "exp", "log", "log1p", "expm1")
-        },
-        **{name: getattr(lax, name) for name in ("sin", "cos", "tan", "tanh", "atan", "sqrt", "rsqrt", "square")},
-        **{name: getattr(lax, name) for name in ("logistic", "is_finite")},
+        **{name: getattr(lax, name) for name in UNARY.split()},
         **{f"integer_pow {y}": lambda x, y=y: lax.integer_pow(x, y) for y in (-2, 0, 1, 2, 3, 5)},
         **{name: lambda x, to=name: x.astype(to) for name in ("int32", "bool")},
         "round": jnp.round,

@@ -80,9 +80,8 @@ def test_agrees_with_a_float64_loop(scale, tau_deg, tau_max_deg, k_max):
 
 
 def test_passes_between_two_looks_change_nothing(monkeypatch):
-    k_max = 50
     weights, first, some = network(20, 0.2), starts(1), np.arange(ROWS) % 3 > 0
-    given = (weights, first, some, 0.5 * DEG, math.pi, k_max)
+    given = (weights, first, some, 0.5 * DEG, math.pi, 50)
     each = refined_by_network(*given)
     asked = []
 

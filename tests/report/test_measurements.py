@@ -41,8 +41,7 @@ def test_one_policy_has_an_interval_over_episodes_and_several_over_seeds():
     assert over_both.upper - over_both.lower > 0.2  # the seeds differ by 0.02, their episodes' luck is the same
     alike = Measured("-", 0, 0, np.arange(3), {"reward": np.ones(3)}, {"reward": np.ones((3, 9))}, is_shared=True)
     assert measurements.over(alike) == "episodes"  # three seeds of one policy are no spread over seeds
-    missing = one._replace(metrics={"success": np.array([np.nan])})
-    assert measurements.spread(missing, "success") is None
+    assert measurements.spread(one._replace(metrics={"success": np.array([np.nan])}), "success") is None
 
 
 def test_a_share_of_all_episodes_has_an_interval():
@@ -83,7 +82,6 @@ def test_differences_of_seeds_are_paired_where_seeds_are_the_same():
 
 def test_variants_are_compared_with_their_own_kind_or_refused():
     rows = [measured([1], labels=100), measured([1], labels=500)]
-    found = measurements.differences(rows, rows[::-1])
-    assert [one.other.labels for one in found] == [100, 500]
+    assert [one.other.labels for one in measurements.differences(rows, rows[::-1])] == [100, 500]
     with pytest.raises(UserError, match=r"has 2 variants .* but not relative, 250 labels"):
         measurements.differences([measured([1], labels=250)], rows)

@@ -16,10 +16,6 @@ def direction(degrees):
     return directions.from_angle(jnp.array(degrees * DEG))
 
 
-def degrees_of(action):
-    return float(directions.to_angle(action)) / DEG
-
-
 def test_rotate_is_counterclockwise():
     np.testing.assert_allclose(directions.rotate(jnp.array([1.0, 0.0]), math.pi / 2), [0, 1], atol=1e-7)
     np.testing.assert_allclose(directions.rotate(jnp.array([3.0, 4.0]), -math.pi / 2), [4, -3], atol=1e-6)
@@ -62,7 +58,7 @@ def test_no_action_is_zero_and_actions_stay_as_they_are():
 )
 def test_clip_to_ball(action, base, radius, clipped):
     result = DIRECTIONS.clip(direction(action), direction(base), radius * DEG)
-    assert degrees_of(result) == pytest.approx(clipped, abs=1e-4)
+    assert float(directions.to_angle(result)) / DEG == pytest.approx(clipped, abs=1e-4)
 
 
 @pytest.mark.parametrize("radius", [math.pi, 100.0])

@@ -208,16 +208,6 @@ class Wider(Window):
     observation = (Quantity("context", 2, "1"), Quantity("half the width", 1, "rad"))
 
 
-def with_preset(**changes):
-    """The probe with one preset."""
-    return dataclasses.replace(PROBE, presets={"small": Preset("seconds", CONFIG, **changes)})
-
-
-def with_environment(make):
-    """The probe with a preset and other environments."""
-    return dataclasses.replace(with_preset(), bodies=(Body("point", "", make),))
-
-
 def with_pictures(drawn):
     """The probe with a body that something draws."""
     return dataclasses.replace(PROBE, bodies=(dataclasses.replace(PROBE.bodies[0], pictures=lambda: drawn),))
@@ -228,10 +218,12 @@ def write(*given):
 
 
 DRAWN = Pictures(lambda env, policy, key, steps: ([None] * steps, [0.0] * steps), write, write, write)
-BY_WIDTH = with_environment(lambda config, split: Window() if config.half_width_deg > 10 else Wider())
+BY_WIDTH = Body("point", "", lambda config, split: Window() if config.half_width_deg > 10 else Wider())
+PRESETS = {"small": Preset("seconds", CONFIG)}
+NARROW = {"narrow": Scenario("", {"half_width_deg": 5.0})}
 TASKS = {
     "a wider scenario": (
-        dataclasses.replace(BY_WIDTH, scenarios={"narrow": Scenario("", {"half_width_deg": 5.0})}),
+        dataclasses.replace(PROBE, bodies=(BY_WIDTH,), presets=PRESETS, scenarios=NARROW),
         "scenario 'narrow' has observations of 3 entries, not 2",
     ),
     "nothing is written": (with_pictures(DRAWN._replace(still=lambda *_: None)), "window.png was not written"),

@@ -61,8 +61,7 @@ def played(env, key):
         following, result = jax.vmap(env.step)(jax.random.split(k_step, 16), states, action)
         return (following, result.obs), (states, obs, memory, action, result, following)
 
-    start = jax.vmap(env.reset)(jax.random.split(key, 16))
-    return jax.lax.scan(advance, start, jnp.arange(60))[1]
+    return jax.lax.scan(advance, jax.vmap(env.reset)(jax.random.split(key, 16)), jnp.arange(60))[1]
 
 
 def flat(tree):
