@@ -86,9 +86,10 @@ def read(path: Path) -> Situations:
         return situations._replace(picture=picture) if picture else situations
     table = _table_in(path)
     columns = _columns(table)
-    known, advice = (OBSERVATION, ACTION, PICTURE, TEXT, *NUMBERS), f"name it {OBSERVATION}.NAME or {ACTION}.NAME"
+    own = (OBSERVATION, ACTION, PICTURE, TEXT, *NUMBERS)
+    advice = f"name it {OBSERVATION}.NAME or {ACTION}.NAME"
     for name in columns:
-        if name not in known and not name.startswith(("observation.", "action.")):
+        if name not in own and not name.startswith(("observation.", "action.")):
             raise UserError(f"{table} has an unknown column {format_value(name)}: {advice}, or leave it out")
     if len({len(values) for values in columns.values()}) > 1:
         raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
