@@ -192,7 +192,8 @@ class Builder:
         operations, self.ops = self.ops, outer
         self._earlier = before  # operations inside are not available outside
         names = [value.name for value in carried]
-        changing, inside = set(names), []  # what every pass must repeat; loop-invariant operations move before the loop
+        changing = set(names)
+        inside = []  # what every pass must repeat; loop-invariant operations move before the loop
         for op in operations:
             name, inputs, outputs, _ = op
             if name == "while" or changing & set(inputs):

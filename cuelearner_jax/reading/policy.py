@@ -124,7 +124,8 @@ def unread(
 ) -> ReadingPolicy:
     """Return a policy without a correction, with arrays of the shapes that `describe` tells."""
     change, zeros = linear.no_change(space, family, obs_size), jnp.zeros
-    z, step = obs_size + space.size, zeros(linear.unknowns(family, obs_size))
+    z = obs_size + space.size
+    step = zeros(linear.unknowns(family, obs_size))
     frame = ObservationFrame(zeros(obs_size), jnp.ones(obs_size), zeros(obs_size), step, zeros(mixed, jnp.int32))
     known, alpha = zeros((labels, z)), zeros((labels, len(space.cues)))
     correction = Correction(change, frame, known, alpha, jnp.ones(z), jnp.float32(0))
