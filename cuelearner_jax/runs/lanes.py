@@ -36,7 +36,7 @@ class LaneGroup:
         takers = CORES if jax.default_backend() == "cpu" and self.mesh.size == 1 else 1
         self.lanes_per_block = config.sizes.lanes_per_block or -(-len(self.seeds) // takers)
         lanes = self.cut.shape[1] // self.mesh.size
-        self.program: Program = make_program(config, guidance, env, self.largest_budget, self.mesh, lanes)
+        self.program: Program = make_program(config, guidance, env, self.largest_budget, self.mesh, lanes=lanes)
 
     @property
     def rounds(self) -> int:
